@@ -74,18 +74,21 @@ class Driver:
 
     def __init__(self, world: World, seed: int) -> None:
         import rclpy
+        from action_msgs.msg import GoalStatus
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PoseWithCovarianceStamped
+        from nav2_msgs.action import NavigateToPose
         from rclpy.action import ActionClient
         from rclpy.qos import QoSProfile
 
-        from thinmap_msgs.action import Explore, NavigateToPose
+        from thinmap_msgs.action import Explore
         from thinmap_ros.ros import messages
 
         rclpy.init()
         self._rclpy = rclpy
         self._messages = messages
         self._goal = NavigateToPose.Goal
+        self._succeeded = GoalStatus.STATUS_SUCCEEDED
         self._world = world
         self._chance = np.random.default_rng(seed)
         self._node = rclpy.create_node('endurance')
@@ -125,7 +128,7 @@ class Driver:
         if self.explores:
             return self._explored
         self.goals += 1
-        goal = self._goal(use_heading=True)
+        goal = self._goal()
         place = random_start(self._world, self._chance)
         goal.pose = self._messages.pose_stamped_msg(place, 'map', 0)
         return goal
@@ -138,7 +141,8 @@ class Driver:
 
     def _on_ended(self, future: Any) -> None:
         self._busy = False
-        self.reached += not self.explores and future.result().result.success
+        is_reached = future.result().status == self._succeeded
+        self.reached += not self.explores and is_reached
         self.explores = False
 
     def _on_pose(self, message: Any) -> None:

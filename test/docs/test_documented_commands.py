@@ -99,6 +99,8 @@ SECTIONS = {
     ('tutorials.md', 'Your robot in 10 minutes'): Section(SIM),
     ('tutorials.md', 'Your bag in 5 minutes'): Section(),
     ('tutorials.md', 'Your map to a Nav2 route graph in 2 minutes'): Section(),
+    ('tutorials.md', "Nav2's clients drive the robot"): Section(SIM),
+    ('tutorials.md', 'Explore with Nav2 and your own SLAM'): Section(SIM),
     ('tutorials.md', 'Two robots'): Section(),
     ('tutorials.md', 'Left running'): Section({'localizer': {}}),
 }
@@ -118,7 +120,8 @@ def told_by(text: str) -> list[str]:
     """Names under which the nodes of a command publish on /diagnostics."""
     words = text.split('--ros-args')[0].split('#')[0].removesuffix('&').split()
     program = words[3]
-    names = words[4:] or FIVE if program == 'thinmap' else [program]
+    renamed = re.search(r'__node:=(\w+)', text)
+    names = words[4:] or FIVE if program == 'thinmap' else [renamed[1] if renamed else program]
     space = re.search(r'__ns:=/(\S+)', text)
     prefix = f'{space[1]}/' if space else ''
     return [f'{prefix}{name}: thinmap' for name in names]

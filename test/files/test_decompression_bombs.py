@@ -114,7 +114,7 @@ def test_keys_of_several_kinds_in_a_world(tmp_path: Path) -> None:
     'place',
     [
         '"id": {}',
-        '"id": 1, "metadata": {{"kind": "end", "clearance": {}}}',
+        '"id": 1, "metadata": {{"class": "end", "clearance": {}}}',
         '"id": -{}',
         '"id": 1e{}',
     ],
@@ -134,7 +134,7 @@ def test_numbers_of_many_digits_in_geojson(tmp_path: Path, place: str, digits: i
 def test_a_kind_of_a_million_letters_in_geojson(tmp_path: Path) -> None:
     path = tmp_path / 'g.geojson'
     node = {'geometry': {'type': 'Point', 'coordinates': [0, 0]}}
-    node['properties'] = {'id': 1, 'metadata': {'kind': 1_000_000 * 'k', 'clearance': 1}}
+    node['properties'] = {'id': 1, 'metadata': {'class': 1_000_000 * 'k', 'clearance': 1}}
     path.write_text(json.dumps({'features': [node]}))
     with pytest.raises(InputError) as error:
         read_geojson(path)

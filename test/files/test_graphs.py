@@ -61,7 +61,22 @@ def test_it_is_what_the_route_server_reads(tmp_path: Path) -> None:
             assert line[-1] == nodes[end]['geometry']['coordinates']
             ways.add((f['properties']['metadata']['edge'], start, end))
     assert {(2, 1, 3), (2, 3, 1), (4, 3, 1), (4, 1, 3), (9, 1, 7), (9, 7, 1), (5, 7, 7)} == ways
-    assert nodes[3]['properties']['metadata'] == {'kind': 'end', 'clearance': 0.4}
+    assert nodes[3]['properties']['metadata'] == {'class': 'end', 'clearance': 0.4}
+    classes = {
+        f['properties']['metadata']['edge']: f['properties']['metadata']['class']
+        for f in features
+        if f['geometry']['type'] == 'MultiLineString'
+    }
+    assert classes == {2: 'dead_end', 4: 'dead_end', 9: 'passage', 5: 'passage'}
+
+
+def test_a_graph_without_paths_has_the_same_nodes_and_straight_edges(tmp_path: Path) -> None:
+    write_geojson(tmp_path / 'g.geojson', example(), with_paths=False)
+    found = read_geojson(tmp_path / 'g.geojson')
+    assert found.nodes.keys() == example().nodes.keys()
+    for number, edge in example().edges.items():
+        np.testing.assert_allclose(found.edges[number].path, edge.path[[0, -1]], atol=1e-4)
+        assert found.edges[number].length_m == pytest.approx(edge.length_m, abs=1e-3)
 
 
 def small() -> TopologicalMap:
@@ -162,7 +177,7 @@ def test_not_a_number_is_never_written(tmp_path: Path) -> None:
     ('place', 'value', 'said'),
     [
         (('properties', 'id'), 1.5, 'id 1.5'),
-        (('properties', 'metadata'), {}, 'kind'),
+        (('properties', 'metadata'), {}, 'class'),
         (('geometry', 'coordinates'), [1.0], 'features.0'),
         (('geometry', 'coordinates'), [1.0, 'x'], 'no finite number'),
         (('geometry',), None, 'features.0'),

@@ -123,7 +123,7 @@ def test_other_images(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('changes', 'said'),
     [
-        ({'origin': [0, 0, 0.5]}, 'yaw 0.5'),
+        ({'origin': [0, 0, float('nan')]}, 'origin'),
         ({'origin': [0, 0]}, 'origin'),
         ({'origin': [0, 'a', 0]}, 'origin'),
         ({'origin': [0, float('inf'), 0]}, 'origin'),

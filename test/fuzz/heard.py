@@ -43,6 +43,7 @@ _TOPICS = {
     'Odometry': ('odom',),
     'PoseWithCovarianceStamped': ('pose',),
     'OccupancyGrid': ('map',),
+    'ProbabilityGrid': ('grid',),
     'TopologicalMap': ('topology',),
 }
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from nav_msgs.msg import OccupancyGrid, Odometry
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import TopologicalEdge, TopologicalMap, TopologicalNode
+from thinmap_msgs.msg import ProbabilityGrid, TopologicalEdge, TopologicalMap, TopologicalNode
 from thinmap_ros.ros import messages
 
 STRANGE = st.sampled_from(
@@ -215,11 +215,18 @@ def topologies(draw, ns=10**9):
     return message
 
 
+@st.composite
+def probability_grids(draw, ns=10**9):
+    grid = draw(grids(ns))
+    return ProbabilityGrid(header=grid.header, info=grid.info, data=grid.data)
+
+
 STRATEGIES = {
     LaserScan: scans,
     Odometry: odometries,
     PoseWithCovarianceStamped: poses,
     OccupancyGrid: grids,
+    ProbabilityGrid: probability_grids,
     TopologicalMap: topologies,
 }
 
@@ -244,7 +251,7 @@ def check_pose(message):
 def check_grid(message):
     patch = messages.grid_from_msg(message)
     assert (
-        patch.cells.size == len(message.data)
+        patch.cells.size >= len(message.data)
         and patch.cells.min() >= -1
         and patch.cells.max() <= 100
     )
@@ -266,6 +273,7 @@ CHECKS = {
     Odometry: check_odometry,
     PoseWithCovarianceStamped: check_pose,
     OccupancyGrid: check_grid,
+    ProbabilityGrid: check_grid,
     TopologicalMap: check_topology,
 }
 

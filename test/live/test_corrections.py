@@ -5,12 +5,12 @@ import signal
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from nav_msgs.msg import Path
 from sensor_msgs.msg import LaserScan
 from support.doctor import Doctor
 from support.slam_room import corridor_ring, scan_in
 
+from thinmap_msgs.msg import ProbabilityGrid
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.correctable import CorrectableGrid
@@ -33,7 +33,7 @@ def scan_of(k):
 
 def named_by(message):
     """Stamp of the correction that a map contains."""
-    return messages.stamp_ns(message.info.map_load_time)
+    return messages.stamp_ns(message.correction_stamp)
 
 
 class Mapping:
@@ -42,8 +42,8 @@ class Mapping:
     def __init__(self, graph):
         self.graph = graph
         self.by_hand = CorrectableGrid(OccupancyGrid(CONFIG))
-        self.maps = graph.heard('map', OccupancyGridMsg, qos.LATCHED)
-        self.windows = graph.heard('local_map', OccupancyGridMsg)
+        self.maps = graph.heard('grid', ProbabilityGrid, qos.LATCHED)
+        self.windows = graph.heard('local_grid', ProbabilityGrid)
         self._scans = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
         self._poses = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self._paths = graph.node.create_publisher(Path, 'trajectory', qos.LATCHED)
@@ -58,7 +58,7 @@ class Mapping:
             'scan: publishers',
             'pose: publishers',
             'trajectory: publishers',
-            'local_map: subscribers',
+            'local_grid: subscribers',
         ]
         self.graph.until(
             lambda: (

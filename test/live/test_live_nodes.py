@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from thinmap_msgs.action import NavigateToPose
-from thinmap_msgs.msg import SlamStatus, TopologicalMap
+from thinmap_msgs.msg import ProbabilityGrid, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.files import occupancy_maps
 from thinmap_ros.logs.bag import Bag
@@ -64,7 +64,7 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     status = graph.heard('slam_status', SlamStatus)
     scans = graph.heard('scan', LaserScan, qos.SENSOR)
     frames = graph.heard('/tf', TFMessage)
-    local_maps = graph.heard('local_map', OccupancyGrid, qos.LATCHED)
+    local_maps = graph.heard('local_grid', ProbabilityGrid, qos.LATCHED)
 
     def links():
         return {(t.header.frame_id, t.child_frame_id) for m in frames for t in m.transforms}
@@ -91,7 +91,7 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and topology')
-    assert maps[-1].info.resolution == pytest.approx(0.1)
+    assert maps[-1].info.resolution == pytest.approx(0.05)
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
     assert response.success, response.message
     assert occupancy_maps.read_map(tmp_path / 'room.yaml').cells.shape[0] > 20

@@ -13,11 +13,11 @@ import pytest
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid
 from support.timeouts import PATIENCE_S
 from tf2_msgs.msg import TFMessage
 
-from thinmap_msgs.action import NavigateToPose
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.ros import messages, qos
 

@@ -15,6 +15,7 @@ import yaml
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from action_msgs.srv import CancelGoal
 from geometry_msgs.msg import PoseStamped
+from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid
 from rclpy.duration import Duration
 from std_msgs.msg import String
@@ -22,7 +23,6 @@ from support.live_graph import Graph
 from support.ros_domains import free_domain
 from support.timeouts import PATIENCE_S
 
-from thinmap_msgs.action import NavigateToPose
 from thinmap_ros.ros import qos
 
 pytestmark = pytest.mark.live
@@ -248,14 +248,14 @@ GO = '{pose: {header: {frame_id: map}, pose: {position: {x: 2.6, y: 2.0}, orient
 
 
 def test_a_goal_is_followed_to_its_end(robot):
-    kind = 'thinmap_msgs/action/NavigateToPose'
+    kind = 'nav2_msgs/action/NavigateToPose'
     said = output('action', 'send_goal', '--feedback', '/navigate_to_pose', kind, GO)
     wanted = [
         'Waiting for an action server to become available...\n',
         'Sending goal:\n     pose:\n  header:\n',
         'Goal accepted with ID: ',
         'Feedback:\n    ',
-        'Result:\n    success: true\n',
+        'Result:\n    error_code: 0\n',
         'Goal finished with status: SUCCEEDED\n',
     ]
     are_in_order(said, wanted)
@@ -297,7 +297,7 @@ def wait_for(condition, what):
 
 def test_the_acceptance_of_a_goal_is_shown_before_its_feedback(graph):
     serve_feedback_first(graph.node, '/hasty')
-    kind = 'thinmap_msgs/action/NavigateToPose'
+    kind = 'nav2_msgs/action/NavigateToPose'
     goal = start('action', 'send_goal', '--feedback', '/hasty', kind, GO)
     graph.until(lambda: goal.poll() is not None, 'the goal ends')
     said, complaints = goal.communicate()

@@ -24,6 +24,7 @@ from support.timeouts import PATIENCE_S
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.ros import qos
 
+TESTS = Path(__file__).resolve().parents[1]
 _DEPTH = 1000
 # Time after which a response is taken to be lost.
 _ASK_AGAIN_S = 20.0
@@ -50,13 +51,14 @@ class Graph:
         remap: tuple[str, ...] = (),
         arguments: tuple[str, ...] = (),
         label: str = '',
+        package: str = 'thinmap_ros.nodes',
         **values: Any,
     ) -> subprocess.Popen[bytes]:
         """Start a node with arguments, ROS's remapping rules and its parameters.
 
-        Its key is its label, or its name.
+        Its key is its label, or its name. package: of its module.
         """
-        command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', *arguments, '--ros-args']
+        command = [sys.executable, '-m', f'{package}.{name}', *arguments, '--ros-args']
         name = label or name
         for rule in remap:
             command += ['-r', rule]
@@ -66,7 +68,12 @@ class Graph:
         log = (self.folder / f'{name}.log').open('wb')
         # Services save and load below the working directory only.
         process = subprocess.Popen(
-            command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True, cwd=self.folder
+            command,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            cwd=self.folder,
+            env={**os.environ, 'PYTHONPATH': f'{TESTS}:{os.environ.get("PYTHONPATH", "")}'},
         )
         log.close()
         self.processes[name] = process

@@ -54,7 +54,7 @@ class FrontierMap:
 
     def __init__(self, allow_backtracking: bool = False) -> None:
         """allow_backtracking: the recent path counts as traversable, however narrow it appears."""
-        self.borders = OpenBorders(_EXPLORER.min_frontier_size_m)
+        self.borders = OpenBorders(_EXPLORER.min_frontier_size)
         self._recent_path = RecentPath() if allow_backtracking else None
         self.patch: GridPatch | None = None
         self._reachable: Mask = np.zeros((0, 0), dtype=np.bool_)
@@ -71,7 +71,7 @@ class FrontierMap:
     def is_open(self, frontier: Frontier) -> bool:
         """Whether enough of a frontier remains; its cells must be of the present frame."""
         left = np.count_nonzero(self.borders.mask[frontier.cells[:, 0], frontier.cells[:, 1]])
-        return bool(left * self.borders.frame.resolution >= _EXPLORER.min_frontier_size_m - 1e-6)
+        return bool(left * self.borders.frame.resolution >= _EXPLORER.min_frontier_size - 1e-6)
 
     def find(self, T_map_base: Array) -> list[Frontier]:
         """All frontiers with a viewpoint that is reachable from a pose (3,)."""

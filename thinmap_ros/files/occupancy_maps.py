@@ -14,10 +14,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
-from thinmap_ros.core.se2 import MAX_COORDINATE_M
+from thinmap_ros.core.grid.rotated import aligned_patch
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.files.limits import FILES
 from thinmap_ros.files.yaml import read_mapping
@@ -73,15 +74,24 @@ def read_map(path: Path, folder: Path | None = None) -> GridPatch:
     """Read a map from its YAML file; trinary and scale modes.
 
     folder: if given, the image must be inside of it. Raises InputError with file, key, value and
-    expectation.
+    expectation. A map with a yaw in its origin is resampled.
     """
     content = read_mapping(path, 'a map_server YAML file')
     image = _image_of(path, content, folder)
-    resolution = _number(path, content, 'resolution', 1e-3, 10.0)
+    resolution = _resolution(path, content)
     origin = _origin(path, content)
     shades = _Shades.of(path, content)
     cells = _cells(path, image, shades)
-    return GridPatch(GridFrame(origin[0], origin[1], resolution), np.ascontiguousarray(cells[::-1]))
+    return aligned_patch(origin, resolution, np.ascontiguousarray(cells[::-1]))
+
+
+def read_resolution(path: Path) -> float:
+    """Edge of a cell (m) of a map, from its YAML file. Raises InputError as `read_map`."""
+    return _resolution(path, read_mapping(path, 'a map_server YAML file'))
+
+
+def _resolution(path: Path, content: dict[str, Any]) -> float:
+    return _number(path, content, 'resolution', 1e-3, 10.0)
 
 
 def _image_of(path: Path, content: dict[str, Any], folder: Path | None) -> Path:
@@ -115,15 +125,13 @@ def _is_negated(path: Path, content: dict[str, Any]) -> bool:
     return bool(value)
 
 
-def _origin(path: Path, content: dict[str, Any]) -> list[float]:
+def _origin(path: Path, content: dict[str, Any]) -> Array:
     value = content.get('origin')
     numbers = value if isinstance(value, list) else []
     fit = all(isinstance(v, int | float) and abs(v) <= MAX_COORDINATE_M for v in numbers)
     if len(numbers) != 3 or not fit:
         raise InputError(f'{path}: origin: {quoted(value)}: expected [x, y, yaw] in m, m, rad')
-    if numbers[2] != 0:
-        raise InputError(f'{path}: origin: yaw {numbers[2]}: expected 0; turned maps are not read')
-    return [float(v) for v in numbers]
+    return se2.pose(*(float(v) for v in numbers))
 
 
 @dataclass(frozen=True)

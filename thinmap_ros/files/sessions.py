@@ -18,7 +18,7 @@ from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.npz import open_regular_file
-from thinmap_ros.files.occupancy_maps import read_map, write_map
+from thinmap_ros.files.occupancy_maps import read_map, read_resolution, write_map
 from thinmap_ros.files.snapshots import read_snapshot, write_snapshot
 
 _MAP_ENDING = '.yaml'
@@ -145,8 +145,8 @@ def load_grid(
 ) -> OccupancyGrid:
     """Read STEM.grid.npz or, where it is missing, STEM.yaml and its image: any map_server map.
 
-    folder: where given, the image has to lie below it. Raises InputError where both are missing, or
-    one is broken or of another resolution.
+    The grid has the resolution of the file. folder: where given, the image has to lie below it.
+    Raises InputError where both are missing, or one is broken.
     """
     stem = stem_of(path)
     description = _with_ending(stem, _MAP_ENDING)
@@ -154,24 +154,23 @@ def load_grid(
         return GRID.load(path, config)
     if not _exists(description):
         raise InputError(f'{stem}: neither {GRID.file(path).name} nor {description.name} exists')
-    patch = read_map(description, folder)
-    try:
-        return OccupancyGrid.from_patch(patch, config)
-    except InputError as error:
-        raise InputError(f'{description}: {error}') from error
+    return OccupancyGrid.from_patch(read_map(description, folder), config)
 
 
-def load_topology(
-    path: str, config: TopologyConfig | None = None, resolution_m: float | None = None
-) -> TopologyBuilder:
-    """Read STEM.topology.npz; resolution_m: of the grid that it belongs to, m, if known.
+def load_topology(path: str, config: TopologyConfig | None = None) -> TopologyBuilder:
+    """Read STEM.topology.npz.
 
-    Raises InputError as `SessionPart.load`, and where it was made from another resolution.
+    Raises InputError as `SessionPart.load`, and where the map beside it has another resolution.
     """
     builder = TOPOLOGY.load(path, config)
-    if None not in (resolution_m, builder.resolution_m) and builder.resolution_m != resolution_m:
-        made = f'made from {builder.resolution_m} m a cell'
-        raise InputError(f'{TOPOLOGY.file(path)}: {made}: expected {resolution_m} m')
+    description = _with_ending(stem_of(path), _MAP_ENDING)
+    own_m = builder.resolution_m
+    if own_m is None or not _exists(description):
+        return builder
+    map_m = read_resolution(description)
+    if abs(map_m - own_m) > 1e-6:
+        file = TOPOLOGY.file(path)
+        raise InputError(f'{file}: made from {own_m} m a cell: expected {map_m} m as the map')
     return builder
 
 

@@ -110,8 +110,9 @@ def topology_builder() -> None:
 
 
 def explorer() -> None:
-    """Warm up the choice of an end node, in a partly unknown room."""
+    """Warm up the choice of an end node, in a partly unknown room, and what other maps need."""
     from thinmap_ros.core.exploration.explorer import Explorer
+    from thinmap_ros.core.exploration.live.map_view import scan_in_map
     from thinmap_ros.core.topology.builder import TopologyConfig, build
 
     patch = _room()
@@ -119,6 +120,7 @@ def explorer() -> None:
     topology = build(patch, (2.0, 2.0), TopologyConfig())
     for scan, T_map_base in _drive():
         rehearsed.step(topology, patch, scan, T_map_base)
+        scan_in_map(patch, T_map_base, scan.range_max_m, scan.stamp_ns)
 
 
 def navigator() -> None:

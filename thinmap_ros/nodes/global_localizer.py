@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, Twist
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.clock import Clock
 from rclpy.node import Node
@@ -41,6 +41,7 @@ from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.tf.odometry_source import OdometrySource
+from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
 
 _SAMPLES_PERIOD_NS = 1_000_000_000
 # Margins added to the radius of the robot: for paths, and for stops in front of obstacles.
@@ -85,6 +86,7 @@ class _Settings:
     search: GlobalLocalizationConfig
     node: GlobalLocalizerConfig
     map_frame: str
+    stamped_commands: bool
     driving: NavigatorConfig
 
     @staticmethod
@@ -96,7 +98,8 @@ class _Settings:
             controller=PathFollowerConfig(max_speed_m_s=own.drive_speed_m_s),
             stop_radius_m=search.robot_radius_m + _STOP_MARGIN_M,
         )
-        return _Settings(search, own, parameters.declare_map_frame(node), driving)
+        map_frame = parameters.declare_map_frame(node)
+        return _Settings(search, own, map_frame, declare_stamped(node), driving)
 
 
 class _LostDetector:
@@ -132,7 +135,7 @@ class _SearchDriver:
     search: None while there is nothing to search.
     """
 
-    def __init__(self, clock: Clock, publish: Callable[[Twist], object]) -> None:
+    def __init__(self, clock: Clock, publish: Callable[[float, float], object]) -> None:
         self.search: ActiveSearch | None = None
         self._clock = clock
         self._publish = publish
@@ -172,12 +175,12 @@ class _SearchDriver:
             self.stop()
             return
         self._is_driving = True
-        self._publish(messages.twist_msg(command.v, command.w))
+        self._publish(command.v, command.w)
 
     def stop(self) -> None:
         """Stop the robot, if it was driven."""
         if self._is_driving:
-            self._publish(messages.twist_msg(0.0, 0.0))
+            self._publish(0.0, 0.0)
         self._is_driving = False
 
     def _is_recent(self, scan_ns: int) -> bool:
@@ -271,10 +274,11 @@ class GlobalLocalizerNode(ThinmapNode):
 
     def _create_driver(self) -> _SearchDriver:
         if not self._settings.node.drive:
-            return _SearchDriver(self.get_clock(), lambda command: None)
-        cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
+            return _SearchDriver(self.get_clock(), lambda v, w: None)
+        base_frame = self._laser_transform.base_frame
+        velocity = VelocityPublisher(self, base_frame, self._settings.stamped_commands)
         self.create_active_timer(CONTROL_PERIOD_S, lambda: self._driver.step())
-        return _SearchDriver(self.get_clock(), cmd_vel.publish)
+        return _SearchDriver(self.get_clock(), velocity.publish)
 
     def reset_state(self) -> None:
         """Discard the search and all inputs but the map."""

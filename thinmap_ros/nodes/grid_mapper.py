@@ -4,17 +4,25 @@ from dataclasses import dataclass
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import MapMetaData, Path
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
-from nav_msgs.msg import Path
+from nav_msgs.srv import GetMap
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
+from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
-from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.errors import ConfigError, InputError, ThinmapError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
+from thinmap_ros.core.grid.occupancy import (
+    ROBOT_GRID,
+    OccupancyConfig,
+    OccupancyGrid,
+    WindowConfig,
+)
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
@@ -30,7 +38,54 @@ from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.session_client import SessionClient
 from thinmap_ros.ros.subscription import subscribe_guarded
 
-_LOST_SIGMA_M = 200.0  # the localizer publishes a larger standard deviation while it is lost
+TRINARY = 'trinary'
+PROBABILITY = 'probability'
+
+
+@dataclass(frozen=True)
+class MapOutputConfig(Config):
+    """How the topic map is published."""
+
+    map_values: str = parameter(
+        TRINARY,
+        'Values of map. trinary: -1 unknown, 0 free, 100 occupied, as slam_toolbox and map_server '
+        'publish them. probability: -1 or the probability of occupancy (%).',
+        choices=(TRINARY, PROBABILITY),
+    )
+    occupied_thresh: float = parameter(
+        0.65,
+        'Probability from which a cell of a trinary map is occupied. Raise it against walls that '
+        'people leave behind, lower it for thin obstacles.',
+        low=0.0,
+        high=1.0,
+    )
+    free_thresh: float = parameter(
+        0.25,
+        'Probability up to which a cell of a trinary map is free. Lower it to show only cells as '
+        'free that many beams have crossed.',
+        low=0.0,
+        high=1.0,
+    )
+    map_update_interval: float = parameter(
+        1.0,
+        'Time between two messages of map (s). Raise it to save CPU and network traffic with '
+        'large maps.',
+        low=0.05,
+        high=3600.0,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.free_thresh < self.occupied_thresh:
+            expected = f'expected less than occupied_thresh ({self.occupied_thresh})'
+            raise ConfigError(f'free_thresh = {self.free_thresh}: {expected}')
+
+    def shown(self, patch: GridPatch) -> GridPatch:
+        """The patch with the values to publish."""
+        if self.map_values == PROBABILITY:
+            return patch
+        limits = (100.0 * self.free_thresh, 100.0 * self.occupied_thresh)
+        return GridPatch(patch.frame, patch.trinary(*limits))
 
 
 @dataclass(frozen=True)
@@ -38,13 +93,15 @@ class _Settings:
     """Parameters of the node; mapping: whether scans change the map."""
 
     grid: OccupancyConfig
+    output: MapOutputConfig
     local_map_size_m: float
     mapping: bool
 
     @staticmethod
     def declare(node: Node) -> '_Settings':
         return _Settings(
-            grid=parameters.declare_config(node, OccupancyConfig),
+            grid=parameters.declare_config(node, OccupancyConfig, base=ROBOT_GRID),
+            output=parameters.declare_config(node, MapOutputConfig),
             local_map_size_m=parameters.declare_config(node, WindowConfig).local_map_size_m,
             mapping=bool(
                 parameters.declare_parameter(
@@ -58,35 +115,111 @@ class _Settings:
 
 
 class _MapPublishers:
-    """Publishes the map and the local maps."""
+    """Publishes the map for others, and the exact grid for thinmap's own nodes.
 
-    def __init__(self, node: Node) -> None:
+    load_ns: time at which the map was begun or loaded.
+    """
+
+    def __init__(self, node: Node, config: MapOutputConfig) -> None:
+        self._config = config
         self._frame = parameters.declare_map_frame(node)
+        self.load_ns = 0
         self._map = node.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
-        self._local_map = node.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
+        self._metadata = node.create_publisher(MapMetaData, 'map_metadata', qos.LATCHED)
+        self._grid = node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
+        self._local_grid = node.create_publisher(ProbabilityGrid, 'local_grid', qos.LATCHED)
 
     def publish_map(self, grid: CorrectableGrid, stamp_ns: int) -> None:
+        """Publish all of the map."""
         patch = grid.shown.known_area()
-        self._map.publish(messages.grid_msg(patch, self._frame, stamp_ns, grid.corrected_ns))
+        message = self.map_message(patch, stamp_ns)
+        self._map.publish(message)
+        self._metadata.publish(message.info)
+        exact = messages.probability_grid_msg(
+            patch, self._frame, stamp_ns, self.load_ns, grid.corrected_ns
+        )
+        self._grid.publish(exact)
 
-    def publish_local_map(self, window: GridPatch, stamp_ns: int, corrected_ns: int) -> None:
-        self._local_map.publish(messages.grid_msg(window, self._frame, stamp_ns, corrected_ns))
+    def map_message(self, patch: GridPatch, stamp_ns: int) -> OccupancyGridMsg:
+        """Message of the topic map."""
+        shown = self._config.shown(patch)
+        return messages.grid_msg(shown, self._frame, stamp_ns, self.load_ns)
+
+    def publish_local_grid(self, window: GridPatch, stamp_ns: int, corrected_ns: int) -> None:
+        """Publish the part of the grid that a scan has changed."""
+        message = messages.probability_grid_msg(
+            window, self._frame, stamp_ns, self.load_ns, corrected_ns
+        )
+        self._local_grid.publish(message)
+
+
+class _ScanPairs:
+    """Pairs each scan with its pose and, where a localizer publishes it, its status.
+
+    A pose of a lost robot, or of one without a map, belongs to no place in the map.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._status_topic = node.resolve_topic_name('slam_status')
+        self._poses: StampMatcher[LaserScan, Array] = StampMatcher()
+        self._states: StampMatcher[tuple[LaserScan, Array], int] = StampMatcher()
+
+    @property
+    def dropped(self) -> int:
+        """Number of scans, poses and states without a partner."""
+        return self._poses.dropped + self._states.dropped
+
+    def add_scan(self, message: LaserScan) -> tuple[LaserScan, Array, bool] | None:
+        """Add a scan; returns scan, T_map_base (3,), whether it is known, once complete."""
+        ns = messages.stamp_ns(message.header.stamp)
+        return self._with_state(ns, self._poses.add_left(ns, message))
+
+    def add_pose(self, message: PoseWithCovarianceStamped) -> tuple[LaserScan, Array, bool] | None:
+        """Add a pose."""
+        ns = messages.stamp_ns(message.header.stamp)
+        T_map_base = messages.pose_from_msg(message.pose.pose)
+        return self._with_state(ns, self._poses.add_right(ns, T_map_base))
+
+    def add_status(self, message: SlamStatus) -> tuple[LaserScan, Array, bool] | None:
+        """Add a status."""
+        return _complete(
+            self._states.add_right(messages.stamp_ns(message.header.stamp), message.state)
+        )
+
+    def _with_state(
+        self, ns: int, pair: tuple[LaserScan, Array] | None
+    ) -> tuple[LaserScan, Array, bool] | None:
+        if pair is None:
+            return None
+        if self._node.count_publishers(self._status_topic) == 0:
+            return *pair, True
+        return _complete(self._states.add_left(ns, pair))
+
+
+def _complete(
+    found: tuple[tuple[LaserScan, Array], int] | None,
+) -> tuple[LaserScan, Array, bool] | None:
+    if found is None:
+        return None
+    pair, state = found
+    return *pair, state not in (SlamStatus.LOST, SlamStatus.NO_MAP)
 
 
 class GridMapperNode(ThinmapNode):
-    """/scan and /pose in; /map once a second and /local_map at every scan out.
+    """/scan, /pose and /slam_status in; /map and /grid, /local_grid at every scan out.
 
-    Services save_map and load_map.
+    Services save_map, load_map; map and dynamic_map return the present map.
 
     After a /trajectory the map is re-rendered, a slice with each scan, near tiles first; meanwhile
-    tiles that are not complete are shown as they were. map_load_time of both is the stamp of the
-    newest trajectory that all of the map follows.
+    tiles that are not complete are shown as they were. correction_stamp of grid and local_grid is
+    the stamp of the newest trajectory that all of the map follows.
     """
 
     def __init__(self) -> None:
         super().__init__('grid_mapper', recovers=True)
         self._settings = _Settings.declare(self)
-        self._output = _MapPublishers(self)
+        self._output = _MapPublishers(self, self._settings.output)
         self._laser_transform = LaserTransform(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
@@ -99,6 +232,7 @@ class GridMapperNode(ThinmapNode):
         self.diagnostics.check_sole_publisher('map')
         # First: of messages that wait together, it is processed before the poses that follow it.
         subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
+        subscribe_guarded(self, SlamStatus, 'slam_status', self._on_status, qos.STREAM)
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         # Mapping continues while a map is saved, and waits while one is loaded: no window of the
@@ -107,11 +241,14 @@ class GridMapperNode(ThinmapNode):
         self._session_client = SessionClient(self, reentrant)
         self.create_service(SaveMap, 'save_map', self._on_save, callback_group=reentrant)
         self.create_service(LoadMap, 'load_map', self._on_load)
-        self.create_active_timer(1.0, self._publish_map)
+        for name in ('map', 'dynamic_map'):
+            self.create_service(GetMap, name, self._on_get_map)
+        self.create_active_timer(self._settings.output.map_update_interval, self._publish_map)
 
     def reset_state(self) -> None:
         """Discard the map, or return to the session that the node was started with."""
-        self._matcher: StampMatcher[LaserScan, tuple[Array, bool]] = StampMatcher()
+        self._pairs = _ScanPairs(self)
+        self._output.load_ns = self.get_clock().now().nanoseconds
         has_map = self._session or self._stamp.latest_ns is not None
         self._stamp.latest_ns = None
         if self._session:
@@ -132,24 +269,28 @@ class GridMapperNode(ThinmapNode):
         """Continue with the map of a killed mapper. Raises InputError where it is no such map."""
         latest_ns, cells = snapshot.split_stamp(state)
         grid = OccupancyGrid.from_state(cells, self._settings.grid)
+        expected_m = self._settings.grid.resolution_m
+        if not self._session and grid.frame.resolution != expected_m:
+            raise InputError(
+                f'map with {grid.frame.resolution} m a cell: expected {expected_m} m (resolution_m)'
+            )
         self._stamp.restore(latest_ns)
         self._replace_grid(grid)
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._add_scan(self._matcher.add_left(messages.stamp_ns(message.header.stamp), message))
+        self._add_scan(self._pairs.add_scan(message))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        is_known = bool(messages.covariance_from_msg(message)[0, 0] < _LOST_SIGMA_M**2)
-        T_map_base = messages.pose_from_msg(message.pose.pose)
-        self._add_scan(
-            self._matcher.add_right(messages.stamp_ns(message.header.stamp), (T_map_base, is_known))
-        )
+        self._add_scan(self._pairs.add_pose(message))
 
-    def _add_scan(self, pair: tuple[LaserScan, tuple[Array, bool]] | None) -> None:
-        self.diagnostics.set_drop_total('scans and poses without a partner', self._matcher.dropped)
-        if pair is None:
+    def _on_status(self, message: SlamStatus) -> None:
+        self._add_scan(self._pairs.add_status(message))
+
+    def _add_scan(self, complete: tuple[LaserScan, Array, bool] | None) -> None:
+        self.diagnostics.set_drop_total('scans and poses without a partner', self._pairs.dropped)
+        if complete is None:
             return
-        message, (T_map_base, is_known) = pair
+        message, T_map_base, is_known = complete
         scan = self._laser_transform.to_scan(message)
         if self._stamp.is_restarted_by(scan.stamp_ns):
             self.reset_state()
@@ -161,11 +302,16 @@ class GridMapperNode(ThinmapNode):
         self._stamp.latest_ns = scan.stamp_ns
         if moved is not None:
             self._publish_map()  # before the windows of the corrected map
-        self._output.publish_local_map(window, scan.stamp_ns, self._grid.corrected_ns)
+        self._output.publish_local_grid(window, scan.stamp_ns, self._grid.corrected_ns)
 
     def _publish_map(self) -> None:
         if self._stamp.latest_ns is not None:
             self._output.publish_map(self._grid, self._stamp.latest_ns)
+
+    def _on_get_map(self, _: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
+        stamp_ns = self._stamp.latest_ns or self.get_clock().now().nanoseconds
+        response.map = self._output.map_message(self._grid.shown.known_area(), stamp_ns)
+        return response
 
     def _on_trajectory(self, message: Path) -> None:
         """A loop was closed: correct the poses at which the scans of the map were made."""
@@ -184,7 +330,8 @@ class GridMapperNode(ThinmapNode):
     def _replace_grid(self, grid: OccupancyGrid) -> None:
         corrected_ns = self._grid.corrected_ns
         self._grid = CorrectableGrid(grid, keeps_scans=False, corrected_ns=corrected_ns)
-        self._stamp.latest_ns = self._stamp.latest_ns or self.get_clock().now().nanoseconds
+        self._output.load_ns = self.get_clock().now().nanoseconds
+        self._stamp.latest_ns = self._stamp.latest_ns or self._output.load_ns
         self._publish_map()
 
     def _save_grid(self, path: str) -> str:

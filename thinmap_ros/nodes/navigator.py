@@ -1,182 +1,158 @@
 """Navigation: goals in, velocity commands out, along wavefront paths on the map."""
 
-import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from rclpy.clock import Clock
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
+from nav_msgs.msg import Path
+from rclpy.action import ActionClient
+from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.action import NavigateToPose
-from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.map_mirror import MapMirror
-from thinmap_ros.core.odometry import OdometryBuffer
 from thinmap_ros.core.planning.navigator import (
     CONTROL_PERIOD_S,
-    SENSOR_TIMEOUT_NS,
     Command,
     Navigator,
     NavigatorConfig,
 )
-from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.navigation.map_input import MapInput
+from thinmap_ros.nodes.navigation.robot_state import RobotState
+from thinmap_ros.nodes.navigation.tasks import ErrorCode, NavigationTask, TaskReader
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.diagnostics import OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
+from thinmap_ros.ros.tf.odometry_source import NONE, OdometrySource
+from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
 
-# Without a new pose the last correction of the odometry holds for a while.
-_TIMEOUTS_NS = {
-    'laser': SENSOR_TIMEOUT_NS,
-    'odometry': SENSOR_TIMEOUT_NS,
-    'localizer': 3_000_000_000,
-}
+# As in Nav2, there is no estimate of the remaining time below this speed or distance.
+_MIN_SPEED_M_S = 0.01
+_MIN_DISTANCE_M = 0.1
+_MAX_INT16 = 2**15 - 1
 
 
-class _RobotState:
-    """Pose and view of the robot, by the last scan, odometry and pose received.
+class _NavigatorPublishers:
+    """Publishes velocity commands and the planned path."""
 
-    scan: the last one that is not blind.
-    """
+    def __init__(self, node: Node, map_frame: str, base_frame: str) -> None:
+        self.map_frame = map_frame
+        self._clock = node.get_clock()
+        self._velocity = VelocityPublisher(node, base_frame, declare_stamped(node))
+        self._plan = node.create_publisher(Path, 'plan', qos.LATCHED)
+        self._published_path: Array | None = None
 
-    def __init__(self, clock: Clock) -> None:
-        self.scan: Scan | None = None
-        self._clock = clock
-        self._is_blind = False
-        self._odometry = OdometryBuffer()
-        self._T_map_odom: Array | None = None
-        self._T_odom_base: Array | None = None
-        self._received_ns: dict[str, int] = {}
+    def command(self, v: float, w: float) -> None:
+        self._velocity.publish(v, w)
 
-    def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
-        self._T_odom_base = T_odom_base
-        self._record_time('odometry')
-        self._odometry.add(stamp_ns, T_odom_base)
-
-    def add_pose(self, stamp_ns: int, T_map_base: Array) -> None:
-        T_odom_base = self._odometry.interpolate(stamp_ns)
-        if T_odom_base is not None:
-            self._record_time('localizer')
-            self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
-
-    def add_scan(self, scan: Scan) -> None:
-        self._is_blind = scan.is_blind
-        if not scan.is_blind:
-            self.scan = scan
-            self._record_time('laser')
-
-    def pose(self) -> Array | None:
-        """T_map_base (3,) now; None before a pose and odometry are received."""
-        if self._T_map_odom is None or self._T_odom_base is None:
-            return None
-        return se2.compose(self._T_map_odom, self._T_odom_base)
-
-    def stop_reason(self) -> str:
-        """Why the robot must not drive on; '' for no reason."""
-        if self._is_blind:
-            return 'laser blind (too few valid beams)'
-        if self._scan_age_ns() > SENSOR_TIMEOUT_NS:
-            return 'laser silent'
-        now_ns = self._clock.now().nanoseconds
-        for source, limit_ns in _TIMEOUTS_NS.items():
-            if now_ns - self._received_ns.get(source, now_ns) > limit_ns:
-                return f'{source} silent'
-        return ''
-
-    def _scan_age_ns(self) -> int:
-        """Time from the last scan to the last odometry, by their stamps; 0 without both."""
-        latest_ns = self._odometry.latest_stamp_ns
-        return 0 if self.scan is None or latest_ns is None else latest_ns - self.scan.stamp_ns
-
-    def _record_time(self, source: str) -> None:
-        self._received_ns[source] = self._clock.now().nanoseconds
+    def plan(self, path: Array | None) -> None:
+        """Publish a path (K, 2), unless it is the one that was published last."""
+        if path is not None and path is not self._published_path:
+            self._published_path = path
+            ns = self._clock.now().nanoseconds
+            self._plan.publish(messages.path_msg(path, self.map_frame, ns))
 
 
 class NavigatorNode(ThinmapNode):
-    """/pose, /odom, /scan and the maps in; /cmd_vel and /plan out; action navigate_to_pose."""
+    """/pose, /scan, odometry, /tf and the maps in; /cmd_vel and /plan out.
+
+    Actions navigate_to_pose and navigate_through_poses, as Nav2's: one goal at a time, a newer one
+    replaces it. /goal_pose sends a goal to navigate_to_pose. Goals in other frames than the map's
+    are transformed when they arrive.
+    """
 
     def __init__(self) -> None:
         super().__init__('navigator')
         self._config = parameters.declare_config(self, NavigatorConfig, self._on_config)
-        self._map_frame = parameters.declare_map_frame(self)
+        map_frame = parameters.declare_map_frame(self)
         self._laser_transform = LaserTransform(self)
+        base_frame = self._laser_transform.base_frame
+        self._output = _NavigatorPublishers(self, map_frame, base_frame)
+        self._tasks = TaskReader(self, map_frame)
+        self._odometry = OdometrySource(
+            self, base_frame, lambda ns, T_odom_base: self._robot.add_odometry(ns, T_odom_base)
+        )
+        self._map = MapInput()
         parameters.reject_unknown(self)
         warm_up.navigator()
         self.reset_state()
-        self._cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
-        self._plan = self.create_publisher(Path, 'plan', qos.LATCHED)
-        subscribe_guarded(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        self._odometry.subscribe()
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        subscribe_guarded(self, OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
+        self._map.subscribe(self)
+        subscribe_guarded(self, PoseStamped, 'goal_pose', self._on_goal_pose, qos.STREAM)
         self._goals = SingleGoalServer(
-            self, NavigateToPose, 'navigate_to_pose', self._on_goal, self._on_cancel, _preempted
+            self,
+            NavigateToPose,
+            'navigate_to_pose',
+            self._on_task,
+            self._on_cancel,
+            self._preempted,
+            self._tasks.to_pose,
         )
+        self._goals.add_action(
+            NavigateThroughPoses, 'navigate_through_poses', self._tasks.through_poses
+        )
+        # As in Nav2, a goal from RViz is one of the action: its status is public.
+        self._own_client = ActionClient(self, NavigateToPose, 'navigate_to_pose')
         self.create_active_timer(CONTROL_PERIOD_S, self._control)
 
     def reset_state(self) -> None:
         """Discard the map and the pose of the robot."""
+        self._odometry.reset()
+        self._tasks.reset()
         self._navigator = Navigator(self._config)
-        self._map = MapMirror()
-        self._robot = _RobotState(self.get_clock())
-        self._published_path: Array | None = None
-        self._goal: tuple[float, float, float | None] = (0.0, 0.0, None)
+        self._map.reset()
+        self._robot = RobotState(self.get_clock(), self._odometry.source != NONE)
+        self._task = NavigationTask(NavigateToPose, (), 0)
         self._is_canceled = False
 
     def _on_config(self, config: NavigatorConfig) -> None:
         """Continue with other parameters: to the same goal, on a new path."""
+        remaining = self._navigator.waypoints_remaining + 1
         self._config = config
         self._navigator = Navigator(config)
         if self._goals.active:
-            self._navigator.set_goal(*self._goal)
+            self._drive_to(self._task.poses[-remaining:])
 
     def stop(self) -> None:
         """End the goal; the robot stops."""
-        self._end(Outcome.ABORTED, 'navigator deactivated or reset')
+        self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, 'navigator deactivated or reset')
 
     def close(self) -> None:
         """Stop the robot: the last thing the node does."""
-        self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
+        self._output.command(0.0, 0.0)
         super().close()
-
-    def _on_odometry(self, message: Odometry) -> None:
-        T_odom_base = messages.pose_from_msg(message.pose.pose)
-        self._robot.add_odometry(messages.stamp_ns(message.header.stamp), T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from_msg(message.pose.pose)
         self._robot.add_pose(messages.stamp_ns(message.header.stamp), T_map_base)
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._robot.add_scan(self._laser_transform.to_scan(message))
+        scan = self._laser_transform.to_scan(message)
+        self._odometry.add_scan_stamp(scan.stamp_ns)
+        self._robot.add_scan(scan)
 
-    def _on_map(self, message: OccupancyGrid) -> None:
-        self._map.replace(messages.grid_from_msg(message))
+    def _on_goal_pose(self, message: PoseStamped) -> None:
+        self._tasks.pose(message)  # raises for an invalid one, which is counted
+        self._own_client.send_goal_async(NavigateToPose.Goal(pose=message))
 
-    def _on_window(self, message: OccupancyGrid) -> None:
-        self._map.paste(messages.grid_from_msg(message))
-
-    def _on_goal(self, request: NavigateToPose.Goal) -> None:
-        try:
-            goal = messages.pose_from_msg(request.pose.pose)
-        except InputError as error:
-            self._end(Outcome.ABORTED, f'goal: {error}')
-            return
-        if request.pose.header.frame_id not in ('', self._map_frame):
-            reason = f'goal in frame "{request.pose.header.frame_id}": expected "{self._map_frame}"'
-            self._end(Outcome.ABORTED, reason)
-            return
+    def _on_task(self, task: NavigationTask) -> None:
         self._is_canceled = False
-        self._goal = (
-            float(goal[0]),
-            float(goal[1]),
-            float(goal[2]) if request.use_heading else None,
-        )
-        self._navigator.set_goal(*self._goal)
+        self._task = task
+        self._drive_to(task.poses)
+
+    def _drive_to(self, poses: tuple[Array, ...]) -> None:
+        """Set poses (3,) as goal; the heading matters at the last one."""
+        x, y, theta = poses[-1].tolist()
+        waypoints = [(float(pose[0]), float(pose[1])) for pose in poses[:-1]]
+        self._navigator.set_goal(x, y, theta, waypoints=waypoints)
+
+    def _preempted(self) -> NavigateToPose.Result:
+        # As in Nav2, an aborted goal without an error code was replaced.
+        return self._task.result(ErrorCode.NONE, 'replaced by a newer goal')
 
     def _on_cancel(self) -> None:
         self._is_canceled = True
@@ -185,20 +161,21 @@ class NavigatorNode(ThinmapNode):
         if not self._goals.active:
             return
         if self._is_canceled:
-            self._end(Outcome.CANCELED, 'cancelled')
+            self._end(Outcome.CANCELED, ErrorCode.NONE, 'cancelled')
             return
         command = self._command()
         if command is None:
-            self._publish_feedback('waiting')
+            self._publish_feedback(0.0)
             return
-        self._cmd_vel.publish(messages.twist_msg(command.v, command.w))
-        self._publish_plan()
+        self._output.command(command.v, command.w)
+        self._output.plan(self._navigator.path)
         if command.state == 'reached':
-            self._end(Outcome.SUCCEEDED, 'goal reached')
+            self._end(Outcome.SUCCEEDED, ErrorCode.NONE, '')
         elif command.state == 'failed':
-            self._end(Outcome.ABORTED, command.reason)
+            code = ErrorCode.TIMEOUT if command.is_timeout else ErrorCode.UNKNOWN
+            self._end(Outcome.ABORTED, code, command.reason)
         else:
-            self._publish_feedback(command.state)
+            self._publish_feedback(command.v)
 
     def _command(self) -> Command | None:
         """The command of the navigator; a stop while the laser is silent.
@@ -224,30 +201,30 @@ class NavigatorNode(ThinmapNode):
         with self.diagnostics.time_step('navigator'):
             return self._navigator.step(T_map_base, patch, scan, CONTROL_PERIOD_S)
 
-    def _publish_plan(self) -> None:
-        path = self._navigator.path
-        if path is not None and path is not self._published_path:
-            self._published_path = path
-            ns = self.get_clock().now().nanoseconds
-            self._plan.publish(messages.path_msg(np.asarray(path), self._map_frame, ns))
-
-    def _publish_feedback(self, state: str) -> None:
-        feedback = NavigateToPose.Feedback()
-        feedback.state = state
-        feedback.distance_remaining_m = self._navigator.distance_remaining_m
+    def _publish_feedback(self, speed_m_s: float) -> None:
+        """Publish feedback; current_pose has no frame while the pose is unknown."""
+        now_ns = int(self.get_clock().now().nanoseconds)
+        remaining_m = self._navigator.distance_remaining_m
+        feedback = self._task.action.Feedback(
+            navigation_time=messages.duration_msg((now_ns - self._task.start_ns) / SECOND_NS),
+            number_of_recoveries=min(self._navigator.recoveries, _MAX_INT16),
+            distance_remaining=remaining_m,
+        )
+        T_map_base = self._robot.pose()
+        if T_map_base is not None:
+            frame = self._output.map_frame
+            feedback.current_pose = messages.pose_stamped_msg(T_map_base, frame, now_ns)
+        if speed_m_s > _MIN_SPEED_M_S and remaining_m > _MIN_DISTANCE_M:
+            feedback.estimated_time_remaining = messages.duration_msg(remaining_m / speed_m_s)
+        if self._task.action is NavigateThroughPoses:
+            feedback.number_of_poses_remaining = self._navigator.waypoints_remaining + 1
         self._goals.feedback(feedback)
 
-    def _end(self, outcome: Outcome, reason: str) -> None:
+    def _end(self, outcome: Outcome, code: ErrorCode, reason: str) -> None:
         self._navigator.cancel()
-        self.diagnostics.set_state(OK, reason)
-        self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
-        self._goals.finish(
-            outcome, NavigateToPose.Result(success=outcome is Outcome.SUCCEEDED, reason=reason)
-        )
-
-
-def _preempted() -> NavigateToPose.Result:
-    return NavigateToPose.Result(success=False, reason='replaced by a newer goal')
+        self.diagnostics.set_state(OK, reason or 'goal reached')
+        self._output.command(0.0, 0.0)
+        self._goals.finish(outcome, self._task.result(code, reason))
 
 
 def main() -> None:

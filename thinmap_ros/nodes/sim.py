@@ -1,13 +1,13 @@
 """A simulated robot: /cmd_vel in; /scan, /odom, /tf, /clock and the true pose out.
 
-~/set_pose teleports it.
+Commands are Twist or TwistStamped, as their publishers choose. ~/set_pose teleports the robot.
 """
 
 from dataclasses import dataclass
 from time import monotonic
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, Twist
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -25,6 +25,7 @@ from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
 from thinmap_ros.ros.lockstep import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep
+from thinmap_ros.ros.velocity.commands import VelocitySubscription
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS, DifferentialDriveRobot
 from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
@@ -145,20 +146,18 @@ class SimNode(Node):
         self._running = False
         self._repeated_s = 0.0
         self._diagnostics = NodeDiagnostics(self)
-        self.create_subscription(Twist, 'cmd_vel', self._on_command, qos.STREAM)
+        VelocitySubscription(self, self._diagnostics, self._on_command)
         self.create_subscription(PoseStamped, '~/set_pose', self._on_teleport, qos.STREAM)
         self._output.publish_laser_pose(self._sim.laser.T_base_laser)
         wall = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(STEP_NS / 1e9 / self._config.real_time_factor, self._tick, clock=wall)
 
-    def _on_command(self, message: Twist) -> None:
-        self._diagnostics.message_received('cmd_vel')
-        command = (message.linear.x, message.angular.z)
-        if not np.isfinite(command).all():
-            reason = f'command {command}: expected finite numbers'
+    def _on_command(self, v: float, w: float) -> None:
+        if not np.isfinite((v, w)).all():
+            reason = f'command {(v, w)}: expected finite numbers'
             self._diagnostics.message_rejected('cmd_vel', reason)
             return
-        self._command = _VelocityCommand(*command, self._sim.stamp_ns)
+        self._command = _VelocityCommand(v, w, self._sim.stamp_ns)
 
     def _on_teleport(self, message: PoseStamped) -> None:
         """Teleport the robot, for kidnapping tests: the odometry does not change."""

@@ -2,9 +2,10 @@
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Path
+from nav_msgs.msg import Path
 from rclpy.node import Node
 
+from thinmap_msgs.msg import ProbabilityGrid
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
@@ -17,6 +18,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.rebuild import Rebuilding
 from thinmap_ros.files.sessions import TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -31,25 +33,26 @@ class _TopologyPublishers:
     """Publishes the topological map, and the part of it near the robot."""
 
     def __init__(self, node: Node) -> None:
-        self._frame = parameters.declare_map_frame(node)
+        self.frame_id = parameters.declare_map_frame(node)
         self._local = node.create_publisher(TopologicalMapMsg, 'local_topology', qos.LATCHED)
         self._global = node.create_publisher(TopologicalMapMsg, 'topology', qos.LATCHED)
         self.has_published = False
 
     def publish_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
         self.has_published = True
-        self._global.publish(messages.topology_msg(topology, self._frame, stamp_ns))
+        self._global.publish(messages.topology_msg(topology, self.frame_id, stamp_ns))
 
     def publish_local_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
-        self._local.publish(messages.topology_msg(topology, self._frame, stamp_ns))
+        self._local.publish(messages.topology_msg(topology, self.frame_id, stamp_ns))
 
 
 class TopologyBuilderNode(ThinmapNode):
-    """/local_map and /pose in; /local_topology and /topology out.
+    """/local_grid and /pose in; /local_topology and /topology out.
 
-    Services save_topology and load_topology.
-    After a /trajectory the graph is rebuilt from the /map that has undergone that correction; until
-    it comes the graph stays as it is. Nodes keep their ids.
+    Services save_topology and load_topology. Where Nav2's route server runs, it is given the graph
+    when it has changed, and when it is saved: client of route_server/set_route_graph.
+    After a /trajectory the graph is rebuilt from the /grid that has undergone that correction;
+    until it comes the graph stays as it is. Nodes keep their ids.
     """
 
     def __init__(self) -> None:
@@ -58,11 +61,14 @@ class TopologyBuilderNode(ThinmapNode):
         self._output = _TopologyPublishers(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
+        self._route_graph = RouteGraphUpdates(
+            self, self._output.frame_id, lambda: self._builder.map
+        )
         parameters.reject_unknown(self)
         warm_up.topology_builder()
         subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
-        subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        subscribe_guarded(self, OccupancyGrid, 'local_map', self._on_window, qos.STREAM)
+        subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
+        subscribe_guarded(self, ProbabilityGrid, 'local_grid', self._on_local_grid, qos.STREAM)
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         self.create_service(SaveMap, 'save_topology', self._on_save)
         self.create_service(LoadMap, 'load_topology', self._on_load)
@@ -98,10 +104,10 @@ class TopologyBuilderNode(ThinmapNode):
         if self._session or self._output.has_published:
             self._publish(self.get_clock().now().nanoseconds)
 
-    def _on_window(self, message: OccupancyGrid) -> None:
+    def _on_local_grid(self, message: ProbabilityGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
         patch = messages.grid_from_msg(message)
-        self._rebuilding.window(patch, messages.stamp_ns(message.info.map_load_time))
+        self._rebuilding.window(patch, messages.stamp_ns(message.correction_stamp))
         self._process(stamp_ns, self._matcher.add_left(stamp_ns, patch))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
@@ -131,8 +137,8 @@ class TopologyBuilderNode(ThinmapNode):
         if self._stamp.is_corrected_by(corrected_ns):
             self._rebuilding.correct(corrected_ns, *messages.trajectory_from_msg(message))
 
-    def _on_map(self, message: OccupancyGrid) -> None:
-        if not self._rebuilding.awaits(messages.stamp_ns(message.info.map_load_time)):
+    def _on_grid(self, message: ProbabilityGrid) -> None:
+        if not self._rebuilding.awaits(messages.stamp_ns(message.correction_stamp)):
             return
         with self.diagnostics.time_step('graph rebuilt'):
             self._rebuilding.rebuild(self._builder, messages.grid_from_msg(message))
@@ -141,6 +147,7 @@ class TopologyBuilderNode(ThinmapNode):
     def _publish(self, stamp_ns: int) -> None:
         self._checkpoint_new_ids()
         self._output.publish_map(self._builder.map, stamp_ns)
+        self._route_graph.graph_changed()
 
     def _checkpoint_new_ids(self) -> None:
         """Save a checkpoint before new ids are published: other nodes may rely on them."""
@@ -151,7 +158,9 @@ class TopologyBuilderNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve(request.path)
-            return f'saved {TOPOLOGY.save(path, self._builder)}'
+            saved = TOPOLOGY.save(path, self._builder)
+            self._route_graph.graph_saved()
+            return f'saved {saved}'
 
         return fill_response(response, save)
 
@@ -163,8 +172,7 @@ class TopologyBuilderNode(ThinmapNode):
         loaded = TopologyBuilder(self._config)
         if path:
             inside = self._save_directory.resolve(path)
-            resolution_m = self._builder.resolution_m
-            loaded = load_topology(inside, self._config, resolution_m)
+            loaded = load_topology(inside, self._config)
         self._builder = loaded
         self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)

@@ -1,11 +1,13 @@
 """An action server with one goal at a time, driven by callbacks without blocking."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
+from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
@@ -18,14 +20,31 @@ class Outcome(Enum):
     CANCELED = 'canceled'
 
 
+class InvalidGoalError(Exception):
+    """A goal that cannot be followed, with the result that its client receives."""
+
+    def __init__(self, result: Any) -> None:
+        super().__init__(str(result))
+        self.result = result
+
+
+@dataclass(frozen=True)
+class _Goal:
+    """An accepted goal, and the server that accepted it."""
+
+    server: ActionServer
+    handle: ServerGoalHandle
+
+
 class SingleGoalServer:
     """Accepts a goal, and returns its result when the node calls `finish`.
 
     Goals are accepted while the node is active. A new goal preempts the old one, which is aborted
     with the result of `preempted`. rclpy runs a goal in a coroutine, and one that waits keeps the
-    executor busy; here the coroutine starts when the result is known. `on_cancel` records the
+    executor busy; here the coroutine starts when the result is known, although the goal's status
+    is EXECUTING from its acceptance on, as clients of Nav2 expect. `on_cancel` records the
     request: the node calls `finish` later, from another callback, when the goal's state has
-    changed.
+    changed. One server may serve several actions: there is one goal at a time among all of them.
     """
 
     def __init__(
@@ -36,49 +55,71 @@ class SingleGoalServer:
         on_goal: Callable[[Any], None],
         on_cancel: Callable[[], None],
         preempted: Callable[[], Any],
+        read: Callable[[Any], Any] = lambda request: request,
     ) -> None:
+        """on_goal: receives what `read` returns for the goal of a request.
+
+        read: raises InvalidGoalError for a goal that is aborted at once; the old goal continues.
+        preempted: returns the result of the old goal, before `on_goal` is called.
+        """
+        self._node = node
         self._on_goal = on_goal
         self._on_cancel = on_cancel
         self._preempted = preempted
-        self._handle: ServerGoalHandle | None = None
+        self._goal: _Goal | None = None
         self._endings: dict[bytes, tuple[Outcome, Any]] = {}
-        self._server = ActionServer(
-            node,
+        self.add_action(action, name, read)
+
+    def add_action(self, action: Any, name: str, read: Callable[[Any], Any]) -> None:
+        """Serve another action; read: as for the first one."""
+        server: ActionServer = ActionServer(
+            self._node,
             action,
             name,
             execute_callback=self._end,
             goal_callback=lambda request: (
-                GoalResponse.ACCEPT if node.is_active else GoalResponse.REJECT
+                GoalResponse.ACCEPT if self._node.is_active else GoalResponse.REJECT
             ),
             cancel_callback=self._cancel,
-            handle_accepted_callback=self._accept,
+            handle_accepted_callback=lambda handle: self._accept(_Goal(server, handle), read),
         )
 
     @property
     def active(self) -> bool:
         """Whether there is a goal."""
-        return self._handle is not None
+        return self._goal is not None
 
     def feedback(self, message: Any) -> None:
         """Publish feedback on the goal, if there is one."""
-        if self._handle is not None:
-            self._handle.publish_feedback(message)
+        if self._goal is not None:
+            self._goal.handle.publish_feedback(message)
 
     def finish(self, outcome: Outcome, result: Any) -> None:
         """End the goal, if there is one, with a result."""
-        handle = self._handle
-        self._handle = None
-        if handle is not None:
-            self._endings[bytes(handle.goal_id.uuid)] = (outcome, result)
-            handle.execute()
+        goal = self._goal
+        self._goal = None
+        if goal is not None:
+            self._run(goal, outcome, result)
 
-    def _accept(self, handle: ServerGoalHandle) -> None:
+    def _run(self, goal: _Goal, outcome: Outcome, result: Any) -> None:
+        """Run the coroutine of a goal, which ends at once."""
+        self._endings[bytes(goal.handle.goal_id.uuid)] = (outcome, result)
+        goal.server.notify_execute(goal.handle, None)
+
+    def _accept(self, goal: _Goal, read: Callable[[Any], Any]) -> None:
+        # What the handle's `execute` does, without the coroutine.
+        goal.handle._update_state(rclpy_implementation.GoalEvent.EXECUTE)
+        try:
+            request = read(goal.handle.request)
+        except InvalidGoalError as invalid:
+            self._run(goal, Outcome.ABORTED, invalid.result)
+            return
         self.finish(Outcome.ABORTED, self._preempted())
-        self._handle = handle
-        self._on_goal(handle.request)
+        self._goal = goal
+        self._on_goal(request)
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        if self._handle is None or handle.goal_id != self._handle.goal_id:
+        if self._goal is None or handle.goal_id != self._goal.handle.goal_id:
             return CancelResponse.REJECT
         self._on_cancel()
         return CancelResponse.ACCEPT

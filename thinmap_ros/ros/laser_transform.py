@@ -20,6 +20,7 @@ class LaserTransform:
 
     It is looked up in the static transforms, as for bags. For a robot that does not publish them,
     the parameter `laser_pose` [x m, y m, yaw rad] is used for every frame. There is no default.
+    base_frame: value of the parameter of this name.
     """
 
     def __init__(self, node: Node) -> None:

@@ -4,16 +4,15 @@ from time import monotonic
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 
-from thinmap_msgs.msg import LocalizationStatus, TopologicalMap
+from thinmap_msgs.msg import LocalizationStatus, ProbabilityGrid, TopologicalMap
 from thinmap_ros.ros import messages, qos
 
 NONE = 'none'
 _TYPES: dict[str, Any] = {
     'pose': PoseWithCovarianceStamped,
-    'local_map': OccupancyGrid,
+    'local_grid': ProbabilityGrid,
     'local_topology': TopologicalMap,
     'localization_status': LocalizationStatus,
 }

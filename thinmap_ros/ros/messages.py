@@ -19,17 +19,18 @@ from geometry_msgs.msg import (
     TransformStamped,
     Twist,
 )
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from nav_msgs.msg import MapMetaData, OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Header
 
-from thinmap_msgs.msg import TopologicalEdge, TopologicalNode
+from thinmap_msgs.msg import ProbabilityGrid, TopologicalEdge, TopologicalNode
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridFrame
+from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
@@ -234,24 +235,44 @@ def trajectory_from_msg(message: Path) -> tuple[NDArray[np.int64], Array]:
     return stamps, np.array([pose_from_msg(pose.pose) for pose in message.poses]).reshape(-1, 3)
 
 
-def grid_msg(patch: GridPatch, frame_id: str, ns: int, corrected_ns: int = 0) -> OccupancyGrid:
-    """Map message; corrected_ns: stamp of the newest trajectory that its grid follows."""
-    message = OccupancyGrid(header=header(frame_id, ns))
-    message.info.map_load_time = time_msg(corrected_ns)
-    message.info.resolution = patch.frame.resolution
-    message.info.height, message.info.width = patch.shape
-    message.info.origin = pose_msg(np.array([patch.frame.origin_x, patch.frame.origin_y, 0.0]))
-    data = array('b')
-    data.frombytes(np.ascontiguousarray(patch.cells).tobytes())
-    message.data = data
+def grid_msg(patch: GridPatch, frame_id: str, ns: int, load_ns: int = 0) -> OccupancyGrid:
+    """Map message; load_ns: time at which the map was loaded or begun."""
+    message = OccupancyGrid(header=header(frame_id, ns), info=_map_info(patch, load_ns))
+    message.data = _int8_array(patch.cells)
     return message
 
 
-def grid_from_msg(message: OccupancyGrid) -> GridPatch:
-    """Patch of a map message.
+def probability_grid_msg(
+    patch: GridPatch, frame_id: str, ns: int, load_ns: int = 0, corrected_ns: int = 0
+) -> ProbabilityGrid:
+    """Message of occupancy probabilities.
 
-    Raises InputError where size and data disagree, the map is rotated, or its cells or resolution
-    are out of range.
+    load_ns: time at which the map was loaded or begun; corrected_ns: stamp of the newest trajectory
+    that all cells follow.
+    """
+    message = ProbabilityGrid(header=header(frame_id, ns), info=_map_info(patch, load_ns))
+    message.correction_stamp = time_msg(corrected_ns)
+    message.data = _int8_array(patch.cells)
+    return message
+
+
+def _map_info(patch: GridPatch, load_ns: int) -> MapMetaData:
+    info = MapMetaData(map_load_time=time_msg(load_ns), resolution=patch.frame.resolution)
+    info.height, info.width = patch.shape
+    info.origin = pose_msg(np.array([patch.frame.origin_x, patch.frame.origin_y, 0.0]))
+    return info
+
+
+def _int8_array(cells: NDArray[np.int8]) -> 'array[int]':
+    data = array('b')
+    data.frombytes(np.ascontiguousarray(cells).tobytes())
+    return data
+
+
+def grid_from_msg(message: OccupancyGrid | ProbabilityGrid) -> GridPatch:
+    """Patch of a map message; one that is rotated is resampled.
+
+    Raises InputError where size and data disagree, or cells or resolution are out of range.
     """
     info = message.info
     # The message holds a float32: 0.1 must be the same number on both sides.
@@ -264,11 +285,9 @@ def grid_from_msg(message: OccupancyGrid) -> GridPatch:
             f'and cells of {MIN_RESOLUTION_M} to {MAX_RESOLUTION_M} m'
         )
     origin = pose_from_msg(info.origin)
-    if abs(origin[2]) > 1e-6:
-        raise InputError(f'map rotated by {origin[2]} rad: expected an origin without rotation')
     cells = np.frombuffer(message.data, dtype=np.int8).reshape(info.height, info.width)
     validation.require_occupancy(cells)
-    return GridPatch(GridFrame(float(origin[0]), float(origin[1]), resolution), cells)
+    return aligned_patch(origin, resolution, cells)
 
 
 def topology_msg(topology: TopologicalMap, frame_id: str, ns: int) -> TopologicalMapMsg:

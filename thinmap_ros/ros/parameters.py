@@ -38,15 +38,19 @@ def declare_config(
     config: type[AnyConfig],
     changed: Callable[[AnyConfig], None] | None = None,
     live: Collection[str] | None = None,
+    base: AnyConfig | None = None,
 ) -> AnyConfig:
     """Declare each field of a config as a parameter of the node; return the config as it was set.
+
+    base: where given, its values are the defaults.
 
     Parameters are read-only without `changed`. With it, those named in `live` (None: all) can be
     set at run time, and `changed` is called with the new config. A value that the config rejects is
     rejected with its reason.
     Raises ConfigError where a value is outside its range or of the wrong type.
     """
-    declared = list(parameters_of(config()))
+    defaults = config() if base is None else base
+    declared = list(parameters_of(defaults))
     names = {name for name, _, _ in declared}
     free = set() if changed is None else names if live is None else set(live)
     values = {}
@@ -57,7 +61,7 @@ def declare_config(
         except Exception as error:
             # rclpy has an exception class for each kind of wrong value.
             raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
-    current = with_values(config(), values)
+    current = with_values(defaults, values)
     if changed is not None:
         _Changes(node, current, free, changed)
     return current

@@ -176,3 +176,27 @@ def test_a_long_border_is_given_up_in_part_only():
     left = np.flatnonzero(borders.mask[:, 19])
     assert left.min() == pytest.approx(5 + 13, abs=2)
     assert left.max() == 28
+
+
+def test_a_map_that_is_replaced_is_processed_everywhere_and_forgotten_where_it_ends():
+    borders = borders_of(half_known())
+    smaller = half_known()[5:, 3:35].copy()
+    smaller[20:, 10:16] = 0
+    smaller[5:10, 17] = 100
+    frame = FRAME.with_origin_at(5, 3)
+    nowhere = np.array([[9.0, 9.0], [9.1, 9.1]])
+    borders.update(GridPatch(frame, smaller.astype(np.int8), is_replaced=True), nowhere)
+    expected = OpenBorders(0.4)
+    expected.update(patch_of(smaller, frame), HERE)
+    at = (slice(5, 30), slice(3, 35))
+    assert (borders.free[at] == expected.free).all()
+    assert (borders.mask[at] == expected.mask).all()
+    assert borders.known_cells == expected.known_cells
+    outside = np.ones(borders.free.shape, dtype=np.bool_)
+    outside[at] = False
+    assert not borders.free[outside].any()
+    assert not borders.mask[outside].any()
+    assert borders.passable[outside].all()
+    revision = borders.revision
+    borders.update(GridPatch(frame, smaller.astype(np.int8), is_replaced=True), nowhere)
+    assert borders.revision == revision

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.mission import (
     Budget,
-    DriveRequest,
     DriveTo,
     Finish,
     InputWatchdog,
@@ -209,8 +208,8 @@ def test_a_navigator_that_lost_the_goal_is_sent_to_the_start_again():
 
 
 def test_a_budget_that_ends_before_the_first_pose_returns_nowhere():
-    mission = mission_of(Scripted(), budget=Budget(time_s=1.0), return_to_start=True)
-    assert mission.check(1.0, False) == Finish(FinishCode.BUDGET_EXHAUSTED, 'time limit of 1 s')
+    mission = mission_of(Scripted(), now_s=1.0, budget=Budget(time_s=1.0), return_to_start=True)
+    assert mission.check(2.0, False) == Finish(FinishCode.BUDGET_EXHAUSTED, 'time limit of 1 s')
 
 
 def test_scans_that_stay_away_end_a_mission():
@@ -293,10 +292,45 @@ def test_goals_with_numbers_that_are_none_are_refused(wrong):
         MissionGoal(area=np.array([[0.0, 0.0], [1.0, wrong], [0.0, 1.0]]))
 
 
-def test_a_goal_is_sent_again_when_it_changes_or_the_navigator_is_silent():
-    request = DriveRequest(pose(1.0, 1.0, math.pi - 0.05), 100.0)
-    assert request.is_same(pose(1.05, 1.05, -math.pi + 0.1))
-    assert not request.is_same(pose(1.2, 1.0, math.pi))
-    assert not request.is_same(pose(1.0, 1.0, math.pi - 0.3))
-    assert not request.is_silent(102.9)
-    assert request.is_silent(103.0)
+def test_while_it_is_paused_nothing_is_decided_and_no_timeout_runs():
+    mission = mission_of(Scripted(GOAL))
+    mission.is_paused = True
+    assert mission.step(at(0.0)) is None
+    assert mission.decision is None
+    assert mission.check(1e6, False) is None
+    mission.is_paused = False
+    assert mission.check(1e6 + 59.0, False) is None
+    assert mission.step(at(0.0)) == DriveTo(GOAL)
+
+
+def test_a_paused_mission_can_be_cancelled():
+    mission = mission_of(Scripted(GOAL))
+    mission.is_paused = True
+    mission.request_cancel()
+    assert mission.check(1.0, False) == Finish(FinishCode.CANCELLED, 'cancelled')
+
+
+def test_what_is_missing_is_named_when_a_mission_ends_for_want_of_it():
+    watchdog = InputWatchdog()
+    mission = mission_of(Scripted(GOAL), now_s=1.0, watchdog=watchdog)
+    watchdog.awaited = 'map on map'
+    end = mission.check(61.1, False)
+    assert end == Finish(FinishCode.SENSOR_TIMEOUT, 'no map on map for 60 s')
+
+
+def test_it_is_known_whether_the_robot_is_back_at_its_start():
+    mission = returning_mission()
+    assert mission.is_running
+    assert not mission.has_returned
+    mission.drive_ended(True, '')
+    assert not mission.is_running
+    assert mission.has_returned
+
+
+def test_the_time_begins_with_a_simulated_clock_that_stands_at_zero_before():
+    mission = mission_of(Scripted(), budget=Budget(time_s=30.0))
+    assert mission.check(500.0, is_driving=False) is None
+    assert mission.elapsed_s(510.0) == 10.0
+    assert mission.check(529.0, is_driving=False) is None
+    end = mission.check(530.0, is_driving=False)
+    assert isinstance(end, Finish) and end.code == FinishCode.BUDGET_EXHAUSTED

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from reference_grid import PlainGrid
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
@@ -176,10 +176,13 @@ def test_a_saved_map_is_resumed():
     assert percent(again, 2.05, 0.05) == 80
 
 
-def test_a_map_of_another_resolution_is_refused():
-    patch = OccupancyGrid(OccupancyConfig(resolution_m=0.05)).known_area()
-    with pytest.raises(InputError, match='resolution'):
-        OccupancyGrid.from_patch(GridPatch(patch.frame, patch.cells))
+def test_the_resolution_of_a_finished_map_is_taken_over():
+    cells = np.full((4, 5), 100, dtype=np.int8)
+    grid = OccupancyGrid.from_patch(
+        GridPatch(GridFrame(1.0, 2.0, 0.02), cells), OccupancyConfig(resolution_m=0.05)
+    )
+    assert grid.frame.resolution == 0.02
+    assert grid.known_area().occupied.sum() == cells.size
 
 
 def test_beams_that_graze_a_wall_do_not_erase_it():

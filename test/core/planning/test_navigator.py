@@ -31,6 +31,57 @@ def test_a_heading_at_the_goal_is_turned_to():
     assert abs(se2.wrap(ride.pose[2] + 2.0)) < 0.2
 
 
+@pytest.mark.parametrize('speed', [0.2, 0.5, 1.2])
+def test_waypoints_are_passed_without_a_stop_and_the_goal_is_reached(speed):
+    config = NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=speed))
+    ride = Ride(room(), (1.0, 1.0, 0.0), config=config)
+    waypoints = [(3.0, 1.2), (5.0, 1.5), (6.5, 3.0)]
+    ride.navigator.set_goal(6.5, 5.0, math.pi / 2, waypoints=waypoints)
+    nearest = [math.inf, math.inf, math.inf]
+    driven = []
+    remaining = []
+    command = ride.step()
+    while command.state == 'driving' and ride.seconds < 120.0:
+        driven.append((ride.navigator.waypoints_remaining, command.v))
+        remaining.append(ride.navigator.distance_remaining_m)
+        nearest = [
+            min(m, math.dist(ride.pose[:2], at)) for m, at in zip(nearest, waypoints, strict=True)
+        ]
+        command = ride.step()
+    assert command.state == 'reached'
+    assert math.dist(ride.pose[:2], (6.5, 5.0)) < 0.2
+    assert abs(se2.wrap(ride.pose[2] - math.pi / 2)) < 0.2
+    assert max(nearest) < (0.2 if speed < 1.0 else 0.7)
+    assert {count for count, _ in driven} == {0, 1, 2, 3}
+    # In between, the robot is slower in bends only.
+    between = [v for count, v in driven if count in (1, 2)]
+    assert min(between) > 0.5 * min(speed, 0.5)
+    assert remaining[1] == pytest.approx(8.2, abs=0.4)
+    assert all(after < before + 0.1 for before, after in itertools.pairwise(remaining[1:]))
+
+
+def test_a_waypoint_that_cannot_be_reached_ends_the_goal_with_its_place():
+    world = room()
+    world[:, 60] = 100
+    ride = Ride(world, (1.0, 1.0, 0.0))
+    ride.navigator.set_goal(2.0, 5.0, waypoints=[(2.0, 3.0), (7.0, 3.0)])
+    while (command := ride.step()).state == 'driving':
+        assert ride.seconds < 60.0
+    assert (command.state, command.is_timeout) == ('failed', False)
+    assert '(7.00, 3.00)' in command.reason
+
+
+@pytest.mark.parametrize(('width', 'is_timeout', 'recoveries'), [(12, True, 1), (60, False, 6)])
+def test_a_robot_that_stood_still_for_too_long_times_out(width, is_timeout, recoveries):
+    """In the corridor it waits; in the hall it looks for a way around the unmapped wall."""
+    world = room(rows=width)
+    world[:, 40] = 100
+    ride = Ride(world, (1.0, 0.6, 0.0), known=room(rows=width))
+    last = ride.go((7.0, 0.6))[-1]
+    assert (last.state, last.is_timeout) == ('failed', is_timeout)
+    assert ride.navigator.recoveries == recoveries
+
+
 @pytest.mark.parametrize('goal', [(30.0, 30.0), (5.0, 0.02), (7.0, 3.0)])
 def test_a_goal_that_cannot_be_reached_is_refused_at_once_with_a_reason(goal):
     world = room()

@@ -72,6 +72,8 @@ class Drive:
 
     def error_m(self):
         """Root mean square error after the drive."""
+        # The localizer starts at its initial pose whenever its first scan comes.
+        self.graph.until(self.estimates, 'the localizer receives scans')
 
         def has_arrived():
             self.command()

@@ -9,13 +9,14 @@ from array import array
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
 from support.doctor import Doctor
 from support.halls import empty_hall
 
-from thinmap_msgs.action import Explore, NavigateToPose
+from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import SlamStatus
 from thinmap_ros.ros import messages, qos
 
@@ -134,7 +135,7 @@ def test_a_robot_does_not_drive_where_half_of_the_laser_does_not_see(graph):
     half[31:] = math.nan
     ended = robot.handle.get_result_async()
     graph.until(lambda: robot.say(half) or ended.done(), 'the goal is given up')
-    assert 'does not see' in ended.result().result.reason
+    assert 'does not see' in ended.result().result.error_msg
     assert robot.commands
     assert not any(drives(command) for command in robot.commands)
 

@@ -72,7 +72,8 @@ class SurveyConfig(TrackerConfig):
     """Which borders count, to whom they belong, and from where they are looked at."""
 
     robot_radius_m: float = robot_radius()
-    min_frontier_size_m: float = parameter(
+    # The name of explore_lite's parameter.
+    min_frontier_size: float = parameter(
         0.5,
         'Shorter frontiers are ignored (m). Raise it for shorter paths, lower it for higher '
         'coverage.',
@@ -135,7 +136,7 @@ class Surveyor:
 
     def __init__(self, config: SurveyConfig) -> None:
         self.config = config
-        self.borders = OpenBorders(config.min_frontier_size_m)
+        self.borders = OpenBorders(config.min_frontier_size)
         self.tracker = EndNodeTracker(config)
         self.stand_ins = EndNodeTracker(config)
         self.trail = RecentPath()
@@ -180,7 +181,7 @@ class Surveyor:
         tracker = EndNodeTracker.from_state(parts['nodes'], self.config)
         self.stand_ins = EndNodeTracker.from_state(parts['stand_ins'], self.config)
         self.tracker = tracker
-        self.borders = OpenBorders.from_state(parts['borders'], self.config.min_frontier_size_m)
+        self.borders = OpenBorders.from_state(parts['borders'], self.config.min_frontier_size)
         visited = {int(row[0]): (float(row[1]), float(row[2])) for row in own['visited']}
         closer = [(float(x), float(y)) for x, y in own['look_closer']]
         self._memory = _Memory(visited, closer, next_id)
@@ -236,7 +237,7 @@ class Surveyor:
             return candidate
         cells = candidate.cells[still]
         length_m = len(cells) * self.borders.frame.resolution
-        long_enough = length_m >= self.config.min_frontier_size_m - 1e-6
+        long_enough = length_m >= self.config.min_frontier_size - 1e-6
         if not (long_enough or self.config.mode == 'paper'):
             return None
         return Candidate(candidate.track, cells, candidate.goal)
@@ -327,7 +328,7 @@ class Surveyor:
         Such a scrap goes to whoever holds most of the stretch: it would be a target that is none at
         the next scan.
         """
-        fewest = round(self.config.min_frontier_size_m / self.borders.frame.resolution)
+        fewest = round(self.config.min_frontier_size / self.borders.frame.resolution)
         return without_scraps(owners, numbers, fewest)
 
     def _stand_in(

@@ -245,6 +245,11 @@ class Explorer:
             self._failures.add((track.x, track.y), self._stamp_ns)
             self._memory.target = None
 
+    def frontiers(self) -> list[Array]:
+        """Cells of each frontier of the last survey that is worth a visit, (N, 2), m, map frame."""
+        frame = self.surveyor.borders.frame
+        return [frame.centres_of(c.cells) for c in self._last.candidates if len(c.cells)]
+
     def _candidates(
         self, topology: TopologicalMap, T_map_base: Array, range_m: float
     ) -> list[Candidate]:

@@ -94,11 +94,13 @@ class OpenBorders:
         """Find the borders of a map anew in a box, the first time and now and then everywhere.
 
         box (2, 2): its lower left and upper right corner, m (see field_of_view.box_of_scan).
-        Other cells change only where the map was corrected.
+        Other cells change only where the map was corrected, or is replaced by another one.
         """
-        whole = self._updates % _WHOLE_EVERY == 0
+        whole = patch.is_replaced or self._updates % _WHOLE_EVERY == 0
         self._updates += 1
         row, col = self._fit(patch)
+        if patch.is_replaced:
+            self._clear_outside(row, col, patch.shape)
         rows, cols = (slice(0, size) for size in patch.shape) if whole else _part(patch, box)
         # A few cells more are read than written, so that the cut is no border.
         wide = (
@@ -223,6 +225,20 @@ class OpenBorders:
         self.mask = np.zeros((0, 0), dtype=np.bool_)
         self.passable = np.ones((0, 0), dtype=np.bool_)
         self._looks = np.zeros((0, 0), dtype=np.uint8)
+
+    def _clear_outside(self, row: int, col: int, shape: tuple[int, int]) -> None:
+        """Make all cells unknown that lie outside a map: it may have become smaller."""
+        outside = np.ones(self.free.shape, dtype=np.bool_)
+        outside[row : row + shape[0], col : col + shape[1]] = False
+        gone = int(np.count_nonzero(self.free & outside))
+        if gone == 0 and not (self.mask & outside).any() and self.passable[outside].all():
+            return
+        self.free[outside] = False
+        self.mask[outside] = False
+        self.passable[outside] = True
+        self.known_cells -= gone
+        self.revision += 1
+        self.changed = None
 
     def _cell_of(self, xy: tuple[float, float]) -> tuple[int, int]:
         """Cell (row, col) that holds a point, m."""

@@ -4,8 +4,7 @@ A mission asks a strategy where to drive, and answers what the robot shall do ne
 and no ROS: time is an argument, in s.
 """
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from thinmap_ros.core import validation
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, FinishCode, Strategy
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.se2 import Array
 
 _SMALLEST_STEP_M = 0.02
 _WALL = np.int8(100)
@@ -119,37 +118,18 @@ Action = DriveTo | Finish | None
 
 
 @dataclass
-class DriveRequest:
-    """Goal (3,) that the navigator was given, and when it last reported on it, s.
-
-    timeout_s: after which it is silent; same_m, same_rad: goals nearer than this are the same.
-    """
-
-    goal: Array
-    last_feedback_s: float
-    timeout_s: float = 3.0
-    same_m: float = 0.1
-    same_rad: float = 0.2
-
-    def is_same(self, goal: Array) -> bool:
-        """Whether another goal (3,) is so near that it need not be sent."""
-        near = math.dist(goal[:2], self.goal[:2]) <= self.same_m
-        return near and abs(wrap(float(goal[2] - self.goal[2]))) <= self.same_rad
-
-    def is_silent(self, now_s: float) -> bool:
-        """Whether the navigator does not report; it may have been restarted and lost the goal."""
-        return now_s - self.last_feedback_s >= self.timeout_s
-
-
-@dataclass
 class InputWatchdog:
-    """When the laser last showed anything and the pose was last tracked, s, and the timeouts."""
+    """When the laser last showed anything and the pose was last tracked, s, and the timeouts.
+
+    awaited: what is missing where there is nothing to explore with, in words.
+    """
 
     last_scan_s: float = 0.0
     last_tracking_s: float = 0.0
     is_lost: bool = False
     scan_timeout_s: float = 60.0
     lost_timeout_s: float = 10.0
+    awaited: str = 'scan that shows anything'
 
     def restart(self, now_s: float) -> None:
         """Start all timeouts."""
@@ -172,7 +152,7 @@ class InputWatchdog:
     def failure(self, now_s: float) -> Finish | None:
         """Reason to give up: no scans, or no pose, for too long."""
         if now_s - self.last_scan_s > self.scan_timeout_s:
-            reason = f'no scan that shows anything for {self.scan_timeout_s:.0f} s'
+            reason = f'no {self.awaited} for {self.scan_timeout_s:.0f} s'
             return Finish(FinishCode.SENSOR_TIMEOUT, reason)
         if self.is_lost and now_s - self.last_tracking_s > self.lost_timeout_s:
             reason = f'the pose has been lost for {self.lost_timeout_s:.0f} s'
@@ -183,7 +163,9 @@ class InputWatchdog:
 class Mission:
     """One exploration from its start to its end.
 
-    decision: the strategy's last one; end: why exploring ended, code NONE before.
+    decision: the strategy's last one; end: why exploring ended, code NONE before; is_paused: while
+    it is, nothing is decided and no timeout runs; has_returned: whether the robot is back at its
+    start.
     """
 
     def __init__(
@@ -200,6 +182,8 @@ class Mission:
         self.odometer = Odometer()
         self.decision: Decision | None = None
         self.end = Finish(FinishCode.NONE, '')
+        self.is_paused = False
+        self.has_returned = False
         self._watchdog = watchdog
         self._started_s = now_s
         self._return_failures = 0
@@ -209,6 +193,11 @@ class Mission:
     def elapsed_s(self, now_s: float) -> float:
         """Time since the start."""
         return now_s - self._started_s
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the mission explores or returns."""
+        return self.state in (MissionState.EXPLORING, MissionState.RETURNING)
 
     def is_resumed_by(self, goal: MissionGoal) -> bool:
         """Whether a next mission continues with the strategy of this one.
@@ -220,7 +209,7 @@ class Mission:
     def step(self, observation: Observation) -> Action:
         """Process a scan that is in the map; the strategy decides while the mission explores."""
         self.odometer.add_pose(observation.T_map_base)
-        if self.state != MissionState.EXPLORING:
+        if self.state != MissionState.EXPLORING or self.is_paused:
             return None
         patch = self.goal.masked(observation.patch)
         self.decision = self.strategy.step(
@@ -236,8 +225,12 @@ class Mission:
 
         is_driving: whether the navigator reports on the goal that it was given.
         """
+        self._start_clock(now_s)
         if self._is_cancel_requested:
             return self.cancel('cancelled')
+        if self.is_paused:
+            self._watchdog.restart(now_s)
+            return None
         failure = self._watchdog.failure(now_s)
         if failure is not None:
             return self._finish(failure)
@@ -254,10 +247,11 @@ class Mission:
     def drive_ended(self, success: bool, reason: str) -> Action:
         """Process the navigator's result for the goal that it was given last."""
         if self.state != MissionState.RETURNING:
-            if not success:
+            if not success and self.state == MissionState.EXPLORING:
                 self.strategy.target_failed(reason)
             return None
         if success:
+            self.has_returned = True
             return self._finish(self.end)
         self._return_failures += 1
         if self._return_failures < self.goal.return_attempts:
@@ -271,6 +265,12 @@ class Mission:
     def cancel(self, reason: str) -> Finish:
         """End the mission before it is done."""
         return self._finish(Finish(FinishCode.CANCELLED, reason))
+
+    def _start_clock(self, now_s: float) -> None:
+        """Start with the first message of a simulated clock, which stands at 0 before it."""
+        if self._started_s == 0.0:
+            self._started_s = now_s
+            self._watchdog.restart(now_s)
 
     def _finish_exploring(self, end: Finish) -> Action:
         """Return to the start if that was asked for, else finish."""
@@ -307,4 +307,5 @@ def masked_outside(patch: GridPatch, polygon: Array) -> GridPatch:
     """Map with all cells outside a polygon (M, 2) as walls; polygon in the map frame, m."""
     centres = patch.frame.centres_of(np.argwhere(np.ones(patch.shape, dtype=np.bool_)))
     within = inside(centres, polygon).reshape(patch.shape)
-    return GridPatch(patch.frame, np.where(within, patch.cells, _WALL).astype(np.int8))
+    cells = np.where(within, patch.cells, _WALL).astype(np.int8)
+    return replace(patch, cells=cells)

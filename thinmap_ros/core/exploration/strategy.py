@@ -81,6 +81,14 @@ class Strategy(Protocol):
         """Process that the present target could not be reached."""
 
 
+@runtime_checkable
+class ShowsFrontiers(Protocol):
+    """A strategy that knows the cells of the frontiers it chooses from."""
+
+    def frontiers(self) -> list[Array]:
+        """Cells of each frontier, (N, 2), m, map frame."""
+
+
 def finish_reason(finished: bool, unreachable: list[int], left: int) -> tuple[FinishCode, str]:
     """Code and words for the state of an exploration with a number of end nodes left."""
     if not finished:

@@ -104,6 +104,10 @@ class OccupancyConfig(Config):
     p_surely_occupied: float = 0.9
 
 
+# On a robot that drives through doors; the experiments of the papers and logs keep the default.
+ROBOT_GRID = OccupancyConfig(resolution_m=0.05)
+
+
 def log_odds(probability: float) -> float:
     """Log odds ln(p / (1 - p))."""
     return math.log(probability / (1.0 - probability))
@@ -140,13 +144,9 @@ class OccupancyGrid:
     def __init__(
         self, config: OccupancyConfig | None = None, frame: GridFrame | None = None
     ) -> None:
+        """Start empty; frame: of the map to continue, whose resolution is taken over."""
         self.config = config or OccupancyConfig()
         self.frame = frame or GridFrame(0.0, 0.0, self.config.resolution_m)
-        if self.frame.resolution != self.config.resolution_m:
-            raise InputError(
-                f'map with {self.frame.resolution} m a cell: '
-                f'expected {self.config.resolution_m} m (resolution_m)'
-            )
         self._tiles = TileStore()
         self._percent = _percent_table()
         self._rendered = RenderedMap(self._percent)
@@ -158,10 +158,7 @@ class OccupancyGrid:
 
     @staticmethod
     def from_patch(patch: GridPatch, config: OccupancyConfig | None = None) -> 'OccupancyGrid':
-        """Start from a finished map, with the same cells.
-
-        Raises InputError if the resolution of the map is not that of the configuration.
-        """
+        """Start from a finished map, with the same cells and resolution."""
         grid = OccupancyGrid(config, patch.frame)
         clamped = np.clip(patch.cells / 100.0, grid.config.p_min, grid.config.p_max)
         odds = np.round(_SCALE * np.log(clamped / (1.0 - clamped))).astype(np.int16)

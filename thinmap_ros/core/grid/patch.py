@@ -22,10 +22,13 @@ class GridPatch:
     Row 0 has the lowest y.
 
     A cell up to 25 % is free, from 65 % occupied; values in between count as unknown.
+    is_replaced: of a map that is received again and again, whether any cell may differ from the
+    last one, and not only those that the last scan can have changed.
     """
 
     frame: GridFrame
     cells: NDArray[np.int8]
+    is_replaced: bool = False
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -46,6 +49,18 @@ class GridPatch:
     def unknown(self) -> NDArray[np.bool_]:
         """Cells that are neither free nor occupied, (H, W)."""
         return ~(self.free | self.occupied)
+
+    def trinary(
+        self, free_at_most: float = FREE_AT_MOST, occupied_at_least: float = OCCUPIED_AT_LEAST
+    ) -> NDArray[np.int8]:
+        """Cells (H, W) as map_server publishes them: -1 unknown, 0 free, 100 occupied.
+
+        Thresholds in %.
+        """
+        cells = np.full(self.shape, UNKNOWN, dtype=np.int8)
+        cells[(self.cells >= 0) & (self.cells <= free_at_most)] = 0
+        cells[self.cells >= occupied_at_least] = 100
+        return cells
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Which of the points (N, 2) lie inside, (N,)."""

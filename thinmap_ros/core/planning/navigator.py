@@ -1,6 +1,8 @@
 """Navigator: plans a path to a goal, follows it, replans, and stops in front of obstacles."""
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +28,8 @@ from thinmap_ros.core.se2 import Array
 CONTROL_PERIOD_S = 0.1
 SENSOR_TIMEOUT_NS = 400_000_000
 _ROUNDING_M_S = 1e-9
+# A waypoint counts as passed on this last part of the path to it at most.
+_MAX_WAYPOINT_PASS_M = 0.7
 _OBSTACLE = 'an obstacle blocks the path'
 _HIDDEN = 'the laser does not see the path: sector of invalid beams'
 
@@ -90,26 +94,30 @@ class NavigatorConfig(Config):
 class Command:
     """Command until the next step: speed v (m/s), turn rate w (rad/s), and state of the goal.
 
-    state: 'idle', 'driving', 'blocked', 'reached' or 'failed'; reason: text, if blocked or failed.
+    state: 'idle', 'driving', 'blocked', 'reached' or 'failed'; reason: text, if blocked or failed;
+    is_timeout: failed because the robot stood still for blocked_timeout_s.
     """
 
     v: float
     w: float
     state: str
     reason: str = ''
+    is_timeout: bool = False
 
 
 @dataclass(eq=False)
 class _Progress:
     """Progress towards a goal: age of the path, time at standstill, remaining path length.
 
-    standstills: number of them without progress; nearest_m: smallest remaining length.
+    standstills: number of them without progress; recoveries: all of them, up to the last waypoint
+    too; nearest_m: smallest remaining length.
     """
 
     path_age_s: float = 0.0
     blocked_s: float = 0.0
     remaining_m: float = 0.0
     standstills: int = 0
+    recoveries: int = 0
     nearest_m: float = math.inf
 
 
@@ -123,18 +131,47 @@ class Navigator:
         self._recent_path = RecentPath()
         self._obstacles = ObstaclePoints()
         self._goal: tuple[float, float] | None = None
+        self._waypoints: list[tuple[float, float]] = []
         self._heading_rad: float | None = None
         self._progress = _Progress()
         self._patch: GridPatch | None = None
 
     @property
     def distance_remaining_m(self) -> float:
-        """Remaining length of the path, m; 0 without a path."""
-        return self._progress.remaining_m
+        """Remaining length of the path, m; 0 without a path.
 
-    def set_goal(self, x: float, y: float, theta: float | None = None) -> None:
-        """Set a goal in the map frame, m, with an optional heading, rad."""
+        Beyond the next waypoint, that of straight lines.
+        """
+        if self._goal is None or self._progress.remaining_m <= 0.0:
+            return self._progress.remaining_m
+        targets = [*self._waypoints, self._goal]
+        later_m = sum(math.dist(a, b) for a, b in itertools.pairwise(targets))
+        return self._progress.remaining_m + later_m
+
+    @property
+    def waypoints_remaining(self) -> int:
+        """Number of waypoints before the goal that are not passed yet."""
+        return len(self._waypoints)
+
+    @property
+    def recoveries(self) -> int:
+        """How often the robot had to stop in front of an obstacle since the goal was set."""
+        return self._progress.recoveries
+
+    def set_goal(
+        self,
+        x: float,
+        y: float,
+        theta: float | None = None,
+        *,
+        waypoints: Sequence[tuple[float, float]] = (),
+    ) -> None:
+        """Set a goal in the map frame, m, with an optional heading, rad.
+
+        waypoints: places that are passed on the way, without a stop.
+        """
         self._goal = (x, y)
+        self._waypoints = list(waypoints)
         self._heading_rad = theta
         self.path = None
         self._progress = _Progress()
@@ -146,6 +183,7 @@ class Navigator:
     def cancel(self) -> None:
         """Cancel the goal; the next steps bring the robot to rest."""
         self._goal = None
+        self._waypoints = []
         self.path = None
         self._progress.remaining_m = 0.0
 
@@ -158,7 +196,11 @@ class Navigator:
         self._recent_path.add_pose(T_map_base)
         if self._goal is None:
             return Command(*self._follower.stop(dt_s), 'idle')
-        if self._has_arrived(T_map_base):
+        while self._waypoints and self._passes_waypoint(T_map_base):
+            self._waypoints.pop(0)
+            self.path = None
+            self._progress = _Progress(recoveries=self._progress.recoveries)
+        if not self._waypoints and self._has_arrived(T_map_base):
             return self._finish_goal(T_map_base, dt_s)
         if self._needs_plan(T_map_base, patch, dt_s):
             reason = self._plan(T_map_base, patch)
@@ -166,10 +208,25 @@ class Navigator:
                 return self._wait(reason, dt_s)
         return self._drive(T_map_base, dt_s)
 
-    def _has_arrived(self, T_map_base: Array) -> bool:
-        """Whether the robot is at its goal, or at the end of its path."""
+    @property
+    def _target(self) -> tuple[float, float]:
+        """The next waypoint, or the goal."""
         assert self._goal is not None
-        ends = [self._goal] if self.path is None else [self._goal, self.path[-1]]
+        return self._waypoints[0] if self._waypoints else self._goal
+
+    def _passes_waypoint(self, T_map_base: Array) -> bool:
+        """Whether the robot is at the next waypoint, or so close that it would brake for it."""
+        if self._has_arrived(T_map_base):
+            return True
+        if self.path is None:
+            return False
+        braking_m = self._follower.v**2 / (2.0 * self.config.controller.max_acceleration_m_s2)
+        nearest = nearest_point(self.path, float(T_map_base[0]), float(T_map_base[1]))
+        return length_from(self.path, nearest) <= min(braking_m, _MAX_WAYPOINT_PASS_M)
+
+    def _has_arrived(self, T_map_base: Array) -> bool:
+        """Whether the robot is at its target, or at the end of its path."""
+        ends = [self._target] if self.path is None else [self._target, self.path[-1]]
         away_m = min(math.dist(end, T_map_base[:2]) for end in ends)
         return away_m <= self.config.xy_goal_tolerance_m
 
@@ -214,7 +271,6 @@ class Navigator:
 
         While the robot is blocked, scan points count as obstacles, too.
         """
-        assert self._goal is not None
         points = (
             self._obstacles.query_radius(T_map_base, self.config.scan_obstacle_range_m)
             if self._progress.blocked_s > 0.0
@@ -223,13 +279,19 @@ class Navigator:
         start = float(T_map_base[0]), float(T_map_base[1])
         trail = self._recent_path.cells(patch.frame, patch.shape)
         path = plan(
-            patch, start, self._goal, self.config.planner, points, self.config.stop_radius_m, trail
+            patch,
+            start,
+            self._target,
+            self.config.planner,
+            points,
+            self.config.stop_radius_m,
+            trail,
         )
         first = self.path is None
         self._progress.path_age_s = 0.0
         if path is None:
             self.path = None
-            where = f'({self._goal[0]:.2f}, {self._goal[1]:.2f})'
+            where = f'({self._target[0]:.2f}, {self._target[1]:.2f})'
             never = first and self._progress.blocked_s == 0.0
             return f'no path to {where}' if never else f'the path to {where} is blocked'
         self.path = path
@@ -242,7 +304,7 @@ class Navigator:
         self._progress.remaining_m = 0.0
         if never or self._progress.blocked_s > self.config.blocked_timeout_s:
             self.cancel()
-            return Command(*self._follower.stop(dt_s), 'failed', reason)
+            return Command(*self._follower.stop(dt_s), 'failed', reason, is_timeout=not never)
         return Command(*self._follower.stop(dt_s), 'blocked', reason)
 
     def _drive(self, T_map_base: Array, dt_s: float) -> Command:
@@ -286,14 +348,15 @@ class Navigator:
         """Act in front of an obstacle: rotate towards the path, else replan, else abort."""
         assert self.path is not None
         reason = _HIDDEN if self._obstacles.is_hidden else _OBSTACLE
-        self._progress.standstills += self._progress.blocked_s == 0.0
+        if self._progress.blocked_s == 0.0:
+            self._progress.standstills += 1
+            self._progress.recoveries += 1
         self._progress.blocked_s += dt_s
-        if (
-            self._progress.blocked_s > self.config.blocked_timeout_s
-            or self._progress.standstills > self.config.max_standstills
-        ):
+        is_timeout = self._progress.blocked_s > self.config.blocked_timeout_s
+        if is_timeout or self._progress.standstills > self.config.max_standstills:
             self.cancel()
-            return Command(*self._follower.override_speed(0.0, 0.0), 'failed', reason)
+            still = self._follower.override_speed(0.0, 0.0)
+            return Command(*still, 'failed', reason, is_timeout)
         heading = self._heading_of_path(T_map_base)
         if abs(se2.wrap(heading - float(T_map_base[2]))) > self.config.aim_tolerance_rad:
             return Command(*self._follower.turn_to(T_map_base, heading, dt_s), 'driving')

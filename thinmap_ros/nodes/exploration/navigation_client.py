@@ -1,93 +1,226 @@
-"""Client of the navigator: one goal at a time, sent again when the navigator is silent."""
+"""Client of a navigator: of ours, of Nav2, or of any server of nav2_msgs/NavigateToPose."""
 
-from collections.abc import Callable
+from dataclasses import dataclass
+from time import monotonic
 
+from action_msgs.msg import GoalStatus
+from nav2_msgs.action import NavigateToPose
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
+from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 
-from thinmap_msgs.action import NavigateToPose
-from thinmap_ros.core.exploration.mission import DriveRequest
+from thinmap_ros.core.exploration.live.drive_progress import Arrivals, DriveProgress
+from thinmap_ros.core.exploration.live.drive_request import DriveRequest, Retries
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.nodes.exploration.driver import OnResult
+from thinmap_ros.nodes.exploration.goal_monitor import GoalMonitor
+from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
 
+_PERIOD_S = 0.1
+# Time after a failure in which the goal of whoever replaced ours becomes known.
+_SETTLE_S = 0.3
+_STATUS_NAMES = {
+    GoalStatus.STATUS_CANCELED: 'cancelled by somebody else',
+    GoalStatus.STATUS_ABORTED: 'aborted',
+}
+
+
+@dataclass
+class _Drive:
+    """A goal at the server.
+
+    failure: why it failed at failed_s, by the clock of the machine.
+    """
+
+    request: DriveRequest
+    progress: DriveProgress
+    handle: ClientGoalHandle | None = None
+    failure: str = ''
+    failed_s: float = 0.0
+
 
 class NavigationClient:
-    """Sends goals to the action navigate_to_pose, and reports how the last one ended."""
+    """Sends goals, and reports how the last one ended.
+
+    A goal that is not answered, or no longer reported on, is sent again. One that is rejected, not
+    answered or without progress too long has failed. While the server drives for somebody else, the
+    goal waits.
+    """
 
     def __init__(
-        self, node: ThinmapNode, frame_id: str, on_result: Callable[[bool, str], None]
+        self,
+        node: ThinmapNode,
+        settings: ExplorationSettings,
+        frame_id: str,
+        on_result: OnResult,
     ) -> None:
-        """Make a client; on_result: receives success and reason, of the last goal only."""
+        """frame_id: frame of the goals; on_result: receives success and reason of the last one."""
         self._node = node
+        self._settings = settings
         self._frame_id = frame_id
         self._on_result = on_result
-        self._client = ActionClient(node, NavigateToPose, 'navigate_to_pose')
-        self._request: DriveRequest | None = None
-        self._handle: ClientGoalHandle | None = None
+        self._client = ActionClient(node, NavigateToPose, settings.navigate_to_pose_action)
+        self._others = GoalMonitor(node, settings.navigate_to_pose_action)
+        self._goal: Array | None = None
+        self._drive: _Drive | None = None
+        self._retries = Retries()
+        self._arrivals = Arrivals()
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_active_timer(_PERIOD_S, self._advance, clock=wall)
 
     @property
     def is_driving(self) -> bool:
-        """Whether the navigator has a goal and reports on it."""
-        return self._request is not None and not self._request.is_silent(self._now_s())
+        """Whether there is a goal that has not ended."""
+        return self._goal is not None
+
+    @property
+    def is_yielding(self) -> bool:
+        """Whether the goal waits for the end of somebody else's."""
+        return self._goal is not None and self._drive is None and self._others.is_taken()
 
     def drive_to(self, goal: Array) -> None:
-        """Send a goal (3,), unless the navigator has about the same and reports on it."""
-        logger = self._node.get_logger()
-        if self._request is not None and self._request.is_silent(self._now_s()):
-            logger.warning(
-                'the navigator is silent: asking again', throttle_duration_sec=WARN_PERIOD_S
-            )
-            self._request = None
-            self._handle = None
-        if self._request is not None and self._request.is_same(goal):
+        """Set the goal (3,), unless the server has about the same."""
+        self._goal = goal
+        if self._arrivals.are_useless(goal):
+            self._arrivals.clear()
+            self._end(False, 'reached, but the target stays')
             return
-        if not self._client.server_is_ready():
-            logger.warning('no navigator yet', throttle_duration_sec=WARN_PERIOD_S)
-            return
-        self._send(DriveRequest(goal, self._now_s()))
+        self._advance()
 
     def cancel(self) -> None:
-        """Cancel the goal."""
-        if self._handle is not None:
-            self._handle.cancel_goal_async()
-        self._handle = None
-        self._request = None
+        """Cancel the goal; there is no result."""
+        self._goal = None
+        self._arrivals.clear()
+        self._withdraw()
 
-    def _send(self, request: DriveRequest) -> None:
-        self._request = request
-        goal = NavigateToPose.Goal(use_heading=True)
+    def robot_moved(self, T_map_base: Array) -> None:
+        """Give up the goal of a robot at a pose (3,) that makes no progress."""
+        drive = self._drive
+        if drive is None or not drive.request.is_accepted:
+            return
+        drive.progress.update(T_map_base, drive.request.remaining_m, self._now_s())
+        timeout_s = self._settings.progress_timeout
+        if 0.0 < timeout_s <= drive.progress.idle_s:
+            self._withdraw()
+            self._end(False, f'no progress for {timeout_s:.0f} s')
+
+    def _advance(self) -> None:
+        """Send the goal if the server does not have it, and may have it."""
+        goal = self._goal
+        if goal is None or not self._keeps_waiting(goal):
+            return
+        logger = self._node.get_logger()
+        if self._others.is_taken():
+            logger.info('waiting: the robot drives for somebody else', throttle_duration_sec=10.0)
+        elif not self._client.server_is_ready():
+            name = self._settings.navigate_to_pose_action
+            logger.warning(f'no server of {name} yet', throttle_duration_sec=WARN_PERIOD_S)
+        elif self._retries.may_send(self._now_s()):
+            self._send(goal)
+
+    def _keeps_waiting(self, goal: Array) -> bool:
+        """Check the goal that the server has; returns whether another one may be sent."""
+        drive = self._drive
+        if drive is None:
+            return True
+        if drive.failure:
+            return self._settle(drive)
+        now_s = self._now_s()
+        if drive.request.is_unanswered(now_s):
+            self._drive = None
+            if self._retries.add_unanswered():
+                self._end(False, f'no answer for {drive.request.answer_timeout_s:.0f} s')
+                return False
+            return True
+        is_gone = drive.request.is_accepted and not self._client.server_is_ready()
+        if is_gone or drive.request.is_silent(now_s):
+            self._node.get_logger().warning(
+                'the navigator is silent: asking again', throttle_duration_sec=WARN_PERIOD_S
+            )
+            self._drive = None
+            return True
+        return not drive.request.is_same(goal)
+
+    def _settle(self, drive: _Drive) -> bool:
+        """Report a failure, unless somebody else has replaced the goal; then it is sent again."""
+        if self._others.is_taken():
+            self._drive = None
+            return True
+        if monotonic() - drive.failed_s >= _SETTLE_S:
+            self._drive = None
+            self._end(False, drive.failure)
+        return False
+
+    def _send(self, goal: Array) -> None:
+        now_s = self._now_s()
+        request = DriveRequest(goal, now_s, self._retries.answer_timeout_s)
+        drive = _Drive(request, DriveProgress(goal))
+        self._drive = drive
+        message = NavigateToPose.Goal()
         now_ns = self._node.get_clock().now().nanoseconds
-        goal.pose = messages.pose_stamped_msg(request.goal, self._frame_id, now_ns)
-        sent = self._client.send_goal_async(goal, self._on_feedback)
-        sent.add_done_callback(lambda future: self._on_response(future, request))
+        message.pose = messages.pose_stamped_msg(goal, self._frame_id, now_ns)
+        sent = self._client.send_goal_async(
+            message, lambda feedback: self._on_feedback(feedback, drive), self._others.new_id()
+        )
+        sent.add_done_callback(lambda future: self._on_response(future, drive))
 
-    def _on_feedback(self, message: NavigateToPose.Impl.FeedbackMessage) -> None:
-        if self._request is not None:
-            self._request.last_feedback_s = self._now_s()
+    def _on_feedback(self, message: NavigateToPose.Impl.FeedbackMessage, drive: _Drive) -> None:
+        drive.request.add_feedback(message.feedback.distance_remaining, self._now_s())
 
-    def _on_response(self, future: Future, request: DriveRequest) -> None:
+    def _on_response(self, future: Future, drive: _Drive) -> None:
         handle = future.result()
-        if request is not self._request:
+        if drive is not self._drive:
             if handle.accepted:
-                # Replaced by another goal, or cancelled, before the navigator responded.
+                # Replaced by another goal, or cancelled, before the server responded.
                 handle.cancel_goal_async()
             return
         if not handle.accepted:
-            self._request = None
+            self._drive = None
+            self._rejected()
             return
-        self._handle = handle
-        handle.get_result_async().add_done_callback(lambda done: self._on_done(done, request))
+        self._retries.add_accepted()
+        drive.request.is_accepted = True
+        drive.handle = handle
+        handle.get_result_async().add_done_callback(lambda done: self._on_done(done, drive))
 
-    def _on_done(self, future: Future, request: DriveRequest) -> None:
-        if request is not self._request:
+    def _rejected(self) -> None:
+        name = self._settings.navigate_to_pose_action
+        self._node.get_logger().warning(
+            f'goal rejected by the server of {name}', throttle_duration_sec=WARN_PERIOD_S
+        )
+        if self._retries.add_rejected(self._now_s()) and not self._others.is_taken():
+            self._end(False, f'goal rejected by the server of {name}')
+
+    def _on_done(self, future: Future, drive: _Drive) -> None:
+        if drive is not self._drive:
             return  # the result of a goal that was replaced
-        result: NavigateToPose.Result = future.result().result
-        self._request = None
-        self._handle = None
-        self._on_result(bool(result.success), str(result.reason))
+        ended = future.result()
+        if ended.status == GoalStatus.STATUS_SUCCEEDED:
+            self._drive = None
+            self._arrivals.add(drive.request.goal)
+            self._end(True, '')
+            return
+        status = _STATUS_NAMES.get(ended.status, f'ended with status {ended.status}')
+        code = f'{status}, error code {ended.result.error_code}'
+        drive.failure = str(ended.result.error_msg) or code
+        drive.failed_s = monotonic()
+
+    def _withdraw(self) -> None:
+        """Have the server drop its goal."""
+        drive = self._drive
+        self._drive = None
+        if drive is not None and drive.handle is not None and not drive.failure:
+            drive.handle.cancel_goal_async()
+
+    def _end(self, is_success: bool, reason: str) -> None:
+        self._goal = None
+        if reason:
+            self._node.get_logger().info(f'target not reached: {reason}')
+        self._on_result(is_success, reason)
 
     def _now_s(self) -> float:
         return float(self._node.get_clock().now().nanoseconds) / 1e9

@@ -32,6 +32,11 @@ class StrategySource:
         self._config = parameters.declare_config(node, ExplorerConfig, self._on_config)
         self._is_outdated = False
 
+    @property
+    def config(self) -> ExplorerConfig:
+        """Parameters of the next new strategy."""
+        return self._config
+
     def initial(self, session: str) -> Strategy:
         """Strategy to start with: of the session STEM where that has one, else new.
 

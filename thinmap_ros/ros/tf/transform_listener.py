@@ -157,6 +157,10 @@ class TransformListener:
         """
         return self._buffer.lookup(target_frame, source_frame, stamp_ns)
 
+    def clear(self) -> None:
+        """Forget all but the static transforms: the time was set back."""
+        self._buffer.clear()
+
     def _on_transforms(self, message: TFMessage) -> None:
         self._add(message, is_static=False)
 

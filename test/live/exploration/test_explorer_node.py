@@ -12,13 +12,19 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid
+from nav2_msgs.action import NavigateToPose
 from rclpy.action import ActionClient, ActionServer
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.action import Explore, NavigateToPose
-from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
+from thinmap_msgs.action import Explore
+from thinmap_msgs.msg import (
+    EndNodeArray,
+    ExplorationStatus,
+    ProbabilityGrid,
+    SlamStatus,
+    TopologicalMap,
+)
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.exploration.mission import MissionState
 from thinmap_ros.core.exploration.strategy import FinishCode
@@ -76,7 +82,7 @@ class Robot:
         self.numbers = count(1)
         self.hears_scans = self.is_tracked = True
         self.end_nodes = graph.heard('end_nodes', EndNodeArray, qos.LATCHED)
-        self.map = self.node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
+        self.map = self.node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
         self.graph_map = self.node.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
         self.pose = self.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self.scan = self.node.create_publisher(LaserScan, 'scan', qos.STREAM)
@@ -93,13 +99,13 @@ class Robot:
 
         def refuse(handle):
             handle.abort()
-            return NavigateToPose.Result(success=False, reason='the wheels are chained')
+            return NavigateToPose.Result(error_code=9000, error_msg='the wheels are chained')
 
         self.driver = ActionServer(self.node, NavigateToPose, 'navigate_to_pose', refuse)
 
     def knows(self, cols):
         patch = room(cols)
-        self.map.publish(messages.grid_msg(patch, 'map', 0))
+        self.map.publish(messages.probability_grid_msg(patch, 'map', 0))
         self.graph_map.publish(
             messages.topology_msg(build(patch, (2.0, 2.0), TopologyConfig()), 'map', 0)
         )

@@ -1,0 +1,137 @@
+"""Maps of other publishers: costs, updates, what is seen in them, and their graph."""
+
+import math
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.live.map_graph import MapGraph
+from thinmap_ros.core.exploration.live.map_view import (
+    occupancy_from_costs,
+    scan_in_map,
+    with_update,
+)
+from thinmap_ros.core.exploration.live.stable_ids import StableIds
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import pose
+from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import NodeKind
+
+SECOND_NS = 1_000_000_000
+AT = pose(1.0, 3.0, 0.0)
+
+
+def crossing(known_cols=120, resolution=0.05, origin=(0.0, 0.0)):
+    """Two corridors 1 m wide that cross, 6 x 6 m, known up to a column."""
+    cells = np.full((120, 120), 100, dtype=np.int8)
+    cells[50:70, 2:118] = 0
+    cells[2:118, 50:70] = 0
+    cells[:, known_cols:] = -1
+    return GridPatch(GridFrame(*origin, resolution), cells)
+
+
+def shifted(patch, rows, cols):
+    """The same map with unknown cells before its first rows and columns."""
+    cells = np.pad(patch.cells, ((rows, 0), (cols, 0)), constant_values=-1)
+    return GridPatch(patch.frame.with_origin_at(-rows, -cols), cells)
+
+
+def test_costs_below_lethal_are_free_space():
+    cells = np.array([[-1, 0, 1, 50, 98, 99, 100]], dtype=np.int8)
+    found = occupancy_from_costs(GridPatch(GridFrame(0.0, 0.0, 0.05), cells))
+    assert found.cells.tolist() == [[-1, 0, 0, 0, 0, 0, 100]]
+
+
+def test_an_update_replaces_a_part_and_leaves_the_old_map_alone():
+    patch = crossing()
+    part = np.full((3, 4), -1, dtype=np.int8)
+    found = with_update(patch, 117, 10, part)
+    assert (found.cells[117:, 10:14] == -1).all()
+    assert (found.cells != patch.cells).sum() == 12
+    for row, col in ((118, 10), (0, 117), (-1, 0), (0, -1)):
+        with pytest.raises(InputError, match='update of 3 x 4 cells'):
+            with_update(patch, row, col, part)
+
+
+def test_what_a_map_shows_ends_at_walls_and_at_the_unknown():
+    scan = scan_in_map(crossing(known_cols=100), pose(3.0, 3.0, 0.5 * math.pi), 8.0, 7)
+    assert scan.stamp_ns == 7
+    ahead, left, behind, right = (scan.ranges_m[i] for i in (180, 270, 0, 90))
+    assert ahead == pytest.approx(2.9, abs=0.01)  # +y
+    assert left == pytest.approx(2.9, abs=0.01)  # -x
+    assert behind == pytest.approx(2.9, abs=0.01)  # -y
+    assert right == pytest.approx(2.0, abs=0.01)  # +x, up to the unknown
+    near = scan_in_map(crossing(), pose(3.0, 3.0, 0.0), 2.0, 0)
+    assert np.isinf(near.ranges_m[180])
+
+
+def test_the_graph_keeps_its_ids_while_the_map_grows_and_its_origin_shifts():
+    graph = MapGraph(TopologyConfig())
+    first = graph.update(crossing(known_cols=90), AT, 0)
+    branch = next(n for n in first.nodes.values() if n.kind == NodeKind.BRANCH)
+    places = {n.id: (n.x, n.y) for n in first.nodes.values()}
+    patch = crossing(origin=(0.0, 0.0))
+    second = graph.update(shifted(patch, 13, 7), AT, 3 * SECOND_NS)
+    expected = build(patch, (1.0, 3.0), TopologyConfig())
+    assert len(second.nodes) == len(expected.nodes)
+    assert len(second.edges) == len(expected.edges)
+    assert second.nodes[branch.id].kind == NodeKind.BRANCH
+    kept = second.nodes.keys() & places.keys()
+    assert len(kept) >= 4
+    for node_id in kept:
+        node = second.nodes[node_id]
+        assert math.dist(places[node_id], (node.x, node.y)) <= 0.5
+    # The end towards the unknown has moved: it is another node.
+    assert len(second.nodes.keys() - places.keys()) == 1
+
+
+def test_the_graph_is_built_again_after_a_period_and_only_of_another_map():
+    graph = MapGraph(TopologyConfig())
+    patch = crossing(known_cols=90)
+    first = graph.update(patch, AT, 0)
+    grown = crossing()
+    assert graph.update(grown, AT, SECOND_NS) is first
+    second = graph.update(grown, AT, 2 * SECOND_NS)
+    assert second is not first
+    assert graph.update(grown, AT, 9 * SECOND_NS) is second
+    # The clock was set back.
+    assert graph.update(patch, AT, 0) is not second
+
+
+def test_where_the_robot_stands_in_no_free_space_the_last_graph_holds():
+    graph = MapGraph(TopologyConfig())
+    first = graph.update(crossing(), AT, 0)
+    cells = np.full((120, 120), -1, dtype=np.int8)
+    unknown = GridPatch(GridFrame(0.0, 0.0, 0.05), cells)
+    assert graph.update(unknown, AT, 9 * SECOND_NS) is first
+
+
+def test_ids_are_never_given_twice():
+    ids = StableIds(0.5)
+    seen = set()
+    for known_cols in (80, 100, 120, 90, 120):
+        fresh = build(crossing(known_cols), (1.0, 3.0), TopologyConfig())
+        found = ids.renamed(fresh)
+        used = [*found.nodes, *found.edges]
+        assert len(used) == len(set(used))
+        assert {n.kind for n in found.nodes.values()} == {n.kind for n in fresh.nodes.values()}
+        assert sorted(e.length_m for e in found.edges.values()) == sorted(
+            e.length_m for e in fresh.edges.values()
+        )
+        seen |= set(used)
+    assert max(seen) == len(seen)
+
+
+def test_parallel_edges_keep_their_own_ids():
+    cells = np.full((60, 120), 100, dtype=np.int8)
+    cells[4:56, 4:116] = 0
+    cells[20:30, 20:100] = 100
+    cells[44:46, 50:60] = 100
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.05), cells)
+    ids = StableIds(0.5)
+    first = ids.renamed(build(patch, (0.5, 0.5), TopologyConfig()))
+    lengths = {e.id: e.length_m for e in first.edges.values()}
+    second = ids.renamed(build(patch, (0.5, 0.5), TopologyConfig()))
+    assert {e.id: e.length_m for e in second.edges.values()} == lengths

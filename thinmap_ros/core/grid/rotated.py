@@ -1,0 +1,71 @@
+"""Maps whose rows are not parallel to the x axis, as map_server files may have."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
+from thinmap_ros.core.grid.tiles import MAX_CELLS
+from thinmap_ros.core.se2 import Array
+
+_ALIGNED_RAD = 1e-6
+
+
+def aligned_patch(T_map_origin: Array, resolution_m: float, cells: NDArray[np.int8]) -> GridPatch:
+    """Patch of cells (H, W) whose first corner and rows have a pose T_map_origin (3,) in the map.
+
+    Rotated cells are resampled: each new cell has the value of the old cell at its centre, and one
+    that contains the centre of an occupied cell is occupied, so that walls keep no gaps.
+    Raises InputError where the resampled map would be too large.
+    """
+    if abs(T_map_origin[2]) < _ALIGNED_RAD:
+        x, y, _ = T_map_origin.tolist()
+        return GridPatch(GridFrame(x, y, resolution_m), cells)
+    frame, (rows, cols) = _bounds(T_map_origin, resolution_m, cells.shape)
+    if rows * cols > MAX_CELLS:
+        raise InputError(
+            f'map rotated by {T_map_origin[2]:.3f} rad: {rows} x {cols} cells: '
+            f'expected {MAX_CELLS} at most'
+        )
+    resampled = np.full((rows, cols), UNKNOWN, dtype=np.int8)
+    for row in range(rows):  # one at a time: a large map needs little more memory than its cells
+        new_cells = np.column_stack([np.full(cols, row), np.arange(cols)])
+        old_cells = _cells_at(frame.centres_of(new_cells), T_map_origin, resolution_m)
+        inside = ((old_cells >= 0) & (old_cells < cells.shape)).all(axis=1)
+        resampled[row, inside] = cells[tuple(old_cells[inside].T)]
+    occupied = np.argwhere(cells >= OCCUPIED_AT_LEAST)
+    centres = (occupied[:, ::-1].astype(np.float64) + 0.5) * resolution_m
+    centres = _transformed(centres, T_map_origin)
+    resampled[tuple(frame.cells_of(centres).T)] = cells[tuple(occupied.T)]
+    return GridPatch(frame, resampled)
+
+
+def _bounds(
+    T_map_origin: Array, resolution_m: float, shape: tuple[int, ...]
+) -> tuple[GridFrame, tuple[int, int]]:
+    """Frame and shape of an aligned grid around a rotated one."""
+    height_m = shape[0] * resolution_m
+    width_m = shape[1] * resolution_m
+    corners = np.array([[0.0, 0.0], [width_m, 0.0], [0.0, height_m], [width_m, height_m]])
+    corners = _transformed(corners, T_map_origin)
+    low = corners.min(axis=0)
+    # Rounded, so that a quarter turn keeps the number of cells.
+    cols, rows = np.ceil(np.round((corners.max(axis=0) - low) / resolution_m, 6)).astype(int)
+    return GridFrame(float(low[0]), float(low[1]), resolution_m), (int(rows), int(cols))
+
+
+def _transformed(points: Array, T: Array) -> Array:
+    """Points (N, 2) in the parent frame of a pose T (3,)."""
+    c = math.cos(T[2])
+    s = math.sin(T[2])
+    return np.asarray(points @ np.array([[c, s], [-s, c]]) + T[:2])
+
+
+def _cells_at(points: Array, T_map_origin: Array, resolution_m: float) -> NDArray[np.int64]:
+    """Rows and columns (N, 2) of the rotated grid in which points (N, 2) of the map lie."""
+    inner = _transformed(points, se2.invert(T_map_origin))
+    return np.floor(inner[:, ::-1] / resolution_m + 1e-9).astype(np.int64)

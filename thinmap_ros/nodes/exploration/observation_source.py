@@ -1,0 +1,165 @@
+"""Inputs of an exploration: those of thinmap's nodes, or the map of any publisher and TF."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from sensor_msgs.msg import LaserScan
+
+from thinmap_msgs.msg import ProbabilityGrid, SlamStatus, TopologicalMap
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.live.map_graph import MapGraph
+from thinmap_ros.core.exploration.mission import InputWatchdog
+from thinmap_ros.core.exploration.observations import Observation, ObservationBuffer
+from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.topology.builder import TopologyConfig
+from thinmap_ros.nodes.exploration.foreign_map import ForeignMap
+from thinmap_ros.nodes.exploration.publishers import PublisherCheck
+from thinmap_ros.nodes.exploration.robot_view import RobotView
+from thinmap_ros.nodes.exploration.settings import ExplorationSettings
+from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.laser_transform import LaserTransform
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
+
+_LOOK_PERIOD_S = 0.5
+# A publisher that is silent because its map does not change: the old one holds.
+_UNCHANGED_NS = 10 * SECOND_NS
+
+
+@dataclass(frozen=True)
+class RobotFrames:
+    """Frame of the map, and the laser on the robot."""
+
+    map_frame: str
+    laser_transform: LaserTransform
+
+
+class ObservationSource:
+    """Makes observations of what is published.
+
+    Where somebody publishes grid, a scan is an observation with the pose of its stamp, and with the
+    local grid of its stamp where that is published. Else each new map is one, with the pose of TF.
+    watchdog: notices inputs that are missing.
+    """
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        settings: ExplorationSettings,
+        frames: RobotFrames,
+        robot_radius_m: float,
+        on_observation: Callable[[Observation], None],
+    ) -> None:
+        """on_observation: receives each observation; its graph is complete after `with_graph`."""
+        self._node = node
+        self._laser_transform = frames.laser_transform
+        self._on_observation = on_observation
+        self._graph_config = TopologyConfig(robot_radius_m=robot_radius_m)
+        self._grids = PublisherCheck(node, 'grid', 'local_grid')
+        self._topologies = PublisherCheck(node, 'topology')
+        self._view = RobotView(node, settings, frames.map_frame, frames.laser_transform)
+        self._map = ForeignMap(node, settings, frames.map_frame, self._uses_foreign_map)
+        self.reset()
+        subscribe_guarded(node, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
+        subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
+        subscribe_guarded(node, ProbabilityGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
+        subscribe_guarded(node, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        subscribe_guarded(node, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        subscribe_guarded(node, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
+        node.create_active_timer(_LOOK_PERIOD_S, self._look)
+
+    def reset(self) -> None:
+        """Discard map, graph and scans."""
+        self.watchdog = InputWatchdog()
+        self._buffer = ObservationBuffer(messages.topology_from_msg(TopologicalMap()))
+        self._graph = MapGraph(self._graph_config)
+        self._view.reset()
+        self._map.reset()
+        self._looked_ns = 0
+
+    def with_graph(self, observation: Observation) -> Observation:
+        """Observation with the graph of its map, if nobody publishes a topological map."""
+        if self._topologies.is_found():
+            return observation
+        T_map_base = observation.T_map_base
+        with self._node.diagnostics.time_step('graph of the map'):
+            graph = self._graph.update(observation.patch, T_map_base, observation.scan.stamp_ns)
+        return observation._replace(topology=graph)
+
+    def _uses_foreign_map(self) -> bool:
+        return not self._grids.is_found()
+
+    # Inputs.
+
+    def _on_topology(self, message: TopologicalMap) -> None:
+        self._topologies.message_received()
+        self._buffer.topology = messages.topology_from_msg(message)
+
+    def _on_grid(self, message: ProbabilityGrid) -> None:
+        self._grids.message_received()
+        self._buffer.replace_map(messages.grid_from_msg(message))
+
+    def _on_local_grid(self, message: ProbabilityGrid) -> None:
+        self._grids.message_received()
+        stamp_ns = messages.stamp_ns(message.header.stamp)
+        self._process(self._buffer.add_local_map(stamp_ns, messages.grid_from_msg(message)))
+
+    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        if self._uses_foreign_map():
+            return
+        stamp_ns = messages.stamp_ns(message.header.stamp)
+        self._process(self._buffer.add_pose(stamp_ns, messages.pose_from_msg(message.pose.pose)))
+
+    def _on_scan(self, message: LaserScan) -> None:
+        if self._uses_foreign_map():
+            self._view.add_scan(message)
+            return
+        scan = self._laser_transform.to_scan(message)
+        if scan.is_blind:
+            return  # ignored: a blind scan observes nothing
+        self.watchdog.awaited = InputWatchdog.awaited
+        self.watchdog.add_scan(self._now_ns() / SECOND_NS)
+        self._process(self._buffer.add_scan(scan))
+
+    def _on_slam_status(self, message: SlamStatus) -> None:
+        is_lost = message.state == SlamStatus.LOST
+        self.watchdog.add_tracking(is_lost, self._now_ns() / SECOND_NS)
+
+    # Outputs.
+
+    def _process(self, observation: Observation | None) -> None:
+        if observation is not None:
+            self._on_observation(observation)
+
+    def _look(self) -> None:
+        """Make an observation of a new map; of an old one if there is none for a long time."""
+        if not self._uses_foreign_map():
+            return
+        now_ns = self._now_ns()
+        is_due = not 0 <= now_ns - self._looked_ns < _UNCHANGED_NS
+        if not (self._map.is_changed or is_due):
+            return
+        try:
+            observation = self._observe(now_ns)
+        except InputError as error:
+            self.watchdog.awaited = f'pose of the robot in the map ({error})'
+            return
+        if observation is None:
+            self.watchdog.awaited = f'map on {self._map.topic}'
+            return
+        self._looked_ns = now_ns
+        self._map.is_changed = False
+        self.watchdog.awaited = f'new map on {self._map.topic}'
+        self.watchdog.add_scan(now_ns / SECOND_NS)
+        self._process(observation)
+
+    def _observe(self, now_ns: int) -> Observation | None:
+        patch = self._map.patch()
+        if patch is None:
+            return None
+        scan, T_map_base = self._view.look(patch, now_ns)
+        return Observation(self._buffer.topology, patch, scan, T_map_base)
+
+    def _now_ns(self) -> int:
+        return int(self._node.get_clock().now().nanoseconds)

@@ -1,0 +1,45 @@
+"""The map that the navigator plans on: thinmap's grid, or the map of another node."""
+
+from nav_msgs.msg import OccupancyGrid
+
+from thinmap_msgs.msg import ProbabilityGrid
+from thinmap_ros.core.grid.map_mirror import MapMirror
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
+
+
+class MapInput:
+    """The newest map: grid and local_grid of grid_mapper, or else map, of whatever SLAM."""
+
+    def __init__(self) -> None:
+        self._map = MapMirror()
+        self._has_grid = False
+
+    @property
+    def patch(self) -> GridPatch | None:
+        """The map, or None before one is received."""
+        return self._map.patch
+
+    def subscribe(self, node: ThinmapNode) -> None:
+        """Start to receive maps."""
+        subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
+        subscribe_guarded(node, ProbabilityGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
+        subscribe_guarded(node, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+
+    def reset(self) -> None:
+        """Discard the map."""
+        self._map = MapMirror()
+        self._has_grid = False
+
+    def _on_grid(self, message: ProbabilityGrid) -> None:
+        self._has_grid = True
+        self._map.replace(messages.grid_from_msg(message))
+
+    def _on_local_grid(self, message: ProbabilityGrid) -> None:
+        self._map.paste(messages.grid_from_msg(message))
+
+    def _on_map(self, message: OccupancyGrid) -> None:
+        if not self._has_grid:
+            self._map.replace(messages.grid_from_msg(message))

@@ -1,0 +1,1 @@
+"""The graph for route servers; a part of the node topology_builder."""

@@ -1,0 +1,1 @@
+"""Velocity commands as messages."""

@@ -1,0 +1,102 @@
+"""Velocity commands on cmd_vel, as Twist or TwistStamped: published and received."""
+
+from collections.abc import Callable
+
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros.diagnostics import WARN, NodeDiagnostics
+
+TOPIC = 'cmd_vel'
+_KINDS: dict[str, type] = {
+    'geometry_msgs/msg/Twist': Twist,
+    'geometry_msgs/msg/TwistStamped': TwistStamped,
+}
+_CHECK_PERIOD_S = 0.25
+
+
+def declare_stamped(node: Node) -> bool:
+    """Declare the parameter `enable_stamped_cmd_vel` and return its value."""
+    return bool(
+        parameters.declare_parameter(
+            node,
+            'enable_stamped_cmd_vel',
+            False,
+            'Type of cmd_vel. true: geometry_msgs/TwistStamped in base_frame, for drivers of '
+            'ros2_control and TurtleBot 4 and beside Nav2 from Kilted on. false: '
+            'geometry_msgs/Twist, as Nav2 in Jazzy.',
+        )
+    )
+
+
+class VelocityPublisher:
+    """Publishes velocity commands on cmd_vel."""
+
+    def __init__(self, node: Node, base_frame: str, is_stamped: bool) -> None:
+        """base_frame: frame of stamped commands."""
+        self._clock = node.get_clock()
+        self._frame = base_frame
+        self._is_stamped = is_stamped
+        kind = TwistStamped if is_stamped else Twist
+        self._publisher = node.create_publisher(kind, TOPIC, qos.STREAM)
+
+    def publish(self, v: float, w: float) -> None:
+        """Publish a command: v m/s ahead, w rad/s to the left."""
+        twist = messages.twist_msg(v, w)
+        if not self._is_stamped:
+            self._publisher.publish(twist)
+            return
+        header = messages.header(self._frame, self._clock.now().nanoseconds)
+        self._publisher.publish(TwistStamped(header=header, twist=twist))
+
+
+class VelocitySubscription:
+    """Receives the commands on cmd_vel in the type in which they are published.
+
+    DDS allows a process one type for each topic, so the subscription is created again when all
+    publishers have the other type.
+    """
+
+    def __init__(
+        self, node: Node, diagnostics: NodeDiagnostics, on_command: Callable[[float, float], None]
+    ) -> None:
+        """on_command: receives v (m/s) and w (rad/s), unchecked."""
+        self._node = node
+        self._diagnostics = diagnostics
+        self._on_command = on_command
+        self._kind = 'geometry_msgs/msg/Twist'
+        self._subscription = self._subscribe()
+        diagnostics.expect_topic(TOPIC)
+        diagnostics.add_check(WARN, self._other_types)
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(_CHECK_PERIOD_S, self._follow_publishers, clock=wall)
+
+    def _subscribe(self) -> object:
+        return self._node.create_subscription(
+            _KINDS[self._kind], TOPIC, self._on_message, qos.STREAM
+        )
+
+    def _on_message(self, message: Twist | TwistStamped) -> None:
+        self._diagnostics.message_received(TOPIC)
+        twist = message.twist if isinstance(message, TwistStamped) else message
+        self._on_command(twist.linear.x, twist.angular.z)
+
+    def _published_types(self) -> set[str]:
+        name = self._node.resolve_topic_name(TOPIC)
+        return {info.topic_type for info in self._node.get_publishers_info_by_topic(name)}
+
+    def _follow_publishers(self) -> None:
+        published = self._published_types().intersection(_KINDS)
+        if not published or self._kind in published:
+            return
+        self._node.destroy_subscription(self._subscription)
+        self._kind = published.pop()
+        self._subscription = self._subscribe()
+
+    def _other_types(self) -> str:
+        others = sorted(self._published_types() - {self._kind})
+        if not others:
+            return ''
+        return f'{TOPIC}: ignored publishers of {", ".join(others)}: expected {self._kind}'
