@@ -86,9 +86,6 @@ class _SimPublishers:
         ns = moment.stamp_ns
         self._publish_clock(ns)
         self._publish_odometry(moment, robot)
-        if self._publish_tf:
-            transform = messages.transform_msg(moment.T_odom_base, 'odom', 'base_link', ns)
-            self._tf.publish(TFMessage(transforms=[transform]))
         self._truth.publish(messages.pose_stamped_msg(robot.T_world_base, 'world', ns))
         if robot.collisions != self._last_collisions:
             self._last_collisions = robot.collisions
@@ -113,6 +110,9 @@ class _SimPublishers:
         self._odom.publish(
             messages.odometry_msg(moment.T_odom_base, velocity, frames, moment.stamp_ns)
         )
+        if self._publish_tf:
+            transform = messages.transform_msg(moment.T_odom_base, *frames, moment.stamp_ns)
+            self._tf.publish(TFMessage(transforms=[transform]))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,11 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+
+from thinmap_ros.ros import qos
 
 _PERIOD_S = 1.0
 _TOPICS_OF_EVERY_NODE = ('/parameter_events', '/rosout', '/diagnostics', '/clock')
@@ -324,9 +328,38 @@ class NodeDiagnostics:
         for publisher in list(self._node.publishers):
             if publisher.topic_name not in _TOPICS_OF_EVERY_NODE:
                 name = publisher.topic_name.lstrip('/')
-                found[f'{name}: subscribers'] = str(publisher.get_subscription_count())
+                found[f'{name}: subscribers'] = _subscribers(self._node, publisher)
         for subscription in list(self._node.subscriptions):
             if subscription.topic_name not in _TOPICS_OF_EVERY_NODE:
                 name = subscription.topic_name.lstrip('/')
-                found[f'{name}: publishers'] = str(subscription.get_publisher_count())
+                found[f'{name}: publishers'] = _publishers(self._node, subscription)
         return found
+
+
+def _subscribers(node: Node, publisher: Publisher) -> str:
+    """Number of matched subscriptions, and why others of the topic do not match."""
+    count = publisher.get_subscription_count()
+    if node.count_subscribers(publisher.topic_name) == count:
+        return str(count)
+    others = node.get_subscriptions_info_by_topic(publisher.topic_name)
+    mismatches = [qos.mismatch(publisher.qos_profile, other.qos_profile) for other in others]
+    return _count_with_mismatches(count, mismatches)
+
+
+def _publishers(node: Node, subscription: Subscription) -> str:
+    """Number of matched publishers, and why others of the topic do not match."""
+    count = subscription.get_publisher_count()
+    if node.count_publishers(subscription.topic_name) == count:
+        return str(count)
+    others = node.get_publishers_info_by_topic(subscription.topic_name)
+    mismatches = [qos.mismatch(other.qos_profile, subscription.qos_profile) for other in others]
+    return _count_with_mismatches(count, mismatches)
+
+
+def _count_with_mismatches(count: int, mismatches: list[str]) -> str:
+    """A count of matched endpoints; mismatches: one text for each endpoint, '' where it matches."""
+    faults = [text for text in mismatches if text]
+    if not faults:
+        return str(count)
+    kinds = '; '.join(dict.fromkeys(faults))
+    return f'{count} (and {len(faults)} with incompatible QoS: {kinds})'

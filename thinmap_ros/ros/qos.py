@@ -47,3 +47,19 @@ def as_recorded(topic: str, offers: list[Qos]) -> QoSProfile:
         else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
+
+
+def mismatch(offered: QoSProfile, requested: QoSProfile) -> str:
+    """What a subscription requests and a publisher does not offer; '' where they match."""
+    faults = []
+    if (
+        requested.reliability == ReliabilityPolicy.RELIABLE
+        and offered.reliability == ReliabilityPolicy.BEST_EFFORT
+    ):
+        faults.append('best effort offered, reliable requested')
+    if (
+        requested.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        and offered.durability == DurabilityPolicy.VOLATILE
+    ):
+        faults.append('volatile offered, transient local requested')
+    return ', '.join(faults)

@@ -63,7 +63,7 @@ class _GuardedSubscription:
         self._time_jumps = 0
         self._losses = MessageLossCounter()
         node.diagnostics.expect_topic(topic)
-        self._adaptive = _AdaptiveSubscription(node, kind, topic, self._on_message, profile)
+        self._adaptive = AdaptiveSubscription(node, kind, topic, self._on_message, profile)
         if self._is_scan:
             node.diagnostics.add_timeout_check(topic, _TIMEOUT_S)
         if self._is_latched:
@@ -121,7 +121,7 @@ class _GuardedSubscription:
             self._guarded(message)
 
 
-class _AdaptiveSubscription:
+class AdaptiveSubscription:
     """A subscription that is replaced by one with lower requests where a publisher offers less.
 
     The odometry of many robots is best effort, and a map may be volatile: with the requests of the

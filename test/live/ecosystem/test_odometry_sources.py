@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Odometry
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import LaserScan
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from support.doctor import Doctor
 from support.peers.transform_client import TransformClient
+from tf2_msgs.msg import TFMessage
 
+from thinmap_msgs.msg import SlamStatus
 from thinmap_ros.core import se2
 from thinmap_ros.ros import messages, qos
 
@@ -18,11 +19,14 @@ pytestmark = pytest.mark.live
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 START = se2.pose(5.0, 2.0, 0.0)
 AT_START = {'initial_x_m': 5.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.0}
-DRIVEN_M = 2.0
+DRIVEN_M = 3.0
 
 
 class Drive:
-    """A simulated robot that drives a curve, with true and estimated poses by their stamps."""
+    """A simulated robot that drives a curve, with true and estimated poses by their stamps.
+
+    It waits for the pose of each scan, so that no result depends on the load of the machine.
+    """
 
     def __init__(self, graph, remap=(), rate=4.0):
         self.graph = graph
@@ -37,6 +41,7 @@ class Drive:
             world='office',
             start='5.0,2.0,0.0',
             wait_for_subscribers=1,
+            lockstep='pose',
             real_time_factor=rate,
         )
 
@@ -46,6 +51,10 @@ class Drive:
     def _on_pose(self, message):
         ns = messages.stamp_ns(message.header.stamp)
         self._poses[ns] = messages.pose_from_msg(message.pose.pose)
+
+    def now_ns(self):
+        """The newest simulated time that was received."""
+        return max(self._truth)
 
     def command(self, v=0.3, w=0.2):
         self._commands.publish(messages.twist_msg(v, w))
@@ -150,30 +159,71 @@ def test_another_node_may_publish_the_transform(graph):
     assert client.chain('odom', 'laser') and client.chain('map', 'odom') is None
 
 
-@pytest.mark.parametrize('seconds', [10.0, pytest.param(60.0, marks=pytest.mark.slow)])
+def test_best_effort_transforms_are_received(graph):
+    transforms = graph.node.create_publisher(TFMessage, '/tf', BEST_EFFORT)
+    graph.node.create_subscription(TFMessage, '/wheels_tf', transforms.publish, 50)
+    graph.start('localizer', use_sim_time=True, odom_source='tf', **AT_START)
+    assert Drive(graph, remap=('odom:=unheard', '/tf:=/wheels_tf')).error_m() < 0.05
+
+
+def test_a_quality_of_service_that_does_not_match_is_named(graph):
+    doctor = Doctor(graph)
+    graph.node.create_publisher(TFMessage, '/tf_static', BEST_EFFORT)
+    status = QoSProfile(
+        depth=1,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+    graph.node.create_subscription(SlamStatus, 'slam_status', print, status)
+    graph.start('localizer', laser_pose='0,0,0')
+    graph.until(
+        lambda: (
+            doctor.value('localizer', 'slam_status: subscribers')
+            == '0 (and 1 with incompatible QoS: volatile offered, transient local requested)'
+        ),
+        'the subscription that receives nothing',
+    )
+    graph.start('navigator')
+    graph.until(
+        lambda: (
+            doctor.value('navigator', 'tf_static: publishers')
+            == '0 (and 1 with incompatible QoS: best effort offered, reliable requested, '
+            'volatile offered, transient local requested)'
+        ),
+        'the publisher that is not received',
+    )
+
+
+@pytest.mark.parametrize('seconds', [15.0, pytest.param(60.0, marks=pytest.mark.slow)])
 def test_every_lookup_at_the_present_time_succeeds(graph, seconds):
+    """By tf2's rules, every 20 ms: map -> odom now, and map -> laser at the newest odometry.
+
+    The simulation waits for the test, too: it is never more than a scan ahead of what is received.
+    """
     graph.start('localizer', use_sim_time=True, **AT_START)
-    drive = Drive(graph, rate=1.0)
     client = TransformClient(graph)
-    scans = graph.heard('scan', LaserScan, qos.SENSOR)
-
-    def now_ns():
-        return max(drive._truth)
-
-    graph.until(lambda: drive.estimates() and scans, 'poses')
-    graph.until(lambda: not client.failure('map', 'odom', now_ns()), 'the first transforms')
+    relay = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose_received', 50)
+    graph.node.create_subscription(PoseWithCovarianceStamped, 'pose', relay.publish, 50)
+    drive = Drive(graph, remap=('pose:=pose_received',), rate=1.0)
+    graph.until(drive.estimates, 'poses')
+    graph.until(lambda: not client.failure('map', 'odom', drive.now_ns()), 'the first transforms')
+    end_ns = drive.now_ns() + round(1e9 * seconds)
     failures = []
     lookups = 0
-    end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s:
+
+    def has_ended():
+        nonlocal lookups
         drive.command(0.2, 0.3)
-        graph.executor.spin_once(timeout_sec=0.0)
         due_s = time.monotonic() + 0.02
         while time.monotonic() < due_s:
             graph.executor.spin_once(timeout_sec=0.005)
-        failures.append(client.failure('map', 'odom', now_ns()))
+        failures.append(client.failure('map', 'odom', drive.now_ns()))
+        failures.append(client.failure('map', 'laser', client.newest_ns('base_link')))
         lookups += 1
-    assert lookups > 10 * seconds
+        return drive.now_ns() > end_ns
+
+    graph.until(has_ended, 'the end of the drive')
+    assert lookups > 10 * seconds, 'at least one for each scan'
     assert not any(failures), [failure for failure in failures if failure][:5]
 
 

@@ -111,3 +111,11 @@ def test_an_invalid_transform_is_refused_with_its_frame(robot):
     message.transform.rotation.w = 0.5
     with pytest.raises(InputError, match='expected norm 1'):
         robot.add(message, is_static=False)
+
+
+def test_time_zero_is_a_time_and_static_transforms_alone_have_none():
+    buffer = TransformBuffer()
+    buffer.add(transform('base_footprint', 'laser', (0.5, 0.0, 0.0)), is_static=True)
+    assert buffer.latest_common_ns('base_footprint', 'laser') is None
+    buffer.add(transform('odom', 'base_footprint', (1.0, 0.0, 0.0), 0.0), is_static=False)
+    assert buffer.latest_common_ns('odom', 'laser') == 0

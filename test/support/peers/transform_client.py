@@ -43,6 +43,10 @@ class TransformClient:
             frame = self._parents[frame]
         return frames
 
+    def newest_ns(self, child):
+        """Stamp of the newest transform to a frame that was received."""
+        return max(self._stamps[child])
+
     def failure(self, target, source, ns):
         """Why a lookup fails; '' where it succeeds."""
         frames = self.chain(target, source)

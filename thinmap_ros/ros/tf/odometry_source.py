@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
@@ -12,7 +13,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded
 from thinmap_ros.ros.tf.transform_listener import TransformBuffer
 
 TOPIC = 'topic'
@@ -53,7 +54,7 @@ class OdometrySource:
         )
         self.source = parameters.declare_config(node, OdometryInputConfig).odom_source
         self._transforms = TransformBuffer()
-        self._last_ns = 0
+        self._last_ns: int | None = None
 
     def subscribe(self) -> None:
         """Start to receive samples."""
@@ -61,16 +62,16 @@ class OdometrySource:
         if self.source == TOPIC:
             subscribe_guarded(node, Odometry, 'odom', self._on_odometry, qos.STREAM)
         elif self.source == TF:
-            node.create_subscription(
-                TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
+            AdaptiveSubscription(
+                node, TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
             )
-            node.create_subscription(TFMessage, '/tf', self._on_transforms, qos.TRANSFORMS)
+            AdaptiveSubscription(node, TFMessage, '/tf', self._on_transforms, qos.TRANSFORMS)
             node.diagnostics.add_update_callback(self._report)
 
     def reset(self) -> None:
         """Forget the samples: the time was set back."""
         self._transforms.clear()
-        self._last_ns = 0
+        self._last_ns = None
 
     def add_scan_stamp(self, stamp_ns: int) -> None:
         """A scan was made: without odometry, the robot is where it was."""
@@ -81,10 +82,10 @@ class OdometrySource:
         stamp_ns = messages.stamp_ns(message.header.stamp)
         self._process(stamp_ns, messages.pose_from_msg(message.pose.pose))
 
-    def _on_static(self, message: TFMessage) -> None:
+    def _on_static(self, message: TFMessage, _info: dict[str, Any]) -> None:
         self._add(message, is_static=True)
 
-    def _on_transforms(self, message: TFMessage) -> None:
+    def _on_transforms(self, message: TFMessage, _info: dict[str, Any]) -> None:
         """Add transforms; the sample is that of the newest time at which all of them are known."""
         self._node.handle_time_jump()
         self._add(message, is_static=False)

@@ -78,7 +78,7 @@ class TransformBuffer:
         Raises InputError where the frames are not connected, or not at that time.
         """
         up, down = self._path(target_frame, source_frame)
-        ns = self._latest_common_ns(up + down) if stamp_ns is None else stamp_ns
+        ns = (self._latest_common_ns(up + down) or 0) if stamp_ns is None else stamp_ns
         return se2.compose(se2.invert(self._chain(up, ns)), self._chain(down, ns))
 
     def latest_common_ns(self, target_frame: str, source_frame: str) -> int | None:
@@ -87,7 +87,7 @@ class TransformBuffer:
             up, down = self._path(target_frame, source_frame)
         except InputError:
             return None
-        return self._latest_common_ns(up + down) or None
+        return self._latest_common_ns(up + down)
 
     def _path(self, target_frame: str, source_frame: str) -> tuple[list[str], list[str]]:
         """Frames from the target, and from the source, up to below their common ancestor."""
@@ -121,9 +121,9 @@ class TransformBuffer:
             T = se2.compose(T_parent_frame, T)
         return T
 
-    def _latest_common_ns(self, frames: list[str]) -> int:
+    def _latest_common_ns(self, frames: list[str]) -> int | None:
         stamps = [self._edges[frame].latest_stamp_ns for frame in frames]
-        return min((stamp for stamp in stamps if stamp is not None), default=0)
+        return min((stamp for stamp in stamps if stamp is not None), default=None)
 
     def _no_sample(self, frame: str, ns: int) -> str:
         edge = self._edges[frame]
