@@ -126,13 +126,18 @@ def test_another_run_beside_it(reports):
 
 
 def test_options_of_the_localizer_have_the_types_of_their_defaults():
-    words = ['slam=ekf_ti', 'initial_x_m=2', 'update_map=false', 'matching.noise_m=0.1']
-    options = {'slam': 'ekf_ti', 'initial_x_m': 2.0, 'update_map': False, 'matching.noise_m': 0.1}
+    words = ['slam=ekf_ti', 'initial_x_m=2', 'mode=localization', 'matching.noise_m=0.1']
+    options = {
+        'slam': 'ekf_ti',
+        'initial_x_m': 2.0,
+        'mode': 'localization',
+        'matching.noise_m': 0.1,
+    }
     assert program._options(words) == options
     for word in (
         'slan=off',
         'initial_x_m=far',
-        'update_map=no',
+        'mode=maps',
         'slam=full_of_hope',
         'square_walls=no',
     ):

@@ -15,6 +15,7 @@ from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.ekf_slam.ekf_localizer import LOCALIZATION, MAPPING
 from thinmap_ros.core.errors import ConfigError, InputError, ThinmapError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import (
@@ -89,6 +90,18 @@ class MapOutputConfig(Config):
 
 
 @dataclass(frozen=True)
+class ModeConfig(Config):
+    """Whether scans change the map."""
+
+    mode: str = parameter(
+        MAPPING,
+        'mapping: scans extend and change the map. localization: the map is published and does '
+        'not change.',
+        choices=(MAPPING, LOCALIZATION),
+    )
+
+
+@dataclass(frozen=True)
 class _Settings:
     """Parameters of the node; mapping: whether scans change the map."""
 
@@ -103,14 +116,7 @@ class _Settings:
             grid=parameters.declare_config(node, OccupancyConfig, base=ROBOT_GRID),
             output=parameters.declare_config(node, MapOutputConfig),
             local_map_size_m=parameters.declare_config(node, WindowConfig).local_map_size_m,
-            mapping=bool(
-                parameters.declare_parameter(
-                    node,
-                    'update_map',
-                    True,
-                    'true: mapping. false: the map is published and does not change.',
-                )
-            ),
+            mapping=parameters.declare_config(node, ModeConfig).mode == MAPPING,
         )
 
 

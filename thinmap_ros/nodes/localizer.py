@@ -1,6 +1,5 @@
 """The pose of the robot: each scan, with the odometry at its stamp, is a step of the localizer."""
 
-from dataclasses import replace
 from time import monotonic, perf_counter
 
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
@@ -31,6 +30,9 @@ from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.files.sessions import LOCALIZER
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.localization.given_map import GivenMap, config_at
+from thinmap_ros.nodes.localization.initial_poses import InitialPoses
+from thinmap_ros.nodes.localization.map_source import load_localizer
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import ERROR, OK
 from thinmap_ros.ros.laser_transform import LaserTransform
@@ -45,6 +47,7 @@ _MAP_WAIT_S = 3.0  # after a restart; the navigator drives for so long without a
 _HEALTH = {
     SlamStatus.TRACKING: (OK, 'tracking'),
     SlamStatus.LOST: (ERROR, 'lost: scans contradict the map'),
+    SlamStatus.NO_MAP: (ERROR, 'no map: waits for topic map; dead reckoning'),
     SlamStatus.BLIND: (ERROR, 'laser blind (too few valid beams): dead reckoning'),
 }
 
@@ -126,8 +129,10 @@ class LocalizerNode(ThinmapNode):
 
     /trajectory after a loop closure.
 
-    Services ~/pause, ~/reset, save_localizer, load_localizer. In the map of a session it is lost
-    until /initialpose arrives or a scan matches at its start pose.
+    Services ~/pause, ~/reset, save_localizer, load_localizer. In a given map it is lost until
+    /initialpose arrives or a scan matches at its start pose. In mode localization the map does not
+    change, and the node has AMCL's interface: amcl_pose, particle_cloud, set_initial_pose,
+    reinitialize_global_localization, request_nomotion_update.
     """
 
     def __init__(self) -> None:
@@ -143,7 +148,7 @@ class LocalizerNode(ThinmapNode):
             self._odometry.odom_frame,
             base_frame if self._odometry.source == NONE else '',
         )
-        self._session = parameters.declare_session(self)
+        self._given = GivenMap(self, self._config)
         self._save_directory = SaveDirectory(self)
         parameters.reject_unknown(self)
         warm_up.localizer()
@@ -156,9 +161,9 @@ class LocalizerNode(ThinmapNode):
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         self._odometry.subscribe()
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        subscribe_guarded(
-            self, PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM
-        )
+        poses = InitialPoses(self, self._output.map_frame, self._on_initial_pose)
+        self._given.source.subscribe(self, self._on_new_map)
+        self._given.create_interface(self._output.map_frame, poses)
         self.create_service(SaveMap, 'save_localizer', self._on_save)
         self.create_service(LoadMap, 'load_localizer', self._on_load)
 
@@ -167,7 +172,7 @@ class LocalizerNode(ThinmapNode):
 
         The robot is at the start pose.
         """
-        self._localizer = self._create_localizer(self._config)
+        self._localizer = self._given.create_localizer()
         self._broadcaster.reset()
         self._odometry.reset()
         self._pairing = ScanOdometrySynchronizer()
@@ -181,17 +186,8 @@ class LocalizerNode(ThinmapNode):
     def _restore(self, state: State) -> None:
         """Continue at the last pose of a killed localizer. Raises InputError where it is none."""
         self._relocation = _Relocation(OdometryAnchor.from_state(state))
+        self._relocation.map = self._given.source.patch
         self._subscribe_map_once(self._relocation)
-
-    def _create_localizer(self, config: LocalizerConfig) -> AnyLocalizer:
-        """A localizer at the start pose, in the map of the session if there is one."""
-        loaded = LOCALIZER.load_optional(self._session, config) if self._session else None
-        return loaded or localizer_class(config)(config)
-
-    def _config_at(self, T_map_base: Array) -> LocalizerConfig:
-        """The configuration with a start pose (3,)."""
-        x, y, yaw = T_map_base.tolist()
-        return replace(self._config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         self._process(self._pairing.add_odometry(stamp_ns, T_odom_base))
@@ -201,10 +197,14 @@ class LocalizerNode(ThinmapNode):
         self._odometry.add_scan_stamp(scan.stamp_ns)
         self._process(self._pairing.add_scan(scan))
 
-    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._localizer.set_pose(
-            messages.pose_from_msg(message.pose.pose), messages.covariance_from_msg(message)
-        )
+    def _on_initial_pose(self, T_map_base: Array, covariance: Array) -> None:
+        self._localizer.set_pose(T_map_base, covariance)
+        self._given.pose_set(covariance)
+
+    def _on_new_map(self) -> None:
+        """Localize in the map that topic map has brought."""
+        if self._relocation is None:
+            self._localizer = self._given.with_new_map(self._localizer)
 
     def _on_topology(self, message: TopologicalMap) -> None:
         self._topology = messages.topology_from_msg(message)
@@ -228,7 +228,7 @@ class LocalizerNode(ThinmapNode):
         """Subscribe once to the map that was built before the crash."""
 
         def on_map(message: OccupancyGrid) -> None:
-            if self._relocation is not relocation:
+            if self._relocation is not relocation or self._given.source.is_from_file:
                 return
             try:
                 relocation.map = messages.grid_from_msg(message)
@@ -265,7 +265,7 @@ class LocalizerNode(ThinmapNode):
                 'the new map may not align with the earlier one'
             )
             T_map_base = se2.compose(last.T_map_odom, T_odom_base)
-            self._localizer = self._create_localizer(self._config_at(T_map_base))
+            self._localizer = self._given.create_localizer_at(T_map_base)
         else:
             kind = localizer_class(self._config)
             self._localizer = kind.from_occupancy_map(
@@ -288,19 +288,21 @@ class LocalizerNode(ThinmapNode):
         return fill_response(response, lambda: self._load(request.path))
 
     def _load(self, path: str) -> str:
-        """Replace the map by that of a session; without one, the localizer keeps its own."""
-        config = self._config_at(self._localizer.pose)
-        loaded = LOCALIZER.load_optional(self._save_directory.resolve(path), config)
+        """Replace the map by that of a session, or by any map_server map; lost until scans fit."""
+        config = config_at(self._config, self._localizer.pose)
+        folder = self._save_directory
+        loaded = load_localizer(folder.resolve(path), config, folder.path)
         if loaded is None:
             return 'the session has no map of the localizer: it keeps its own'
         self._localizer = loaded
+        self._given.source.replaced()
         if self._topology is not None:
             set_topology(loaded, self._topology)
         features = line_features(loaded)
         return f'{len(features)} line features loaded' if features else 'local map loaded'
 
     def _publish(self, scan: Scan, estimate: Estimate, step_ms: float) -> None:
-        state = _state_of(scan, estimate)
+        state = _state_of(scan, estimate) if self._given.source.has_map else SlamStatus.NO_MAP
         self.diagnostics.record_step_time('localizer', step_ms)
         self.diagnostics.set_state(*_HEALTH[state])
         if estimate.correction is not None:
@@ -308,7 +310,9 @@ class LocalizerNode(ThinmapNode):
             stamps, poses = self._localizer.keyframe_trajectory()
             self._output.publish_trajectory(scan.stamp_ns, stamps.tolist(), poses)
             self.get_logger().info(f'loop closed: {len(poses)} keyframe poses corrected')
-        self._broadcaster.update(estimate.T_map_odom)
+        if state != SlamStatus.NO_MAP:
+            self._broadcaster.update(estimate.T_map_odom)
+        self._given.publish(scan.stamp_ns, estimate, state)
         status = SlamStatus(state=state, step_time_ms=step_ms)
         self._output.publish_estimate(scan.stamp_ns, estimate, self._localizer, status)
 

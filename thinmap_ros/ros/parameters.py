@@ -30,6 +30,7 @@ ROBOT = (
     'odom_frame',
     'odom_source',
     'base_frame',
+    'mode',
 )
 
 AnyConfig = TypeVar('AnyConfig', bound=Config)

@@ -79,13 +79,13 @@ def test_a_saved_state_is_resumed_in_another_session():
 def test_without_mapping_no_feature_comes_grows_or_goes():
     localizer = at_start()
     driven(localizer, 600)
-    config = EkfConfig(slam='ekf_ti', initial_x_m=2.0, initial_y_m=2.0, update_map=False)
+    config = EkfConfig(slam='ekf_ti', initial_x_m=2.0, initial_y_m=2.0, mode='localization')
     second = EkfLocalizer.from_state(localizer.state(), config)
     before = lengths_of(second)
     errors, _ = driven(second, 100)
     assert lengths_of(second) == pytest.approx(before, abs=1e-9)
     assert np.hypot(*errors[-1, :2]) < 0.1
-    alone = at_start(update_map=False)
+    alone = at_start(mode='localization')
     driven(alone, 100)
     assert alone.features == []
 

@@ -631,7 +631,7 @@ def test_a_robot_outside_of_a_loaded_map_stays_lost(whole_drive):
 def test_without_mapping_the_map_stays_as_it_is(whole_drive):
     _, first = whole_drive
     state = {name: array.copy() for name, array in first.state().items()}
-    second = Localizer.from_state(state, LocalizerConfig(**AT_START, update_map=False))
+    second = Localizer.from_state(state, LocalizerConfig(**AT_START, mode='localization'))
     rows, _ = driven(300, seed=8, localizer=second)
     assert not rows[-1][1].is_lost
     assert worst(rows[10:]) < 0.08

@@ -30,6 +30,9 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
+# Values of the parameter `mode`, as in slam_toolbox.
+MAPPING = 'mapping'
+LOCALIZATION = 'localization'
 _START = np.diag(np.square([1e-4, 1e-4, 1e-4]))  # of the initial pose, which defines the map frame
 _IN_SESSION = np.diag(np.square([0.3, 0.3, 0.15]))  # of the initial pose in a loaded map
 # The filter assumes independent odometry errors and does not calibrate the systematic ones. This
@@ -61,13 +64,21 @@ class EkfConfig(Config):
         high=se2.MAX_COORDINATE_M,
     )
     initial_yaw_rad: float = parameter(0.0, 'Initial heading in the map (rad).')
-    update_map: bool = parameter(
-        True, 'true: mapping. false: localization in the loaded map, which does not change.'
+    mode: str = parameter(
+        MAPPING,
+        'mapping: scans extend and change the map. localization: the map is given (a session, '
+        'map_file_name or topic map) and does not change.',
+        choices=(MAPPING, LOCALIZATION),
     )
     odometry: OdometryConfig = part(OdometryConfig)
     lines: LineConfig = part(LineConfig)
     association: AssociationConfig = part(AssociationConfig)
     features: FeatureConfig = part(FeatureConfig)
+
+    @property
+    def is_mapping(self) -> bool:
+        """Whether scans change the map."""
+        return self.mode == MAPPING
 
 
 class EkfLocalizer:
@@ -171,7 +182,7 @@ class EkfLocalizer:
             lines = extract_lines(scan, self.config.lines)
             observed = len(lines)
             matched, is_valid = self._features.observe(
-                self._filter, lines, scan, learn=self.config.update_map
+                self._filter, lines, scan, learn=self.config.is_mapping
             )
             self._rejected += not is_valid
             self._is_observation_due = False  # a scan from the same pose is not independent

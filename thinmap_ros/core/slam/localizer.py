@@ -37,7 +37,7 @@ from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
 from thinmap_ros.core.slam.heading import HeadingCorrection
 from thinmap_ros.core.slam.matching import local_map
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
-from thinmap_ros.core.slam.matching.occupancy_surfaces import occupied_surface_points
+from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points
 from thinmap_ros.core.slam.matching.scan_matcher import (
     FEWEST_POINTS,
     Match,
@@ -152,6 +152,20 @@ class Localizer:
         return localizer
 
     @staticmethod
+    def in_occupancy_map(patch: GridPatch, config: LocalizerConfig | None = None) -> 'Localizer':
+        """Localizer in an occupancy map, at the configured initial pose.
+
+        It is delocalized until scans fit.
+        """
+        localizer = Localizer(config)
+        local = localizer._map.map
+        local.add_free_cells(*free_cells(patch, local.config.resolution_m))
+        for faces in occupied_surface_points(patch):
+            local.add_walls(faces.points, faces.normal)
+        localizer._start_delocalized(local.state())
+        return localizer
+
+    @staticmethod
     def from_occupancy_map(
         patch: GridPatch,
         last: OdometryAnchor,
@@ -163,10 +177,7 @@ class Localizer:
         T_odom_base (3,): odometry pose now. The standard deviation of the pose is the odometry
         noise since `last` plus one cell of the map (in rad, too, for the heading).
         """
-        localizer = Localizer(config)
-        for faces in occupied_surface_points(patch):
-            localizer._map.map.add_walls(faces.points, faces.normal)
-        localizer._start_delocalized(localizer._map.map.state())
+        localizer = Localizer.in_occupancy_map(patch, config)
         moved = se2.between(last.T_odom_base, T_odom_base)
         turn = float(last.T_map_odom[2] + last.T_odom_base[2])
         variances = odometry_variances(moved, localizer.config.odometry)
@@ -193,7 +204,9 @@ class Localizer:
         self._tracking.update(match)
         self._update(match, prediction, is_stationary)
         self._tracking.record_pose(self._pose, self._uncertainty.since_match)
-        if self.config.update_map and not self._tracking.is_delocalized:
+        if not self.config.is_mapping:
+            self._detect_loss()
+        elif not self._tracking.is_delocalized:
             self._update_map(scan, points)
         correction = self._loops.step()
         if correction is not None:
@@ -217,7 +230,21 @@ class Localizer:
         """Start in a loaded local map: delocalized until scans fit."""
         self._map.load(given)
         self._tracking.start_delocalized()
-        self._uncertainty.since_match = self._slip_covariance()
+        self._uncertainty.place(self._pose, self._slip_covariance())
+
+    def _detect_loss(self) -> None:
+        """In a map that does not change, the robot is delocalized if scans contradict it.
+
+        Dead reckoning continues from the last scan that agreed.
+        """
+        if self._tracking.is_delocalized or not self._tracking.needs_submap:
+            return
+        dead_reckoned = self._tracking.dead_reckoned
+        self._pose = dead_reckoned.T_map_base
+        self._prediction.reset_segment()
+        covariance = dead_reckoned.covariance + self._slip_covariance()
+        self._uncertainty.place(self._pose, covariance)
+        self._tracking.lose()
 
     def _slip_covariance(self) -> Array:
         """Covariance (3, 3) of a pose after the largest expected wheel slip."""

@@ -100,6 +100,11 @@ class Tracking:
         self.is_delocalized = True
         self.evidence = self._loaded_evidence
 
+    def lose(self) -> None:
+        """The robot is delocalized in the map as it is, until scans fit."""
+        self.is_delocalized = True
+        self.evidence = min(self.evidence, self._lost_evidence)
+
     def start_submap(self) -> None:
         """Start a new, provisional local map."""
         self.evidence = 0.0

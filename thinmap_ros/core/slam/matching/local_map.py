@@ -158,6 +158,24 @@ class LocalMap:
             far = points[:, :2].mean(axis=0) + _FAR_M * normal
             _hit(points, far, np.zeros(3), self.lattice, self.config.occupied_min_hit_ratio)
 
+    def add_free_cells(self, free: NDArray[np.bool_], row: int, col: int) -> None:
+        """Add cells (H, W) that an occupancy map knows to be free, the first one at (row, col).
+
+        Before its walls: these are propagated into the cells that exist.
+        """
+        if not free.any():
+            return
+        padded = np.pad(free, ((row % TILE, -(row + free.shape[0]) % TILE), (col % TILE, 0)))
+        padded = np.pad(padded, ((0, 0), (0, -padded.shape[1] % TILE)))
+        rows = padded.shape[0] // TILE
+        cols = padded.shape[1] // TILE
+        blocks = padded.reshape(rows, TILE, cols, TILE).swapaxes(1, 2)
+        used = np.argwhere(blocks.any(axis=(2, 3)))
+        places = used + (row // TILE, col // TILE)
+        cells = self.tiles.read_tiles(places)
+        cells['seen'] = np.maximum(cells['seen'], blocks[tuple(used.T)])
+        self.tiles.write_tiles(places, cells)
+
     def state(self) -> dict[str, NDArray[Any]]:
         """All cells as arrays by name, for `restore`."""
         tiles = self.tiles

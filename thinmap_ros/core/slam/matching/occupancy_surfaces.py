@@ -1,5 +1,6 @@
 """Surface points on the walls of an occupancy map, for scan matching."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,34 @@ def occupied_surface_points(patch: GridPatch) -> list[WallFaces]:
     """
     depth_m = max(0.5 * patch.frame.resolution - OccupancyConfig().surface_thickness_m, 0.0)
     return [_faces(patch, row, col, depth_m) for row, col in _SIDES]
+
+
+def free_cells(patch: GridPatch, cell_m: float) -> tuple[NDArray[np.bool_], int, int]:
+    """Cells of a lattice with cells of cell_m that an occupancy map knows to be free.
+
+    Returns them as (H, W), and row and column of the first one.
+    """
+    frame = patch.frame
+    rows = _nearest(frame.origin_y, patch.shape[0], frame.resolution, cell_m)
+    cols = _nearest(frame.origin_x, patch.shape[1], frame.resolution, cell_m)
+    free = patch.free[rows.indices][:, cols.indices]
+    return free, rows.first, cols.first
+
+
+class _Axis(NamedTuple):
+    """The first cell of a lattice along an axis, and the cell (N,) of a map at each of them."""
+
+    first: int
+    indices: NDArray[np.int64]
+
+
+def _nearest(origin_m: float, count: int, resolution_m: float, cell_m: float) -> _Axis:
+    """Cells of a lattice whose centres lie in a map with `count` cells from an origin."""
+    first = math.ceil(origin_m / cell_m - 0.5)
+    end = math.ceil((origin_m + count * resolution_m) / cell_m - 0.5)
+    centres = (np.arange(first, end) + 0.5) * cell_m
+    indices = np.floor((centres - origin_m) / resolution_m).astype(np.int64)
+    return _Axis(first, np.clip(indices, 0, count - 1))
 
 
 def _faces(patch: GridPatch, row: int, col: int, depth_m: float) -> WallFaces:

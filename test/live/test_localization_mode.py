@@ -1,0 +1,191 @@
+"""Localization in a given map on a live graph: AMCL's job."""
+
+import math
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav2_msgs.msg import ParticleCloud
+from nav2_msgs.srv import SetInitialPose
+from nav_msgs.msg import OccupancyGrid
+from std_srvs.srv import Empty
+from support.foreign_map import write_foreign_map
+
+from thinmap_msgs.msg import LocalizationStatus, SlamStatus
+from thinmap_msgs.srv import LoadMap
+from thinmap_ros.core import se2
+from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.ros import messages, qos
+
+pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
+START = (2.0, 2.0, 0.0)
+WORLD = 'room_10x10'
+COVARIANCE = np.diag([0.04, 0.04, 0.01])
+
+
+class Robot:
+    """A robot that drives in circles, with what the localizer publishes."""
+
+    def __init__(self, graph, start=START):
+        self.graph = graph
+        self.truth = graph.heard('ground_truth', PoseStamped)
+        self.poses = graph.heard('pose', PoseWithCovarianceStamped)
+        self.status = graph.heard('slam_status', SlamStatus)
+        self.commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
+        self.initial = graph.node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 10)
+        graph.start(
+            'sim',
+            world=WORLD,
+            start=','.join(map(str, start)),
+            real_time_factor=4.0,
+            lockstep='pose',
+        )
+
+    def localize(self, **values):
+        self.graph.start('localizer', use_sim_time=True, mode='localization', **values)
+        self.graph.until(lambda: self.status and self.truth, 'a first status')
+
+    def drive_until(self, condition, what):
+        ahead = Twist()
+        ahead.linear.x = 0.25
+        ahead.angular.z = 0.2
+
+        def met():
+            self.commands.publish(ahead)
+            return condition()
+
+        self.graph.until(met, what, 120.0)
+
+    def travelled_m(self):
+        xy = np.array([[m.pose.position.x, m.pose.position.y] for m in self.truth])
+        return np.hypot(*np.diff(xy, axis=0).T).sum()
+
+    def is_tracking(self):
+        return [s.state for s in self.status[-5:]] == [SlamStatus.TRACKING] * 5
+
+    def states(self):
+        return {message.state for message in self.status}
+
+    def true_pose(self):
+        return messages.pose_from_msg(self.truth[-1].pose)
+
+    def send_initial_pose(self, T, frame='map'):
+        self.graph.until(self.initial.get_subscription_count, 'a subscriber of initialpose')
+        self.initial.publish(pose_msg(T, frame))
+
+    def errors_m(self):
+        """Distance of each pose from the true one at its stamp, m."""
+        truth = {messages.stamp_ns(m.header.stamp): m.pose.position for m in self.truth}
+        pairs = [
+            (m.pose.pose.position, truth[messages.stamp_ns(m.header.stamp)])
+            for m in self.poses
+            if messages.stamp_ns(m.header.stamp) in truth
+        ]
+        return np.array([math.hypot(a.x - b.x, a.y - b.y) for a, b in pairs])
+
+
+def pose_msg(T, frame='map'):
+    return messages.pose_with_covariance_msg(np.array(T), COVARIANCE, frame, 0)
+
+
+@pytest.fixture(autouse=True)
+def state_home(tmp_path, monkeypatch):
+    monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path / 'home'))
+
+
+def test_it_tracks_in_a_map_of_another_program_and_remembers_the_last_pose(graph, tmp_path):
+    path = write_foreign_map(tmp_path, WORLD)
+    robot = Robot(graph)
+    amcl = graph.heard('amcl_pose', PoseWithCovarianceStamped, qos.LATCHED)
+    clouds = graph.heard('particle_cloud', ParticleCloud, qos.SENSOR)
+    start = {f'initial_pose.{key}': v for key, v in zip(('x', 'y', 'yaw'), START, strict=True)}
+    robot.localize(map_file_name=str(path), set_initial_pose=True, **start)
+    robot.drive_until(lambda: robot.travelled_m() > 12.0 and clouds, 'a drive')
+    assert robot.states() == {SlamStatus.TRACKING}
+    errors = robot.errors_m()
+    assert len(errors) > 100
+    assert np.sqrt(np.mean(errors**2)) < 0.05
+    assert amcl[-1].header.frame_id == 'map'
+    weights = [particle.weight for particle in clouds[-1].particles]
+    assert sum(weights) == pytest.approx(1.0)
+    graph.call(Empty, 'request_nomotion_update', Empty.Request())
+
+    robot.commands.publish(Twist())
+    graph.until(lambda: robot.poses, 'poses')
+    assert graph.stop('localizer') == 0
+    robot.status.clear()
+    robot.localize(map_file_name=str(path))
+    graph.until(robot.is_tracking, 'that it finds itself at the last pose')
+    assert 'last pose' in graph.log('localizer')
+
+
+def test_it_is_lost_in_the_wrong_building(graph, tmp_path):
+    path = write_foreign_map(tmp_path, 'office')
+    robot = Robot(graph)
+    robot.localize(map_file_name=str(path))
+    robot.send_initial_pose(START)
+    robot.drive_until(lambda: robot.travelled_m() > 10.0, 'ten metres')
+    assert robot.status[-1].state == SlamStatus.LOST
+
+
+def test_a_loaded_map_of_another_building_leads_to_lost(graph, tmp_path):
+    right = write_foreign_map(tmp_path, WORLD)
+    write_foreign_map(tmp_path, 'office', 'office')
+    robot = Robot(graph)
+    robot.localize(map_file_name=str(right))
+    robot.send_initial_pose(START)
+    graph.until(robot.is_tracking, 'tracking')
+    answer = graph.call(LoadMap, 'load_localizer', LoadMap.Request(path='office.yaml'))
+    assert answer.success, answer.message
+    robot.status.clear()
+    robot.drive_until(lambda: len(robot.status) > 30, 'some scans')
+    assert robot.status[-1].state == SlamStatus.LOST
+    assert graph.call(LoadMap, 'load_localizer', LoadMap.Request(path='drawn.yaml')).success
+    robot.send_initial_pose(robot.true_pose())
+    robot.drive_until(robot.is_tracking, 'tracking again')
+
+
+def test_without_a_map_it_says_so_until_one_arrives_and_takes_poses_in_any_frame(graph, tmp_path):
+    patch = read_map(write_foreign_map(tmp_path, WORLD))
+    robot = Robot(graph)
+    robot.localize()
+    graph.until(lambda: len(robot.status) > 5, 'states')
+    assert robot.states() == {SlamStatus.NO_MAP}
+    maps = graph.node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
+    maps.publish(messages.grid_msg(patch, 'map', 0))
+    graph.until(lambda: robot.status[-1].state == SlamStatus.LOST, 'lost in the map')
+    answer = graph.call(
+        SetInitialPose, 'set_initial_pose', SetInitialPose.Request(pose=pose_msg(START))
+    )
+    assert answer is not None
+    graph.until(robot.is_tracking, 'tracking by the service')
+    # The odometry starts at 0: the pose of the robot in the frame odom is known.
+    robot.send_initial_pose((30.0, 30.0, 0.0))
+    graph.until(lambda: robot.status[-1].state == SlamStatus.LOST, 'lost at a wrong pose')
+    T_map_odom = se2.pose(30.0, 30.0, 0.0)
+    inside = se2.between(T_map_odom, np.array(START))
+    robot.send_initial_pose(inside, 'odom')
+    graph.until(robot.is_tracking, 'tracking by a pose in the frame odom')
+    robot.send_initial_pose(START, 'nowhere')
+    graph.until(lambda: 'nowhere' in graph.log('localizer'), 'a warning')
+    assert robot.is_tracking()
+
+
+def test_the_global_localizer_finds_a_robot_by_the_service_of_amcl(graph, tmp_path):
+    path = write_foreign_map(tmp_path, WORLD)
+    robot = Robot(graph, (5.5, 2.0, 1.0))
+    status = graph.heard('localization_status', LocalizationStatus, qos.LATCHED)
+    graph.start('global_localizer', use_sim_time=True, map_path=str(path))
+    robot.localize(map_file_name=str(path), set_initial_pose=True)
+    graph.until(lambda: status, 'the global localizer')
+    assert robot.status[-1].state == SlamStatus.LOST
+    graph.call(Empty, 'reinitialize_global_localization', Empty.Request())
+    robot.drive_until(robot.is_tracking, 'that it is found')
+    assert robot.errors_m()[-1] < 0.1
+
+
+def test_contradicting_parameters_end_the_start_in_words(graph):
+    process = graph.start('localizer', mode='localization', slam='ekf_ti')
+    assert graph.ended(process) == 2
+    graph.processes.clear()
+    assert 'expected a session_path' in graph.log('localizer')

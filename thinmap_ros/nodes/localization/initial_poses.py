@@ -1,0 +1,47 @@
+"""Initial poses of a user, in any frame."""
+
+from collections.abc import Callable
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError, quoted
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph.keyframes import rotated_covariance
+from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.tf.transform_listener import TransformListener
+
+
+class InitialPoses:
+    """Subscribes to initialpose; calls `process` with pose (3,) and covariance (3, 3), map frame.
+
+    Poses in other frames are transformed by the newest transforms.
+    """
+
+    def __init__(
+        self, node: ThinmapNode, map_frame: str, process: Callable[[Array, Array], None]
+    ) -> None:
+        self._map_frame = map_frame
+        self._process = process
+        self._transforms = TransformListener(node)
+        subscribe_guarded(node, PoseWithCovarianceStamped, 'initialpose', self.add_pose, qos.STREAM)
+
+    def add_pose(self, message: PoseWithCovarianceStamped) -> None:
+        """Process a message. Raises InputError where it is invalid, or its frame unknown."""
+        pose = messages.pose_from_msg(message.pose.pose)
+        covariance = messages.covariance_from_msg(message)
+        frame = message.header.frame_id.lstrip('/')
+        if frame not in ('', self._map_frame):
+            T_map_frame = self._lookup(frame)
+            pose = se2.compose(T_map_frame, pose)
+            covariance = rotated_covariance(covariance, float(T_map_frame[2]))
+        self._process(pose, covariance)
+
+    def _lookup(self, frame: str) -> Array:
+        try:
+            return self._transforms.lookup(self._map_frame, frame)
+        except InputError as error:
+            expected = f'expected a frame connected to {quoted(self._map_frame)}'
+            raise InputError(f'frame {quoted(frame)}: {error}: {expected}') from error

@@ -1,0 +1,113 @@
+"""The map that a localizer localizes in: of a file, a session, or a topic."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from nav_msgs.msg import OccupancyGrid
+
+from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
+from thinmap_ros.files import sessions
+from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.files.sessions import LOCALIZER
+from thinmap_ros.nodes.localization.config import LocalizationConfig
+from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
+
+
+class MapSource:
+    """Creates localizers in the given map; without any, `patch` is None until topic map is heard.
+
+    name: of the map, to which a saved pose belongs.
+    """
+
+    def __init__(
+        self, config: LocalizerConfig, localization: LocalizationConfig, session: str
+    ) -> None:
+        """Raises ConfigError where the parameters contradict each other, InputError for a file."""
+        self._session = session
+        self._is_mapping = config.is_mapping
+        self._first_map_only = localization.first_map_only
+        self.patch: GridPatch | None = None
+        self._has_loaded = False
+        file = localization.map_file_name
+        self.name = file or session or 'topic map'
+        if self._is_mapping:
+            if file:
+                raise ConfigError('map_file_name is given: expected mode = localization')
+            return
+        if not session and localizer_class(config) is not Localizer:
+            raise ConfigError(
+                f'mode = localization with slam = {config.slam}: expected a session_path with its '
+                'line features'
+            )
+        if file:
+            self.patch = read_map(Path(file))
+
+    @property
+    def has_map(self) -> bool:
+        """Whether there is a map, or none is needed."""
+        return self._is_mapping or bool(self._session or self._has_loaded) or self.patch is not None
+
+    @property
+    def _is_topic(self) -> bool:
+        return not self._is_mapping and self.name == 'topic map'
+
+    @property
+    def is_from_file(self) -> bool:
+        """Whether the map is the one of a file in mode localization."""
+        return not self._is_mapping and not self._session and not self._is_topic
+
+    def create_localizer(self, config: LocalizerConfig) -> AnyLocalizer:
+        """A localizer at the configured pose, delocalized if in a given map."""
+        if self.patch is not None:
+            return Localizer.in_occupancy_map(self.patch, config)
+        if self._session:
+            loaded = load_localizer(self._session, config)
+            if loaded is not None:
+                return loaded
+        return localizer_class(config)(config)
+
+    def replace(self, patch: GridPatch) -> bool:
+        """Take another map; returns whether it is different."""
+        if self.patch is not None and (
+            self.patch.frame == patch.frame and np.array_equal(self.patch.cells, patch.cells)
+        ):
+            return False
+        self.patch = patch
+        return True
+
+    def replaced(self) -> None:
+        """A service has loaded another map: there is one."""
+        self._has_loaded = True
+
+    def subscribe(self, node: ThinmapNode, changed: Callable[[], None]) -> None:
+        """Subscribe to topic map if the map is to come from there; changed: there is a new one."""
+        if not self._is_topic:
+            return
+
+        def on_map(message: OccupancyGrid) -> None:
+            if self.patch is not None and self._first_map_only:
+                return
+            if self.replace(messages.grid_from_msg(message)):
+                changed()
+
+        subscribe_guarded(node, OccupancyGrid, 'map', on_map, qos.LATCHED)
+
+
+def load_localizer(
+    path: str, config: LocalizerConfig, folder: Path | None = None
+) -> AnyLocalizer | None:
+    """Localizer in the map of a session, or in its grid: any map_server map.
+
+    folder: where given, an image has to lie below it. None: no map that this localizer can use.
+    Raises InputError where a file is broken, or the path names no map.
+    """
+    loaded = LOCALIZER.load_optional(path, config)
+    if loaded is not None or localizer_class(config) is not Localizer:
+        return loaded
+    return Localizer.in_occupancy_map(sessions.load_grid(path, None, folder).known_area(), config)
