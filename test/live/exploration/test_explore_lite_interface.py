@@ -156,6 +156,7 @@ def test_a_map_that_is_not_latched_is_heard(graph, listener):
     listener.say(True, 'exploration_in_progress')
 
 
+@pytest.mark.slow
 def test_what_is_missing_ends_an_exploration_with_its_name(graph):
     robot = RoomRobot(graph)
     robot.maps = False

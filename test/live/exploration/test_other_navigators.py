@@ -93,6 +93,7 @@ def test_a_late_answer_counts_and_a_cancelled_exploration_cancels_the_goal(graph
     assert scene.cancel(result) == GoalStatus.STATUS_CANCELED
 
 
+@pytest.mark.slow
 def test_goals_that_are_aborted_or_rejected_or_make_no_progress_end_in_unreachable(graph):
     scene = Scene(graph, mode='abort', progress_timeout=10.0)
     assert scene.end(scene.explore()) == UNREACHABLE
