@@ -11,7 +11,8 @@ from std_msgs.msg import String, UInt32
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
-from thinmap_ros.files import package_data
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.files import occupancy_maps, package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.sim.coverage import observable_cells
@@ -72,7 +73,7 @@ class Exploration:
         return self.graph.start('explorer', use_sim_time=True, **values)
 
     def tell(self, mode):
-        """Have the stand-in behave differently from the next goal on."""
+        """Have the substitute for Nav2 behave differently from the next goal on."""
         self.mode.publish(String(data=mode))
 
     def ended(self, **goal):
@@ -125,6 +126,19 @@ def pose_of(text):
     return np.array([float(part) for part in text.split(',')])
 
 
+def small_dungeon(shared_data, folder):
+    """World file of the part of a dungeon within 12 m of the start, closed by walls."""
+    _, patch, _ = read_world(shared_data / 'worlds' / 'dungeon' / 'd114.yaml')
+    x, y = pose_of(DUNGEON)[:2]
+    low, high = patch.frame.cells_of(np.array([[x - 12.0, y - 12.0], [x + 12.0, y + 12.0]]))
+    low = np.maximum(low, 0)
+    cells = patch.cells[low[0] : high[0], low[1] : high[1]].copy()
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    frame = patch.frame.with_origin_at(*low.tolist())
+    return occupancy_maps.write_map(folder / 'small_dungeon', GridPatch(frame, cells))
+
+
 def test_a_foreign_slam_and_nav2_are_enough(graph, office):
     office.start_foreign_slam()
     office.start_nav2()
@@ -157,9 +171,8 @@ def test_nav2_drives_through_an_office_that_our_nodes_map(graph, office):
 
 
 @pytest.mark.slow
-def test_nav2_and_a_foreign_slam_complete_a_dungeon(graph, shared_data):
-    world = shared_data / 'worlds' / 'dungeon' / 'd114.yaml'
-    dungeon = Exploration(graph, world, DUNGEON)
+def test_nav2_and_a_foreign_slam_complete_a_dungeon(graph, shared_data, tmp_path):
+    dungeon = Exploration(graph, small_dungeon(shared_data, tmp_path), DUNGEON)
     dungeon.start_foreign_slam()
     dungeon.start_nav2()
     dungeon.start_explorer()
@@ -169,9 +182,8 @@ def test_nav2_and_a_foreign_slam_complete_a_dungeon(graph, shared_data):
 
 
 @pytest.mark.slow
-def test_nav2_drives_through_a_dungeon_that_our_nodes_map(graph, shared_data):
-    world = shared_data / 'worlds' / 'dungeon' / 'd114.yaml'
-    dungeon = Exploration(graph, world, DUNGEON)
+def test_nav2_drives_through_a_dungeon_that_our_nodes_map(graph, shared_data, tmp_path):
+    dungeon = Exploration(graph, small_dungeon(shared_data, tmp_path), DUNGEON)
     dungeon.start_our_slam()
     dungeon.start_nav2(paced_by='local_topology')
     dungeon.start_explorer()
