@@ -1,4 +1,4 @@
-"""A stand-in for Nav2's bt_navigator, by its documented rules: it drives the robot on map and TF.
+"""A substitute for Nav2's bt_navigator, by its documented rules: it drives the robot on map and TF.
 
 A lifecycle node with the action navigate_to_pose. Unconfigured there is no server; an inactive one
 rejects goals. A newer goal preempts the running one, which is aborted with an empty result. On
@@ -33,7 +33,7 @@ FAILED = 9000
 _POLL_S = 0.002
 
 
-class StandIn(LifecycleNode):
+class BtNavigator(LifecycleNode):
     """Parameters: autostart; paced_by: see `spin_once`."""
 
     def __init__(self):
@@ -190,7 +190,7 @@ class StandIn(LifecycleNode):
 
 def main():
     rclpy.init()
-    node = StandIn()
+    node = BtNavigator()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     node.start()
