@@ -47,6 +47,7 @@ IS_WHEEL = bool({'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'} & set(sy
 # Folders of a wheel, as packages, and where they come from.
 WHEEL_DATA = {
     f'{NAME}.data.{NAME}.config': 'config',
+    f'{NAME}.data.{NAME}.config.robots': 'config/robots',
     f'{NAME}.data.{NAME}.config.sensors': 'config/sensors',
     f'{NAME}.data.{NAME}.worlds': 'worlds',
     f'{NAME}.data.thinmap_msgs.msg': 'thinmap_msgs/msg',
@@ -56,7 +57,8 @@ BUILD = TemporaryDirectory()
 ROS_DATA = [
     ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
     (f'share/{NAME}', ['package.xml']),
-    (f'share/{NAME}/config', glob('config/*.yaml')),
+    (f'share/{NAME}/config', glob('config/*.*')),
+    (f'share/{NAME}/config/robots', glob('config/robots/*.yaml')),
     (f'share/{NAME}/config/sensors', glob('config/sensors/*.yaml')),
     (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
 ]

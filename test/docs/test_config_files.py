@@ -141,12 +141,12 @@ def test_an_unknown_parameter_comes_with_what_was_probably_meant(declared, name,
 
 def test_there_is_a_file_for_each_node_and_no_other():
     files = sorted(path.stem for path in (ROOT / 'config').glob('*.yaml'))
-    assert files == sorted([*NODES, 'robot'])
+    assert files == sorted([*NODES, 'thinmap'])
 
 
 def test_robot_file_is_accepted_by_every_node_and_has_its_defaults(declared):
     """One file describes the robot for all nodes."""
-    path = ROOT / 'config' / 'robot.yaml'
+    path = ROOT / 'config' / 'thinmap.yaml'
     values = yaml.safe_load(path.read_text())['/**']['ros__parameters']
     assert sorted(values) == sorted(parameters.ROBOT)
     seen = set()
@@ -176,13 +176,14 @@ def test_the_readme_names_parameters_that_there_are():
         assert parameter in flat(yaml.safe_load(text)['/**']['ros__parameters']), (node, parameter)
 
 
-PRESETS = sorted((ROOT / 'config' / 'sensors').glob('*'))
+PRESETS = sorted((ROOT / 'config').glob('*s/*.yaml'))
 
 
 @pytest.mark.parametrize('name', ['localizer', 'grid_mapper', 'sim'])
 @pytest.mark.parametrize('preset', PRESETS, ids=lambda path: path.stem)
 def test_sensor_presets_are_known_to_the_nodes_and_hold_in_any_namespace(declared, preset, name):
-    wanted = yaml.safe_load(preset.read_text())[f'/**/{name}']['ros__parameters']
+    content = yaml.safe_load(preset.read_text())
+    wanted = content[f'/**/{name}']['ros__parameters']
     for namespace in ('', '/robot1'):
         remap = ('-r', f'__ns:={namespace}') if namespace else ()
         found = declared(name, '--params-file', str(preset), *remap)
@@ -190,10 +191,10 @@ def test_sensor_presets_are_known_to_the_nodes_and_hold_in_any_namespace(declare
 
 
 def test_preset_of_a_laser_that_publishes_zero_holds_for_every_node_with_a_laser(declared):
-    preset = ROOT / 'config' / 'sensors' / 'turtlebot3_lds.yaml'
+    preset = ROOT / 'config' / 'robots' / 'turtlebot3.yaml'
     files = (ROOT / 'config').glob('*.yaml')
     declaring = {path.stem for path in files if 'zero_is_no_return' in path.read_text()}
-    for name in sorted(declaring - {'robot'}):
+    for name in sorted(declaring - {'thinmap'}):
         arguments = [
             word
             for key, value in NEEDED.get(name, {}).items()

@@ -328,7 +328,7 @@ def test_programs_packages_and_fields_need_no_graph():
     assert 'thinmap_ros replay' in output('pkg', 'executables', 'thinmap_ros').splitlines()
     assert {'rclpy', 'thinmap_ros'} <= set(output('pkg', 'list').splitlines())
     share = Path(output('pkg', 'prefix', '--share', 'thinmap_ros').strip())
-    assert (share / 'config' / 'sensors' / 'turtlebot3_lds.yaml').exists()
+    assert (share / 'config' / 'robots' / 'turtlebot3.yaml').exists()
     assert share.is_relative_to(output('pkg', 'prefix', 'thinmap_ros').strip())
     assert 'usage: replay' in output('run', 'thinmap_ros', 'replay', '--help')
     shown = output('interface', 'show', 'geometry_msgs/msg/TwistStamped')

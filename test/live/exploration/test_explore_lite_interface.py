@@ -74,7 +74,7 @@ def test_it_starts_by_itself_pauses_and_returns_while_somebody_else_drives(graph
     listener.say(True, 'exploration_in_progress')
     graph.until(lambda: len(robot.targets) > seen, 'the target again')
     assert np.allclose(messages.pose_from_msg(robot.targets[-1].pose), goal, atol=0.2)
-    # Whoever drives has brought the robot there, and the SLAM has seen the rest of the room.
+    # The other driver has brought the robot there, and the SLAM has seen the rest of the room.
     robot.at = goal
     robot.patch = room(60)
     listener.until_word('returning_to_origin')
@@ -156,6 +156,7 @@ def test_a_map_that_is_not_latched_is_heard(graph, listener):
     listener.say(True, 'exploration_in_progress')
 
 
+@pytest.mark.slow
 def test_what_is_missing_ends_an_exploration_with_its_name(graph):
     robot = RoomRobot(graph)
     robot.maps = False

@@ -20,7 +20,7 @@ UNREACHABLE = (GoalStatus.STATUS_SUCCEEDED, ExplorationStatus.UNREACHABLE)
 
 
 class Scene:
-    """A robot in a room, a stand-in for Nav2 with a mode, and an exploration."""
+    """A robot in a room, a substitute for Nav2 with a mode, and an exploration."""
 
     def __init__(self, graph, mode='drive', **values):
         self.graph = graph
@@ -93,6 +93,7 @@ def test_a_late_answer_counts_and_a_cancelled_exploration_cancels_the_goal(graph
     assert scene.cancel(result) == GoalStatus.STATUS_CANCELED
 
 
+@pytest.mark.slow
 def test_goals_that_are_aborted_or_rejected_or_make_no_progress_end_in_unreachable(graph):
     scene = Scene(graph, mode='abort', progress_timeout=10.0)
     assert scene.end(scene.explore()) == UNREACHABLE
@@ -134,7 +135,7 @@ def test_somebody_elses_goal_pauses_the_exploration_until_it_has_ended(graph):
     other.cancel_goal_async()
     graph.until(ended.done, 'the end of the other goal')
     assert ended.result().status == GoalStatus.STATUS_CANCELED
-    graph.until(lambda: scene.words[-1].data == 'exploration_in_progress', 'it goes on')
+    graph.until(lambda: scene.words[-1].data == 'exploration_in_progress', 'it continues')
     scene.until_it_drives()
     assert 'not reached' not in graph.log('explorer')
     assert scene.cancel(result) == GoalStatus.STATUS_CANCELED

@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
+from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid
+from rclpy.action import ActionClient
 from std_msgs.msg import String, UInt32
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
-from thinmap_ros.files import package_data
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.files import occupancy_maps, package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.sim.coverage import observable_cells
@@ -19,6 +22,7 @@ from thinmap_ros.sim.world import World
 pytestmark = pytest.mark.live
 PEERS = 'support.peers'
 OFFICE = '1.3,1.2,0.0'
+DUNGEON = '42.05,21.05,-1.238'
 RANGE_M = 8.0
 
 
@@ -34,6 +38,7 @@ class Exploration:
         self.targets = graph.heard('exploration_target', PoseStamped, qos.LATCHED)
         self.collisions = graph.heard('collisions', UInt32, qos.LATCHED)
         self.status = graph.heard('exploration_status', ExplorationStatus, qos.LATCHED)
+        self.client = ActionClient(graph.node, Explore, 'explore')
         self.mode = graph.node.create_publisher(String, 'nav2_mode', qos.LATCHED)
 
     def start_nav2(self, **values):
@@ -48,7 +53,7 @@ class Exploration:
         """The same with thinmap's localizer, mapper and graph."""
         names = ('localizer', 'grid_mapper', 'topology_builder')
         x, y, theta = self.start.split(',')
-        at = {'initial_x_m': float(x), 'initial_y_m': float(y), 'initial_theta_rad': float(theta)}
+        at = {'initial_x_m': float(x), 'initial_y_m': float(y), 'initial_yaw_rad': float(theta)}
         self.graph.start('thinmap', arguments=names, use_sim_time=True, **at)
         self._start_sim('local_topology', 3)
 
@@ -68,7 +73,7 @@ class Exploration:
         return self.graph.start('explorer', use_sim_time=True, **values)
 
     def tell(self, mode):
-        """Have the stand-in behave differently from the next goal on."""
+        """Have the substitute for Nav2 behave differently from the next goal on."""
         self.mode.publish(String(data=mode))
 
     def ended(self, **goal):
@@ -76,8 +81,23 @@ class Exploration:
         ended = self.graph.act(Explore, 'explore', Explore.Goal(**goal))
         return ended.status, ended.result.status
 
-    def until_word(self, word):
-        self.graph.until(lambda: any(m.data == word for m in self.words), word)
+    def until_logged(self, text):
+        self.graph.until(lambda: text in self.graph.log('explorer'), text)
+
+    def drive_to_somewhere_else(self):
+        """Send somebody else's goal to Nav2: it pauses the exploration until it is reached."""
+        goal = NavigateToPose.Goal()
+        goal.pose = messages.pose_stamped_msg(pose_of(self.start), 'map', 0)
+        client = ActionClient(self.graph.node, NavigateToPose, 'navigate_to_pose')
+        self.graph.until(lambda: self.targets and self.is_in_progress(), 'a target')
+        ended = self.graph.send_goal(client, goal).get_result_async()
+        self.graph.until(lambda: self.words[-1].data == 'exploration_paused', 'it pauses')
+        self.graph.until(ended.done, 'the goal of somebody else')
+        assert ended.result().status == GoalStatus.STATUS_SUCCEEDED
+        self.graph.until(self.is_in_progress, 'it continues')
+
+    def is_in_progress(self):
+        return bool(self.words) and self.words[-1].data == 'exploration_in_progress'
 
     def word_list(self):
         return [message.data for message in self.words]
@@ -85,14 +105,38 @@ class Exploration:
     def coverage(self, T_world_map):
         """Share of what can be observed that the last map holds as free."""
         world = World.from_patch(*read_world(package_data.world_path(self.world)))
-        start = np.array([float(part) for part in self.start.split(',')])
-        cells = observable_cells(world, start, PRESETS['2dx'].radius_m, RANGE_M)
+        cells = observable_cells(world, pose_of(self.start), PRESETS['2dx'].radius_m, RANGE_M)
         return cells.coverage(messages.grid_from_msg(self.maps[-1]), T_world_map)
+
+    def is_complete(self, end, T_world_map, at_least):
+        """Check the end: all is resolved, by a robot that touched nothing; prints the coverage."""
+        assert end.reason_code == ExplorationStatus.ALL_RESOLVED, end.reason
+        coverage = self.coverage(T_world_map)
+        print(f'coverage {coverage:.4f}, {end.distance_m:.1f} m, {end.elapsed.sec} s')
+        assert coverage >= at_least
+        assert self.collisions[-1].data == 0
 
 
 @pytest.fixture
 def office(graph):
     return Exploration(graph, 'office', OFFICE)
+
+
+def pose_of(text):
+    return np.array([float(part) for part in text.split(',')])
+
+
+def small_dungeon(shared_data, folder):
+    """World file of the part of a dungeon within 12 m of the start, closed by walls."""
+    _, patch, _ = read_world(shared_data / 'worlds' / 'dungeon' / 'd114.yaml')
+    x, y = pose_of(DUNGEON)[:2]
+    low, high = patch.frame.cells_of(np.array([[x - 12.0, y - 12.0], [x + 12.0, y + 12.0]]))
+    low = np.maximum(low, 0)
+    cells = patch.cells[low[0] : high[0], low[1] : high[1]].copy()
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    frame = patch.frame.with_origin_at(*low.tolist())
+    return occupancy_maps.write_map(folder / 'small_dungeon', GridPatch(frame, cells))
 
 
 def test_a_foreign_slam_and_nav2_are_enough(graph, office):
@@ -101,6 +145,48 @@ def test_a_foreign_slam_and_nav2_are_enough(graph, office):
     office.start_explorer()
     status, end = office.ended(return_home=True)
     assert status == GoalStatus.STATUS_SUCCEEDED
-    assert end.reason_code == ExplorationStatus.ALL_RESOLVED, end.reason
-    start = np.array([float(part) for part in OFFICE.split(',')])
-    print('coverage', office.coverage(start), end)
+    office.is_complete(end, pose_of(OFFICE), 0.99)
+    assert office.word_list()[-3:] == [
+        'exploration_complete',
+        'returning_to_origin',
+        'returned_to_origin',
+    ]
+
+
+def test_nav2_drives_through_an_office_that_our_nodes_map(graph, office):
+    office.tell('refuse')
+    office.start_our_slam()
+    office.start_nav2(paced_by='local_topology')
+    office.start_explorer()
+    handle = graph.send_goal(office.client, Explore.Goal())
+    office.until_logged('goal rejected')
+    office.tell('abort')
+    office.until_logged('target not reached: failed to create a plan')
+    office.tell('drive')
+    office.drive_to_somewhere_else()
+    ended = handle.get_result_async()
+    graph.until(ended.done, 'the exploration ends')
+    assert ended.result().status == GoalStatus.STATUS_SUCCEEDED
+    office.is_complete(ended.result().result.status, None, 0.97)
+
+
+@pytest.mark.slow
+def test_nav2_and_a_foreign_slam_complete_a_dungeon(graph, shared_data, tmp_path):
+    dungeon = Exploration(graph, small_dungeon(shared_data, tmp_path), DUNGEON)
+    dungeon.start_foreign_slam()
+    dungeon.start_nav2()
+    dungeon.start_explorer()
+    status, end = dungeon.ended()
+    assert status == GoalStatus.STATUS_SUCCEEDED
+    dungeon.is_complete(end, pose_of(DUNGEON), 0.98)
+
+
+@pytest.mark.slow
+def test_nav2_drives_through_a_dungeon_that_our_nodes_map(graph, shared_data, tmp_path):
+    dungeon = Exploration(graph, small_dungeon(shared_data, tmp_path), DUNGEON)
+    dungeon.start_our_slam()
+    dungeon.start_nav2(paced_by='local_topology')
+    dungeon.start_explorer()
+    status, end = dungeon.ended()
+    assert status == GoalStatus.STATUS_SUCCEEDED
+    dungeon.is_complete(end, None, 0.97)

@@ -1,4 +1,4 @@
-"""A stand-in for the SLAM of somebody else: the true pose, as map and TF, and nothing more.
+"""A substitute for the SLAM of somebody else: the true pose, as map and TF, and nothing more.
 
 Publishes map (-1, 0, 100; cells of 5 cm) once a second, whose origin moves with what is known and
 by parts of a cell, as with slam_toolbox, and map -> odom on /tf. The map frame is the start pose.

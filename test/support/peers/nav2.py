@@ -1,4 +1,4 @@
-"""A stand-in for Nav2's bt_navigator, by its documented rules: it drives the robot on map and TF.
+"""A substitute for Nav2's bt_navigator, by its documented rules: it drives the robot on map and TF.
 
 A lifecycle node with the action navigate_to_pose. Unconfigured there is no server; an inactive one
 rejects goals. A newer goal preempts the running one, which is aborted with an empty result. On
@@ -33,8 +33,8 @@ FAILED = 9000
 _POLL_S = 0.002
 
 
-class StandIn(LifecycleNode):
-    """Parameters: autostart; paced_by: a message of this topic, too, ends the wait for a scan."""
+class BtNavigator(LifecycleNode):
+    """Parameters: autostart; paced_by: see `spin_once`."""
 
     def __init__(self):
         super().__init__('bt_navigator')
@@ -139,7 +139,10 @@ class StandIn(LifecycleNode):
         self._paced_ns = messages.stamp_ns(message.header.stamp)
 
     def spin_once(self):
-        """Process the newest scan once its pose is known: a cycle of the controller."""
+        """Process the newest scan once its pose is known: a cycle of the controller.
+
+        With a topic in paced_by, once there is a message of it for the scan, even without a pose.
+        """
         if not self._scans:
             return
         message = self._scans[-1]
@@ -150,11 +153,13 @@ class StandIn(LifecycleNode):
             T_map_base = self._transforms.lookup('map', 'base_link', stamp_ns)
             scan = self._laser.to_scan(message)
         except InputError:
-            return
+            if not self._is_paced:
+                return
+        else:
+            period_s = min(max((stamp_ns - self._last_ns) / 1e9, 0.0), 0.5)
+            self._last_ns = stamp_ns
+            self._control(T_map_base, scan, period_s)
         self._scans.clear()
-        period_s = min(max((stamp_ns - self._last_ns) / 1e9, 0.0), 0.5)
-        self._last_ns = stamp_ns
-        self._control(T_map_base, scan, period_s)
         paced = TopologicalMap() if self._is_paced else PoseWithCovarianceStamped()
         paced.header.stamp = message.header.stamp
         self._paced.publish(paced)
@@ -185,7 +190,7 @@ class StandIn(LifecycleNode):
 
 def main():
     rclpy.init()
-    node = StandIn()
+    node = BtNavigator()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     node.start()

@@ -21,7 +21,7 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
 
 _PERIOD_S = 0.1
-# Time after a failure in which the goal of whoever replaced ours becomes known.
+# Time after a failure in which a goal that has replaced ours becomes known.
 _SETTLE_S = 0.3
 _STATUS_NAMES = {
     GoalStatus.STATUS_CANCELED: 'cancelled by somebody else',
