@@ -10,6 +10,7 @@ from nav_msgs.msg import MapMetaData, OccupancyGrid
 from nav_msgs.srv import GetMap
 from PIL import Image
 from sensor_msgs.msg import LaserScan
+from support.doctor import Doctor
 from support.nav2 import map_readers
 
 from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
@@ -35,12 +36,18 @@ class Mapping:
         self._scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
         self._pose = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         laser = ','.join(f'{v:.6f}' for v in self.samples[0].scan.T_base_laser)
+        self.doctor = Doctor(graph)
         graph.start('grid_mapper', laser_pose=laser, **parameters)
-        self.wait_for_topics(self._scan, self._pose)
-        graph.until(lambda: graph.node.count_publishers('local_grid'), 'windows')
+        self.wait_for('scan: publishers', 'pose: publishers', 'local_grid: subscribers')
+        graph.until(
+            lambda: all(p.get_subscription_count() for p in (self._scan, self._pose)), 'grid_mapper'
+        )
 
-    def wait_for_topics(self, *publishers):
-        self.graph.until(lambda: all(p.get_subscription_count() for p in publishers), 'grid_mapper')
+    def wait_for(self, *keys):
+        """Wait until the mapper has found the test: what is published earlier is lost."""
+        self.graph.until(
+            lambda: all(self.doctor.number('grid_mapper', key) for key in keys), 'discovery'
+        )
 
     def publish(self, sample):
         scan = sample.scan
@@ -187,7 +194,8 @@ def test_services_metadata_and_late_subscribers_have_the_present_map(graph):
 def test_scans_of_a_lost_robot_are_not_mapped(graph):
     mapping = Mapping(graph)
     status = graph.node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
-    mapping.wait_for_topics(status)
+    mapping.wait_for('slam_status: publishers')
+    graph.until(status.get_subscription_count, 'grid_mapper')
 
     def add(sample, state):
         message = SlamStatus(state=state)
