@@ -65,7 +65,9 @@ def _description(image: str, patch: GridPatch) -> dict[str, Any]:
         'origin': [round(frame.origin_x, 6), round(frame.origin_y, 6), 0.0],
         'negate': 0,
         'occupied_thresh': OCCUPIED_AT_LEAST / 100,
-        # Below the darkness of unknown cells (50/255): with 0.25, readers would read them as free.
+        # map_saver writes 0.25 beside the same grey values, but map_server takes each pixel below
+        # free_thresh as free, and unknown is 50/255 = 0.19608 dark: the map would lose what is
+        # unknown. Another grey value would not be unknown to readers that expect 205.
         'free_thresh': 0.196,
     }
 

@@ -12,6 +12,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import State
@@ -130,13 +131,16 @@ def stem_of(path: str) -> Path:
     return Path(path).absolute()
 
 
-def save_grid(path: str, grid: OccupancyGrid) -> str:
-    """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written. Raises OSError."""
+def save_grid(path: str, grid: OccupancyGrid, shown: GridPatch | None = None) -> str:
+    """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written. Raises OSError.
+
+    shown: the cells of the image, where they differ from those of the grid.
+    """
     stem = stem_of(path)
     # No file takes its name before all are written: a full disk leaves the old session unchanged.
     with atomic_write(GRID.file(path)) as aside:
         GRID.write(aside, grid)
-        write_map(stem, grid.known_area())
+        write_map(stem, grid.known_area() if shown is None else shown)
     return f'{stem}.pgm, {_MAP_ENDING} and {GRID.ending}'
 
 

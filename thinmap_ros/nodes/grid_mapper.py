@@ -83,9 +83,11 @@ class MapOutputConfig(Config):
 
     def shown(self, patch: GridPatch) -> GridPatch:
         """The patch with the values to publish."""
-        if self.map_values == PROBABILITY:
-            return patch
-        limits = (100.0 * self.free_thresh, 100.0 * self.occupied_thresh)
+        return patch if self.map_values == PROBABILITY else self.trinary(patch)
+
+    def trinary(self, patch: GridPatch) -> GridPatch:
+        """The patch with -1, 0 and 100, in whole percent as map_saver compares them."""
+        limits = (round(100.0 * self.free_thresh), round(100.0 * self.occupied_thresh))
         return GridPatch(patch.frame, patch.trinary(*limits))
 
 
@@ -344,7 +346,8 @@ class GridMapperNode(ThinmapNode):
         """Save the map, after all of it follows the newest correction."""
         if self._grid.finish() is not None:
             self._publish_map()
-        return f'saved {sessions.save_grid(path, self._grid.shown)}'
+        shown = self._settings.output.trinary(self._grid.shown.known_area())
+        return f'saved {sessions.save_grid(path, self._grid.shown, shown)}'
 
     async def _on_save(
         self, request: SaveMap.Request, response: SaveMap.Response

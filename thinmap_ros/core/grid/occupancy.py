@@ -119,7 +119,7 @@ class WindowConfig(Config):
 
     local_map_size_m: float = parameter(
         16.0,
-        'Side length of local_map, centred on the robot (m). Set it to twice the range of the '
+        'Side length of local_grid, centred on the robot (m). Set it to twice the range of the '
         'laser; lower: less computing time.',
         low=2.0,
         high=100.0,
