@@ -128,6 +128,7 @@ def test_pip_installs_one_command_with_its_data(installed: Path) -> None:
     for inside, source in [
         ('thinmap_ros/worlds', 'worlds'),
         ('thinmap_ros/config', 'config'),
+        ('thinmap_ros/config/robots', 'config/robots'),
         ('thinmap_ros/config/sensors', 'config/sensors'),
         ('thinmap_msgs/msg', 'thinmap_msgs/msg'),
     ]:

@@ -75,6 +75,7 @@ KNOWN_PACKAGES = {
     'std_msgs',
     'std_srvs',
     'tf2_msgs',
+    'unique_identifier_msgs',
     'visualization_msgs',
 }
 MANIFESTS = [ROOT / 'package.xml', ROOT / 'thinmap_msgs' / 'package.xml']

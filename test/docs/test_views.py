@@ -1,4 +1,4 @@
-"""The views for RViz and Foxglove name topics that the nodes publish or subscribe to, with types."""
+"""The views for RViz and Foxglove name topics of the nodes, with their types."""
 
 import json
 import re
