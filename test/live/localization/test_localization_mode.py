@@ -9,7 +9,7 @@ from nav2_msgs.msg import ParticleCloud
 from nav2_msgs.srv import SetInitialPose
 from nav_msgs.msg import OccupancyGrid
 from std_srvs.srv import Empty
-from support.foreign_map import write_foreign_map
+from support.peers.foreign_map import write_foreign_map
 
 from thinmap_msgs.msg import LocalizationStatus, SlamStatus
 from thinmap_msgs.srv import LoadMap
