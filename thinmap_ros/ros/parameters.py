@@ -30,7 +30,6 @@ ROBOT = (
     'odom_frame',
     'odom_source',
     'base_frame',
-    'mode',
 )
 
 AnyConfig = TypeVar('AnyConfig', bound=Config)
