@@ -22,7 +22,8 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 class MapSource:
     """Creates localizers in the given map.
 
-    patch: None until topic map is received, where no other map is given. name: of the map, to which a saved pose belongs.
+    patch: None until topic map is received, where no other map is given. name: of the map, to which
+    a saved pose belongs.
     """
 
     def __init__(
