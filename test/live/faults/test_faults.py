@@ -65,7 +65,8 @@ def start_together(graph, *names, **simulation):
 def start_one(graph, name):
     own = {
         'localizer': {**AT_START, 'recovery_timeout_s': RECOVER_S},
-        'grid_mapper': {'recovery_timeout_s': RECOVER_S},
+        # As in the papers: a graph of larger cells keeps more of its ids.
+        'grid_mapper': {'recovery_timeout_s': RECOVER_S, 'resolution_m': 0.1},
         'topology_builder': {'recovery_timeout_s': RECOVER_S},
     }
     graph.start(name, use_sim_time=True, **own.get(name, {}))
@@ -212,7 +213,7 @@ def test_a_killed_node_with_other_parameters_is_reset_and_reports_why(graph):
     state = graph.folder / 'state'
     graph.until(lambda: len(list(state.glob('[!.]*.npz'))) == 3, 'all is kept')
     changed = {
-        'grid_mapper': ({'resolution_m': 0.1}, 'expected 0.1 m (resolution_m)'),
+        'grid_mapper': ({'resolution_m': 0.05}, 'expected 0.05 m (resolution_m)'),
         'topology_builder': ({'window_memory_m': 20.0}, '(window_memory_m, update_context_m)'),
     }
     for name, (values, said) in changed.items():
@@ -229,7 +230,7 @@ def test_a_killed_node_with_other_parameters_is_reset_and_reports_why(graph):
     start_one(graph, 'localizer')
     graph.until(lambda: 'T_map_odom: (4,)' in graph.log('localizer'), 'it says so')
     assert 'checkpoint rejected' in graph.log('localizer')
-    graph.until(lambda: maps and maps[-1].info.resolution > 0.06, 'a map with the new cells')
+    graph.until(lambda: maps and maps[-1].info.resolution < 0.06, 'a map with the new cells')
     for name in MAPPING:
         assert graph.stop(name) == 0
 
