@@ -175,7 +175,12 @@ AMCL = Package(
         _row('odom_frame_id', 'odom', 'localizer/odom_frame', 'global_localizer/odom_frame'),
         _row('pf_err', '0.05', note=_NO_FILTER),
         _row('pf_z', '0.99', note=_NO_FILTER),
-        _row('random_seed', '-1', 'global_localizer/seed'),
+        _row(
+            'random_seed',
+            '-1',
+            'global_localizer/seed',
+            note='negative (a seed from the clock): ignored',
+        ),
         _row('recovery_alpha_fast', '0.0', note='no: global_localizer with `start_automatically`'),
         _row('recovery_alpha_slow', '0.0', note='no: global_localizer with `start_automatically`'),
         _row('resample_interval', '1', note=_NO_FILTER),
