@@ -6,12 +6,16 @@ THINMAP_WRITE_CONFIG=1 rewrites the tables of the page.
 import os
 import re
 
+import numpy as np
 import pytest
 import rclpy
 import yaml
 from support.node_list import ROOT, node_class
 
 from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.files.occupancy_maps import write_map
 from thinmap_ros.ros.foreign.tables import PACKAGES
 
 PAGE = ROOT / 'docs' / 'coming_from.md'
@@ -111,6 +115,19 @@ def test_a_negative_random_seed_leaves_the_default(start, given, seed):
     assert warnings == []
     with pytest.raises(ConfigError, match='seed'):
         start('global_localizer', '-p', 'seed:=-1')
+
+
+def test_the_map_of_map_server_is_that_of_localizer_and_grid_mapper(start, tmp_path):
+    cells = np.full((40, 40), 0, dtype=np.int8)
+    cells[[0, -1]] = 100
+    path = write_map(tmp_path / 'hall', GridPatch(GridFrame(0.0, 0.0, 0.05), cells))
+    given = (f'yaml_filename:={path}', 'free_thresh_default:=0.2', 'occupied_thresh_default:=0.7')
+    arguments = [word for rule in (*given, 'mode:=localization') for word in ('-p', rule)]
+    values, warnings = start('localizer', *arguments)
+    assert (values['map_file_name'], warnings) == (str(path), [])
+    values, warnings = start('grid_mapper', *arguments)
+    assert (values['session_path'], warnings) == (str(path), [])
+    assert (values['free_thresh'], values['occupied_thresh']) == (0.2, 0.7)
 
 
 def test_a_misspelt_name_is_warned_of_with_what_was_probably_meant(start):
