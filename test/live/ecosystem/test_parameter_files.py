@@ -5,8 +5,13 @@ from pathlib import Path
 import pytest
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import GetState
+from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
+from support.peers.foreign_map import write_foreign_map
+
+from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
 FILES = Path(__file__).resolve().parents[2] / 'docs' / 'foreign'
@@ -47,3 +52,21 @@ def test_files_of_other_packages_start_our_nodes_under_their_names(graph, tmp_pa
         assert 'ignored parameters' in graph.log(name)
     for name in expected:
         assert graph.stop(name) == 0
+
+
+def test_grid_mapper_publishes_the_map_of_map_server(graph, tmp_path):
+    path = write_foreign_map(tmp_path, 'room_10x10')
+    graph.start(
+        'grid_mapper',
+        ('__node:=map_server',),
+        label='map_server',
+        yaml_filename=str(path),
+        mode='localization',
+    )
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    graph.until(lambda: maps, 'the map')
+    walls, given = messages.grid_from_msg(maps[-1]), read_map(path)
+    assert walls.frame.resolution == pytest.approx(given.frame.resolution)
+    assert (walls.cells == 100).sum() == (given.cells == 100).sum() > 100
+    assert (walls.cells == 0).sum() == (given.cells == 0).sum() > 1000
+    assert graph.stop('map_server') == 0
