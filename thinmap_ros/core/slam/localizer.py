@@ -138,7 +138,8 @@ class Localizer:
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Set the pose (3,) with covariance (3, 3) in the current map.
 
-        The map is not updated until scans confirm the pose.
+        The map is not updated until scans confirm the pose. In a map that does not change, the
+        robot is lost until then.
         """
         if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
             self._rejected += 1
@@ -146,7 +147,8 @@ class Localizer:
         self._pose = se2.pose(*T_map_base.tolist())
         self._uncertainty.place(self._pose, covariance)
         self._prediction.reset_segment()
-        self._tracking.place(self._pose, self._uncertainty.since_match)
+        is_map_given = not self.config.is_mapping
+        self._tracking.place(self._pose, self._uncertainty.since_match, is_map_given)
         self._map.rerender(self.keyframes, self._pose)
 
     def state(self) -> dict[str, NDArray[Any]]:

@@ -12,6 +12,8 @@ from thinmap_ros.core.slam.odometry_prediction import Prediction
 
 # Inliers for each contradicting point with which a match overrides the odometry.
 INLIERS_PER_CONTRADICTION = 3.0
+# Of a pose that no scan has confirmed: less than a scan with 30 % inliers removes.
+_UNCONFIRMED_EVIDENCE = 0.3 / INLIERS_PER_CONTRADICTION
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +94,15 @@ class Tracking:
         if self.agrees:
             self.dead_reckoned = DeadReckoning(T_map_base, covariance)
 
-    def place(self, T_map_base: Array, covariance: Array) -> None:
-        """Set the pose (3,) with covariance (3, 3); the robot is delocalized until scans fit."""
+    def place(self, T_map_base: Array, covariance: Array, is_map_given: bool = False) -> None:
+        """Set the pose (3,) with covariance (3, 3); the robot is delocalized until scans fit.
+
+        is_map_given: the map does not change: the robot is also lost until the first scan that
+        fits. Outside of the map no scan contradicts it.
+        """
         self.is_delocalized = True
         self._provisional_path_m = 0.0
-        self.evidence = 0.0
+        self.evidence = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
         self.dead_reckoned = DeadReckoning(T_map_base, covariance)
 
     def start_delocalized(self) -> None:
