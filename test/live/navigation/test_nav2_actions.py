@@ -8,7 +8,7 @@ import pytest
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from geometry_msgs.msg import PoseStamped, Quaternion, Twist, TwistStamped
 from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.action import ActionClient
 from support.doctor import Doctor
 from support.halls import AT_START, START
@@ -156,6 +156,13 @@ def test_a_newer_goal_replaces_the_running_one_across_both_actions(client):
     assert all(is_stopped(command) for command in client.commands)
 
 
+def knows(message, x, y):
+    """Whether a place is known to be free."""
+    patch = messages.grid_from_msg(message)
+    cell = patch.frame.cells_of(np.array([[x, y]]))[0]
+    return bool(patch.contains(np.array([[x, y]]))[0]) and bool(patch.free[tuple(cell)])
+
+
 def is_stopped(command):
     return command.linear.x == command.angular.z == 0.0
 
@@ -273,6 +280,8 @@ def test_the_robot_reaches_its_goal_with_odometry_by_tf_and_without_any(graph, s
         real_time_factor=2.0,
     )
     goal = pose_at(3.0, 2.6)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    graph.until(lambda: maps and knows(maps[-1], 3.0, 2.6), 'a map that knows the goal')
     client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
     ended = graph.result(graph.send_goal(client, NavigateToPose.Goal(pose=goal)), 'the goal')
     assert ended.status == GoalStatus.STATUS_SUCCEEDED, ended
