@@ -20,7 +20,7 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 
 
 class MapSource:
-    """Creates localizers in the given map; without any, `patch` is None until topic map is heard.
+    """Creates localizers in the given map; without any, `patch` is None until topic map is received.
 
     name: of the map, to which a saved pose belongs.
     """
