@@ -179,15 +179,25 @@ def test_the_readme_names_parameters_that_there_are():
 PRESETS = sorted((ROOT / 'config').glob('*s/*.yaml'))
 
 
-@pytest.mark.parametrize('name', ['localizer', 'grid_mapper', 'sim'])
 @pytest.mark.parametrize('preset', PRESETS, ids=lambda path: path.stem)
-def test_sensor_presets_are_known_to_the_nodes_and_hold_in_any_namespace(declared, preset, name):
+@pytest.mark.parametrize('name', NODES)
+def test_presets_are_known_to_every_node_and_hold_in_any_namespace(declared, preset, name):
     content = yaml.safe_load(preset.read_text())
-    wanted = content[f'/**/{name}']['ros__parameters']
-    for namespace in ('', '/robot1'):
+    sections = {section.rpartition('/')[2] for section in content} - {'**'}
+    assert sections <= set(NODES)
+    own = content.get(f'/**/{name}', {}).get('ros__parameters', {})
+    of_all = content.get('/**', {}).get('ros__parameters', {})
+    assert set(of_all) <= set(parameters.ROBOT)
+    needed = NEEDED.get(name, {})
+    arguments = [
+        word for key, value in needed.items() for word in ('-p', f'{key}:={json.dumps(value)}')
+    ]
+    for namespace in ('', '/robot1') if own else ('',):
         remap = ('-r', f'__ns:={namespace}') if namespace else ()
-        found = declared(name, '--params-file', str(preset), *remap)
-        assert {key: found[key][0] for key in flat(wanted)} == flat(wanted)
+        found = declared(name, '--params-file', str(preset), *remap, *arguments)
+        assert {key: found[key][0] for key in flat(own)} == flat(own)
+        shared = of_all.keys() & found.keys()
+        assert {key: found[key][0] for key in shared} == {key: of_all[key] for key in shared}
 
 
 def test_preset_of_a_laser_that_publishes_zero_holds_for_every_node_with_a_laser(declared):

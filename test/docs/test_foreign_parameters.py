@@ -6,12 +6,16 @@ THINMAP_WRITE_CONFIG=1 rewrites the tables of the page.
 import os
 import re
 
+import numpy as np
 import pytest
 import rclpy
 import yaml
 from support.node_list import ROOT, node_class
 
 from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.files.occupancy_maps import write_map
 from thinmap_ros.ros.foreign.tables import PACKAGES
 
 PAGE = ROOT / 'docs' / 'coming_from.md'
@@ -102,6 +106,46 @@ def test_a_file_of_another_package_starts_the_node(start, file, node, expected, 
 def test_the_own_name_wins_over_that_of_another_package(start):
     arguments = ('-p', 'transform_timeout:=0.7', '-p', 'transform_tolerance:=0.1')
     assert start('localizer', *arguments)[0]['transform_tolerance'] == 0.1
+
+
+@pytest.mark.parametrize(('given', 'seed'), [(-1, 0), (0, 0), (7, 7)])
+def test_a_negative_random_seed_leaves_the_default(start, given, seed):
+    values, warnings = start('global_localizer', '-p', f'random_seed:={given}')
+    assert values['seed'] == seed
+    assert warnings == []
+    with pytest.raises(ConfigError, match='seed'):
+        start('global_localizer', '-p', 'seed:=-1')
+
+
+def test_the_map_of_map_server_is_that_of_localizer_and_grid_mapper(start, tmp_path):
+    cells = np.full((40, 40), 0, dtype=np.int8)
+    cells[[0, -1]] = 100
+    path = write_map(tmp_path / 'hall', GridPatch(GridFrame(0.0, 0.0, 0.05), cells))
+    given = (f'yaml_filename:={path}', 'free_thresh_default:=0.2', 'occupied_thresh_default:=0.7')
+    arguments = [word for rule in (*given, 'mode:=localization') for word in ('-p', rule)]
+    values, warnings = start('localizer', *arguments)
+    assert (values['map_file_name'], warnings) == (str(path), [])
+    values, warnings = start('grid_mapper', *arguments)
+    assert (values['session_path'], warnings) == (str(path), [])
+    assert (values['free_thresh'], values['occupied_thresh']) == (0.2, 0.7)
+
+
+def test_a_misspelt_name_is_warned_of_with_what_was_probably_meant(start):
+    arguments = ('-p', 'map_update_intervall:=5.0', '-p', 'occupied_tresh:=0.7')
+    values, (warning,) = start('grid_mapper', *arguments)
+    assert 'map_update_intervall (did you mean map_update_interval?)' in warning
+    assert 'occupied_tresh (did you mean occupied_thresh?)' in warning
+    assert (values['map_update_interval'], values['occupied_thresh']) == (1.0, 0.65)
+
+
+def test_only_names_that_no_node_takes_are_warned_of(start):
+    """One warning in all for those; none for what is meant for explorer or navigator."""
+    arguments = ('-p', 'min_frontier_size:=0.7', '-p', 'FollowPath.max_vel_x:=0.3')
+    assert start('localizer', *arguments)[1] == []
+    unknown = ('-p', 'potential_scale:=0.1', '-p', 'gain_scale:=2.0')
+    _, (warning,) = start('localizer', *arguments, *unknown)
+    assert warning.count('potential_scale') == warning.count('gain_scale') == 1
+    assert 'min_frontier_size' not in warning and 'max_vel_x' not in warning
 
 
 def test_an_integer_is_accepted_for_a_float(start):

@@ -156,7 +156,7 @@ def test_bad_messages_are_refused_in_words_and_nothing_dies(graph):
 @pytest.mark.parametrize(
     ('name', 'parameters', 'said'),
     [
-        ('localizer', {'gaet': 1.0}, 'no parameter gaet'),
+        ('localizer', {'gaet': 1.0, 'strict_parameters': True}, 'no parameter gaet'),
         ('grid_mapper', {'resolution_m': 0.0}, 'resolution_m'),
         ('sim', {'world': 'atlantis'}, 'atlantis'),
         ('sim', {'start': '1,2'}, 'x,y,theta'),

@@ -137,7 +137,8 @@ def test_what_cannot_be_run_is_reported_in_one_line(ros_domain):
     assert 'usage: thinmap' in run('--help').stdout
     done = run('localizer', 'pilot')
     assert done.returncode == 2 and done.stderr.startswith('error: pilot')
-    done = run('localizer', 'grid_mapper', '--ros-args', '-p', 'gaet:=1.0')
+    strict = ('-p', 'gaet:=1.0', '-p', 'strict_parameters:=true')
+    done = run('localizer', 'grid_mapper', '--ros-args', *strict)
     assert done.returncode == 2 and 'localizer, grid_mapper has no parameter gaet' in done.stderr
     assert len(done.stderr.splitlines()) == 1
     done = run('localizer', 'grid_mapper', '--ros-args', '-p', 'association.gate:=-1.0')

@@ -4,13 +4,19 @@ import subprocess
 import sys
 
 import pytest
+from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
+
+from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
+from thinmap_ros.ros import qos
 
 pytestmark = pytest.mark.live
 
 
 def value(number):
+    if isinstance(number, str):
+        return ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=number)
     return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=number)
 
 
@@ -49,6 +55,43 @@ def test_the_navigator_changes_its_speed_and_refuses_what_makes_no_sense(graph):
         SetParametersAtomically, '/navigator/set_parameters_atomically', request
     ).result.successful
     assert graph.stop('navigator') == 0
+
+
+def test_localizer_and_grid_mapper_keep_their_map_while_parameters_change(graph):
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    windows = graph.heard('local_grid', ProbabilityGrid, qos.LATCHED)
+    states = graph.heard('slam_status', SlamStatus)
+    start = {'initial_x_m': 2.0, 'initial_y_m': 2.0}
+    graph.start('localizer', use_sim_time=True, **start)
+    graph.start('grid_mapper', use_sim_time=True, map_update_interval=3600.0)
+    graph.start('sim', start='2.0,2.0,0.0', real_time_factor=4.0)
+    graph.until(lambda: len(states) > 5 and len(windows) > 2, 'tracking and mapping')
+    assert not maps
+
+    # The map comes at once, and with its new values.
+    assert change(graph, 'grid_mapper', map_values='probability').successful
+    graph.until(lambda: maps, 'a map')
+    cells = set(maps[-1].data)
+    assert -1 in cells and cells - {-1, 0, 100}
+    assert change(graph, 'grid_mapper', map_values='trinary', map_update_interval=0.5).successful
+    graph.until(lambda: len(maps) > 3, 'maps at the new rate')
+    assert set(maps[-1].data) == {-1, 0, 100}
+    known = sum(cell >= 0 for cell in maps[-1].data)
+    assert change(graph, 'grid_mapper', occupied_thresh=1.0, free_thresh=0.0).successful
+    graph.until(lambda: sum(cell >= 0 for cell in maps[-1].data) < known, 'fewer known cells')
+    result = change(graph, 'grid_mapper', occupied_thresh=0.3, free_thresh=0.4)
+    assert not result.successful and 'free_thresh = 0.4' in result.reason
+
+    names = ('lost_threshold', 'loop_closure.min_inlier_ratio', 'matching.max_range_m')
+    values = dict(zip(names, (8.0, 0.9, 6.0), strict=True))
+    assert change(graph, 'localizer', **values).successful
+    assert current(graph, 'localizer', *names) == [8.0, 0.9, 6.0]
+    result = change(graph, 'localizer', lost_threshold=-1.0)
+    assert not result.successful and 'lost_threshold' in result.reason
+    before = len(states)
+    graph.until(lambda: len(states) > before + 5, 'more poses')
+    assert {status.state for status in states} == {SlamStatus.TRACKING}
+    assert states[-1].inlier_ratio > 0.5, 'it matches scans with the map that it has'
 
 
 def test_what_cannot_change_is_marked_and_refused(graph):

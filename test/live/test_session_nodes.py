@@ -202,7 +202,7 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     graph.until(lambda: not graphs[-1].nodes, 'an empty graph')
     known = messages.grid_from_msg(maps[-1])
     assert np.array_equal(known.occupied, grid.known_area().occupied)
-    # The resolution of a map is taken over.
+    # The mapper adopts the resolution of a map.
     occupancy_maps.write_map(tmp_path / 'coarse', room_of(0.2)[0].known_area())
     assert load('coarse.yaml').success
     graph.until(lambda: maps[-1].info.resolution > 0.15, 'the map with its own cells')

@@ -174,9 +174,11 @@ class Graph:
     def act(self, kind: type, name: str, goal: Any) -> Any:
         """Result of an action's goal, with status."""
         client = ActionClient(self.node, kind, name)
-        ended = self.send_goal(client, goal).get_result_async()
-        self.until(ended.done, f'{name} ends')
-        return ended.result()
+        return self.result(self.send_goal(client, goal), name)
+
+    def result(self, handle: Any, what: str) -> Any:
+        """Result of an accepted goal, with status; asks again, as a response may be lost."""
+        return self._first(handle.get_result_async, f'{what} ends')
 
     def ended(self, process: subprocess.Popen[bytes]) -> int:
         """Exit code of a node that ends by itself."""

@@ -60,7 +60,13 @@ _STATES = {
 class GlobalLocalizerConfig(Config):
     """Parameters of the node besides those of the search."""
 
-    seed: int = parameter(0, 'Seed of the samples.')
+    seed: int = parameter(
+        0,
+        'Seed of the samples: the same seed and scans give the same answers. Another value for '
+        'another sequence of samples.',
+        low=0,
+        high=2**31 - 1,
+    )
     start_automatically: bool = parameter(
         False, 'Start at once, and when the localizer has reported LOST for lost_timeout_s.'
     )

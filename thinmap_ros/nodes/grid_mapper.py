@@ -1,6 +1,7 @@
 """The occupancy grid: each scan is added at the pose that the localizer found for it."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -9,6 +10,7 @@ from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from nav_msgs.srv import GetMap
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from rclpy.timer import Timer
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
@@ -113,10 +115,11 @@ class _Settings:
     mapping: bool
 
     @staticmethod
-    def declare(node: Node) -> '_Settings':
+    def declare(node: Node, changed: Callable[[MapOutputConfig], None]) -> '_Settings':
+        """changed: is called with another output, which can be set at run time."""
         return _Settings(
             grid=parameters.declare_config(node, OccupancyConfig, base=ROBOT_GRID),
-            output=parameters.declare_config(node, MapOutputConfig),
+            output=parameters.declare_config(node, MapOutputConfig, changed),
             local_map_size_m=parameters.declare_config(node, WindowConfig).local_map_size_m,
             mapping=parameters.declare_config(node, ModeConfig).mode == MAPPING,
         )
@@ -129,7 +132,7 @@ class _MapPublishers:
     """
 
     def __init__(self, node: Node, config: MapOutputConfig) -> None:
-        self._config = config
+        self.config = config
         self._frame = parameters.declare_map_frame(node)
         self.load_ns = 0
         self._map = node.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
@@ -150,7 +153,7 @@ class _MapPublishers:
 
     def map_message(self, patch: GridPatch, stamp_ns: int) -> OccupancyGridMsg:
         """Message of the topic map."""
-        shown = self._config.shown(patch)
+        shown = self.config.shown(patch)
         return messages.grid_msg(shown, self._frame, stamp_ns, self.load_ns)
 
     def publish_local_grid(self, window: GridPatch, stamp_ns: int, corrected_ns: int) -> None:
@@ -226,7 +229,7 @@ class GridMapperNode(ThinmapNode):
 
     def __init__(self) -> None:
         super().__init__('grid_mapper', recovers=True)
-        self._settings = _Settings.declare(self)
+        self._settings = _Settings.declare(self, self._on_output)
         self._output = _MapPublishers(self, self._settings.output)
         self._laser_transform = LaserTransform(self)
         self._session = parameters.declare_session(self)
@@ -251,7 +254,21 @@ class GridMapperNode(ThinmapNode):
         self.create_service(LoadMap, 'load_map', self._on_load)
         for name in ('map', 'dynamic_map'):
             self.create_service(GetMap, name, self._on_get_map)
-        self.create_active_timer(self._settings.output.map_update_interval, self._publish_map)
+        self._map_timer = self._create_map_timer()
+
+    def _create_map_timer(self) -> Timer:
+        return self.create_active_timer(
+            self._settings.output.map_update_interval, self._publish_map
+        )
+
+    def _on_output(self, config: MapOutputConfig) -> None:
+        """Publish the map with other values or at another rate, the first at once."""
+        self._settings = replace(self._settings, output=config)
+        self._output.config = config
+        self.destroy_timer(self._map_timer)
+        self._map_timer = self._create_map_timer()
+        if self.is_active:
+            self._publish_map()
 
     def reset_state(self) -> None:
         """Discard the map, or return to the session that the node was started with."""

@@ -19,9 +19,10 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor, ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer import LIVE_PARAMETERS, LocalizerConfig
 from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
+    adjust,
     line_features,
     localizer_class,
     set_topology,
@@ -137,7 +138,9 @@ class LocalizerNode(ThinmapNode):
 
     def __init__(self) -> None:
         super().__init__('localizer', recovers=True)
-        self._config = parameters.declare_config(self, LocalizerConfig)
+        self._config = parameters.declare_config(
+            self, LocalizerConfig, self._on_config, LIVE_PARAMETERS
+        )
         self._output = _PosePublishers(self)
         self._laser_transform = LaserTransform(self)
         base_frame = self._laser_transform.base_frame
@@ -166,6 +169,12 @@ class LocalizerNode(ThinmapNode):
         self._given.create_interface(self._output.map_frame, poses)
         self.create_service(SaveMap, 'save_localizer', self._on_save)
         self.create_service(LoadMap, 'load_localizer', self._on_load)
+
+    def _on_config(self, config: LocalizerConfig) -> None:
+        """Continue in the same map with other parameters."""
+        self._config = config
+        self._given.config = config
+        adjust(self._localizer, config)
 
     def reset_state(self) -> None:
         """Discard the map, or return to the session that the node was started with.

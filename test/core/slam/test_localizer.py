@@ -489,6 +489,22 @@ def test_kidnapping_starts_a_new_submap_and_reports_lost():
     np.testing.assert_allclose(found, steps, atol=0.06)
 
 
+@pytest.mark.parametrize('threshold', [1.0, 1000.0])
+def test_other_parameters_apply_at_once_and_keep_the_map(threshold):
+    rng = np.random.default_rng(8)
+    rows, localizer = driven(100)
+    frames = list(localizer.keyframes)
+    state = {name: array.copy() for name, array in localizer.state().items()}
+    matching = replace(localizer.config.matching, max_range_m=20.0)
+    localizer.adjust(LocalizerConfig(lost_threshold=threshold, matching=matching, initial_x_m=-5.0))
+    assert localizer.config.initial_x_m == AT_START['initial_x_m'], 'for a reset'
+    assert localizer.keyframes == frames
+    for name, array in localizer.state().items():
+        np.testing.assert_array_equal(array, state[name])
+    carried = on(localizer, 30, np.array([1.0, 2.0, 0.5]), rows[-1][2], rng, ELSEWHERE)
+    assert any(estimate.is_lost for _, estimate, _ in carried) == (threshold == 1.0)
+
+
 def crowd(at, rng):
     """The room, and a crowd around a position that moves between scans."""
     angles = rng.uniform(-np.pi, np.pi, 30)

@@ -274,8 +274,7 @@ def test_the_robot_reaches_its_goal_with_odometry_by_tf_and_without_any(graph, s
     )
     goal = pose_at(3.0, 2.6)
     client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
-    ended = graph.send_goal(client, NavigateToPose.Goal(pose=goal)).get_result_async()
-    graph.until(ended.done, 'the goal ends')
-    assert ended.result().status == GoalStatus.STATUS_SUCCEEDED, ended.result()
+    ended = graph.result(graph.send_goal(client, NavigateToPose.Goal(pose=goal)), 'the goal')
+    assert ended.status == GoalStatus.STATUS_SUCCEEDED, ended
     place = truth[-1].pose.position
     assert math.dist((place.x, place.y), (3.0, 2.6)) < 0.3

@@ -144,7 +144,7 @@ class OccupancyGrid:
     def __init__(
         self, config: OccupancyConfig | None = None, frame: GridFrame | None = None
     ) -> None:
-        """Start empty; frame: of the map to continue, whose resolution is taken over."""
+        """Start empty; frame: of the map to continue, which gives the resolution."""
         self.config = config or OccupancyConfig()
         self.frame = frame or GridFrame(0.0, 0.0, self.config.resolution_m)
         self._tiles = TileStore()

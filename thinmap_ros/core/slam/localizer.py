@@ -8,14 +8,14 @@ accumulated covariance connects the two.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.config import parameter, part
+from thinmap_ros.core.config import parameter, parameters_of, part
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
 from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Correction, Estimate
@@ -72,6 +72,14 @@ class LocalizerConfig(EkfConfig):
     loop_closure: LoopClosureConfig = part(LoopClosureConfig)
 
 
+# What can change while a map is kept: `Localizer.adjust`.
+LIVE_PARAMETERS = (
+    'lost_threshold',
+    *(f'matching.{name}' for name, _, _ in parameters_of(MatchingConfig())),
+    *(f'loop_closure.{name}' for name, _, _ in parameters_of(LoopClosureConfig())),
+)
+
+
 class Localizer:
     """Scan matching with a local map, keyframes and loop closure.
 
@@ -99,6 +107,18 @@ class Localizer:
             config.loop_closure, config.keyframes, config.matching, config.local_map
         )
         self._path = KeyframeTrajectory()
+
+    def adjust(self, config: LocalizerConfig) -> None:
+        """Continue with other values of `LIVE_PARAMETERS`; map, path and pose stay."""
+        self.config = replace(
+            self.config,
+            lost_threshold=config.lost_threshold,
+            matching=config.matching,
+            loop_closure=config.loop_closure,
+        )
+        self._matcher = Matcher(config.matching)
+        self._tracking.adjust(config.lost_threshold, config.matching.min_inlier_ratio)
+        self._loops.adjust(config.loop_closure, config.matching)
 
     @property
     def rejected(self) -> int:

@@ -18,6 +18,12 @@ def line_features(localizer: AnyLocalizer) -> list[LineFeature]:
     return localizer.features if isinstance(localizer, EkfLocalizer) else []
 
 
+def adjust(localizer: AnyLocalizer, config: LocalizerConfig) -> None:
+    """Continue with other values of `LIVE_PARAMETERS`, which are all of scan matching."""
+    if isinstance(localizer, Localizer):
+        localizer.adjust(config)
+
+
 def set_topology(localizer: AnyLocalizer, topology: TopologicalMap) -> None:
     """Set the topological map with which an EKF localizer selects its local area."""
     if isinstance(localizer, EkfLocalizer):

@@ -56,9 +56,13 @@ class Tracking:
         self.evidence = 0.0
         self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
         self.dead_reckoned = DeadReckoning(T_map_base, np.zeros((3, 3)))
+        self.adjust(lost_threshold, least_fit)
+        self._provisional_path_m = 0.0  # remaining path for which a new local map is provisional
+
+    def adjust(self, lost_threshold: float, least_fit: float) -> None:
+        """Set the evidence at which the robot is lost, and the inlier ratio of a scan that fits."""
         self._lost_evidence = lost_threshold
         self._least_fit = least_fit
-        self._provisional_path_m = 0.0  # remaining path for which a new local map is provisional
 
     @property
     def agrees(self) -> bool:

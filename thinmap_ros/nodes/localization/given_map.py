@@ -19,12 +19,15 @@ _WARN_PERIOD_S = 30.0
 
 
 class GivenMap:
-    """The given map, the poses to start from, and AMCL's interface; in mode mapping, a session."""
+    """The given map, the poses to start from, and AMCL's interface; in mode mapping, a session.
+
+    config: of the next localizer.
+    """
 
     def __init__(self, node: ThinmapNode, config: LocalizerConfig) -> None:
         """Declare the parameters. Raises ConfigError or InputError as `MapSource`."""
         self._node = node
-        self._config = config
+        self.config = config
         self._settings = parameters.declare_config(node, LocalizationConfig)
         self.source = MapSource(config, self._settings, parameters.declare_session(node))
         self._last_pose = LastPose(
@@ -35,7 +38,7 @@ class GivenMap:
 
     def create_interface(self, map_frame: str, poses: InitialPoses) -> None:
         """Offer AMCL's topics and services in mode localization."""
-        if not self._config.is_mapping:
+        if not self.config.is_mapping:
             self._amcl = AmclInterface(self._node, map_frame, poses.add_pose)
 
     def create_localizer(self) -> AnyLocalizer:
@@ -44,7 +47,7 @@ class GivenMap:
         It is initial_pose where set, else the start pose where it is not 0, else the last pose.
         """
         self._given_covariance = None
-        config = self._config
+        config = self.config
         if config.is_mapping:
             return self.source.create_localizer(config)
         if self._settings.set_initial_pose:
@@ -61,7 +64,7 @@ class GivenMap:
 
     def create_localizer_at(self, T_map_base: Array) -> AnyLocalizer:
         """A localizer at a pose (3,); in a given map it is delocalized until scans fit."""
-        return self.source.create_localizer(config_at(self._config, T_map_base))
+        return self.source.create_localizer(config_at(self.config, T_map_base))
 
     def with_new_map(self, localizer: AnyLocalizer) -> AnyLocalizer:
         """The localizer that follows another one in a map from its topic."""

@@ -20,9 +20,10 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 
 
 class MapSource:
-    """Creates localizers in the given map; without any, `patch` is None until topic map is received.
+    """Creates localizers in the given map.
 
-    name: of the map, to which a saved pose belongs.
+    patch: None until topic map is received, where no other map is given. name: of the map, to which
+    a saved pose belongs.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Parameters of other packages, with the parameters of thinmap that do the same.
 
-Names and defaults are those of slam_toolbox (Jazzy), nav2_amcl, Nav2's controller and navigator,
-and m-explore-ros2's explore_lite.
+Names and defaults are those of slam_toolbox (Jazzy), nav2_amcl, Nav2's map server, controller
+and navigator, and m-explore-ros2's explore_lite.
 """
 
 from dataclasses import dataclass
@@ -175,7 +175,12 @@ AMCL = Package(
         _row('odom_frame_id', 'odom', 'localizer/odom_frame', 'global_localizer/odom_frame'),
         _row('pf_err', '0.05', note=_NO_FILTER),
         _row('pf_z', '0.99', note=_NO_FILTER),
-        _row('random_seed', '-1', 'global_localizer/seed'),
+        _row(
+            'random_seed',
+            '-1',
+            'global_localizer/seed',
+            note='negative (a seed from the clock): ignored',
+        ),
         _row('recovery_alpha_fast', '0.0', note='no: global_localizer with `start_automatically`'),
         _row('recovery_alpha_slow', '0.0', note='no: global_localizer with `start_automatically`'),
         _row('resample_interval', '1', note=_NO_FILTER),
@@ -235,4 +240,26 @@ NAV2 = Package(
     ),
 )
 
-PACKAGES = (SLAM_TOOLBOX, AMCL, EXPLORE_LITE, NAV2)
+MAP_SERVER = Package(
+    'map_server and map_saver',
+    ('localizer', 'grid_mapper'),
+    (
+        _row(
+            'yaml_filename',
+            '',
+            'localizer/map_file_name',
+            'grid_mapper/session_path',
+            note='with `mode: localization`',
+        ),
+        _row('topic_name', 'map', note=f'{_REMAP}: `-r map:=/other_map`'),
+        _row('frame_id', 'map', note='no: `map_frame`; drivers have a `frame_id`, too'),
+        _row('save_map_timeout', '2.0', note='no: the map is there, nothing is waited for'),
+        _row('free_thresh_default', '0.25', 'grid_mapper/free_thresh', note='of `map`, too'),
+        _row(
+            'occupied_thresh_default', '0.65', 'grid_mapper/occupied_thresh', note='of `map`, too'
+        ),
+        _row('map_subscribe_transient_local', 'true', note='no: `map` is always latched'),
+    ),
+)
+
+PACKAGES = (SLAM_TOOLBOX, AMCL, MAP_SERVER, EXPLORE_LITE, NAV2)

@@ -5,6 +5,8 @@ from rclpy.parameter import Parameter
 
 from thinmap_ros.ros.foreign.tables import PACKAGES, ForeignParameter
 
+_SEED = 'random_seed'  # negative: AMCL takes one from the clock
+
 
 def translate(node: Node, program: str) -> None:
     """Give a node its own parameters for those of other packages that it was started with.
@@ -22,6 +24,8 @@ def translate(node: Node, program: str) -> None:
         values = list(value) if isinstance(value, list | tuple) else len(own) * [value]
         if foreign.name not in own:
             del given[foreign.name]
+        if foreign.name == _SEED and isinstance(value, int) and value < 0:
+            continue
         for name, single in zip(own, values, strict=False):
             given.setdefault(name, Parameter(name, value=single))
 

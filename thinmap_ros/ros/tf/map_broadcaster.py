@@ -50,13 +50,18 @@ class MapBroadcaster:
         self._frames = [(map_frame, odom_frame)]
         if identity_frame:
             self._frames.append((odom_frame, identity_frame))
-        self._config = parameters.declare_config(node, BroadcastConfig)
+        self._config = parameters.declare_config(
+            node, BroadcastConfig, self._on_config, live=('transform_tolerance',)
+        )
         self._T_map_odom: Array | None = None
         if not self._config.publish_tf:
             return
         self._publisher = node.create_publisher(TFMessage, '/tf', qos.TRANSFORMS)
         if self._config.transform_publish_period > 0.0:
             node.create_active_timer(self._config.transform_publish_period, self._publish)
+
+    def _on_config(self, config: BroadcastConfig) -> None:
+        self._config = config
 
     def update(self, T_map_odom: Array) -> None:
         """Publish another transform (3,) from now on."""

@@ -108,9 +108,7 @@ class LoopClosure:
     ) -> None:
         self.keyframes = Keyframes(keyframes)
         self.edges: list[Edge] = []
-        self._config = config
-        # No wheel slip here: the covariance along the graph contains it.
-        self._matcher = Matcher(replace(matching, wheel_slip_m=0.001, wheel_slip_rad=0.001))
+        self.adjust(config, matching)
         self._jobs: deque[_Job] = deque()
         self._pending: tuple[Keyframe, Array] | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
@@ -119,6 +117,12 @@ class LoopClosure:
         self._submaps = Submaps(local_map)
         self._rounds: Iterator[Array] | None = None
         self._after: Array = np.zeros((0, 3))
+
+    def adjust(self, config: LoopClosureConfig, matching: MatchingConfig) -> None:
+        """Search with other parameters from now on; keyframes and edges stay."""
+        self._config = config
+        # No wheel slip here: the covariance along the graph contains it.
+        self._matcher = Matcher(replace(matching, wheel_slip_m=0.001, wheel_slip_rad=0.001))
 
     def needs_keyframe(self, T_map_base: Array) -> bool:
         """Whether a scan at a pose (3,) becomes the next keyframe."""
