@@ -28,3 +28,34 @@ def test_points_that_contradict_count_three_times_as_much_as_points_that_fit():
     assert tracking.evidence == 0.25
     tracking.update(match(0.75, 0.0))
     assert tracking.agrees
+
+
+def test_evidence_that_is_high_is_limited_when_the_robot_is_lost_so_that_scans_place_it_again():
+    tracking = Tracking(4.0, 0.6, np.zeros(3))
+    for _ in range(20):
+        tracking.update(match(0.0, 1.0))
+    assert tracking.evidence == pytest.approx(20.0)
+    assert not tracking.is_lost
+    tracking.lose()
+    assert tracking.is_lost
+    assert tracking.evidence == 4.0
+    tracking.update(match(0.0, 1.0))
+    assert tracking.evidence == 4.0
+    scans = 0
+    while tracking.is_lost:
+        tracking.update(match(1.0, 0.0))
+        scans += 1
+    assert scans == 12
+    assert not tracking.is_delocalized
+
+
+def test_in_a_given_map_a_pose_is_lost_until_a_scan_fits():
+    for is_map_given in (False, True):
+        tracking = Tracking(4.0, 0.6, np.zeros(3))
+        tracking.place(np.ones(3), np.eye(3), is_map_given)
+        for update in (None, match(0.0, 0.0)):
+            assert tracking.is_lost == is_map_given
+            tracking.update(update)
+        assert tracking.is_lost == is_map_given
+        tracking.update(match(0.7, 0.0))
+        assert not tracking.is_lost

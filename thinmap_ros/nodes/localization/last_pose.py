@@ -9,7 +9,7 @@ import yaml
 from rclpy.node import Node
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.yaml import read_mapping
@@ -30,15 +30,23 @@ class LastPose:
         self._saved_at_s = -math.inf
 
     def load(self) -> Array | None:
-        """The pose (3,) in this map; None where there is none, or the file is broken."""
+        """The pose (3,) in this map; None without one: no file, a broken one, or another map."""
         if math.isinf(self._period_s) or not self._path.exists():
             return None
         try:
             content = read_mapping(self._path, 'the last pose of a localizer')
-            return self._pose_of(content) if content.get('map') == self._map_name else None
+            pose = self._pose_of(content)
         except InputError as error:
             self._node.get_logger().warning(f'{error}: starting without a last pose')
             return None
+        named = content.get('map')
+        if named == self._map_name:
+            return pose
+        self._node.get_logger().info(
+            f'{self._path}: pose in map {quoted(named)}, not in {quoted(self._map_name)}: '
+            'starting without a last pose'
+        )
+        return None
 
     def save(self, T_map_base: Array) -> None:
         """Save a pose (3,), unless the last one was saved recently."""
@@ -51,7 +59,8 @@ class LastPose:
             write_text(self._path, yaml.safe_dump({'map': self._map_name, **dict(values)}))
         except OSError as error:
             self._node.get_logger().warning(
-                f'{self._path}: {error.strerror}: last pose not saved',
+                f'pose_file: {error.filename or self._path}: {error.strerror}: '
+                'last pose not saved: expected a file that can be written',
                 throttle_duration_sec=_WARN_PERIOD_S,
             )
 

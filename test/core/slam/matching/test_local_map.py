@@ -406,3 +406,32 @@ def test_kernels_are_what_they_are_in_plain_python(rng, monkeypatch):
     assert (ours['seen'] > 0).any()
     for name in ours.dtype.names:
         np.testing.assert_allclose(ours[name], theirs[name], atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(('row', 'col'), [(0, 0), (-7, 3), (TILE - 2, -TILE - 5)])
+def test_free_cells_of_a_map_are_observed_and_no_others(row, col):
+    rng = np.random.default_rng(row + 1000)
+    free = rng.random((TILE + 9, 2 * TILE + 3)) < 0.3
+    local_map = LocalMap()
+    local_map.add_free_cells(free, row, col)
+    height, width = free.shape
+    cells = local_map.tiles.read(row - 5, col - 5, height + 10, width + 10)
+    np.testing.assert_array_equal(cells['seen'] > 0, np.pad(free, 5))
+    assert not cells['hits'].any()
+
+
+def test_free_cells_keep_the_observations_and_walls_that_are_there():
+    local_map = LocalMap()
+    add_scan(local_map, ROOM, np.array([2.0, 2.0, 0.0]))
+    before = local_map.tiles.read(0, 0, 2 * TILE, 2 * TILE).copy()
+    local_map.add_free_cells(np.ones((2 * TILE, 2 * TILE), dtype=np.bool_), 0, 0)
+    after = local_map.tiles.read(0, 0, 2 * TILE, 2 * TILE)
+    np.testing.assert_array_equal(after['seen'], np.maximum(before['seen'], 1))
+    np.testing.assert_array_equal(after['hits'], before['hits'])
+
+
+def test_no_free_cells_leave_the_map_empty():
+    local_map = LocalMap()
+    local_map.add_free_cells(np.zeros((5, 5), dtype=np.bool_), 3, 3)
+    assert local_map.is_empty
+    assert local_map.tiles.used == LocalMap().tiles.used

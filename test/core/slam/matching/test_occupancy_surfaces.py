@@ -11,7 +11,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.slam.matching.local_map import LocalMap
-from thinmap_ros.core.slam.matching.occupancy_surfaces import occupied_surface_points
+from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
 
 START = np.array([2.0, 2.0, 0.0])
@@ -71,6 +71,25 @@ def test_faces_of_a_map_hold_a_robot_along_their_normals():
 def test_a_map_without_walls_has_no_points():
     patch = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((5, 5), dtype=np.int8))
     assert all(len(faces.points) == 0 for faces in occupied_surface_points(patch))
+
+
+@pytest.mark.parametrize('resolution', [0.03, 0.05, 0.1])
+@pytest.mark.parametrize('origin', [(0.0, 0.0), (-1.234, 2.017)])
+def test_free_cells_are_those_of_the_map_at_their_centres(resolution, origin):
+    rng = np.random.default_rng(4)
+    cells = rng.choice(np.array([-1, 0, 100], dtype=np.int8), (40, 50))
+    patch = GridPatch(GridFrame(*origin, resolution), cells)
+    free, row, col = free_cells(patch, 0.05)
+    assert 0 < free.sum() < free.size
+    size = np.array(free.shape) * 0.05
+    np.testing.assert_allclose(size, np.array(cells.shape) * resolution, atol=0.05)
+    for (i, j), is_free in np.ndenumerate(free):
+        x = (col + j + 0.5) * 0.05 - origin[0]
+        y = (row + i + 0.5) * 0.05 - origin[1]
+        near_row = min(int(y / resolution + 1e-9), 39), min(int(y / resolution - 1e-9), 39)
+        near_col = min(int(x / resolution + 1e-9), 49), min(int(x / resolution - 1e-9), 49)
+        # A centre on an edge between two cells may count to either.
+        assert is_free in patch.free[np.ix_(near_row, near_col)]
 
 
 def killed(config, seed, resolution, slip):
