@@ -65,7 +65,8 @@ def test_grid_mapper_publishes_the_map_of_map_server(graph, tmp_path):
     )
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graph.until(lambda: maps, 'the map')
-    walls, given = messages.grid_from_msg(maps[-1]), read_map(path)
+    walls = messages.grid_from_msg(maps[-1])
+    given = read_map(path)
     assert walls.frame.resolution == pytest.approx(given.frame.resolution)
     assert (walls.cells == 100).sum() == (given.cells == 100).sum() > 100
     assert (walls.cells == 0).sum() == (given.cells == 0).sum() > 1000
