@@ -5,20 +5,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import MapMetaData, Path
-from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
+from nav_msgs.msg import Path
 from nav_msgs.srv import GetMap
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.timer import Timer
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
+from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.ekf_slam.ekf_localizer import LOCALIZATION, MAPPING
-from thinmap_ros.core.errors import ConfigError, InputError, ThinmapError
+from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import (
     ROBOT_GRID,
@@ -26,12 +25,12 @@ from thinmap_ros.core.grid.occupancy import (
     OccupancyGrid,
     WindowConfig,
 )
-from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.mapping.map_output import MapOutputConfig, MapPublishers
+from thinmap_ros.nodes.mapping.scan_pairs import ScanPairs
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.laser_transform import LaserTransform
@@ -40,57 +39,6 @@ from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.session_client import SessionClient
 from thinmap_ros.ros.subscription import subscribe_guarded
-
-TRINARY = 'trinary'
-PROBABILITY = 'probability'
-
-
-@dataclass(frozen=True)
-class MapOutputConfig(Config):
-    """How the topic map is published."""
-
-    map_values: str = parameter(
-        TRINARY,
-        'Values of map. trinary: -1 unknown, 0 free, 100 occupied, as slam_toolbox and map_server '
-        'publish them. probability: -1 or the probability of occupancy (%).',
-        choices=(TRINARY, PROBABILITY),
-    )
-    occupied_thresh: float = parameter(
-        0.65,
-        'Probability from which a cell of a trinary map is occupied. Raise it against walls that '
-        'people leave behind, lower it for thin obstacles.',
-        low=0.0,
-        high=1.0,
-    )
-    free_thresh: float = parameter(
-        0.25,
-        'Probability up to which a cell of a trinary map is free. Lower it to show only cells as '
-        'free that many beams have crossed.',
-        low=0.0,
-        high=1.0,
-    )
-    map_update_interval: float = parameter(
-        1.0,
-        'Time between two messages of map (s). Raise it to save CPU and network traffic with '
-        'large maps.',
-        low=0.05,
-        high=3600.0,
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.free_thresh < self.occupied_thresh:
-            expected = f'expected less than occupied_thresh ({self.occupied_thresh})'
-            raise ConfigError(f'free_thresh = {self.free_thresh}: {expected}')
-
-    def shown(self, patch: GridPatch) -> GridPatch:
-        """The patch with the values to publish."""
-        return patch if self.map_values == PROBABILITY else self.trinary(patch)
-
-    def trinary(self, patch: GridPatch) -> GridPatch:
-        """The patch with -1, 0 and 100, in whole percent as map_saver compares them."""
-        limits = (round(100.0 * self.free_thresh), round(100.0 * self.occupied_thresh))
-        return GridPatch(patch.frame, patch.trinary(*limits))
 
 
 @dataclass(frozen=True)
@@ -125,98 +73,6 @@ class _Settings:
         )
 
 
-class _MapPublishers:
-    """Publishes the map for others, and the exact grid for thinmap's own nodes.
-
-    load_ns: time at which the map was begun or loaded.
-    """
-
-    def __init__(self, node: Node, config: MapOutputConfig) -> None:
-        self.config = config
-        self._frame = parameters.declare_map_frame(node)
-        self.load_ns = 0
-        self._map = node.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
-        self._metadata = node.create_publisher(MapMetaData, 'map_metadata', qos.LATCHED)
-        self._grid = node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
-        self._local_grid = node.create_publisher(ProbabilityGrid, 'local_grid', qos.LATCHED)
-
-    def publish_map(self, grid: CorrectableGrid, stamp_ns: int) -> None:
-        """Publish all of the map."""
-        patch = grid.shown.known_area()
-        message = self.map_message(patch, stamp_ns)
-        self._map.publish(message)
-        self._metadata.publish(message.info)
-        exact = messages.probability_grid_msg(
-            patch, self._frame, stamp_ns, self.load_ns, grid.corrected_ns
-        )
-        self._grid.publish(exact)
-
-    def map_message(self, patch: GridPatch, stamp_ns: int) -> OccupancyGridMsg:
-        """Message of the topic map."""
-        shown = self.config.shown(patch)
-        return messages.grid_msg(shown, self._frame, stamp_ns, self.load_ns)
-
-    def publish_local_grid(self, window: GridPatch, stamp_ns: int, corrected_ns: int) -> None:
-        """Publish the part of the grid that a scan has changed."""
-        message = messages.probability_grid_msg(
-            window, self._frame, stamp_ns, self.load_ns, corrected_ns
-        )
-        self._local_grid.publish(message)
-
-
-class _ScanPairs:
-    """Pairs each scan with its pose and, where a localizer publishes it, its status.
-
-    A pose of a lost robot, or of one without a map, belongs to no place in the map.
-    """
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._status_topic = node.resolve_topic_name('slam_status')
-        self._poses: StampMatcher[LaserScan, Array] = StampMatcher()
-        self._states: StampMatcher[tuple[LaserScan, Array], int] = StampMatcher()
-
-    @property
-    def dropped(self) -> int:
-        """Number of scans, poses and states without a partner."""
-        return self._poses.dropped + self._states.dropped
-
-    def add_scan(self, message: LaserScan) -> tuple[LaserScan, Array, bool] | None:
-        """Add a scan; returns scan, T_map_base (3,), whether it is known, once complete."""
-        ns = messages.stamp_ns(message.header.stamp)
-        return self._with_state(ns, self._poses.add_left(ns, message))
-
-    def add_pose(self, message: PoseWithCovarianceStamped) -> tuple[LaserScan, Array, bool] | None:
-        """Add a pose."""
-        ns = messages.stamp_ns(message.header.stamp)
-        T_map_base = messages.pose_from_msg(message.pose.pose)
-        return self._with_state(ns, self._poses.add_right(ns, T_map_base))
-
-    def add_status(self, message: SlamStatus) -> tuple[LaserScan, Array, bool] | None:
-        """Add a status."""
-        return _complete(
-            self._states.add_right(messages.stamp_ns(message.header.stamp), message.state)
-        )
-
-    def _with_state(
-        self, ns: int, pair: tuple[LaserScan, Array] | None
-    ) -> tuple[LaserScan, Array, bool] | None:
-        if pair is None:
-            return None
-        if self._node.count_publishers(self._status_topic) == 0:
-            return *pair, True
-        return _complete(self._states.add_left(ns, pair))
-
-
-def _complete(
-    found: tuple[tuple[LaserScan, Array], int] | None,
-) -> tuple[LaserScan, Array, bool] | None:
-    if found is None:
-        return None
-    pair, state = found
-    return *pair, state not in (SlamStatus.LOST, SlamStatus.NO_MAP)
-
-
 class GridMapperNode(ThinmapNode):
     """/scan, /pose and /slam_status in; /map and /grid, /local_grid at every scan out.
 
@@ -230,7 +86,7 @@ class GridMapperNode(ThinmapNode):
     def __init__(self) -> None:
         super().__init__('grid_mapper', recovers=True)
         self._settings = _Settings.declare(self, self._on_output)
-        self._output = _MapPublishers(self, self._settings.output)
+        self._output = MapPublishers(self, self._settings.output)
         self._laser_transform = LaserTransform(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
@@ -272,7 +128,7 @@ class GridMapperNode(ThinmapNode):
 
     def reset_state(self) -> None:
         """Discard the map, or return to the session that the node was started with."""
-        self._pairs = _ScanPairs(self)
+        self._pairs = ScanPairs(self)
         self._output.load_ns = self.get_clock().now().nanoseconds
         has_map = self._session or self._stamp.latest_ns is not None
         self._stamp.latest_ns = None

@@ -1,0 +1,1 @@
+"""Parts of the grid mapper: its input and its output."""
