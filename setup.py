@@ -81,7 +81,7 @@ setup(
     ],
     options={'build': {'build_base': BUILD.name}} if IS_WHEEL else {},
     package_dir=WHEEL_DATA if IS_WHEEL else {},
-    package_data={NAME: ['py.typed'], '': ['*.yaml', '*.msg']},
+    package_data={NAME: ['py.typed'], '': ['*.yaml', '*.msg', '*.rviz', '*.json']},
     data_files=[] if IS_WHEEL else ROS_DATA,
     install_requires=[
         'lz4',

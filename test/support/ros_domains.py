@@ -6,9 +6,11 @@ Nodes of two tests on one domain would communicate, also if different users run 
 import errno
 import itertools
 import os
+import re
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 # Above it, the ports of a domain are in the range of ephemeral ports.
 DOMAINS = range(1, 102)
@@ -17,6 +19,7 @@ _FIRST_PORT = 7410
 _PORTS_A_DOMAIN = 250
 _PORTS_A_PARTICIPANT = 2
 _PARTICIPANTS = 32
+SHARED_MEMORY = Path('/dev/shm')
 # Each test uses another domain, and processes start at different ones.
 _turns = itertools.count(os.getpid())
 
@@ -31,6 +34,7 @@ def free_domain() -> Iterator[int]:
             continue
         with lock:
             if not _has_nodes(domain):
+                _remove_stale_ports(domain)
                 yield domain
                 return
     raise RuntimeError(f'none of the ROS domains {DOMAINS[0]} to {DOMAINS[-1]} is free')
@@ -57,6 +61,19 @@ def _has_nodes(domain: int) -> bool:
     first = _FIRST_PORT + _PORTS_A_DOMAIN * domain
     ports = range(first, first + _PORTS_A_PARTICIPANT * _PARTICIPANTS, _PORTS_A_PARTICIPANT)
     return any(_is_bound(port) for port in ports)
+
+
+def _remove_stale_ports(domain: int) -> None:
+    """Remove shared memory of nodes of this domain that were killed.
+
+    A node that is killed while it holds the lock of a port leaves it locked: the next node with
+    this port would wait for ever.
+    """
+    first = _FIRST_PORT - _FIRST_PORT % 100 + _PORTS_A_DOMAIN * domain
+    for path in SHARED_MEMORY.glob('*fastrtps_port*'):
+        number = re.search(r'port(\d+)', path.name)
+        if number and first <= int(number[1]) < first + _PORTS_A_DOMAIN:
+            path.unlink(missing_ok=True)
 
 
 def _is_bound(port: int) -> bool:

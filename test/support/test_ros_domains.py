@@ -46,6 +46,17 @@ def test_a_domain_that_another_process_has_is_left_alone(monkeypatch):
         assert again == domain
 
 
+def test_ports_that_killed_nodes_left_behind_are_removed(monkeypatch, tmp_path):
+    monkeypatch.setattr(ros_domains, 'SHARED_MEMORY', tmp_path)
+    monkeypatch.setattr(ros_domains, 'DOMAINS', range(11, 12))
+    names = ('fastrtps_port10161', 'fastrtps_port10161_el', 'sem.fastrtps_port10161_mutex')
+    others = ('fastrtps_port10411', 'sem.fastrtps_port9911_mutex', 'fastrtps_0123456789abcdef')
+    for name in (*names, *others):
+        (tmp_path / name).touch()
+    with ros_domains.free_domain():
+        assert {path.name for path in tmp_path.iterdir()} == set(others)
+
+
 def test_a_domain_on_which_a_node_listens_is_left_alone(monkeypatch):
     with ros_domains.free_domain() as domain:
         pass

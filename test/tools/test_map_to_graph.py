@@ -139,7 +139,7 @@ def test_maps_of_one_value(
         {'resolution': -0.1},
         {'resolution': float('nan')},
         {'resolution': None},
-        {'origin': [0.0, 0.0, 0.3]},
+        {'origin': [0.0, 0.0]},
         {'origin': [0.0, float('nan'), 0.0]},
         {'mode': 'colour'},
     ],
