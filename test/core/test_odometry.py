@@ -63,9 +63,48 @@ def test_a_scan_waits_for_odometry_as_new_as_itself():
     pairing = ScanOdometrySynchronizer()
     assert pairing.add_odometry(0, se2.pose(0, 0, 0)) == []
     assert pairing.add_scan(scan_at(SECOND)) == []
-    ((scan, T_odom_base),) = pairing.add_odometry(2 * SECOND, se2.pose(2, 0, 0))
+    assert pairing.add_odometry(SECOND // 2, se2.pose(0.5, 0, 0)) == []
+    ((scan, T_odom_base),) = pairing.add_odometry(SECOND * 3 // 2, se2.pose(1.5, 0, 0))
     assert scan.stamp_ns == SECOND
     assert T_odom_base[0] == pytest.approx(1.0)
+
+
+def driven(pairing, seconds, ahead_s=lambda s: 0.0):
+    """Pairs of a drive at 1 m/s: odometry at 50 Hz with stamps that are ahead, scans at 10 Hz."""
+    pairs = []
+    for k in range(round(50 * seconds)):
+        s = k / 50
+        pairs += pairing.add_odometry(round((s + ahead_s(s)) * SECOND), se2.pose(s, 0, 0))
+        if k % 5 == 2:
+            pairs += pairing.add_scan(scan_at(round(s * SECOND)))
+    return pairs
+
+
+@pytest.mark.parametrize(
+    ('ahead_s', 'lost'),
+    [
+        (lambda s: 9.0 if s == 3.0 else 0.0, 1),
+        (lambda s: 5.0 if 3.0 <= s < 8.0 else 0.0, 51),
+        (lambda s: -5.0 if 6.0 <= s < 8.0 else 0.0, 21),
+    ],
+    ids=['one sample 9 s ahead', 'ahead for 5 s', 'behind for 2 s'],
+)
+def test_odometry_with_wrong_stamps_gives_no_scan_a_wrong_pose(ahead_s, lost):
+    pairing = ScanOdometrySynchronizer()
+    pairs = driven(pairing, 20, ahead_s)
+    for scan, T_odom_base in pairs:
+        assert T_odom_base[0] == pytest.approx(scan.stamp_ns / SECOND, abs=0.021)
+    assert len(pairs) >= 199 - lost
+    assert len(pairs) + pairing.dropped + pairing.waiting == 200
+    assert pairing.discarded_odometry > 0
+
+
+def test_a_pause_of_the_odometry_is_not_interpolated():
+    pairing = ScanOdometrySynchronizer()
+    pairing.add_odometry(0, se2.pose(0, 0, 0))
+    pairing.add_scan(scan_at(SECOND))
+    assert pairing.add_odometry(3 * SECOND, se2.pose(2, 0, 0)) == []
+    assert pairing.dropped == 1
 
 
 def test_scans_older_than_all_odometry_and_too_many_waiting_are_dropped_and_counted():

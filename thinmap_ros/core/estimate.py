@@ -28,6 +28,7 @@ class Estimate:
     while the robot stands still). n_features, n_local_features: features in the map, and in the
     local area. inlier_ratio: share of the scan points in known space that fit the map.
     is_lost: the pose is unknown; the covariance is accordingly large.
+    blind_reason: why the laser does not confirm the pose, which follows the odometry; '': it does.
     correction: keyframe poses before and after, if this step closed a loop; T_map_base is then the
     corrected pose.
     """
@@ -41,4 +42,5 @@ class Estimate:
     n_local_features: int = 0
     inlier_ratio: float = 0.0
     is_lost: bool = False
+    blind_reason: str = ''
     correction: Correction | None = None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.laser_monitor import LaserMonitor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, Field
@@ -22,12 +23,19 @@ class OdometryBuffer:
     """The last few seconds of odometry, looked up by stamp.
 
     Stamps of real robots step back a little now and then: a late sample is inserted in order. A
-    sample older than the whole buffer means that time was set back (a bag was restarted): the
-    buffer is cleared.
+    sample much older than the newest one means that time was set back (a bag was restarted), or
+    that the stamps before it were wrong: the buffer is cleared.
+    discarded: number of samples with such stamps.
     """
 
-    def __init__(self, span_ns: int = 10_000_000_000) -> None:
+    def __init__(self, span_ns: int = 10_000_000_000, max_gap_ns: int | None = None) -> None:
+        """max_gap_ns: longest time that is interpolated, and that a stamp may step back.
+
+        None: any within the span.
+        """
+        self.discarded = 0
         self._span_ns = span_ns
+        self._max_gap_ns = max_gap_ns
         self._stamps: list[int] = []
         self._poses: list[Array] = []
 
@@ -47,7 +55,8 @@ class OdometryBuffer:
                 f'odometry at {stamp_ns} ns: pose {pose}: expected finite numbers, at most '
                 f'{se2.MAX_COORDINATE_M:g} m'
             )
-        if self._stamps and stamp_ns < self._stamps[-1] - self._span_ns:
+        if self._stamps and stamp_ns < self._stamps[-1] - (self._max_gap_ns or self._span_ns):
+            self.discarded += len(self._stamps) - bisect_left(self._stamps, stamp_ns)
             self._stamps = []
             self._poses = []
         index = bisect_left(self._stamps, stamp_ns)
@@ -61,7 +70,7 @@ class OdometryBuffer:
     def interpolate(self, stamp_ns: int) -> Array | None:
         """Pose at a stamp.
 
-        Exact at a sample, interpolated between two, None outside the buffer.
+        Exact at a sample, interpolated between two, None outside the buffer and in a long gap.
         """
         index = bisect_left(self._stamps, stamp_ns)
         if index == len(self._stamps):
@@ -72,6 +81,8 @@ class OdometryBuffer:
             return None
         before = self._stamps[index - 1]
         after = self._stamps[index]
+        if self._max_gap_ns is not None and after - before > self._max_gap_ns:
+            return None
         share = (stamp_ns - before) / (after - before)
         return se2.interpolate(self._poses[index - 1], self._poses[index], share)
 
@@ -81,6 +92,9 @@ class OdometryBuffer:
         if first > 256:
             del self._stamps[:first], self._poses[:first]
 
+
+# Between samples that are further apart, the robot need not have moved evenly.
+MAX_ODOMETRY_GAP_NS = SECOND_NS
 
 FIELDS = {
     'stamp_ns': Field(np.int64, (), 0, MAX_COUNT),
@@ -184,15 +198,21 @@ class OdometryIncrements:
 class ScanOdometrySynchronizer:
     """Interpolates odometry at the stamp of each scan, in the order of the scans.
 
-    A scan waits until newer odometry has arrived. Live nodes and replay use it alike, so that both
-    process the same pairs.
+    A scan waits until newer odometry has arrived. One that the laser did not measure is blind (see
+    `LaserMonitor`). Live nodes and replay use it alike, so that both process the same pairs.
     """
 
     def __init__(self, capacity: int = 20) -> None:
-        self._buffer = OdometryBuffer()
+        self._buffer = OdometryBuffer(max_gap_ns=MAX_ODOMETRY_GAP_NS)
+        self._laser = LaserMonitor()
         self._waiting: deque[Scan] = deque()
         self._capacity = capacity
         self.dropped = 0
+
+    @property
+    def discarded_odometry(self) -> int:
+        """Odometry samples whose stamps were ahead of those after them."""
+        return self._buffer.discarded
 
     @property
     def waiting(self) -> int:
@@ -231,5 +251,5 @@ class ScanOdometrySynchronizer:
             if T_odom_base is None:
                 self.dropped += 1
             else:
-                ready.append((scan, T_odom_base))
+                ready.append((self._laser.checked(scan, T_odom_base), T_odom_base))
         return ready

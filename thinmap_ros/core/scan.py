@@ -1,6 +1,6 @@
 """One revolution of a planar laser scanner."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,6 +12,8 @@ from thinmap_ros.core.se2 import Array
 
 # With a smaller share of valid beams, the space in front of the laser is unobserved.
 MIN_VALID_BEAM_RATIO = 0.1
+# Fewer hits do not show whether the laser works.
+MIN_HITS = 10
 # Maximum distance of a laser from the centre of its robot.
 MAX_MOUNT_OFFSET_M = 100.0
 
@@ -23,7 +25,8 @@ class Scan:
     stamp_ns: time of the scan; ranges_m (N,): raw, may hold inf, NaN and nonsense; beam i points to
     angle_min_rad + i * angle_increment_rad in the laser frame (a negative increment is a clockwise
     laser); T_base_laser (3,): the laser's pose on the robot; zero_is_no_return: whether this
-    laser's driver publishes 0 for a beam without return. Use `Scan.create` to make one.
+    laser's driver publishes 0 for a beam without return; fault: why the ranges of the laser were
+    replaced by invalid ones. Use `Scan.create` to make one.
 
     Each range is one of `hit`, `no_return`, `below_range_min`, or invalid (`valid` is False).
     Source: REP 117, with range_max as a finite value for "no return", which many drivers publish.
@@ -37,6 +40,7 @@ class Scan:
     range_max_m: float
     T_base_laser: Array
     zero_is_no_return: bool = False
+    fault: str = ''
 
     @staticmethod
     def create(
@@ -126,6 +130,15 @@ class Scan:
         """Whether so few beams are valid that the laser must be covered or broken."""
         return int(np.count_nonzero(self.valid)) < MIN_VALID_BEAM_RATIO * self.ranges_m.size
 
+    @property
+    def blind_reason(self) -> str:
+        """Why the scan observes nothing; '' for a scan that is not blind."""
+        return (self.fault or 'too few valid beams') if self.is_blind else ''
+
+    def blinded(self, fault: str) -> 'Scan':
+        """The scan with invalid ranges only: the laser did not measure the given ones."""
+        return replace(self, ranges_m=np.full_like(self.ranges_m, np.nan), fault=fault)
+
     def points_laser(self) -> Array:
         """End points of the hits, laser frame, (M, 2)."""
         ranges = self.ranges_m[self.hit]
@@ -135,3 +148,12 @@ class Scan:
     def points_base(self) -> Array:
         """End points of the hits, robot frame, (M, 2)."""
         return se2.transform_points(self.T_base_laser, self.points_laser())
+
+
+def is_most_missed(scan: Scan, missed: int) -> bool:
+    """Whether a scan has no return from most of the surfaces in range: `missed` beams have none.
+
+    Hits count for the scan: a surface that moves is hit by other beams.
+    """
+    fewest = max(MIN_HITS, MIN_VALID_BEAM_RATIO * scan.ranges_m.size)
+    return bool(missed >= fewest and missed > np.count_nonzero(scan.hit))

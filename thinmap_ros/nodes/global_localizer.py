@@ -347,11 +347,11 @@ class GlobalLocalizerNode(ThinmapNode):
         scan = self._laser_transform.to_scan(message)
         self._received.add('scan')
         self._odometry.add_scan_stamp(scan.stamp_ns)
-        self._driver.add_scan(scan)
         self._process(self._pairing.add_scan(scan))
 
     def _process(self, ready: list[tuple[Scan, Array]]) -> None:
         for scan, T_odom_base in ready:
+            self._driver.add_scan(scan)
             localization = self._create_localization() if self._is_requested else None
             if localization is not None:
                 with self.diagnostics.time_step('global localization'):

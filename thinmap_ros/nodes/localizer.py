@@ -49,7 +49,6 @@ _HEALTH = {
     SlamStatus.TRACKING: (OK, 'tracking'),
     SlamStatus.LOST: (ERROR, 'lost: scans contradict the map'),
     SlamStatus.NO_MAP: (ERROR, 'no map: waits for topic map; dead reckoning'),
-    SlamStatus.BLIND: (ERROR, 'laser blind (too few valid beams): dead reckoning'),
 }
 
 
@@ -231,6 +230,8 @@ class LocalizerNode(ThinmapNode):
                 self._last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         diagnostics = self.diagnostics
         diagnostics.set_drop_total('scans without odometry at their time', self._pairing.dropped)
+        discarded = self._pairing.discarded_odometry
+        diagnostics.set_drop_total('odometry with stamps ahead of those after it', discarded)
         diagnostics.set_drop_total('invalid scans or odometry', self._localizer.rejected)
 
     def _subscribe_map_once(self, relocation: _Relocation) -> None:
@@ -311,9 +312,9 @@ class LocalizerNode(ThinmapNode):
         return f'{len(features)} line features loaded' if features else 'local map loaded'
 
     def _publish(self, scan: Scan, estimate: Estimate, step_ms: float) -> None:
-        state = _state_of(scan, estimate) if self._given.source.has_map else SlamStatus.NO_MAP
+        state = _state_of(estimate) if self._given.source.has_map else SlamStatus.NO_MAP
         self.diagnostics.record_step_time('localizer', step_ms)
-        self.diagnostics.set_state(*_HEALTH[state])
+        self.diagnostics.set_state(*_health(state, estimate))
         if estimate.correction is not None:
             # Before the first pose that follows from it.
             stamps, poses = self._localizer.keyframe_trajectory()
@@ -326,11 +327,18 @@ class LocalizerNode(ThinmapNode):
         self._output.publish_estimate(scan.stamp_ns, estimate, self._localizer, status)
 
 
-def _state_of(scan: Scan, estimate: Estimate) -> int:
-    """State of a SlamStatus; without valid beams it is unknown whether the robot is lost."""
-    if scan.is_blind:
+def _state_of(estimate: Estimate) -> int:
+    """State of a SlamStatus; of a blind laser it is unknown whether the robot is lost."""
+    if estimate.blind_reason:
         return int(SlamStatus.BLIND)
     return int(SlamStatus.LOST if estimate.is_lost else SlamStatus.TRACKING)
+
+
+def _health(state: int, estimate: Estimate) -> tuple[bytes, str]:
+    """Level and text for /diagnostics."""
+    if state == SlamStatus.BLIND:
+        return ERROR, f'laser blind ({estimate.blind_reason}): dead reckoning'
+    return _HEALTH[state]
 
 
 def _feature_msg(feature: Feature) -> LineFeature:

@@ -7,6 +7,7 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
+from thinmap_msgs.msg import SlamStatus
 from thinmap_ros.core.planning.navigator import (
     CONTROL_PERIOD_S,
     Command,
@@ -81,6 +82,7 @@ class NavigatorNode(ThinmapNode):
         self._odometry.subscribe()
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._map.subscribe(self)
         subscribe_guarded(self, PoseStamped, 'goal_pose', self._on_goal_pose, qos.STREAM)
         self._goals = SingleGoalServer(
@@ -134,6 +136,9 @@ class NavigatorNode(ThinmapNode):
         scan = self._laser_transform.to_scan(message)
         self._odometry.add_scan_stamp(scan.stamp_ns)
         self._robot.add_scan(scan)
+
+    def _on_slam_status(self, message: SlamStatus) -> None:
+        self._robot.is_confirmed = message.state != SlamStatus.BLIND
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._tasks.pose(message)  # raises for an invalid one, which is counted

@@ -196,6 +196,7 @@ class EkfLocalizer:
             matched,
             len(self._features),
             len(self._filter.area),
+            blind_reason=scan.blind_reason,
         )
 
     def optimized_trajectory(self) -> Array:

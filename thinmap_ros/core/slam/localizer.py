@@ -45,11 +45,13 @@ from thinmap_ros.core.slam.matching.scan_matcher import (
     MatchingConfig,
 )
 from thinmap_ros.core.slam.matching.surface import surface_points
+from thinmap_ros.core.slam.matching.visibility import misses_walls
 from thinmap_ros.core.slam.motion_model import MotionConfig
 from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction, Prediction
 from thinmap_ros.core.slam.tracking import INLIERS_PER_CONTRADICTION, Tracking
 
 _SIGMAS = 3.0
+_NO_RETURNS = 'no returns from walls of the map'
 _VIEW_M = 1.0  # path length after which the errors of two matches are independent
 
 
@@ -226,6 +228,7 @@ class Localizer:
         self._tracking.update(match)
         self._update(match, prediction, is_stationary)
         self._tracking.record_pose(self._pose, self._uncertainty.since_match)
+        blind_reason = self._blind_reason(scan, match)
         if not self.config.is_mapping:
             self._detect_loss()
         elif not self._tracking.is_delocalized:
@@ -235,7 +238,7 @@ class Localizer:
             self._apply(correction)
         self._map.render(self.keyframes)
         self._record_pose(scan)
-        return self._estimate(match, correction)
+        return self._estimate(match, correction, blind_reason)
 
     def optimized_trajectory(self) -> Array:
         """Poses (N, 3) of all steps since the start, after all corrections."""
@@ -288,6 +291,14 @@ class Localizer:
             return None  # all points in one cell do not determine a pose
         covariance = self._uncertainty.since_match
         return self._matcher.match(points, scan.T_base_laser, self._map.map, prior, covariance)
+
+    def _blind_reason(self, scan: Scan, match: Match | None) -> str:
+        """Why the laser does not confirm the pose; '' if it does, or if no wall is in range."""
+        if match is not None or scan.is_blind or self._tracking.is_lost:
+            return scan.blind_reason
+        covariance = self._uncertainty.since_match
+        misses = misses_walls(scan, self._map.map, self._pose, covariance)
+        return _NO_RETURNS if misses else ''
 
     def _update(self, match: Match | None, prediction: Prediction, is_stationary: bool) -> None:
         """Set the pose to that of an accepted match, or else to the predicted one."""
@@ -395,7 +406,9 @@ class Localizer:
         frame = self.keyframes[anchor]
         return self._uncertainty.covariance(frame.T_map_base, frame.covariance)
 
-    def _estimate(self, match: Match | None, correction: Correction | None) -> Estimate:
+    def _estimate(
+        self, match: Match | None, correction: Correction | None, blind_reason: str
+    ) -> Estimate:
         covariance = self._covariance()
         if self._tracking.is_lost:
             covariance = covariance + UNKNOWN
@@ -405,5 +418,6 @@ class Localizer:
             se2.compose(self._pose, se2.invert(self._prediction.T_odom_base)),
             inlier_ratio=0.0 if match is None else match.inlier_ratio,
             is_lost=self._tracking.is_lost,
+            blind_reason=blind_reason,
             correction=correction,
         )

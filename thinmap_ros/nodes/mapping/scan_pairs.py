@@ -13,7 +13,8 @@ from thinmap_ros.ros import messages
 class ScanPairs:
     """Pairs each scan with its pose and, where a localizer publishes it, its status.
 
-    A pose of a lost robot, or of one without a map, belongs to no place in the map.
+    A pose of a lost robot, or of one without a map, belongs to no place in the map, and a blind
+    scan observes nothing.
     """
 
     def __init__(self, node: Node) -> None:
@@ -60,4 +61,4 @@ def _complete(
     if found is None:
         return None
     pair, state = found
-    return *pair, state not in (SlamStatus.LOST, SlamStatus.NO_MAP)
+    return *pair, state == SlamStatus.TRACKING

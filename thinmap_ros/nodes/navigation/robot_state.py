@@ -3,34 +3,40 @@
 from rclpy.clock import Clock
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.odometry import OdometryBuffer
+from thinmap_ros.core.laser_monitor import LaserMonitor
+from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, OdometryBuffer
 from thinmap_ros.core.planning.navigator import SENSOR_TIMEOUT_NS
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
 
 # Without a new pose the last correction of the odometry holds for a while; without odometry, the
 # robot does not know its pose meanwhile.
 _POSE_TIMEOUT_NS = 3_000_000_000
-_POSE_ONLY_TIMEOUT_NS = 1_000_000_000
+_POSE_ONLY_TIMEOUT_NS = SECOND_NS
 
 
 class RobotState:
     """Pose and view of the robot now, and whether they are recent.
 
-    scan: the last one that is not blind.
+    scan: the last one that is not blind; is_confirmed: False while the localizer reports that the
+    laser does not confirm the pose.
     """
 
     def __init__(self, clock: Clock, has_odometry: bool) -> None:
         """has_odometry: False where the odometry says that the robot never moves."""
         self.scan: Scan | None = None
+        self.is_confirmed = True
         self._clock = clock
         self._timeouts_ns = {
             'laser': SENSOR_TIMEOUT_NS,
             'odometry': SENSOR_TIMEOUT_NS,
             'localizer': _POSE_TIMEOUT_NS if has_odometry else _POSE_ONLY_TIMEOUT_NS,
         }
-        self._is_blind = False
-        self._odometry = OdometryBuffer()
+        self._laser = LaserMonitor()
+        self._blind_reason = ''
+        self._stamp_offset_ns = 0  # of the odometry when the last scan was received
+        self._odometry = OdometryBuffer(max_gap_ns=MAX_ODOMETRY_GAP_NS)
         self._T_map_odom: Array | None = None
         self._T_odom_base: Array | None = None
         self._received_ns: dict[str, int] = {}
@@ -50,9 +56,12 @@ class RobotState:
 
     def add_scan(self, scan: Scan) -> None:
         """Add a scan; a blind one is not kept, and is a reason to stop."""
-        self._is_blind = scan.is_blind
+        if self._T_odom_base is not None:
+            scan = self._laser.checked(scan, self._T_odom_base)
+        self._blind_reason = scan.blind_reason
         if not scan.is_blind:
             self.scan = scan
+            self._stamp_offset_ns = self._scan_age_ns()
             self._record_time('laser')
 
     def pose(self) -> Array | None:
@@ -63,8 +72,12 @@ class RobotState:
 
     def stop_reason(self) -> str:
         """Why the robot must not drive on; '' for no reason."""
-        if self._is_blind:
-            return 'laser blind (too few valid beams)'
+        if self._blind_reason:
+            return f'laser blind ({self._blind_reason})'
+        if not self.is_confirmed:
+            return 'laser blind (it does not confirm the pose)'
+        if abs(self._stamp_offset_ns) > SENSOR_TIMEOUT_NS:
+            return f'stamps of laser and odometry {abs(self._stamp_offset_ns) / 1e9:.1f} s apart'
         if self._scan_age_ns() > SENSOR_TIMEOUT_NS:
             return 'laser silent'
         now_ns = self._clock.now().nanoseconds

@@ -41,7 +41,7 @@ CELL = np.dtype(
 )
 HERE = 100  # stored value of an offset of 0
 _SHIFT = TILE.bit_length() - 1
-_MASK = TILE - 1
+TILE_MASK = TILE - 1
 _MOST_SEEN = 255
 _FAR_M = 1e4  # distance from which the walls of an occupancy map are taken to be observed
 
@@ -277,13 +277,13 @@ def off_wall(lattice: LocalMapView, x: float, y: float) -> tuple[bool, bool, flo
     slot = slot_of(lattice, row, col)
     if slot == NO_TILE:
         return False, False, 0.0, 0.0, lattice.pool[0, 0, 0]
-    cell = lattice.pool[slot, row & _MASK, col & _MASK]
+    cell = lattice.pool[slot, row & TILE_MASK, col & TILE_MASK]
     is_seen = bool(cell['seen'] > 0)
     if cell['to_row'] == 0:
         return is_seen, False, 0.0, 0.0, cell
     row += int(cell['to_row']) - HERE
     col += int(cell['to_col']) - HERE
-    wall = lattice.pool[slot_of(lattice, row, col), row & _MASK, col & _MASK]
+    wall = lattice.pool[slot_of(lattice, row, col), row & TILE_MASK, col & TILE_MASK]
     return is_seen, True, x - col - wall['x'], y - row - wall['y'], wall
 
 
@@ -330,7 +330,8 @@ def _touched(
 
 
 @inlined
-def _is_wall(cell: Any, share: float) -> bool:
+def is_wall(cell: Any, share: float) -> bool:
+    """Whether a cell is a wall: hits are more than a share of its observations."""
     return bool(cell['hits'] > share * cell['seen'])
 
 
@@ -375,10 +376,10 @@ def _add(
             # Near its end a beam that grazes a wall traverses cells of this wall.
             if slot == NO_TILE or (abs(row - end_row) <= 1 and abs(col - end_col) <= 1):
                 continue
-            cell = lattice.pool[slot, row & _MASK, col & _MASK]
-            was_wall = _is_wall(cell, share)
+            cell = lattice.pool[slot, row & TILE_MASK, col & TILE_MASK]
+            was_wall = is_wall(cell, share)
             _observe(cell, 0)
-            if was_wall and not _is_wall(cell, share):
+            if was_wall and not is_wall(cell, share):
                 gone.append((row, col))
     _hit(points, laser, T_map_base, lattice, share)
     if len(gone):
@@ -423,8 +424,8 @@ def _hit(
         slot = slot_of(lattice, row, col)
         if slot == NO_TILE:
             continue
-        cell = lattice.pool[slot, row & _MASK, col & _MASK]
-        was_wall = _is_wall(cell, share)
+        cell = lattice.pool[slot, row & TILE_MASK, col & TILE_MASK]
+        was_wall = is_wall(cell, share)
         _observe(cell, 1)
         c2 = points[i, 2]
         s2 = points[i, 3]
@@ -434,7 +435,7 @@ def _hit(
         own = 0.5 * math.atan2(turned[1], turned[0])
         side = math.cos(own) * back_x + math.sin(own) * back_y
         _learn_surface(cell, x - col, y - row, (turned[0], turned[1], side))
-        if not was_wall and _is_wall(cell, share):
+        if not was_wall and is_wall(cell, share):
             _appear(lattice, row, col)
 
 
@@ -451,7 +452,7 @@ def _lead(
         for row in range(top, top + TILE):
             for col in range(left, left + TILE):
                 slot = slot_of(lattice, row, col)
-                if _is_wall(lattice.pool[slot, row & _MASK, col & _MASK], share):
+                if is_wall(lattice.pool[slot, row & TILE_MASK, col & TILE_MASK], share):
                     _appear(lattice, row, col)
 
 
@@ -464,7 +465,7 @@ def _appear(lattice: LocalMapView, row: int, col: int) -> None:
             slot = slot_of(lattice, row + down, col + right)
             if slot == NO_TILE or squared > lattice.reach * lattice.reach:
                 continue
-            cell = lattice.pool[slot, (row + down) & _MASK, (col + right) & _MASK]
+            cell = lattice.pool[slot, (row + down) & TILE_MASK, (col + right) & TILE_MASK]
             to_row = int(cell['to_row']) - HERE
             to_col = int(cell['to_col']) - HERE
             if cell['to_row'] == 0 or squared < to_row * to_row + to_col * to_col:
@@ -478,14 +479,14 @@ def _vanish(lattice: LocalMapView, gone: list[tuple[int, int]], share: float) ->
     led = [(0, 0) for _ in range(0)]
     for row, col in gone:
         slot = slot_of(lattice, row, col)
-        if _is_wall(lattice.pool[slot, row & _MASK, col & _MASK], share):
+        if is_wall(lattice.pool[slot, row & TILE_MASK, col & TILE_MASK], share):
             continue
         for down in range(-lattice.reach, lattice.reach + 1):
             for right in range(-lattice.reach, lattice.reach + 1):
                 slot = slot_of(lattice, row + down, col + right)
                 if slot == NO_TILE:
                     continue
-                cell = lattice.pool[slot, (row + down) & _MASK, (col + right) & _MASK]
+                cell = lattice.pool[slot, (row + down) & TILE_MASK, (col + right) & TILE_MASK]
                 if cell['to_row'] == HERE - down and cell['to_col'] == HERE - right:
                     cell['to_row'] = 0
                     led.append((row + down, col + right))
@@ -501,13 +502,13 @@ def _vanish(lattice: LocalMapView, gone: list[tuple[int, int]], share: float) ->
 def _ask(lattice: LocalMapView, row: int, col: int) -> bool:
     """Adopt the nearest wall of a neighbour cell if it is nearer; returns whether it was."""
     changed = False
-    cell = lattice.pool[slot_of(lattice, row, col), row & _MASK, col & _MASK]
+    cell = lattice.pool[slot_of(lattice, row, col), row & TILE_MASK, col & TILE_MASK]
     for i in range(-1, 2):
         for j in range(-1, 2):
             slot = slot_of(lattice, row + i, col + j)
             if slot == NO_TILE:
                 continue
-            other = lattice.pool[slot, (row + i) & _MASK, (col + j) & _MASK]
+            other = lattice.pool[slot, (row + i) & TILE_MASK, (col + j) & TILE_MASK]
             if other['to_row'] == 0:
                 continue
             down = i + int(other['to_row']) - HERE
