@@ -169,6 +169,23 @@ def test_a_hall_in_which_nothing_is_near_is_not_blind(graph):
     )
 
 
+def test_a_robot_stands_while_the_localizer_reports_a_laser_that_confirms_nothing(graph):
+    doctor = Doctor(graph)
+    graph.start('navigator', laser_pose='0,0,0')
+    status = graph.node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
+    robot = Robot(graph)
+    free = np.full(61, math.inf)
+    robot.until(free, drives, 'it drives')
+    blind = SlamStatus(state=SlamStatus.BLIND)
+    robot.until(free, lambda c: status.publish(blind) or stands(c), 'it stands')
+    graph.until(
+        lambda: robot.say(free) or 'does not confirm' in doctor.status('navigator').message,
+        'the reason',
+    )
+    confirmed = SlamStatus(state=SlamStatus.TRACKING)
+    robot.until(free, lambda c: status.publish(confirmed) or drives(c), 'it drives again')
+
+
 def test_a_laser_that_is_blind_from_the_start_is_reported(graph):
     doctor = Doctor(graph)
     graph.start('navigator', laser_pose='0,0,0')

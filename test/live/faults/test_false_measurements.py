@@ -1,4 +1,4 @@
-"""Sensors that send false measurements: the robot stops, says why, and knows its pose afterwards."""
+"""Sensors send false measurements: the robot stops, says why, and knows its pose afterwards."""
 
 from array import array
 from dataclasses import dataclass
