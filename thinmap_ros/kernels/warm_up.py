@@ -75,8 +75,10 @@ def localizer() -> None:
     rehearsed = Localizer()
     for scan, T_map_base in _drive():
         rehearsed.step(scan, T_map_base)
-    # Also the search for a scan without a match, and the start from a loaded map.
+    # Also the search for a scan without a match, walls without returns, and the start from a loaded
+    # map.
     rehearsed.step(_odd_scan(), T_map_base)
+    rehearsed.step(_scan(_REHEARSAL.scans + 1, np.full(_REHEARSAL.beams, np.inf)), T_map_base)
     Localizer.from_state(rehearsed.state())
     Localizer.from_occupancy_map(_room(), OdometryAnchor(0, T_map_base, T_map_base), T_map_base)
     # A revisit needs covariances along the graph.
