@@ -3,7 +3,7 @@
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav2_msgs.action import NavigateToPose
@@ -75,6 +75,21 @@ def test_two_localizers_on_one_graph_are_detected_and_reported(graph):
     assert '2 nodes publish /pose' in graph.log('localizer')
     graph.node.destroy_publisher(rival)
     graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.WARN, 'the complaint ends')
+
+
+def test_another_publisher_of_velocity_commands_is_reported(graph):
+    doctor = Doctor(graph)
+    graph.start('navigator', laser_pose='0,0,0')
+    rival = graph.node.create_publisher(Twist, 'cmd_vel', qos.STREAM)
+    graph.until(
+        lambda: '2 nodes publish /cmd_vel' in doctor.status('navigator').message,
+        'the second publisher of /cmd_vel',
+    )
+    assert doctor.level('navigator') == DiagnosticStatus.WARN
+    graph.node.destroy_publisher(rival)
+    graph.until(
+        lambda: 'publish /cmd_vel' not in doctor.status('navigator').message, 'the complaint ends'
+    )
 
 
 def test_past_errors_are_not_reported_first(ros_domain, monkeypatch):

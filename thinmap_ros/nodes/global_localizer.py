@@ -1,6 +1,5 @@
 """Global localization: finds the pose of a robot anywhere in the map, on request or when lost."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -141,10 +140,11 @@ class _SearchDriver:
     search: None while there is nothing to search.
     """
 
-    def __init__(self, clock: Clock, publish: Callable[[float, float], object]) -> None:
+    def __init__(self, clock: Clock, velocity: VelocityPublisher | None) -> None:
+        """velocity: None for a node that does not drive."""
         self.search: ActiveSearch | None = None
         self._clock = clock
-        self._publish = publish
+        self._velocity = velocity
         self._is_driving = False
         self.reset()
 
@@ -181,13 +181,19 @@ class _SearchDriver:
             self.stop()
             return
         self._is_driving = True
-        self._publish(command.v, command.w)
+        if self._velocity is not None:
+            self._velocity.publish(command.v, command.w)
 
     def stop(self) -> None:
         """Stop the robot, if it was driven."""
-        if self._is_driving:
-            self._publish(0.0, 0.0)
+        if self._is_driving and self._velocity is not None:
+            self._velocity.publish(0.0, 0.0)
         self._is_driving = False
+
+    def close(self) -> None:
+        """Stop the robot, if it was driven, before the node is gone."""
+        if self._is_driving and self._velocity is not None:
+            self._velocity.stop()
 
     def _is_recent(self, scan_ns: int) -> bool:
         odometry_age_ns = int(self._clock.now().nanoseconds) - self._odometry_ns
@@ -280,11 +286,11 @@ class GlobalLocalizerNode(ThinmapNode):
 
     def _create_driver(self) -> _SearchDriver:
         if not self._settings.node.drive:
-            return _SearchDriver(self.get_clock(), lambda v, w: None)
+            return _SearchDriver(self.get_clock(), None)
         base_frame = self._laser_transform.base_frame
         velocity = VelocityPublisher(self, base_frame, self._settings.stamped_commands)
         self.create_active_timer(CONTROL_PERIOD_S, lambda: self._driver.step())
-        return _SearchDriver(self.get_clock(), velocity.publish)
+        return _SearchDriver(self.get_clock(), velocity)
 
     def reset_state(self) -> None:
         """Discard the search and all inputs but the map."""
@@ -302,7 +308,7 @@ class GlobalLocalizerNode(ThinmapNode):
 
     def close(self) -> None:
         """Stop the robot: the last thing the node does."""
-        self.stop()
+        self._driver.close()
         super().close()
 
     def _on_map(self, message: OccupancyGrid) -> None:

@@ -48,6 +48,9 @@ class _NavigatorPublishers:
     def command(self, v: float, w: float) -> None:
         self._velocity.publish(v, w)
 
+    def stop(self) -> None:
+        self._velocity.stop()
+
     def plan(self, path: Array | None) -> None:
         """Publish a path (K, 2), unless it is the one that was published last."""
         if path is not None and path is not self._published_path:
@@ -125,7 +128,7 @@ class NavigatorNode(ThinmapNode):
 
     def close(self) -> None:
         """Stop the robot: the last thing the node does."""
-        self._output.command(0.0, 0.0)
+        self._output.stop()
         super().close()
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:

@@ -272,8 +272,8 @@ class NodeDiagnostics:
         """Call `work` once a second, before the diagnostics are published."""
         self._update_callbacks.append(work)
 
-    def check_sole_publisher(self, topic: str) -> None:
-        """Report an error while another node publishes a topic of this node."""
+    def check_sole_publisher(self, topic: str, level: bytes = ERROR) -> None:
+        """Report at a level that another node publishes a topic of this node."""
         name = self._node.resolve_topic_name(topic)
 
         def rivals() -> str:
@@ -287,7 +287,7 @@ class NodeDiagnostics:
                 f'{len(nodes)} nodes publish {name}: {", ".join(sorted(nodes))}: stop all but one'
             )
 
-        self.add_check(ERROR, rivals)
+        self.add_check(level, rivals)
 
     def _publish(self) -> None:
         for work in self._update_callbacks:

@@ -4,10 +4,12 @@ from collections.abc import Callable
 
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.node import Node
 
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.diagnostics import WARN, NodeDiagnostics
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 TOPIC = 'cmd_vel'
 _KINDS: dict[str, type] = {
@@ -15,6 +17,7 @@ _KINDS: dict[str, type] = {
     'geometry_msgs/msg/TwistStamped': TwistStamped,
 }
 _CHECK_PERIOD_S = 0.25
+_ACKNOWLEDGEMENT = Duration(seconds=1.0)
 
 
 def declare_stamped(node: Node) -> bool:
@@ -32,15 +35,22 @@ def declare_stamped(node: Node) -> bool:
 
 
 class VelocityPublisher:
-    """Publishes velocity commands on cmd_vel."""
+    """Publishes velocity commands on cmd_vel, and reports other publishers of it."""
 
-    def __init__(self, node: Node, base_frame: str, is_stamped: bool) -> None:
+    def __init__(self, node: ThinmapNode, base_frame: str, is_stamped: bool) -> None:
         """base_frame: frame of stamped commands."""
         self._clock = node.get_clock()
         self._frame = base_frame
         self._is_stamped = is_stamped
         kind = TwistStamped if is_stamped else Twist
         self._publisher = node.create_publisher(kind, TOPIC, qos.STREAM)
+        # A joystick or Nav2's behaviors may share the topic on purpose.
+        node.diagnostics.check_sole_publisher(TOPIC, WARN)
+
+    def stop(self) -> None:
+        """Publish a stop, and wait until it is received: a publisher that is gone sends nothing."""
+        self.publish(0.0, 0.0)
+        self._publisher.wait_for_all_acked(_ACKNOWLEDGEMENT)
 
     def publish(self, v: float, w: float) -> None:
         """Publish a command: v m/s ahead, w rad/s to the left."""
