@@ -24,10 +24,12 @@ class ObservationBuffer:
 
     A scan is complete with the pose of its stamp. Where local maps are published, it also waits for
     the local map of its stamp: evaluated against an older map, a scan shows nothing new.
+    is_blind: whether the laser measures nothing, by the localizer; its scans are no observations.
     """
 
     def __init__(self, topology: TopologicalMap) -> None:
         self.topology = topology
+        self.is_blind = False
         self._map = MapMirror()
         self._has_local_map = False
         self._pose_matcher: StampMatcher[Scan, Array] = StampMatcher()
@@ -64,7 +66,7 @@ class ObservationBuffer:
         return None if match is None else self._observation(match[0])
 
     def _observation(self, pair: tuple[Scan, Array]) -> Observation | None:
-        """Observation of a scan and its pose; None as long as there is no map."""
-        if self._map.patch is None:
+        """Observation of a scan and its pose; None without a map, or of a blind laser."""
+        if self._map.patch is None or self.is_blind:
             return None
         return Observation(self.topology, self._map.patch, *pair)

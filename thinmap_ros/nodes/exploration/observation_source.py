@@ -77,7 +77,6 @@ class ObservationSource:
         self._view.reset()
         self._map.reset()
         self._looked_ns = 0
-        self._is_blind = False  # the laser, by the status of the localizer
 
     def with_graph(self, observation: Observation) -> Observation:
         """Observation with the graph of its map, if nobody publishes a topological map."""
@@ -117,21 +116,21 @@ class ObservationSource:
             self._view.add_scan(message)
             return
         scan = self._laser_transform.to_scan(message)
-        if scan.is_blind or self._is_blind:
+        if scan.is_blind or self._buffer.is_blind:
             return  # ignored: a blind scan observes nothing
         self.watchdog.awaited = InputWatchdog.awaited
         self.watchdog.add_scan(self._now_ns() / SECOND_NS)
         self._process(self._buffer.add_scan(scan))
 
     def _on_slam_status(self, message: SlamStatus) -> None:
-        self._is_blind = message.state == SlamStatus.BLIND
+        self._buffer.is_blind = message.state == SlamStatus.BLIND
         is_lost = message.state == SlamStatus.LOST
         self.watchdog.add_tracking(is_lost, self._now_ns() / SECOND_NS)
 
     # Outputs.
 
     def _process(self, observation: Observation | None) -> None:
-        if observation is not None and not self._is_blind:
+        if observation is not None:
             self._on_observation(observation)
 
     def _look(self) -> None:
