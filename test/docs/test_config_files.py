@@ -51,7 +51,7 @@ def described(name, value, descriptor, indent):
     if descriptor.additional_constraints:
         text += f' {descriptor.additional_constraints.capitalize()}.'
     assert text, f'{name} has no description'
-    if not descriptor.read_only and name not in OWN_WORDS:
+    if not (descriptor.read_only or name in OWN_WORDS or 'run time' in text):
         text += ' Can be changed at run time.'
     comment = f'{indent}# '
     lines = textwrap.wrap(text, 112, initial_indent=comment, subsequent_indent=comment)

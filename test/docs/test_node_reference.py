@@ -97,6 +97,8 @@ def parameters(node, name):
             else descriptor.additional_constraints
         )
         live = '' if descriptor.read_only else 'yes'
+        if limits and descriptor.additional_constraints:
+            live = descriptor.additional_constraints.removeprefix('at run time ')
         shown = f'`{value}`' if value != '' else ''
         yield f'| `{key}` | {shown} | {span} | {live} | {descriptor.description} |'
 

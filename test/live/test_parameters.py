@@ -35,19 +35,32 @@ def current(graph, node, *names):
 
 
 def test_the_navigator_changes_its_speed_and_refuses_what_makes_no_sense(graph):
-    graph.start('navigator')
+    graph.start('navigator', **{'controller.max_speed_m_s': 0.5})
     names = ('controller.max_speed_m_s', 'controller.max_angular_speed_rad_s')
     speed, turn = names
-    assert change(graph, 'navigator', **{speed: 0.5, turn: 0.7}).successful
-    assert current(graph, 'navigator', *names) == [0.5, 0.7]
+    assert change(graph, 'navigator', **{speed: 0.4, turn: 0.7}).successful
+    assert current(graph, 'navigator', *names) == [0.4, 0.7]
     graph.until(
-        lambda: f'changed: {speed} = 0.5, {turn} = 0.7' in graph.log('navigator'), 'a report'
+        lambda: f'changed: {speed} = 0.4, {turn} = 0.7' in graph.log('navigator'), 'a report'
     )
     # All or none, with a reason; NaN is in no range.
     for wrong in (-1.0, 1e9, float('nan'), float('inf')):
         result = change(graph, 'navigator', **{turn: 0.9, speed: wrong})
         assert not result.successful and 'max_speed_m_s' in result.reason, result
-    assert current(graph, 'navigator', *names) == [0.5, 0.7]
+    assert current(graph, 'navigator', *names) == [0.4, 0.7]
+    # A peer cannot make the robot faster or thinner than it was started; it can undo its changes.
+    for name, unsafe, start in (
+        (speed, 5.0, 0.5),
+        (turn, 3.0, 1.0),
+        ('controller.max_acceleration_m_s2', 10.0, 0.4),
+        ('robot_radius_m', 0.0, 0.25),
+        ('stop_radius_m', 0.0, 0.24),
+        ('reaction_time_s', 0.0, 0.3),
+    ):
+        result = change(graph, 'navigator', **{name: unsafe})
+        assert not result.successful
+        assert f'{name} = {unsafe}: expected' in result.reason and str(start) in result.reason
+        assert change(graph, 'navigator', **{name: start}).successful
     request = SetParametersAtomically.Request(
         parameters=[Parameter(name='map_frame', value=value(1.0))]
     )

@@ -13,6 +13,9 @@ from typing import Any, TypeVar
 
 from thinmap_ros.core.errors import ConfigError, quoted
 
+SAFE_LOWER = 'lower'
+SAFE_HIGHER = 'higher'
+
 
 def parameter(
     default: Any,
@@ -21,12 +24,20 @@ def parameter(
     low: float | None = None,
     high: float | None = None,
     choices: Sequence[str] | None = None,
+    safe: str = '',
 ) -> Any:
     """Declare a field of a Config: default, description (with unit) and allowed values.
 
-    low, high: inclusive bounds of a number; choices: the allowed strings.
+    low, high: inclusive bounds of a number; choices: the allowed strings; safe: SAFE_LOWER or
+    SAFE_HIGHER, the only direction in which a value that concerns safety may change at run time.
     """
-    metadata = {'description': description, 'low': low, 'high': high, 'choices': choices}
+    metadata = {
+        'description': description,
+        'low': low,
+        'high': high,
+        'choices': choices,
+        'safe': safe,
+    }
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -38,6 +49,7 @@ def robot_radius() -> Any:
         'of rotation to the farthest point of the footprint.',
         low=0.0,
         high=5.0,
+        safe=SAFE_HIGHER,
     )
     return dataclasses.field(default=field.default, metadata={**field.metadata, 'shared': True})
 
@@ -96,6 +108,21 @@ def with_values(config: AnyConfig, values: Mapping[str, Any]) -> AnyConfig:
         elif field.name in values:
             own[field.name] = values[field.name]
     return dataclasses.replace(config, **own)
+
+
+def check_safety(start: Config, changed: Config) -> None:
+    """Check that no parameter makes a running robot less safe than the configuration at its start.
+
+    Raises ConfigError naming the parameter, its value and what was expected.
+    """
+    values = {name: value for name, _, value in parameters_of(changed)}
+    for name, field, bound in parameters_of(start):
+        value = values[name]
+        safe = field.metadata['safe']
+        if safe == SAFE_LOWER and value > bound:
+            raise ConfigError(f'{name} = {value}: expected at most {bound}, as at the start')
+        if safe == SAFE_HIGHER and value < bound:
+            raise ConfigError(f'{name} = {value}: expected at least {bound}, as at the start')
 
 
 def _part_with(prefix: str, config: AnyConfig, values: Mapping[str, Any]) -> AnyConfig:

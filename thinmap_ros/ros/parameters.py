@@ -16,7 +16,14 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from thinmap_ros.core.config import Config, parameters_of, with_values
+from thinmap_ros.core.config import (
+    SAFE_HIGHER,
+    SAFE_LOWER,
+    Config,
+    check_safety,
+    parameters_of,
+    with_values,
+)
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.ros.foreign.translation import is_known
 
@@ -33,6 +40,10 @@ ROBOT = (
 )
 
 AnyConfig = TypeVar('AnyConfig', bound=Config)
+_RUN_TIME = {
+    SAFE_LOWER: 'at run time at most the value at the start',
+    SAFE_HIGHER: 'at run time at least the value at the start',
+}
 
 
 def declare_config(
@@ -48,7 +59,8 @@ def declare_config(
 
     Parameters are read-only without `changed`. With it, those named in `live` (None: all) can be
     set at run time, and `changed` is called with the new config. A value that the config rejects is
-    rejected with its reason.
+    rejected with its reason; so is one that makes the robot less safe than at its start, as every
+    peer on the graph may set parameters.
     Raises ConfigError where a value is outside its range or of the wrong type.
     """
     defaults = config() if base is None else base
@@ -77,6 +89,7 @@ class _Changes(Generic[AnyConfig]):
         self, node: Node, current: AnyConfig, free: set[str], changed: Callable[[AnyConfig], None]
     ) -> None:
         self._node = node
+        self._start = current
         self._current = current
         self._free = free
         self._changed = changed
@@ -91,7 +104,7 @@ class _Changes(Generic[AnyConfig]):
 
     def _check(self, given: list[Parameter]) -> SetParametersResult:
         try:
-            self._with(given)
+            check_safety(self._start, self._with(given))
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -243,6 +256,8 @@ def _descriptor(field: 'dataclasses.Field[Any]', read_only: bool) -> ParameterDe
     descriptor = ParameterDescriptor(description=description, read_only=read_only)
     if choices is not None:
         descriptor.additional_constraints = 'one of: ' + ', '.join(choices)
+    elif field.metadata['safe'] and not read_only:
+        descriptor.additional_constraints = _RUN_TIME[field.metadata['safe']]
     if low is None or high is None or isinstance(field.default, bool):
         return descriptor
     if isinstance(field.default, int):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.config import Config, parameter, part
+from thinmap_ros.core.config import SAFE_HIGHER, Config, parameter, part
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.obstacle_points import ObstaclePoints
@@ -46,6 +46,7 @@ class NavigatorConfig(Config):
         'robot_radius_m.',
         low=0.0,
         high=5.0,
+        safe=SAFE_HIGHER,
     )
     reaction_time_s: float = parameter(
         0.3,
@@ -53,6 +54,7 @@ class NavigatorConfig(Config):
         'networks.',
         low=0.0,
         high=5.0,
+        safe=SAFE_HIGHER,
     )
     xy_goal_tolerance_m: float = parameter(
         0.15,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.config import SAFE_LOWER, Config, parameter
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, wrap
 
@@ -17,18 +17,25 @@ from thinmap_ros.core.se2 import Array, wrap
 class PathFollowerConfig(Config):
     """Limits of the drive, and how closely a path is followed."""
 
-    max_speed_m_s: float = parameter(0.2, 'Maximum speed (m/s).', low=0.01, high=5.0)
+    max_speed_m_s: float = parameter(
+        0.2, 'Maximum speed (m/s).', low=0.01, high=5.0, safe=SAFE_LOWER
+    )
     max_angular_speed_rad_s: float = parameter(
-        1.0, 'Maximum angular speed (rad/s).', low=0.05, high=10.0
+        1.0, 'Maximum angular speed (rad/s).', low=0.05, high=10.0, safe=SAFE_LOWER
     )
     max_acceleration_m_s2: float = parameter(
         0.4,
         'Maximum acceleration (m/s^2). Lower: smoother, longer stopping distances.',
         low=0.01,
         high=10.0,
+        safe=SAFE_LOWER,
     )
     max_angular_acceleration_rad_s2: float = parameter(
-        2.5, 'Maximum angular acceleration (rad/s^2). Lower: smoother turns.', low=0.05, high=20.0
+        2.5,
+        'Maximum angular acceleration (rad/s^2). Lower: smoother turns.',
+        low=0.05,
+        high=20.0,
+        safe=SAFE_LOWER,
     )
     lookahead_distance_m: float = parameter(
         0.35,
