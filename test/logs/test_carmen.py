@@ -116,6 +116,10 @@ def test_gzip_is_the_same(tmp_path: Path) -> None:
         'FLASER -1 1.0 0 0 0 0 0 0 1.0 h 1\n',
         'FLASER\n',
         'FLASER 1 1.0 0 0 0 nan 0 0 1.0 h 1\n',
+        'FLASER 1 1.0 0 0 0 1e9 0 0 1.0 h 1\n',
+        ODOM.replace('1.5', '1e308'),
+        ODOM.replace('2.5', '-1e17'),
+        ODOM.replace('-3.0', '1e17'),
         'FLASER 1 1.0 0 0 0 0 0 0 nan h 1\n',
         'FLASER 1 1.0 0 0 0 0 0 0 -1.0 h 1\n',
         'FLASER 1 1.0 0 0 0 0 0 0 99999999999.0 h 1\n',
@@ -132,6 +136,14 @@ def test_a_broken_line_is_skipped_counted_and_named(tmp_path: Path, broken: str)
     assert log.skipped.count == 1
     assert log.skipped.first.startswith(f'{path}:2: ')
     assert '\n' not in log.skipped.first
+
+
+def test_a_robotlaser_line_with_the_laser_far_away_is_skipped_alone(tmp_path: Path) -> None:
+    log = CarmenLog(write(tmp_path, ROBOTLASER.replace(' 1.2 2.0 ', ' 999.0 2.0 ') + ROBOTLASER))
+    event = list(log.events())[-1]
+    assert isinstance(event, ScanEvent)
+    assert event.scan.T_base_laser == pytest.approx([0.2, 0.0, 0.0])
+    assert log.skipped.count == 1
 
 
 def test_a_number_cut_in_half_is_not_taken_for_a_whole_one(tmp_path: Path) -> None:

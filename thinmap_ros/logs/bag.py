@@ -239,8 +239,11 @@ class BagLog:
 def _odometry(message: Any) -> OdometryEvent:
     rotation_matrix(message.pose.pose.orientation)  # raises InputError if it is invalid
     T_odom_base = decode.pose(message.pose.pose)
-    if not se2.is_finite(T_odom_base):
-        raise InputError(f'pose {T_odom_base.tolist()}: expected finite numbers')
+    if not se2.is_bounded_pose(T_odom_base):
+        raise InputError(
+            f'pose {T_odom_base.tolist()}: expected finite numbers, at most '
+            f'{se2.MAX_COORDINATE_M:g} m'
+        )
     return OdometryEvent(decode.stamp_ns(message), T_odom_base)
 
 

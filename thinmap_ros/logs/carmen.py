@@ -171,13 +171,15 @@ class CarmenLog:
         )
         T_odom_laser = _pose(rest[0:3])
         T_odom_base = _pose(rest[3:6])
-        if self._T_base_laser is None:
-            # The laser is mounted rigidly: the offset of the first line is used for all, without
-            # its rounding errors.
-            self._T_base_laser = np.round(se2.between(T_odom_base, T_odom_laser), 3)
-        mount = self._offset() if self.options.offset_m else self._T_base_laser
+        # The laser is mounted rigidly: the offset of the first valid line is used for all, without
+        # its rounding errors.
+        measured = self._T_base_laser
+        if measured is None:
+            measured = np.round(se2.between(T_odom_base, T_odom_laser), 3)
+        mount = self._offset() if self.options.offset_m else measured
         limit = min(max_range, self.options.range_max_m)
         scan = self._scan(_stamp(rest[11]), words[9 : 9 + count], (start, step), limit, mount)
+        self._T_base_laser = measured
         return [OdometryEvent(scan.stamp_ns, T_odom_base), ScanEvent(scan)]
 
     def _offset(self) -> Array:
@@ -226,6 +228,7 @@ def _stamp(word: str) -> int:
 
 def _pose(words: list[str]) -> Array:
     pose = np.array(words, dtype=np.float64)
-    if pose.shape != (3,) or not np.isfinite(pose).all():
-        raise ValueError(f'pose {words}: expected three finite numbers')
+    # Written so that NaN is refused, too. A heading of so many turns has no meaning either.
+    if pose.shape != (3,) or not np.abs(pose).max() <= se2.MAX_COORDINATE_M:
+        raise ValueError(f'pose {words}: expected three numbers, at most {se2.MAX_COORDINATE_M:g}')
     return se2.pose(*pose)

@@ -1,15 +1,18 @@
 """Replays a log or bag through localizer, grid and topology, as fast as possible."""
 
 import argparse
+import signal
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.scan import Scan
@@ -17,8 +20,9 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.logs.log import Event, Log, SkippedRecords
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.replaying import replay, write_outputs
+from thinmap_ros.replaying import Replay, replay, write_outputs
 from thinmap_ros.tools import cli
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
@@ -78,10 +82,15 @@ class ReplayView:
 
 def _work(arguments: argparse.Namespace) -> None:
     with _view(arguments) as view:
-        _play(arguments, None if view is None else ReplayView(view))
-        if view is not None and arguments.view:
+        result = _play(arguments, None if view is None else ReplayView(view))
+        if view is not None and arguments.view and result.ended_by is None:
             print('close the viewer to end', file=sys.stderr)
             view.wait_until_closed()
+    if isinstance(result.ended_by, ThinmapError | OSError):
+        written = f'the {len(result.poses)} scans before it are in {arguments.out}'
+        raise InputError(f'{result.ended_by}; {written}') from result.ended_by
+    if result.ended_by is not None:
+        raise result.ended_by
 
 
 @contextmanager
@@ -99,7 +108,38 @@ def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
         yield view
 
 
-def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
+class _InterruptibleLog:
+    """A log that ends at Ctrl-C or SIGTERM after a whole event; a second signal ends at once."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._is_interrupted = False
+
+    @property
+    def skipped(self) -> SkippedRecords:
+        """Unusable records of the log."""
+        return self._log.skipped
+
+    def events(self) -> Iterator[Event]:
+        """Events of the log; raises KeyboardInterrupt between two of them."""
+        signals = (signal.SIGINT, signal.SIGTERM)
+        before = [signal.signal(number, self._interrupt) for number in signals]
+        try:
+            for event in self._log.events():
+                if self._is_interrupted:
+                    raise KeyboardInterrupt
+                yield event
+        finally:
+            for number, handler in zip(signals, before, strict=True):
+                signal.signal(number, handler)
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self._is_interrupted:
+            raise KeyboardInterrupt
+        self._is_interrupted = True
+
+
+def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
     config = PipelineConfig(
         localizer=cli.config_from(arguments, LocalizerConfig),
         grid=cli.config_from(arguments, OccupancyConfig),
@@ -107,7 +147,11 @@ def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
     wall = time.perf_counter()
     cpu = time.process_time()
     result = replay(
-        cli.open_log(arguments), config, show_progress=not arguments.quiet, watcher=shown
+        _InterruptibleLog(cli.open_log(arguments)),
+        config,
+        show_progress=not arguments.quiet,
+        watcher=shown,
+        keep_partial=True,
     )
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{arguments.log.name}: {len(result.poses)} scans'
@@ -115,10 +159,13 @@ def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
     skipped = f', {result.skipped} skipped' if result.skipped else ''
     if result.first_skipped:
         skipped += f' (first: {result.first_skipped})'
+    if report['refused']:
+        skipped += f', {report["refused"]} not mapped (first: {report["first_refused"]})'
     print(
         f'{arguments.out}: {report["scans"]} scans{skipped}, {report["distance"]:.1f} m, '
         f'{report["ms_per_scan"]["all"]["median"]:.1f} ms a scan'
     )
+    return result
 
 
 def main() -> None:
