@@ -31,6 +31,12 @@ from thinmap_ros.logs.log import (
     refuse_foreign,
 )
 
+_KEYWORDS = (b'ODOM', b'FLASER', b'ROBOTLASER1')  # other lines are not read
+_TOO_LONG = (
+    f'expected at most {LOGS.lines} lines, and {LOGS.file_ratio} times the bytes of a gzip file: '
+    'only the lines before are read'
+)
+
 
 @dataclass(frozen=True)
 class LaserOptions(Config):
@@ -98,7 +104,12 @@ class CarmenLog:
             with _open(self.path) as stream:
                 # One byte more than the limit: no more of a longer line is ever read.
                 lines = iter(lambda: stream.readline(LOGS.line_bytes + 1), b'')
+                unread = _unpacked_bytes(self.path)
                 for number, line in enumerate(lines, start=1):
+                    unread -= len(line)
+                    if number > LOGS.lines or unread < 0:
+                        self.skipped.add_first(f'{self.path}:{number}: {_TOO_LONG}')
+                        return
                     if len(line) > LOGS.line_bytes:
                         raise InputError(
                             f'{self.path}:{number}: a line of more than {LOGS.line_bytes} bytes: '
@@ -108,6 +119,8 @@ class CarmenLog:
                         raise InputError(
                             f'{self.path}:{number}: a zero byte: expected a text file (CARMEN log)'
                         )
+                    if line.endswith(b'\n') and not line.lstrip().startswith(_KEYWORDS):
+                        continue
                     text = line.decode('utf-8', errors='replace')
                     yield (
                         number,
@@ -211,9 +224,18 @@ def _check_length(words: list[str], count: int, expected: str) -> None:
 
 
 def _open(path: Path) -> BinaryIO:
+    return gzip.open(path, 'rb') if _is_gzip(path) else path.open('rb')  # type: ignore[return-value]
+
+
+def _is_gzip(path: Path) -> bool:
     with path.open('rb') as stream:
-        zipped = stream.read(2) == b'\x1f\x8b'
-    return gzip.open(path, 'rb') if zipped else path.open('rb')  # type: ignore[return-value]
+        return stream.read(2) == b'\x1f\x8b'
+
+
+def _unpacked_bytes(path: Path) -> int:
+    """Largest number of bytes that are read of a log."""
+    size = path.stat().st_size
+    return LOGS.unpacked_bytes(size) if _is_gzip(path) else LOGS.line_bytes * LOGS.lines
 
 
 def _stamp(word: str) -> int:

@@ -122,8 +122,9 @@ class Localizer:
 
     @property
     def rejected(self) -> int:
-        """Number of odometry poses and `set_pose` calls with invalid values, and of scans that lie
-        too far from the others for one map.
+        """Number of odometry poses and `set_pose` calls with invalid values.
+
+        And of scans that lie too far from the others for one map.
         """
         return self._rejected + self._prediction.rejected + self._map.refused
 
