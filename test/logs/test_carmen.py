@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.stamps import LATEST_S
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
 
@@ -279,3 +280,20 @@ def test_damaged_files(tmp_path: Path, noise: bytes, at: int, zipped: bool) -> N
     content = gzip.compress(content) if zipped else content
     at = min(at, len(content))
     assert _is_read_or_refused(write(tmp_path, content[:at] + noise + content[at + len(noise) :]))
+
+
+@pytest.mark.parametrize(
+    ('word', 'stamp_ns'),
+    [('12', 12_000_000_000), ('12.', 12_000_000_000), ('0', 0), ('12.5', 12_500_000_000)],
+)
+def test_a_stamp_may_be_a_whole_second(tmp_path: Path, word: str, stamp_ns: int) -> None:
+    event, *_ = read(write(tmp_path, ODOM.replace('976052857.437530', word) + FLASER))
+    assert isinstance(event, OdometryEvent)
+    assert event.stamp_ns == stamp_ns
+
+
+def test_the_latest_stamp_is_that_of_ros_messages(tmp_path: Path) -> None:
+    lines = [ODOM.replace('976052857.437530', f'{LATEST_S + k}') for k in (-1, 0)]
+    log = CarmenLog(write(tmp_path, ''.join([*lines, FLASER])))
+    assert len(list(log.events())) == 3
+    assert log.skipped.count == 1
