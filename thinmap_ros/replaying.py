@@ -2,6 +2,8 @@
 
 import json
 import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -64,22 +66,31 @@ def replay(
     result = Replay(Pipeline(config))
     pairing = ScanOdometrySynchronizer()
     tidy_up = compiler_memory_releaser()
-    try:
+    with _errors_kept(result, keep_partial):
         for event in tqdm(log.events(), unit=' events', disable=not show_progress):
             _add_event(result, pairing, event, watcher)
             tidy_up()
-    except (Exception, KeyboardInterrupt) as error:
-        if not (keep_partial and result.poses):
-            raise
-        result.ended_by = error
-    result.pipeline.finish()
+    with _errors_kept(result, keep_partial):
+        result.pipeline.finish()
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
     if not result.poses:
         raise InputError(f'no scan with odometry around its stamp; {result.skipped} skipped')
     if watcher is not None:
-        watcher.finish(result.stamps_ns[-1], result.pipeline)
+        with _errors_kept(result, keep_partial):
+            watcher.finish(result.stamps_ns[-1], result.pipeline)
     return result
+
+
+@contextmanager
+def _errors_kept(result: Replay, keep_partial: bool) -> Iterator[None]:
+    """Keep the first error as `Replay.ended_by`, if there are results to be kept."""
+    try:
+        yield
+    except (Exception, KeyboardInterrupt) as error:
+        if not (keep_partial and result.poses):
+            raise
+        result.ended_by = result.ended_by or error
 
 
 def _add_event(

@@ -470,3 +470,26 @@ def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypat
     assert 'close the viewer to end' in capsys.readouterr().err
     assert {path.name for path in (tmp_path / 'out').iterdir()} == FILES
     assert rows_of(received, '/map/robot') == 30, 'it was sent all of it'
+
+
+class FullDisk(Diary):
+    """A view that fails at the twentieth scan, and at the end."""
+
+    def pose(self, ns, T_map_base, covariance):
+        super().pose(ns, T_map_base, covariance)
+        if self.told['pose'] == 20:
+            raise OSError('disk full')
+
+    def grid(self, ns, patch):
+        if self.told['pose'] == 20:
+            raise OSError('disk full again')
+
+
+def test_an_error_of_the_view_keeps_what_was_mapped_if_asked(log):
+    carmen = CarmenLog(log, LaserOptions())
+    watcher = ReplayView(FullDisk())
+    result = replay(carmen, PipelineConfig(), watcher=watcher, keep_partial=True)
+    assert str(result.ended_by) == 'disk full'
+    assert len(result.poses) == 20
+    with pytest.raises(OSError, match='disk full'):
+        replay(carmen, PipelineConfig(), watcher=ReplayView(FullDisk()))

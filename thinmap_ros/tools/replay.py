@@ -95,7 +95,7 @@ def _work(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
-    """The requested viewer and recording. The recording is deleted if the replay fails."""
+    """The requested viewer and recording. It is deleted if nothing was replayed."""
     if not (arguments.view or arguments.recording):
         yield None
         return
@@ -109,7 +109,7 @@ def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
 
 
 class _InterruptibleLog:
-    """A log that ends at Ctrl-C or SIGTERM after a whole event; a second signal ends at once."""
+    """A log that ends after a whole event once it is interrupted."""
 
     def __init__(self, log: Log) -> None:
         self._log = log
@@ -122,21 +122,29 @@ class _InterruptibleLog:
 
     def events(self) -> Iterator[Event]:
         """Events of the log; raises KeyboardInterrupt between two of them."""
-        signals = (signal.SIGINT, signal.SIGTERM)
-        before = [signal.signal(number, self._interrupt) for number in signals]
-        try:
-            for event in self._log.events():
-                if self._is_interrupted:
-                    raise KeyboardInterrupt
-                yield event
-        finally:
-            for number, handler in zip(signals, before, strict=True):
-                signal.signal(number, handler)
+        for event in self._log.events():
+            if self._is_interrupted:
+                raise KeyboardInterrupt
+            yield event
 
-    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+    def interrupt(self, number: int, frame: FrameType | None) -> None:
+        """End after this event; the second time at once."""
         if self._is_interrupted:
             raise KeyboardInterrupt
         self._is_interrupted = True
+
+
+@contextmanager
+def _interruptible(log: Log) -> Iterator[_InterruptibleLog]:
+    """The log, which Ctrl-C and SIGTERM end after a whole event: the results are consistent."""
+    interruptible = _InterruptibleLog(log)
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, interruptible.interrupt) for number in signals]
+    try:
+        yield interruptible
+    finally:
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)
 
 
 def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
@@ -146,13 +154,10 @@ def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
     )
     wall = time.perf_counter()
     cpu = time.process_time()
-    result = replay(
-        _InterruptibleLog(cli.open_log(arguments)),
-        config,
-        show_progress=not arguments.quiet,
-        watcher=shown,
-        keep_partial=True,
-    )
+    with _interruptible(cli.open_log(arguments)) as log:
+        result = replay(
+            log, config, show_progress=not arguments.quiet, watcher=shown, keep_partial=True
+        )
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{arguments.log.name}: {len(result.poses)} scans'
     report = write_outputs(result, arguments.out, title, seconds)

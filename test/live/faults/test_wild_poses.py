@@ -1,4 +1,4 @@
-"""One pose kilometres away on a live graph: refused and counted; map and localizer go on."""
+"""One pose kilometres away on a live graph: refused and counted; map and localizer continue."""
 
 import numpy as np
 import pytest
