@@ -55,6 +55,7 @@ class Pipeline:
         # Known poses are never corrected.
         self._grid = CorrectableGrid(OccupancyGrid(self.config.grid), not pose_source)
         self.corrections = 0
+        self.refusals: list[str] = []  # why scans are not on the map, a reason for each
         self.topology = TopologyBuilder(self.config.topology)
         self.stage_seconds: dict[str, list[float]] = {}
         self._scans = 0
@@ -76,6 +77,7 @@ class Pipeline:
                     *self.localizer.keyframe_trajectory(), scan.stamp_ns
                 )
             moved = self._grid.update(None if estimate.is_lost else scan, estimate.T_map_base)
+            self.refusals += self._grid.take_refusals()
         if moved is not None:
             self._rebuild(moved)
         if self._window is None or self._scans % self.config.scans_per_graph == 0:
@@ -86,6 +88,7 @@ class Pipeline:
     def finish(self) -> None:
         """Complete a pending correction after the last scan."""
         moved = self._grid.finish()
+        self.refusals += self._grid.take_refusals()
         if moved is not None:
             self._rebuild(moved)
 

@@ -2,6 +2,8 @@
 
 import json
 import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -9,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from tqdm import tqdm
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
@@ -18,14 +20,17 @@ from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
-from thinmap_ros.logs.log import Log, OdometryEvent
+from thinmap_ros.logs.log import Event, Log, OdometryEvent
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view import figures
 
 
 @dataclass(eq=False)
 class Replay:
-    """Result of a replay: the pipeline at the end, and the pose (3,) of every scan."""
+    """Result of a replay: the pipeline at the end, and the pose (3,) of every scan.
+
+    ended_by: what ended the replay before the end of the log; None if nothing did.
+    """
 
     pipeline: Pipeline
     stamps_ns: list[int] = field(default_factory=list)
@@ -33,6 +38,7 @@ class Replay:
     local_features: list[int] = field(default_factory=list)
     skipped: int = 0
     first_skipped: str = ''
+    ended_by: Exception | KeyboardInterrupt | None = None
 
 
 class Watcher(Protocol):
@@ -46,33 +52,62 @@ class Watcher(Protocol):
 
 
 def replay(
-    log: Log, config: PipelineConfig, show_progress: bool = False, watcher: Watcher | None = None
+    log: Log,
+    config: PipelineConfig,
+    show_progress: bool = False,
+    watcher: Watcher | None = None,
+    keep_partial: bool = False,
 ) -> Replay:
-    """Replay a log through the pipeline. Raises InputError if it has no scan with odometry."""
+    """Replay a log through the pipeline. Raises InputError if it has no scan with odometry.
+
+    keep_partial: an error, or Ctrl-C, after the first scan ends the replay there
+    (`Replay.ended_by`) instead of being raised.
+    """
     result = Replay(Pipeline(config))
     pairing = ScanOdometrySynchronizer()
     tidy_up = compiler_memory_releaser()
-    for event in tqdm(log.events(), unit=' events', disable=not show_progress):
-        if isinstance(event, OdometryEvent):
-            ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
-        else:
-            ready = pairing.add_scan(event.scan)
-        for scan, T_odom_base in ready:
-            step = result.pipeline.step(scan, T_odom_base)
-            result.stamps_ns.append(scan.stamp_ns)
-            result.poses.append(step.estimate.T_map_base)
-            result.local_features.append(step.estimate.n_local_features)
-            if watcher is not None:
-                watcher.step(scan, T_odom_base, step.estimate, result.pipeline)
-        tidy_up()
-    result.pipeline.finish()
+    with _errors_kept(result, keep_partial):
+        for event in tqdm(log.events(), unit=' events', disable=not show_progress):
+            _add_event(result, pairing, event, watcher)
+            tidy_up()
+    with _errors_kept(result, keep_partial):
+        result.pipeline.finish()
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
     if not result.poses:
         raise InputError(f'no scan with odometry around its stamp; {result.skipped} skipped')
     if watcher is not None:
-        watcher.finish(result.stamps_ns[-1], result.pipeline)
+        with _errors_kept(result, keep_partial):
+            watcher.finish(result.stamps_ns[-1], result.pipeline)
     return result
+
+
+@contextmanager
+def _errors_kept(result: Replay, keep_partial: bool) -> Iterator[None]:
+    """Keep the first error as `Replay.ended_by`, if there are results to be kept."""
+    try:
+        yield
+    except (Exception, KeyboardInterrupt) as error:
+        if not (keep_partial and result.poses):
+            raise
+        result.ended_by = result.ended_by or error
+
+
+def _add_event(
+    result: Replay, pairing: ScanOdometrySynchronizer, event: Event, watcher: Watcher | None
+) -> None:
+    """Process the scans that are complete with this event."""
+    if isinstance(event, OdometryEvent):
+        ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
+    else:
+        ready = pairing.add_scan(event.scan)
+    for scan, T_odom_base in ready:
+        step = result.pipeline.step(scan, T_odom_base)
+        result.stamps_ns.append(scan.stamp_ns)
+        result.poses.append(step.estimate.T_map_base)
+        result.local_features.append(step.estimate.n_local_features)
+        if watcher is not None:
+            watcher.step(scan, T_odom_base, step.estimate, result.pipeline)
 
 
 def write_outputs(
@@ -84,7 +119,7 @@ def write_outputs(
     poses = np.array(result.poses)
     folder.mkdir(parents=True, exist_ok=True)
     trajectories.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
-    final = list(pipeline.localizer.optimized_trajectory())
+    final = list(pipeline.localizer.optimized_trajectory())[: len(poses)]
     trajectories.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
     occupancy_maps.write_map(folder / 'map', patch)
     graphs.write_geojson(folder / 'topology.geojson', pipeline.topology.map)
@@ -96,13 +131,20 @@ def write_outputs(
 
 
 def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[str, Any]:
-    stages = {name: np.array(taken) for name, taken in result.pipeline.stage_seconds.items()}
-    rebuilds = stages.pop('rebuild', np.zeros(0))
+    seconds_of = dict(result.pipeline.stage_seconds)
+    rebuilds = np.array(seconds_of.pop('rebuild', []))
+    # Where an error ended it, the last scan did not pass all stages.
+    complete = min(map(len, seconds_of.values()))
+    stages = {name: np.array(taken[:complete]) for name, taken in seconds_of.items()}
+    refusals = result.pipeline.refusals
     stages['all'] = np.sum(list(stages.values()), axis=0)
     return {
         'scans': len(poses),
         'skipped': result.skipped,
         'first_skipped': result.first_skipped,
+        'refused': len(refusals),
+        'first_refused': refusals[0] if refusals else '',
+        'ended_by': '' if result.ended_by is None else one_line_reason(result.ended_by),
         'wall_s': round(seconds[0], 3),
         'cpu_s': round(seconds[1], 3),
         'peak_mb': round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),

@@ -7,7 +7,7 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.odometry import OdometryBuffer, ScanOdometrySynchronizer
+from thinmap_ros.core.odometry import OdometryBuffer, OdometryIncrements, ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
 
 SECOND = 1_000_000_000
@@ -114,3 +114,16 @@ def test_scans_older_than_all_odometry_and_too_many_waiting_are_dropped_and_coun
     for stamp in (11, 12, 13):
         pairing.add_scan(scan_at(stamp * SECOND))
     assert pairing.dropped == 2
+
+
+@pytest.mark.parametrize('gap_s', [0.2, 120.0, 1000.0, 1e6])
+def test_odometry_that_is_kilometres_away_after_a_gap_is_a_discontinuity(gap_s):
+    increments = OdometryIncrements()
+    increments.add(0, np.zeros(3))
+    far = increments.add(int(gap_s * SECOND), se2.pose(2000.0, 0.0, 0.0))
+    assert far.T_before_base.tolist() == [0.0, 0.0, 0.0]
+    assert 0.0 < far.discontinuity_m < 400.0
+    assert increments.rejected == 1
+    back = increments.add(int((gap_s + 0.2) * SECOND), se2.pose(2000.1, 0.0, 0.0))
+    assert back.T_before_base[0] == pytest.approx(0.1)
+    assert increments.rejected == 1

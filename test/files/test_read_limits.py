@@ -5,10 +5,13 @@ A small file that expands or nests without bounds is rejected in one line, with 
 
 import functools
 import gzip
+import json
 import re
 import subprocess
 import sys
+import tempfile
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,7 +19,18 @@ import lz4.frame
 import pytest
 import zstandard
 from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message, Schema
+from mcap.records import (
+    Channel,
+    Chunk,
+    DataEnd,
+    Footer,
+    Header,
+    Message,
+    MessageIndex,
+    Schema,
+)
+from rosbags.typesys import Stores, get_typestore
+from support.carmen_log import carmen_lines
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.limits import LOGS
@@ -25,20 +39,25 @@ from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.mcap_reader import Damage, intact_records
 from thinmap_ros.logs.mcap_records import DamagedError, decompress, records_of
+from thinmap_ros.logs.storage import own_typestore, typestore_of
+from thinmap_ros.tools.carmen_to_bag import convert
 
 MAGIC = b'\x89MCAP0\r\n'
 EXPANDED = 900 * 2**20
 MOST_MB = 300
 RUNNER = """
-import pathlib, runpy, sys
+import pathlib, runpy, sys, time
 del sys.argv[0]
 try:
     runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)
 finally:
     # Not ru_maxrss: after a fork that is at least what the parent had.
     status = pathlib.Path('/proc/self/status').read_text()
+    print('cpu', time.process_time())
     print('peak', int(status.split('VmHWM:')[1].split()[0]) // 1024)
 """
+# Generous for a slow machine; without limits it takes minutes.
+MOST_CPU_S = 120.0
 
 
 def run(tool: str, *arguments: Path | str) -> tuple[int, str, int]:
@@ -47,6 +66,7 @@ def run(tool: str, *arguments: Path | str) -> tuple[int, str, int]:
     done = subprocess.run(command, capture_output=True, text=True)
     assert 'Traceback' not in done.stderr, done.stderr[-2000:]
     peak = int(done.stdout.split()[-1])
+    assert float(done.stdout.split()[-3]) < MOST_CPU_S
     return done.returncode, (done.stderr.splitlines() or [''])[-1], peak
 
 
@@ -237,3 +257,186 @@ def test_a_long_line_is_read(tmp_path: Path) -> None:
     path = tmp_path / 'log.clf'
     path.write_text(f'FLASER 100000 {ranges} 0 0 0 0 0 0 1.0 host 1.0\n' * 2)
     assert len(list(CarmenLog(path).events())) == 4
+
+
+@pytest.mark.programs
+def test_empty_lines_without_end(tmp_path: Path) -> None:
+    path = tmp_path / 'log.clf.gz'
+    begin = gzip.compress(('\n'.join(carmen_lines()) + '\n').encode())
+    path.write_bytes(begin + 1000 * gzip.compress(b'\n' * 2**20))
+    code, line, peak_mb = run('replay', path, '-o', tmp_path / 'out', '--quiet')
+    assert code == 0, line
+    assert peak_mb < MOST_MB
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert report['scans'] == 30, 'what comes before the limit is used'
+    assert f'log.clf.gz:{LOGS.lines + 1}: expected at most' in report['first_skipped']
+
+
+@pytest.mark.programs
+def test_long_lines_without_end(tmp_path: Path) -> None:
+    path = tmp_path / 'log.clf.gz'
+    begin = gzip.compress(('\n'.join(carmen_lines()) + '\n').encode())
+    path.write_bytes(begin + 1000 * gzip.compress(b' ' * (2**20 - 1) + b'\n'))
+    log = CarmenLog(path)
+    assert len(list(log.events())) == 90
+    number = int(log.skipped.first.removeprefix(f'{path}:').partition(':')[0])
+    assert 200 < number < 400, 'after 256 MB'
+
+
+def compressed_bag(folder: Path, packed: bytes, name: str = 'bag_0.mcap.zstd') -> Path:
+    """A bag folder of one file that is compressed as a whole."""
+    folder.mkdir()
+    (folder / name).write_bytes(packed)
+    (folder / 'metadata.yaml').write_text(
+        'rosbag2_bagfile_information: '
+        f'{{relative_file_paths: [{name}], compression_mode: FILE, compression_format: zstd}}'
+    )
+    return folder
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder for temporary files."""
+    folder = tmp_path / 'temporary'
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, 'tempdir', str(folder))
+    monkeypatch.setenv('TMPDIR', str(folder))
+    return folder
+
+
+@pytest.mark.parametrize('name', ['bag_0.mcap.zstd', 'bag_0.db3.zstd'])
+def test_a_bag_file_that_expands_without_end(tmp_path: Path, temporary: Path, name: str) -> None:
+    bag = compressed_bag(tmp_path / 'bag', packed_zeros('zstd', EXPANDED), name)
+    assert (bag / name).stat().st_size < 200_000
+    with pytest.raises(InputError, match=rf'{name}: expected at most {256 << 20} bytes'):
+        Bag(bag)
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_compressed_bag_file_leaves_no_file_behind(tmp_path: Path, temporary: Path) -> None:
+    convert(log_of(tmp_path), tmp_path / 'plain.mcap')
+    packed = zstandard.compress((tmp_path / 'plain.mcap').read_bytes())
+    bag = Bag(compressed_bag(tmp_path / 'bag', packed))
+    plain = Bag(tmp_path / 'plain.mcap')
+    assert [m.data for m in bag.messages()] == [m.data for m in plain.messages()]
+    # Not even while it is read: whatever ends the program, nothing is left.
+    assert list(temporary.iterdir()) == []
+    with pytest.raises(InputError, match=r'bag_0.mcap.zstd: no MCAP file'):
+        Bag(compressed_bag(tmp_path / 'other', zstandard.compress(b'no bag')))
+
+
+def log_of(folder: Path) -> CarmenLog:
+    (folder / 'log.clf').write_text('\n'.join(carmen_lines()) + '\n')
+    return CarmenLog(folder / 'log.clf')
+
+
+def definitions_of(builder: RecordBuilder) -> None:
+    """A channel 1 that is read, and a channel 2 that is not."""
+    Schema(1, data=b'string data', encoding='ros2msg', name='std_msgs/msg/String').write(builder)
+    Channel(1, '/said', 'cdr', {}, 1).write(builder)
+    Channel(2, '/unread', 'cdr', {}, 1).write(builder)
+
+
+@functools.cache
+def unread_records(count: int, message_bytes: int) -> tuple[bytes, int, int]:
+    """Messages of channel 2, compressed; their size and checksum."""
+    builder = RecordBuilder()
+    Message(2, log_time=5, data=bytes(message_bytes), publish_time=5, sequence=0).write(builder)
+    content = builder.end() * count
+    return zstandard.compress(content), len(content), zlib.crc32(content)
+
+
+def bag_of_unread_chunks(path: Path, indexed: bool, kind: tuple[int, int], chunks: int) -> Path:
+    """A bag without a summary, of chunks of 200 MB that nobody reads, and two messages."""
+    packed, size, checksum = unread_records(*kind)
+    builder = RecordBuilder()
+    Header('ros2', 'test').write(builder)
+    definitions_of(builder)
+    Message(channel_id=1, log_time=3, data=b'before', publish_time=3, sequence=0).write(builder)
+    for _ in range(chunks):
+        Chunk('zstd', packed, 5, 5, checksum, size).write(builder)
+        if indexed:
+            MessageIndex(2, [(5, 0)]).write(builder)
+    Message(channel_id=1, log_time=9, data=b'behind', publish_time=9, sequence=1).write(builder)
+    path.write_bytes(MAGIC + builder.end())
+    return path
+
+
+READER = """
+import pathlib, sys, time
+from thinmap_ros.logs.bag import Bag
+begun = time.process_time()
+bag = Bag(pathlib.Path(sys.argv[1]))
+found = [message.data.decode() for message in bag.messages({'/said'})]
+status = pathlib.Path('/proc/self/status').read_text()
+peak = int(status.split('VmHWM:')[1].split()[0]) // 1024
+print(*found, time.process_time() - begun, peak)
+"""
+UNREAD = {
+    'indexed, small messages': (True, (2_000_000, 69), 40),
+    'small messages': (False, (2_000_000, 69), 1),
+    'large messages': (False, (20, 10_000_000), 10),
+    'one message': (False, (1, 200_000_000), 10),
+}
+
+
+@pytest.mark.programs
+@pytest.mark.parametrize('name', UNREAD)
+def test_records_that_nobody_reads_take_no_memory(tmp_path: Path, name: str) -> None:
+    indexed, kind, chunks = UNREAD[name]
+    path = bag_of_unread_chunks(tmp_path / 'bag.mcap', indexed, kind, chunks)
+    done = subprocess.run(
+        [sys.executable, '-c', READER, path], capture_output=True, text=True, check=True
+    )
+    *found, cpu_s, peak_mb = done.stdout.split()
+    assert found == ['before', 'behind']
+    assert float(cpu_s) < MOST_CPU_S
+    assert int(peak_mb) < MOST_MB
+
+
+def scan_definition(*extra: str) -> Schema:
+    """LaserScan as ROS defines it, with more fields."""
+    known = get_typestore(Stores.ROS2_JAZZY)
+    text, _ = known.generate_msgdef('sensor_msgs/msg/LaserScan', ros_version=2)
+    own, separator, nested = text.partition('=' * 80)
+    data = '\n'.join([own, extra[0], separator + nested, *extra[1:]])
+    return Schema(1, data=data.encode(), encoding='ros2msg', name='sensor_msgs/msg/LaserScan')
+
+
+def doubled(levels: int, last: str) -> list[str]:
+    """A field whose number of nested fields doubles with each level."""
+    parts = ['x/M0 extra']
+    for k in range(levels):
+        fields = f'x/M{k + 1} a\nx/M{k + 1} b' if k < levels - 1 else last
+        parts.append(f'{"=" * 80}\nMSG: x/M{k}\n{fields}')
+    return parts
+
+
+LARGE_DEFINITIONS = {
+    'fields': ['\n'.join(f'bool f{k}' for k in range(60_000))],
+    'lines': [900_000 * '\n'],
+    'nested': doubled(40, 'bool c'),
+    'nested without data': doubled(40, 'int32 C=1'),
+    'array': ['x/M0[1000000000] extra', f'{"=" * 80}\nMSG: x/M0\nbool a'],
+}
+
+
+@pytest.mark.usefixtures('in_short')
+@pytest.mark.parametrize('name', LARGE_DEFINITIONS)
+def test_a_large_definition_is_replaced_by_that_of_ros(name: str) -> None:
+    schema = scan_definition(*LARGE_DEFINITIONS[name])
+    assert len(schema.data) <= LOGS.schema_bytes
+    assert 'extra' not in fields_of(schema) and 'ranges' in fields_of(schema)
+    with pytest.raises(ValueError, match='expected at most'):
+        own_typestore(schema)
+
+
+def test_a_definition_with_more_fields_is_read() -> None:
+    few = '\n'.join(f'bool f{k}' for k in range(3000))
+    assert 'f2999' in fields_of(scan_definition(few))
+    nested = doubled(10, 'bool c')
+    assert 'extra' in fields_of(scan_definition(*nested))
+
+
+def fields_of(schema: Schema) -> list[str]:
+    return [name for name, _ in typestore_of(schema).fielddefs[schema.name][1]]

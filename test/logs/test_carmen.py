@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.stamps import LATEST_S
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
 
@@ -116,6 +117,10 @@ def test_gzip_is_the_same(tmp_path: Path) -> None:
         'FLASER -1 1.0 0 0 0 0 0 0 1.0 h 1\n',
         'FLASER\n',
         'FLASER 1 1.0 0 0 0 nan 0 0 1.0 h 1\n',
+        'FLASER 1 1.0 0 0 0 1e9 0 0 1.0 h 1\n',
+        ODOM.replace('1.5', '1e308'),
+        ODOM.replace('2.5', '-1e17'),
+        ODOM.replace('-3.0', '1e17'),
         'FLASER 1 1.0 0 0 0 0 0 0 nan h 1\n',
         'FLASER 1 1.0 0 0 0 0 0 0 -1.0 h 1\n',
         'FLASER 1 1.0 0 0 0 0 0 0 99999999999.0 h 1\n',
@@ -132,6 +137,14 @@ def test_a_broken_line_is_skipped_counted_and_named(tmp_path: Path, broken: str)
     assert log.skipped.count == 1
     assert log.skipped.first.startswith(f'{path}:2: ')
     assert '\n' not in log.skipped.first
+
+
+def test_a_robotlaser_line_with_the_laser_far_away_is_skipped_alone(tmp_path: Path) -> None:
+    log = CarmenLog(write(tmp_path, ROBOTLASER.replace(' 1.2 2.0 ', ' 999.0 2.0 ') + ROBOTLASER))
+    event = list(log.events())[-1]
+    assert isinstance(event, ScanEvent)
+    assert event.scan.T_base_laser == pytest.approx([0.2, 0.0, 0.0])
+    assert log.skipped.count == 1
 
 
 def test_a_number_cut_in_half_is_not_taken_for_a_whole_one(tmp_path: Path) -> None:
@@ -267,3 +280,20 @@ def test_damaged_files(tmp_path: Path, noise: bytes, at: int, zipped: bool) -> N
     content = gzip.compress(content) if zipped else content
     at = min(at, len(content))
     assert _is_read_or_refused(write(tmp_path, content[:at] + noise + content[at + len(noise) :]))
+
+
+@pytest.mark.parametrize(
+    ('word', 'stamp_ns'),
+    [('12', 12_000_000_000), ('12.', 12_000_000_000), ('0', 0), ('12.5', 12_500_000_000)],
+)
+def test_a_stamp_may_be_a_whole_second(tmp_path: Path, word: str, stamp_ns: int) -> None:
+    event, *_ = read(write(tmp_path, ODOM.replace('976052857.437530', word) + FLASER))
+    assert isinstance(event, OdometryEvent)
+    assert event.stamp_ns == stamp_ns
+
+
+def test_the_latest_stamp_is_that_of_ros_messages(tmp_path: Path) -> None:
+    lines = [ODOM.replace('976052857.437530', f'{LATEST_S + k}') for k in (-1, 0)]
+    log = CarmenLog(write(tmp_path, ''.join([*lines, FLASER])))
+    assert len(list(log.events())) == 3
+    assert log.skipped.count == 1

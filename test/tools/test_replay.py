@@ -2,6 +2,8 @@
 
 import gzip
 import json
+import re
+import signal
 import subprocess
 import sys
 import threading
@@ -191,6 +193,88 @@ def test_bad_lines_are_counted_and_the_first_is_named(tmp_path):
     assert (report['scans'], report['skipped']) == (28, 2)
     assert 'some.log:11: ' in report['first_skipped']
     assert '2 skipped' in done.stdout and 'some.log:11: ' in done.stdout
+
+
+WILD = {
+    '1e308': (lambda line: line.replace('ODOM 0.3300', 'ODOM 1e308'), 1),
+    '1e17': (lambda line: line.replace('ODOM 0.3300', 'ODOM 1e17'), 1),
+    'kilometres': (lambda line: line.replace('0.3300 0 0', '2000.0 2000.0 0'), 0),
+}
+
+
+@pytest.mark.programs
+@pytest.mark.parametrize('case', WILD)
+def test_one_wild_pose_leaves_the_rest_of_the_log(tmp_path, case):
+    alter, skipped = WILD[case]
+    # The robot's clock jumps ahead before the wild pose: odometry may have come far since.
+    lines = carmen_lines(11) + carmen_lines(start_s=1e4)[23:]
+    altered = [alter(line) if k in (23, 24) else line for k, line in enumerate(lines)]
+    assert altered != lines
+    path = tmp_path / 'some.log'
+    path.write_text('\n'.join(altered))
+    done = run(path, '-o', tmp_path / 'out', '--quiet')
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert (report['scans'], report['skipped'], report['refused']) == (30, skipped, 0)
+    assert report['ended_by'] == ''
+    trajectory = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
+    assert np.abs(trajectory[:, 1] - 0.03 * np.arange(30)).max() < 0.03
+
+
+@pytest.mark.programs
+def test_scans_beyond_the_largest_map_are_counted_and_named(tmp_path):
+    # Odometry that may be true: 340 m in three minutes. At cells of 0.02 m that is too far.
+    away = [line for line in carmen_lines(start_s=200.0) if line.startswith('FLASER')][10]
+    away = away.replace('0.3000 0 0', '240.0 240.0 0')
+    path = tmp_path / 'some.log'
+    path.write_text('\n'.join([*carmen_lines(10), away, *carmen_lines(start_s=400.0)[23:]]))
+    done = run(path, '-o', tmp_path / 'out', '--quiet', '--resolution-m', '0.02')
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert (report['scans'], report['refused']) == (30, 1)
+    assert report['first_refused'].startswith('scan at 202000000000 ns: laser at 2')
+    assert '1 not mapped (first: scan at 202000000000 ns' in done.stdout
+    assert (tmp_path / 'out' / 'map.pgm').stat().st_size < 1_000_000
+
+
+@pytest.mark.programs
+def test_what_was_mapped_before_an_error_is_written(log, tmp_path):
+    log.write_text(log.read_text() + 'ODOM \0\n' + '\n'.join(carmen_lines(start_s=100.0)))
+    done = run(log, '-o', tmp_path / 'out', '--quiet')
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f'replay: error: {log}:62: a zero byte')
+    assert line.endswith(f'the 30 scans before it are in {tmp_path / "out"}')
+    assert {path.name for path in (tmp_path / 'out').iterdir()} == FILES
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert report['scans'] == 30
+    assert 'a zero byte' in report['ended_by']
+
+
+@pytest.mark.programs
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_what_was_mapped_before_ctrl_c_is_written(tmp_path, number):
+    path = tmp_path / 'long.log'
+    path.write_text('\n'.join(carmen_lines(80)) + '\n')
+    with path.open('a') as stream:
+        for lap in range(1, 100):
+            stream.write('\n'.join(carmen_lines(80, start_s=20.0 * lap)) + '\n')
+    command = [sys.executable, '-m', 'thinmap_ros.tools.replay', path, '-o', tmp_path / 'out']
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE) as replaying:
+        shown = b''
+        while not re.search(rb'[1-9][0-9]+ events', shown):
+            more = replaying.stderr.read1()
+            assert more, shown
+            shown += more
+        replaying.send_signal(number)
+        out, err = replaying.communicate(timeout=PATIENCE_S)
+    assert replaying.returncode == 130
+    assert err.decode().splitlines()[-1] == 'replay: interrupted'
+    assert {path.name for path in (tmp_path / 'out').iterdir()} == FILES
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert 0 < report['scans'] < 8000
+    assert report['ended_by'] == 'KeyboardInterrupt'
+    assert f'{report["scans"]} scans' in out.decode()
 
 
 @pytest.mark.programs
@@ -386,3 +470,26 @@ def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypat
     assert 'close the viewer to end' in capsys.readouterr().err
     assert {path.name for path in (tmp_path / 'out').iterdir()} == FILES
     assert rows_of(received, '/map/robot') == 30, 'it was sent all of it'
+
+
+class FullDisk(Diary):
+    """A view that fails at the twentieth scan, and at the end."""
+
+    def pose(self, ns, T_map_base, covariance):
+        super().pose(ns, T_map_base, covariance)
+        if self.told['pose'] == 20:
+            raise OSError('disk full')
+
+    def grid(self, ns, patch):
+        if self.told['pose'] == 20:
+            raise OSError('disk full again')
+
+
+def test_an_error_of_the_view_keeps_what_was_mapped_if_asked(log):
+    carmen = CarmenLog(log, LaserOptions())
+    watcher = ReplayView(FullDisk())
+    result = replay(carmen, PipelineConfig(), watcher=watcher, keep_partial=True)
+    assert str(result.ended_by) == 'disk full'
+    assert len(result.poses) == 20
+    with pytest.raises(OSError, match='disk full'):
+        replay(carmen, PipelineConfig(), watcher=ReplayView(FullDisk()))

@@ -112,8 +112,11 @@ class OdometryLimits:
     max_gap_ns: int = 120_000_000_000
 
     def distance_m(self, seconds: float) -> float:
-        """Largest distance between two samples so many seconds apart, m."""
-        return self.jump_m + self.max_speed_m_s * seconds
+        """Largest distance between two samples so many seconds apart, m.
+
+        After a longer gap than `max_gap_ns` it is not larger: nobody has seen that drive.
+        """
+        return self.jump_m + self.max_speed_m_s * min(seconds, self.max_gap_ns / SECOND_NS)
 
 
 _LIMITS = OdometryLimits()

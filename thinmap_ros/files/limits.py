@@ -29,14 +29,22 @@ class LogLimits:
     """Bags and logs of sensor data. Sizes in bytes."""
 
     file_bytes: int = 32 << 30  # decompressed
+    file_ratio: int = 200  # of decompressed to compressed bytes, beyond `small_file_bytes`
+    small_file_bytes: int = 256 << 20
     line_bytes: int = 4 << 20  # of a text log
+    lines: int = 1 << 23  # a day of odometry at 97 Hz
     chunk_bytes: int = 256 << 20  # uncompressed, and any other record
     summary_bytes: int = 64 << 20
     definitions_bytes: int = 64 << 20  # schemas and channels, all together
     definitions: int = 1 << 16
     schema_bytes: int = 1 << 20
+    schema_fields: int = 8000  # with those of nested types, each time; and lines
     buffered_bytes: int = 512 << 20  # messages that wait to be sorted by time
     queue_depth: int = 100_000
+
+    def unpacked_bytes(self, packed_bytes: int) -> int:
+        """Largest size of a file that is compressed to a number of bytes."""
+        return min(self.file_bytes, max(self.small_file_bytes, self.file_ratio * packed_bytes))
 
 
 PIECE_BYTES = 1 << 20  # large files are read in pieces

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.limits import LOGS
 from thinmap_ros.logs import decode
-from thinmap_ros.logs.bag_directory import bag_files, decompressed_files
+from thinmap_ros.logs.bag_directory import DecompressedFile, bag_files
 from thinmap_ros.logs.laser_mount import Mount, StaticTransforms, rotation_matrix
 from thinmap_ros.logs.log import (
     Event,
@@ -53,13 +52,12 @@ class Bag:
         self.topics: dict[str, str] = {}
         self.offers: dict[str, list[Qos]] = {}
         self._storages: list[Storage] = []
-        self._unpacked: list[TemporaryDirectory[str] | None] = []
+        self._unpacked: list[DecompressedFile] = []
         self._files = bag_files(path)
         self._unreadable = 0
         try:
-            for file, unpacked_into in decompressed_files(self._files.files):
-                self._unpacked.append(unpacked_into)
-                self._add(storage_of(file))
+            for file in self._files.files:
+                self._add(self._opened(file))
         except OSError as error:
             raise InputError(f'{path}: {error.strerror or error}') from error
         if self.damage and not any(storage.has_messages for storage in self._storages):
@@ -117,6 +115,16 @@ class Bag:
             raise InputError(
                 f'{where}: no {validation.quoted_name(message.type_name)}: {reason}'
             ) from error
+
+    def _opened(self, file: Path) -> Storage:
+        if file.suffix != '.zstd':
+            return storage_of(file)
+        unpacked = DecompressedFile(file)
+        self._unpacked.append(unpacked)
+        try:
+            return storage_of(unpacked.path)
+        except InputError as error:
+            raise InputError(str(error).replace(str(unpacked.path), str(file))) from error
 
     def _add(self, storage: Storage) -> None:
         self._storages.append(storage)
@@ -239,8 +247,11 @@ class BagLog:
 def _odometry(message: Any) -> OdometryEvent:
     rotation_matrix(message.pose.pose.orientation)  # raises InputError if it is invalid
     T_odom_base = decode.pose(message.pose.pose)
-    if not se2.is_finite(T_odom_base):
-        raise InputError(f'pose {T_odom_base.tolist()}: expected finite numbers')
+    if not se2.is_bounded_pose(T_odom_base):
+        raise InputError(
+            f'pose {T_odom_base.tolist()}: expected finite numbers, at most '
+            f'{se2.MAX_COORDINATE_M:g} m'
+        )
     return OdometryEvent(decode.stamp_ns(message), T_odom_base)
 
 

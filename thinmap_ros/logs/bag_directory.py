@@ -1,10 +1,9 @@
 """rosbag2 folders: their files, and how these are compressed (metadata.yaml)."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from tempfile import TemporaryDirectory
-from typing import Any
+from tempfile import TemporaryDirectory, TemporaryFile
+from typing import IO, Any
 
 import zstandard
 
@@ -79,30 +78,35 @@ def _listed(folder: Path, information: Any) -> BagFiles:
     return BagFiles(files, compressed_messages=mode == 'message')
 
 
-def decompressed_files(
-    files: list[Path],
-) -> Iterator[tuple[Path, TemporaryDirectory[str] | None]]:
-    """The files; those ending in .zstd are decompressed into a temporary folder.
+class DecompressedFile:
+    """A file that is compressed as a whole, decompressed for as long as this object exists.
 
-    Raises InputError if a file is invalid, or expands to more than LOGS.file_bytes.
+    An MCAP file has no name, so that nothing of it is left, however the program ends. SQLite opens
+    files by name only: that one is in a temporary folder.
     """
-    for file in files:
-        if file.suffix != '.zstd':
-            yield file, None
-            continue
-        folder = TemporaryDirectory(prefix='thinmap_')
-        target = Path(folder.name) / file.stem
-        _unpack(file, target)
-        yield target, folder
+
+    def __init__(self, file: Path) -> None:
+        """Raises InputError if a file is invalid, or expands to more than it may."""
+        self._folder: TemporaryDirectory[str] | None = None
+        if file.stem.endswith('.db3'):
+            self._folder = TemporaryDirectory(prefix='thinmap_')
+            self.path = Path(self._folder.name) / file.stem
+            self._stream: IO[bytes] = self.path.open('w+b')
+        else:
+            self._stream = TemporaryFile()  # noqa: SIM115
+            self.path = Path(f'/proc/self/fd/{self._stream.fileno()}')
+        _unpack(file, self._stream)
+        self._stream.flush()
 
 
-def _unpack(file: Path, target: Path) -> None:
+def _unpack(file: Path, out: IO[bytes]) -> None:
+    limit = LOGS.unpacked_bytes(file.stat().st_size)
     try:
-        with file.open('rb') as packed, target.open('wb') as out:
+        with file.open('rb') as packed:
             reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
             while piece := reader.read(PIECE_BYTES):
-                if out.tell() + len(piece) > LOGS.file_bytes:
-                    raise InputError(f'{file}: more than {LOGS.file_bytes} bytes decompressed')
+                if out.tell() + len(piece) > limit:
+                    raise InputError(f'{file}: expected at most {limit} bytes decompressed')
                 out.write(piece)
     except zstandard.ZstdError as error:
         raise InputError(f'{file}: no zstd file: {str(error)[:120]}') from error

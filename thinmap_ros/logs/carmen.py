@@ -31,6 +31,12 @@ from thinmap_ros.logs.log import (
     refuse_foreign,
 )
 
+_KEYWORDS = (b'ODOM', b'FLASER', b'ROBOTLASER1')  # other lines are not read
+_TOO_LONG = (
+    f'expected at most {LOGS.lines} lines, and {LOGS.file_ratio} times the bytes of a gzip file: '
+    'only the lines before are read'
+)
+
 
 @dataclass(frozen=True)
 class LaserOptions(Config):
@@ -98,7 +104,12 @@ class CarmenLog:
             with _open(self.path) as stream:
                 # One byte more than the limit: no more of a longer line is ever read.
                 lines = iter(lambda: stream.readline(LOGS.line_bytes + 1), b'')
+                unread = _unpacked_bytes(self.path)
                 for number, line in enumerate(lines, start=1):
+                    unread -= len(line)
+                    if number > LOGS.lines or unread < 0:
+                        self.skipped.add_first(f'{self.path}:{number}: {_TOO_LONG}')
+                        return
                     if len(line) > LOGS.line_bytes:
                         raise InputError(
                             f'{self.path}:{number}: a line of more than {LOGS.line_bytes} bytes: '
@@ -108,6 +119,8 @@ class CarmenLog:
                         raise InputError(
                             f'{self.path}:{number}: a zero byte: expected a text file (CARMEN log)'
                         )
+                    if line.endswith(b'\n') and not line.lstrip().startswith(_KEYWORDS):
+                        continue
                     text = line.decode('utf-8', errors='replace')
                     yield (
                         number,
@@ -171,13 +184,15 @@ class CarmenLog:
         )
         T_odom_laser = _pose(rest[0:3])
         T_odom_base = _pose(rest[3:6])
-        if self._T_base_laser is None:
-            # The laser is mounted rigidly: the offset of the first line is used for all, without
-            # its rounding errors.
-            self._T_base_laser = np.round(se2.between(T_odom_base, T_odom_laser), 3)
-        mount = self._offset() if self.options.offset_m else self._T_base_laser
+        # The laser is mounted rigidly: the offset of the first valid line is used for all, without
+        # its rounding errors.
+        measured = self._T_base_laser
+        if measured is None:
+            measured = np.round(se2.between(T_odom_base, T_odom_laser), 3)
+        mount = self._offset() if self.options.offset_m else measured
         limit = min(max_range, self.options.range_max_m)
         scan = self._scan(_stamp(rest[11]), words[9 : 9 + count], (start, step), limit, mount)
+        self._T_base_laser = measured
         return [OdometryEvent(scan.stamp_ns, T_odom_base), ScanEvent(scan)]
 
     def _offset(self) -> Array:
@@ -209,9 +224,18 @@ def _check_length(words: list[str], count: int, expected: str) -> None:
 
 
 def _open(path: Path) -> BinaryIO:
+    return gzip.open(path, 'rb') if _is_gzip(path) else path.open('rb')  # type: ignore[return-value]
+
+
+def _is_gzip(path: Path) -> bool:
     with path.open('rb') as stream:
-        zipped = stream.read(2) == b'\x1f\x8b'
-    return gzip.open(path, 'rb') if zipped else path.open('rb')  # type: ignore[return-value]
+        return stream.read(2) == b'\x1f\x8b'
+
+
+def _unpacked_bytes(path: Path) -> int:
+    """Largest number of bytes that are read of a log."""
+    size = path.stat().st_size
+    return LOGS.unpacked_bytes(size) if _is_gzip(path) else LOGS.line_bytes * LOGS.lines
 
 
 def _stamp(word: str) -> int:
@@ -226,6 +250,7 @@ def _stamp(word: str) -> int:
 
 def _pose(words: list[str]) -> Array:
     pose = np.array(words, dtype=np.float64)
-    if pose.shape != (3,) or not np.isfinite(pose).all():
-        raise ValueError(f'pose {words}: expected three finite numbers')
+    # Written so that NaN is refused, too. A heading of so many turns has no meaning either.
+    if pose.shape != (3,) or not np.abs(pose).max() <= se2.MAX_COORDINATE_M:
+        raise ValueError(f'pose {words}: expected three numbers, at most {se2.MAX_COORDINATE_M:g}')
     return se2.pose(*pose)

@@ -57,7 +57,10 @@ class SkippedRecords:
 class Log(Protocol):
     """A log file or bag."""
 
-    skipped: SkippedRecords
+    @property
+    def skipped(self) -> SkippedRecords:
+        """Unusable records so far."""
+        ...
 
     def events(self) -> Iterator[Event]:
         """Odometry and scans in the order of the file."""

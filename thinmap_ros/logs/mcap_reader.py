@@ -9,6 +9,7 @@ import struct
 import zlib
 from bisect import bisect_right
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -30,12 +31,14 @@ from thinmap_ros.logs.mcap_records import (
     DamagedError,
     Definition,
     Records,
+    Section,
     chunk_records,
     definition,
-    records_of,
+    plain_records,
 )
 
 _FOOTER = struct.Struct('<QQI')
+_CHANNEL_ID = struct.Struct('<H')
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _LAST_OPCODE = Opcode.DATA_END
 
@@ -130,11 +133,7 @@ class McapFile:
             self.definitions.add(record)
         self._chunk_spans = summary.blocks if self.definitions.channels else []
         if not self._chunk_spans:
-            for block, records in _walk(path, summary, self.damage):
-                for record in records.definitions:
-                    self.definitions.add(record)
-                if records.log_ns.size:
-                    self._chunk_spans.append(block)
+            self._chunk_spans = list(_first_pass(path, summary, self.definitions, self.damage))
         self.has_messages = bool(self._chunk_spans)
 
     def messages(self, topics: set[str] | None = None) -> Iterator[tuple[Schema, Channel, Message]]:
@@ -149,21 +148,16 @@ class McapFile:
             yield *chosen[message.channel_id], message
 
     def _in_log_order(self, channel_ids: frozenset[int]) -> Iterator[Message]:
-        queue = _LogOrder(channel_ids)
+        queue = _LogOrder()
         blocks = [
             b for b in self._chunk_spans if b.channel_ids is None or b.channel_ids & channel_ids
         ]
         with self.path.open('rb') as stream:
             for block in sorted(blocks, key=lambda b: b.first_ns):
                 yield from queue.before(block.first_ns)
-                try:
-                    records = _load(stream, block)
-                except DamagedError as error:
-                    self.damage.parts[block.start] = str(error)
-                    continue
-                if records.damaged:
-                    self.damage.parts[block.start] = records.damaged
-                queue.add(records)
+                records = _load_intact(stream, block, channel_ids, self.damage)
+                if records is not None:
+                    queue.add(records)
         yield from queue.before(None)
 
 
@@ -173,8 +167,7 @@ class _LogOrder:
     It buffers about _MOST_HELD bytes at most: beyond that, messages are out of order.
     """
 
-    def __init__(self, channel_ids: frozenset[int]) -> None:
-        self._wanted = np.array(sorted(channel_ids), dtype=np.uint16)
+    def __init__(self) -> None:
         self._loaded: dict[int, tuple[Records, NDArray[np.intp]]] = {}
         self._heap: list[tuple[int, int, int]] = []
         self._held = 0
@@ -182,8 +175,7 @@ class _LogOrder:
 
     def add(self, records: Records) -> None:
         """Add the records of a chunk."""
-        wanted = np.flatnonzero(np.isin(records.channel_ids, self._wanted))
-        order = wanted[np.argsort(records.log_ns[wanted], kind='stable')]
+        order = np.argsort(records.log_ns, kind='stable')
         if order.size:
             self._number += 1
             self._loaded[self._number] = (records, order)
@@ -216,40 +208,81 @@ def intact_records(path: Path, damage: Damage) -> Iterator[Definition | Message]
     """
     summary = summary_of(path)
     yield from summary.definitions
-    for _, records in _walk(path, summary, damage):
-        yield from records.definitions
-        yield from records.messages()
+    with _opened(path) as stream:
+        for block in _chunk_spans(stream, path, summary, damage):
+            records = _load_intact(stream, block, None, damage)
+            if records is not None:
+                yield from records.definitions
+                yield from records.messages()
 
 
-def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[ChunkSpan, Records]]:
-    """Chunk spans and their records in file order; damaged parts are added to `damage`.
+def _first_pass(
+    path: Path, summary: Summary, definitions: Definitions, damage: Damage
+) -> Iterator[ChunkSpan]:
+    """Chunk spans with messages of a file; its definitions and damaged parts are added to these.
 
-    After a damaged part, reading continues at the next chunk of the summary. Raises InputError if
-    the file does not begin with the magic bytes of MCAP.
+    A chunk is unpacked only if its message index names a channel that is not known yet, or if it
+    has no message index.
     """
+    with _opened(path) as stream:
+        for block in _chunk_spans(stream, path, summary, damage):
+            channel_ids = _indexed_channels(stream, block)
+            if channel_ids and channel_ids <= definitions.channels.keys():
+                first_ns = _first_log_time(stream, block)
+                yield replace(block, first_ns=first_ns, channel_ids=channel_ids)
+                continue
+            records = _load_intact(stream, block, frozenset(), damage)
+            if records is None:
+                continue
+            for record in records.definitions:
+                definitions.add(record)
+            if records.count:
+                channel_ids = records.all_channel_ids
+                yield replace(block, first_ns=records.first_ns, channel_ids=channel_ids)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """The opened file. Raises InputError if it does not begin with the magic bytes of MCAP."""
     with path.open('rb') as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             raise InputError(f'{path}: no MCAP file: expected it to begin with {MAGIC!r}')
-        chunks = sorted(block.start for block in summary.blocks)
-        for block in _chunk_spans(stream, path.stat().st_size, chunks, damage):
-            try:
-                records = _load(stream, block)
-            except DamagedError as error:
-                damage.parts[block.start] = str(error)
-                continue
-            if records.damaged:
-                damage.parts[block.start] = records.damaged
-            channel_ids = frozenset(np.unique(records.channel_ids).tolist())
-            yield replace(block, first_ns=records.first_ns, channel_ids=channel_ids), records
+        yield stream
+
+
+def _indexed_channels(stream: BinaryIO, block: ChunkSpan) -> frozenset[int]:
+    """Channels of a chunk by the message indexes behind it; none if it has no index."""
+    channel_ids: set[int] = set()
+    at = block.end
+    while block.is_chunk and block.whole:
+        stream.seek(at)
+        head = stream.read(HEAD.size + _CHANNEL_ID.size)
+        if len(head) < HEAD.size + _CHANNEL_ID.size:
+            break
+        code, length = HEAD.unpack_from(head)
+        if code != Opcode.MESSAGE_INDEX or length < _CHANNEL_ID.size:
+            break
+        channel_ids.update(_CHANNEL_ID.unpack_from(head, HEAD.size))
+        at += HEAD.size + length
+    return frozenset(channel_ids)
+
+
+def _first_log_time(stream: BinaryIO, block: ChunkSpan) -> int:
+    """Log time of the earliest message of a chunk, as its header says."""
+    stream.seek(block.start + HEAD.size)
+    return int.from_bytes(stream.read(8), 'little')
 
 
 def _chunk_spans(
-    stream: BinaryIO, size: int, chunks: list[int], damage: Damage
+    stream: BinaryIO, path: Path, summary: Summary, damage: Damage
 ) -> Iterator[ChunkSpan]:
-    """Chunk spans of a file of `size` bytes; `chunks`: first bytes of chunks by the summary.
+    """Chunk spans of a file in its order; damaged parts are added to `damage`.
 
-    Data that a recorder has appended since are ignored.
+    After a damaged part, reading continues at the next chunk of the summary. Data that a recorder
+    has appended since are ignored.
     """
+    size = path.stat().st_size
+    chunks = sorted(block.start for block in summary.blocks)
     at = len(MAGIC)
     stretch = at
     while True:
@@ -284,18 +317,32 @@ def _chunk_spans(
         stretch = at
 
 
-def _load(stream: BinaryIO, block: ChunkSpan) -> Records:
-    """Records of a chunk span. Raises DamagedError."""
+def _load_intact(
+    stream: BinaryIO, block: ChunkSpan, wanted: frozenset[int] | None, damage: Damage
+) -> Records | None:
+    """Records of a chunk span, without what is damaged: this is added to `damage`."""
+    try:
+        records = _load(stream, block, wanted)
+    except DamagedError as error:
+        damage.parts[block.start] = str(error)
+        return None
+    if records.damaged:
+        damage.parts[block.start] = records.damaged
+    return records
+
+
+def _load(stream: BinaryIO, block: ChunkSpan, wanted: frozenset[int] | None) -> Records:
+    """Records of a chunk span; wanted: channels, None for all. Raises DamagedError."""
     stream.seek(block.start)
     if not block.is_chunk:
-        return records_of(stream.read(block.end - block.start))
+        return plain_records(Section(stream, block.end - block.start), wanted=wanted)
     length = block.end - block.start - HEAD.size
     if length > LOGS.chunk_bytes:
         raise DamagedError(f'chunk of {length} bytes: expected at most {LOGS.chunk_bytes}')
     head = stream.read(HEAD.size)
     if block.whole and head != HEAD.pack(Opcode.CHUNK, length):
         raise DamagedError(f'no chunk of {length} bytes')
-    return chunk_records(stream.read(length), block.whole)
+    return chunk_records(Section(stream, length), block.whole, wanted)
 
 
 def summary_of(path: Path) -> Summary:

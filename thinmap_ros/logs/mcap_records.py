@@ -9,7 +9,7 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Any
+from typing import Any, BinaryIO
 
 import lz4.frame
 import numpy as np
@@ -28,9 +28,11 @@ FIRST_PRIVATE_OPCODE = 0x80
 
 HEAD = struct.Struct('<BQ')
 _CHUNK = struct.Struct('<QQQI')
+_LENGTH = struct.Struct('<I')
 _MESSAGE = struct.Struct('<HIQQ')
 _IN_CHUNK = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _SLICE = 2**16
+_LONGEST_NAME = 1000  # of a compression
 
 Definition = Schema | Channel
 
@@ -43,28 +45,28 @@ class DamagedError(Exception):
 class Records:
     """The records of a chunk, or of a range of the file without chunks.
 
-    definitions: schemas and channels; log_ns (N,), channel_ids (N,), offsets (N,): the messages in
-    file order, with offsets into `data`; damaged: why records were omitted, else empty.
+    definitions: schemas and channels; log_ns (N,), channel_ids (N,), offsets (N,): the messages of
+    the wanted channels in file order, with offsets into `data`, which holds only these; count,
+    first_ns, all_channel_ids: number, earliest log time (0 if there are none) and channels of all
+    messages; damaged: why records were omitted, else empty.
     """
 
-    data: bytes
+    data: bytes | bytearray
     definitions: list[Definition]
     log_ns: NDArray[np.uint64]
     channel_ids: NDArray[np.uint16]
     offsets: NDArray[np.uint64]
+    count: int
+    first_ns: int
+    all_channel_ids: frozenset[int]
     damaged: str = ''
-
-    @property
-    def first_ns(self) -> int:
-        """Log time of the earliest message; 0 if there are none."""
-        return int(self.log_ns.min()) if self.log_ns.size else 0
 
     def message(self, index: int) -> Message:
         """Message by its index in `offsets`."""
         at = int(self.offsets[index])
         (_, length) = HEAD.unpack_from(self.data, at - HEAD.size)
         channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(self.data, at)
-        content = self.data[at + _MESSAGE.size : at + length]
+        content = bytes(self.data[at + _MESSAGE.size : at + length])
         return Message(channel_id, log_ns, content, publish_ns, sequence)
 
     def messages(self) -> Iterator[Message]:
@@ -72,29 +74,48 @@ class Records:
         return (self.message(index) for index in range(self.offsets.size))
 
 
-def chunk_records(content: bytes, whole: bool) -> Records:
+class Section:
+    """The next bytes of a stream, at most `left`."""
+
+    def __init__(self, stream: BinaryIO, left: int) -> None:
+        self._stream = stream
+        self.left = left
+
+    def read(self, size: int) -> bytes:
+        """Read up to `size` bytes; none at the end of the section or of the stream."""
+        piece = self._stream.read(max(min(size, self.left), 0))
+        self.left -= len(piece)
+        return piece
+
+
+def chunk_records(content: Section, whole: bool, wanted: frozenset[int] | None = None) -> Records:
     """Records in the content of a chunk; if it is truncated (not `whole`), those before the end.
 
-    Raises DamagedError if it is corrupt or larger than LOGS.chunk_bytes.
+    wanted: the channels whose messages are kept, None for all. Only these take memory: the chunk is
+    unpacked in pieces. Raises DamagedError if it is corrupt or larger than LOGS.chunk_bytes.
     """
     try:
-        _, _, size, checksum = _CHUNK.unpack_from(content)
-        (n,) = struct.unpack_from('<I', content, _CHUNK.size)
-        compression = content[_CHUNK.size + 4 : _CHUNK.size + 4 + n].decode('ascii')
-        (length,) = struct.unpack_from('<Q', content, _CHUNK.size + 4 + n)
+        _, _, size, checksum = _CHUNK.unpack(content.read(_CHUNK.size))
+        (n,) = _LENGTH.unpack(content.read(_LENGTH.size))
+        compression = content.read(min(n, _LONGEST_NAME)).decode('ascii')
+        (length,) = struct.unpack('<Q', content.read(8))
     except (struct.error, ValueError) as error:
         raise DamagedError(f'no chunk header: {_short(error)}') from error
-    packed = content[_CHUNK.size + 12 + n : _CHUNK.size + 12 + n + length]
-    if whole and len(packed) < length:
-        raise DamagedError(f'{len(packed)} bytes compressed: expected {length}')
+    if whole and content.left < length:
+        raise DamagedError(f'{content.left} bytes compressed: expected {length}')
     # The length of the record itself may be damaged.
-    complete = len(packed) == length
-    data = decompress(compression, packed, size, complete)
-    if complete and len(data) != size:
-        raise DamagedError(f'{len(data)} bytes uncompressed: expected {size}')
-    if complete and checksum and zlib.crc32(data) != checksum:
+    complete = content.left >= length
+    content.left = min(content.left, length)
+    found = _Found(wanted)
+    checked = 0
+    for piece in _pieces(compression, content, size, complete):
+        checked = zlib.crc32(piece, checked)
+        found.feed(piece)
+    if complete and found.size != size:
+        raise DamagedError(f'{found.size} bytes uncompressed: expected {size}')
+    if complete and checksum and checked != checksum:
         raise DamagedError('wrong checksum')
-    return records_of(data, complete)
+    return found.records(complete)
 
 
 def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> bytes:
@@ -103,36 +124,47 @@ def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> 
     size: declared bytes; no more is ever decompressed. Raises DamagedError if it exceeds
     LOGS.chunk_bytes, or the data expand to more than declared.
     """
-    if size > LOGS.chunk_bytes:
-        raise DamagedError(f'{size} bytes uncompressed: expected at most {LOGS.chunk_bytes}')
-    if compression == '':
-        return data
-    if compression not in ('lz4', 'zstd'):
-        raise DamagedError(f'compression {compression[:20]!r}: expected none, lz4 or zstd')
-    pieces = _lz4_pieces(data) if compression == 'lz4' else _zstd_pieces(data)
     result = bytearray()
-    try:
-        for piece in pieces:
-            result += piece
-            if len(result) > size:
-                raise DamagedError(f'more than the declared {size} bytes uncompressed')
-    except (RuntimeError, zstandard.ZstdError) as error:
-        if whole:
-            raise DamagedError(f'{compression}: {_short(error)}') from error
+    for piece in _pieces(compression, Section(BytesIO(data), len(data)), size, whole):
+        result += piece
     return bytes(result)
 
 
-def _zstd_pieces(data: bytes) -> Iterator[bytes]:
-    reader = zstandard.ZstdDecompressor().stream_reader(BytesIO(data), read_across_frames=True)
+def _pieces(compression: str, packed: Section, size: int, whole: bool) -> Iterator[bytes]:
+    """Uncompressed pieces of data; raises DamagedError as `decompress` does."""
+    if size > LOGS.chunk_bytes:
+        raise DamagedError(f'{size} bytes uncompressed: expected at most {LOGS.chunk_bytes}')
+    unpack = {'': _plain_pieces, 'lz4': _lz4_pieces, 'zstd': _zstd_pieces}.get(compression)
+    if unpack is None:
+        raise DamagedError(f'compression {compression[:20]!r}: expected none, lz4 or zstd')
+    unpacked = 0
+    try:
+        for piece in unpack(packed):
+            unpacked += len(piece)
+            if unpacked > size:
+                raise DamagedError(f'more than the declared {size} bytes uncompressed')
+            yield piece
+    except (RuntimeError, zstandard.ZstdError) as error:
+        if whole:
+            raise DamagedError(f'{compression}: {_short(error)}') from error
+
+
+def _plain_pieces(data: Section) -> Iterator[bytes]:
+    while piece := data.read(PIECE_BYTES):
+        yield piece
+
+
+def _zstd_pieces(data: Section) -> Iterator[bytes]:
+    source: Any = data  # of the methods of a stream, only `read` is used
+    reader = zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True)
     while piece := reader.read(PIECE_BYTES):
         yield piece
 
 
-def _lz4_pieces(data: bytes) -> Iterator[bytes]:
+def _lz4_pieces(data: Section) -> Iterator[bytes]:
     unpacker: Any = lz4.frame.LZ4FrameDecompressor()
-    for at in range(0, len(data), _SLICE):
-        piece = unpacker.decompress(data[at : at + _SLICE], max_length=PIECE_BYTES)
-        yield piece
+    while packed := data.read(_SLICE):
+        yield unpacker.decompress(packed, max_length=PIECE_BYTES)
         while not unpacker.needs_input and not unpacker.eof:
             yield unpacker.decompress(b'', max_length=PIECE_BYTES)
         if unpacker.eof:
@@ -146,66 +178,163 @@ def records_of(data: bytes, whole: bool = True) -> Records:
     data (not `whole`) an incomplete last record is expected. Raises DamagedError if there are too
     many definitions.
     """
-    found = _Found([], array('Q'), array('H'), array('Q'))
-    at = 0
-    is_record = True
-    while at + HEAD.size <= len(data):
-        code, length = HEAD.unpack_from(data, at)
-        start = at + HEAD.size
-        is_record = code in _IN_CHUNK or code >= FIRST_PRIVATE_OPCODE
-        if not is_record or start + length > len(data):
-            break
-        found.add(code, data, start, length)
-        at = start + length
-    if at < len(data) and (whole or not is_record):
-        found.drop_last(f'no record at byte {at} of {len(data)}')
-    return Records(
-        data,
-        found.definitions,
-        np.frombuffer(found.log_ns, dtype=np.uint64),
-        np.frombuffer(found.channel_ids, dtype=np.uint16),
-        np.frombuffer(found.offsets, dtype=np.uint64),
-        found.damaged,
-    )
+    return plain_records(Section(BytesIO(data), len(data)), whole)
 
 
-@dataclass
+def plain_records(
+    content: Section, whole: bool = True, wanted: frozenset[int] | None = None
+) -> Records:
+    """Consecutive records outside of chunks, as `records_of`; wanted: as in `chunk_records`."""
+    found = _Found(wanted)
+    for piece in _plain_pieces(content):
+        found.feed(piece)
+    return found.records(whole)
+
+
 class _Found:
-    """Collects the records of some bytes, in 18 bytes per message."""
+    """Collects the records of a stream of bytes, in 18 bytes per message that is wanted."""
 
-    definitions: list[Definition]
-    log_ns: 'array[int]'
-    channel_ids: 'array[int]'
-    offsets: 'array[int]'
-    damaged: str = ''
+    def __init__(self, wanted: frozenset[int] | None) -> None:
+        self.size = 0  # bytes so far
+        self._wanted = wanted
+        self._definitions: list[Definition] = []
+        self._messages = _Messages()
+        self._buffer = bytearray()  # of the record that is not complete yet
+        self._skipped = 0  # remaining bytes of a record that is not kept
+        self._skipped_message: tuple[int, int] | None = None  # its channel and log time
+        self._end_at: int | None = None  # of the records, where bytes follow that are none
+        self._damaged = ''
 
-    def add(self, code: int, data: bytes, start: int, length: int) -> None:
+    def feed(self, piece: bytes) -> None:
+        """Add bytes. Raises DamagedError if there are too many definitions."""
+        self.size += len(piece)
+        if self._end_at is not None:
+            return
+        jump = min(self._skipped, len(piece))
+        self._skipped -= jump
+        if self._skipped == 0 and self._skipped_message is not None:
+            self._messages.count(*self._skipped_message)
+            self._skipped_message = None
+        self._buffer += memoryview(piece)[jump:]
+        del self._buffer[: self._parse()]
+
+    def records(self, whole: bool) -> Records:
+        """The records so far; whole: the bytes are complete."""
+        at = self.size - len(self._buffer) if self._end_at is None else self._end_at
+        is_record = self._end_at is None
+        is_cut = self._skipped > 0 or at < self.size
+        if is_cut and (whole or not is_record):
+            self._damaged = self._damaged or f'no record at byte {at} of {self.size}'
+            self._messages.drop_last()
+        return self._messages.as_records(self._definitions, self._damaged)
+
+    def _parse(self) -> int:
+        """Add the complete records of the buffer; returns how many of its bytes they take."""
+        data = self._buffer
+        at = 0
+        while at + HEAD.size <= len(data):
+            code, length = HEAD.unpack_from(data, at)
+            if code not in _IN_CHUNK and code < FIRST_PRIVATE_OPCODE:
+                self._end_at = self.size - len(data) + at
+                break
+            start = at + HEAD.size
+            if start + length > len(data):
+                return self._skip(code, start, length) or at
+            self._add(code, start, length)
+            at = start + length
+        return at
+
+    def _skip(self, code: int, start: int, length: int) -> int:
+        """Skip an incomplete record that is not kept; returns the bytes up to the end, or 0."""
+        available = len(self._buffer) - start
+        if code == Opcode.MESSAGE and min(length, available) >= _MESSAGE.size:
+            channel_id, _, log_ns, _ = _MESSAGE.unpack_from(self._buffer, start)
+            if self._is_wanted(channel_id) or log_ns >= LATEST_NS:
+                return 0
+            self._skipped_message = (channel_id, log_ns)
+        elif code < FIRST_PRIVATE_OPCODE:
+            return 0
+        self._skipped = length - available
+        return len(self._buffer)
+
+    def _is_wanted(self, channel_id: int) -> bool:
+        return self._wanted is None or channel_id in self._wanted
+
+    def _add(self, code: int, start: int, length: int) -> None:
         """Add a record by the position of its content, or store why it is invalid."""
+        data = self._buffer
         try:
             if code == Opcode.MESSAGE:
-                self._add_message(data, start, length)
+                self._add_message(start, length)
             elif code in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.definitions.append(definition(code, data[start : start + length]))
+                self._definitions.append(definition(code, bytes(data[start : start + length])))
         except DamagedError as error:
-            self.damaged = self.damaged or str(error)
-        if len(self.definitions) > LOGS.definitions:
+            self._damaged = self._damaged or str(error)
+        if len(self._definitions) > LOGS.definitions:
             raise DamagedError(f'more than {LOGS.definitions} schemas and channels')
 
-    def drop_last(self, reason: str) -> None:
-        """Omit the last message."""
-        self.damaged = self.damaged or reason
-        for values in (self.log_ns, self.channel_ids, self.offsets):
-            del values[-1:]
-
-    def _add_message(self, data: bytes, start: int, length: int) -> None:
+    def _add_message(self, start: int, length: int) -> None:
         if length < _MESSAGE.size:
             raise DamagedError(f'message of {length} bytes: expected at least {_MESSAGE.size}')
-        channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
+        channel_id, _, log_ns, _ = _MESSAGE.unpack_from(self._buffer, start)
         if log_ns >= LATEST_NS:
             raise DamagedError(f'message logged at {log_ns} ns: expected less than {LATEST_NS}')
-        self.log_ns.append(log_ns)
-        self.channel_ids.append(channel_id)
-        self.offsets.append(start)
+        self._messages.count(channel_id, log_ns)
+        if self._is_wanted(channel_id):
+            record = memoryview(self._buffer)[start - HEAD.size : start + length]
+            self._messages.keep(channel_id, log_ns, record)
+            record.release()  # the buffer can be shortened again
+
+
+class _Messages:
+    """Messages: the number of all, and the content of those that are kept."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+        self._log_ns = array('Q')
+        self._channel_ids = array('H')
+        self._offsets = array('Q')
+        self._count = 0
+        self._first_ns = LATEST_NS
+        self._all_channel_ids: set[int] = set()
+        self._is_last_kept = False
+
+    def count(self, channel_id: int, log_ns: int) -> None:
+        """Count a message."""
+        self._count += 1
+        self._first_ns = min(self._first_ns, log_ns)
+        self._all_channel_ids.add(channel_id)
+        self._is_last_kept = False
+
+    def keep(self, channel_id: int, log_ns: int, record: memoryview) -> None:
+        """Keep the whole record of the message that was counted last."""
+        self._log_ns.append(log_ns)
+        self._channel_ids.append(channel_id)
+        self._offsets.append(len(self._data) + HEAD.size)
+        self._data += record
+        self._is_last_kept = True
+
+    def drop_last(self) -> None:
+        """Omit the last message, once."""
+        self._count = max(self._count - 1, 0)
+        if self._is_last_kept:
+            for values in (self._log_ns, self._channel_ids, self._offsets):
+                del values[-1:]
+        self._is_last_kept = False
+
+    def as_records(self, definitions: list[Definition], damaged: str) -> Records:
+        """The messages, with the definitions that were found among them."""
+        return Records(
+            self._data,
+            definitions,
+            np.frombuffer(self._log_ns, dtype=np.uint64),
+            np.frombuffer(self._channel_ids, dtype=np.uint16),
+            np.frombuffer(self._offsets, dtype=np.uint64),
+            self._count,
+            self._first_ns if self._count else 0,
+            frozenset(self._all_channel_ids),
+            damaged,
+        )
 
 
 def definition(code: int, content: bytes) -> Definition:

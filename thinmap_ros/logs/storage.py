@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, cast
 
 from mcap.records import Schema
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import ConnectionExtRosbag2, Qos
+from rosbags.interfaces import ConnectionExtRosbag2, Nodetype, Qos
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -154,7 +154,41 @@ def own_typestore(schema: Schema) -> Typestore:
     """Types of one schema. Raises errors of rosbags' parser, and ValueError if too large."""
     if len(schema.data) > LOGS.schema_bytes:
         raise ValueError(f'definition of {len(schema.data)} bytes: expected {LOGS.schema_bytes}')
-    return _parsed(schema.name, schema.encoding, schema.data.decode())
+    text = schema.data.decode()
+    _require_few(sum(map(text.count, '\n;,')), 'lines')
+    typestore = _parsed(schema.name, schema.encoding, text)
+    _require_few(_field_count(typestore, schema.name, {}), 'fields')
+    return typestore
+
+
+def _require_few(count: int, what: str) -> None:
+    if count > LOGS.schema_fields:
+        raise ValueError(f'definition of {count} {what}: expected at most {LOGS.schema_fields}')
+
+
+def _field_count(typestore: Typestore, name: str, known: dict[str, int]) -> int:
+    """Number of fields of a type with those of its nested types, each time that they occur.
+
+    known: of the types that were counted. Types without data take time, too, but no bytes of a
+    message: for a sequence of them nothing bounds the time. Raises ValueError for such a sequence,
+    and for a type that contains itself.
+    """
+    if name in known:
+        return known[name]
+    known[name] = LOGS.schema_fields + 1  # if it contains itself
+    total = 0
+    for _, (kind, value) in typestore.fielddefs[name][1]:
+        is_list = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+        (element, element_name), length = cast(Any, value if is_list else ((kind, value), 1))
+        if element != Nodetype.NAME:
+            total += 1
+            continue
+        nested = _field_count(typestore, element_name, known)
+        if kind == Nodetype.SEQUENCE and nested == 0:
+            raise ValueError(f'sequence of {element_name[:80]}: expected a type with fields')
+        total += (nested + 1) * (length if kind == Nodetype.ARRAY else 1)
+    known[name] = total
+    return total
 
 
 @lru_cache(maxsize=64)

@@ -38,7 +38,7 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.session_client import SessionClient
-from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 
 
 @dataclass(frozen=True)
@@ -184,6 +184,9 @@ class GridMapperNode(ThinmapNode):
         if moved is not None:
             self._publish_map()  # before the windows of the corrected map
         self._output.publish_local_grid(window, scan.stamp_ns, self._grid.corrected_ns)
+        for refusal in self._grid.take_refusals():
+            self.diagnostics.message_rejected('scan', refusal)
+            self.get_logger().warning(f'scan: {refusal}', throttle_duration_sec=WARN_PERIOD_S)
 
     def _publish_map(self) -> None:
         if self._stamp.latest_ns is not None:

@@ -1,15 +1,18 @@
 """Replays a log or bag through localizer, grid and topology, as fast as possible."""
 
 import argparse
+import signal
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.scan import Scan
@@ -17,8 +20,9 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.logs.log import Event, Log, SkippedRecords
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.replaying import replay, write_outputs
+from thinmap_ros.replaying import Replay, replay, write_outputs
 from thinmap_ros.tools import cli
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
@@ -78,15 +82,20 @@ class ReplayView:
 
 def _work(arguments: argparse.Namespace) -> None:
     with _view(arguments) as view:
-        _play(arguments, None if view is None else ReplayView(view))
-        if view is not None and arguments.view:
+        result = _play(arguments, None if view is None else ReplayView(view))
+        if view is not None and arguments.view and result.ended_by is None:
             print('close the viewer to end', file=sys.stderr)
             view.wait_until_closed()
+    if isinstance(result.ended_by, ThinmapError | OSError):
+        written = f'the {len(result.poses)} scans before it are in {arguments.out}'
+        raise InputError(f'{result.ended_by}; {written}') from result.ended_by
+    if result.ended_by is not None:
+        raise result.ended_by
 
 
 @contextmanager
 def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
-    """The requested viewer and recording. The recording is deleted if the replay fails."""
+    """The requested viewer and recording. It is deleted if nothing was replayed."""
     if not (arguments.view or arguments.recording):
         yield None
         return
@@ -99,26 +108,69 @@ def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
         yield view
 
 
-def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
+class _InterruptibleLog:
+    """A log that ends after a whole event once it is interrupted."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._is_interrupted = False
+
+    @property
+    def skipped(self) -> SkippedRecords:
+        """Unusable records of the log."""
+        return self._log.skipped
+
+    def events(self) -> Iterator[Event]:
+        """Events of the log; raises KeyboardInterrupt between two of them."""
+        for event in self._log.events():
+            if self._is_interrupted:
+                raise KeyboardInterrupt
+            yield event
+
+    def interrupt(self, number: int, frame: FrameType | None) -> None:
+        """End after this event; the second time at once."""
+        if self._is_interrupted:
+            raise KeyboardInterrupt
+        self._is_interrupted = True
+
+
+@contextmanager
+def _interruptible(log: Log) -> Iterator[_InterruptibleLog]:
+    """The log, which Ctrl-C and SIGTERM end after a whole event: the results are consistent."""
+    interruptible = _InterruptibleLog(log)
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, interruptible.interrupt) for number in signals]
+    try:
+        yield interruptible
+    finally:
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)
+
+
+def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
     config = PipelineConfig(
         localizer=cli.config_from(arguments, LocalizerConfig),
         grid=cli.config_from(arguments, OccupancyConfig),
     )
     wall = time.perf_counter()
     cpu = time.process_time()
-    result = replay(
-        cli.open_log(arguments), config, show_progress=not arguments.quiet, watcher=shown
-    )
+    with _interruptible(cli.open_log(arguments)) as log:
+        result = replay(
+            log, config, show_progress=not arguments.quiet, watcher=shown, keep_partial=True
+        )
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{arguments.log.name}: {len(result.poses)} scans'
     report = write_outputs(result, arguments.out, title, seconds)
     skipped = f', {result.skipped} skipped' if result.skipped else ''
     if result.first_skipped:
         skipped += f' (first: {result.first_skipped})'
+    if report['refused']:
+        skipped += f', {report["refused"]} not mapped (first: {report["first_refused"]})'
     print(
         f'{arguments.out}: {report["scans"]} scans{skipped}, {report["distance"]:.1f} m, '
         f'{report["ms_per_scan"]["all"]["median"]:.1f} ms a scan'
     )
+    return result
 
 
 def main() -> None:

@@ -12,6 +12,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid import rerendering
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
+from thinmap_ros.core.grid.patch import UNKNOWN
 from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.scan import Scan
@@ -275,3 +276,40 @@ def test_tiles_hold_the_sum_of_grids_within_the_limits():
         off = np.abs(both[place] - expected)
         assert off.max() <= 1, 'even odds are a thousandth off'
         assert not off[expected != 0].any()
+
+
+def test_a_scan_that_is_too_far_away_is_left_out_and_named():
+    grid = CorrectableGrid(OccupancyGrid())
+    grid.update(SCANS[0], TRUE[0])
+    before = grid.shown.known_area().cells
+    grid.update(SCANS[1], np.array([3e3, 3e3, 0.0]))
+    (refusal,) = grid.take_refusals()
+    assert 'scan at 1 ns: laser at 3000.1, 3000.05 m: map of' in refusal
+    assert grid.take_refusals() == []
+    np.testing.assert_array_equal(grid.shown.known_area().cells, before)
+    grid.update(SCANS[2], TRUE[2])
+    assert grid.take_refusals() == []
+    assert (grid.shown.known_area().cells != UNKNOWN).sum() > (before != UNKNOWN).sum()
+
+
+def test_a_scan_that_is_too_far_away_does_not_lose_a_correction():
+    grid = CorrectableGrid(OccupancyGrid())
+    for k in range(20):
+        grid.update(SCANS[k], TRUE[k])
+    grid.apply_correction(np.array([0, 19]), TRUE[[0, 19]], since_ns=19)
+    moved = [grid.update(SCANS[20], np.array([3e3, 3e3, 0.0])) for _ in range(30)]
+    assert sum(each is not None for each in moved) == 1
+    assert not grid.is_rerendering
+    assert len(grid.take_refusals()) == 30
+
+
+def test_scans_that_a_correction_moves_too_far_away_are_left_out_and_named():
+    grid = CorrectableGrid(OccupancyGrid())
+    for k in range(20):
+        grid.update(SCANS[k], TRUE[k])
+    far = TRUE[[0, 10, 19]] + [[0.0, 0.0, 0.0], [2e4, 2e4, 0.0], [0.0, 0.0, 0.0]]
+    grid.apply_correction(np.array([0, 10, 19]), far, since_ns=19)
+    while grid.is_rerendering:
+        grid.update(SCANS[19], TRUE[19])
+    assert grid.take_refusals(), 'those around the tenth'
+    assert (grid.shown.known_area().cells != UNKNOWN).sum() > 1000

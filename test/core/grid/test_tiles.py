@@ -147,3 +147,26 @@ def test_copies_hold_the_tiles_and_not_the_room(copied):
     np.testing.assert_array_equal(tiles.read(3, -70, 200, 100), 5)
     assert other.read(3, -70, 2, 1).ravel().tolist() == [6, 5]
     assert not tiles.read(0, 500, 10, 10).any() and (other.read(0, 500, 10, 10) == 7).all()
+
+
+def test_a_map_that_does_not_begin_at_the_origin_takes_room_only_for_what_it_holds():
+    tiles = TileStore(begins_at_origin=False)
+    tiles.write(50_000 * TILE, -70_000 * TILE, np.ones((1, 1), dtype=np.int16))
+    assert tiles.directory.shape == (1, 1)
+    assert tiles.bounds() == (50_000 * TILE, -70_000 * TILE, 50_001 * TILE, -69_999 * TILE)
+    with pytest.raises(InputError, match='tiles: expected'):
+        tiles.write(0, 0, np.ones((1, 1), dtype=np.int16))
+    with pytest.raises(InputError, match='tiles from its origin'):
+        TileStore(begins_at_origin=False).grow_to(1 << 40, 0, 1 << 40, 0)
+
+
+def test_a_wide_map_may_be_mostly_empty():
+    tiles = TileStore(max_extent_tiles=1_000_000)
+    tiles.write(0, 0, np.ones((1, 1), dtype=np.int16))
+    tiles.write(900 * TILE, 900 * TILE, np.ones((1, 1), dtype=np.int16))
+    assert tiles.used == 2
+    with pytest.raises(InputError, match='1001 x 1001 tiles: expected 1000000 at most'):
+        tiles.grow_to(1000, 1000, 1000, 1000)
+    with pytest.raises(InputError, match='32769 tiles: expected 32768 at most'):
+        tiles.allocate(np.argwhere(np.ones((181, 182)))[: 1 << 15])
+    assert tiles.used == 2

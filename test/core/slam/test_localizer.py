@@ -16,6 +16,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.sim.drives import DriveConfig
 from thinmap_ros.sim.drives import drive as drive_along
 from thinmap_ros.sim.laser import LaserScannerConfig
@@ -800,3 +801,22 @@ def test_along_a_smooth_corridor_odometry_decides(step_m):
         estimate = localizer.step(scan_in(SMOOTH, truth, rng, k * PERIOD_NS), odom)
     assert 8.0 < estimate.T_map_base[0] < 10.5
     assert abs(estimate.T_map_base[1]) < 0.1
+
+
+def test_where_the_map_would_become_too_large_a_new_one_begins():
+    rng = np.random.default_rng(8)
+    localizer = at_start(local_map=LocalMapConfig(resolution_m=0.01))
+    rows = on(localizer, 3, START, np.zeros(3), rng)
+    truth, _, odom = rows[-1]
+    for leap in range(1, 4):
+        # As far as odometry can have come while there were no scans.
+        odom = se2.compose(odom, np.array([240.0, 240.0, 0.0]))
+        stamp = localizer._prediction.stamp_ns + 1000 * PERIOD_NS
+        estimate = localizer.step(scan_in(ROOM, truth, rng, stamp), odom)
+        assert (localizer.rejected, estimate.is_lost) == ((0, False) if leap < 3 else (1, True))
+    after = on(localizer, 10, truth, odom, rng)
+    assert localizer.rejected == 1
+    assert after[-1][1].inlier_ratio > 0.7, 'it fits the new map'
+    steps = [se2.between(a[0], b[0]) for a, b in pairwise(after)]
+    found = [se2.between(a[1].T_map_base, b[1].T_map_base) for a, b in pairwise(after)]
+    np.testing.assert_allclose(found, steps, atol=0.06)

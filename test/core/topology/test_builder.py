@@ -213,3 +213,15 @@ def test_drives_through_floors_lead_to_the_map_of_the_whole(shared_data, name):
     assert_like(
         builder.map, build(GridPatch(patch.frame.with_origin_at(-PAD, -PAD), shown), start, config)
     )
+
+
+@pytest.mark.parametrize('place', [(2.05, 2.05), (-50.0, -50.0)])
+def test_a_robot_in_no_free_space_starts_nothing(place):
+    cells = np.full((100, 100), 100, dtype=np.int8)
+    cells[60:90, 60:90] = 0
+    builder = TopologyBuilder(TopologyConfig(seed_search_radius_m=0.3))
+    assert not builder.update(GridPatch(GridFrame(0.0, 0.0, 0.1), cells), np.array([*place, 0.0]))
+    assert builder._view.robot.shape == (0, 2)
+    assert not builder._view.free.any()
+    assert builder.update(GridPatch(GridFrame(0.0, 0.0, 0.1), cells), np.array([7.5, 7.5, 0.0]))
+    assert builder._view.robot.shape == (1, 2)

@@ -95,3 +95,15 @@ def test_rows_of_any_layout():
 def test_equals_opencv_on_floors(shared_data, name):
     free = world(shared_data, name)[0].free
     assert np.array_equal(thin(free), opencv(free))
+
+
+@pytest.mark.parametrize(
+    'rows',
+    [
+        ('.#..', '#..#', '###.', '###.', '#.#.', '.#..'),
+        ('..#...', '...#.#', '.####.', '#.###.', '.#.#.#'),
+    ],
+)
+def test_after_a_sub_iteration_without_changes_the_other_one_follows(rows):
+    free = np.array([[cell == '#' for cell in row] for row in rows])
+    assert np.array_equal(thin(free), literal(free))

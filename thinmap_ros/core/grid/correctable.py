@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.scan_history import CorrectedPoses, PoseHistory
@@ -25,6 +26,7 @@ class CorrectableGrid:
         """Start with a grid. If keeps_scans is False, it is never corrected."""
         self.shown = grid
         self.corrected_ns = corrected_ns
+        self._refusals: list[str] = []
         self._history: PoseHistory[StoredScan] | None = PoseHistory() if keeps_scans else None
         self._pending_ns: int | None = None
         self._rerendering: Rerendering | None = None
@@ -54,13 +56,23 @@ class CorrectableGrid:
         """Continue the re-rendering, then add a scan made at a robot pose (3,).
 
         scan: None if its pose is unknown. Returns the corrected poses when a re-rendering is
-        complete, without that of this scan. Raises InputError as `OccupancyGrid.add_scan` does.
+        complete, without that of this scan. Scans that `OccupancyGrid.add_scan` refuses are left
+        out: `take_refusals`.
         """
         self._T_map_base = T_map_base
         moved = self._render_slice()
         if scan is not None:
-            self._add_scan(scan, T_map_base)
+            try:
+                self._add_scan(scan, T_map_base)
+            except InputError as error:
+                self._refusals.append(str(error))
         return moved
+
+    def take_refusals(self) -> list[str]:
+        """Why scans were left out since the last call, a reason for each."""
+        refusals = self._refusals
+        self._refusals = []
+        return refusals
 
     def finish(self) -> CorrectedPoses | None:
         """Complete a re-rendering in progress, and return the corrected poses."""
@@ -87,7 +99,7 @@ class CorrectableGrid:
             self._rerendering = Rerendering(self.shown, kept, poses, self._T_map_base)
             # The step that closes a loop is already long: rendering starts with the next one.
             return None
-        self._rerendering.render_slice(self.shown)
+        self._refusals += self._rerendering.render_slice(self.shown)
         if not self._rerendering.is_complete:
             return None
         self.shown = self._rerendering.grid

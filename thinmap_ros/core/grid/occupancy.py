@@ -218,7 +218,11 @@ class OccupancyGrid:
         # Before drawing: increments that cannot be merged must not remain in the buffer.
         last_row = (math.floor(y) + radius) // TILE
         last_col = (math.floor(x) + radius) // TILE
-        self._tiles.grow_to(tile_row, tile_col, last_row, last_col)
+        try:
+            self._tiles.grow_to(tile_row, tile_col, last_row, last_col)
+        except InputError as error:
+            place = f'{T_map_laser[0]:g}, {T_map_laser[1]:g} m'
+            raise InputError(f'scan at {scan.stamp_ns} ns: laser at {place}: {error}') from error
         increments = self._empty_increments(radius)
         self._cache_bearings(scan)
         heading = float(T_map_laser[2])

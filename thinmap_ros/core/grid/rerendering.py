@@ -2,11 +2,13 @@
 
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.tiles import TILE
@@ -133,24 +135,33 @@ class Rerendering:
 
     def add_scan(self, kept: StoredScan, T_map_base: Array) -> None:
         """Add a scan that arrived meanwhile, made at a pose (3,) that is already correct."""
-        self._added.add_scan(kept.scan, T_map_base)
+        with suppress(InputError):  # it is shown when all is complete
+            self._added.add_scan(kept.scan, T_map_base)
         box = _tile_boxes([kept.extent], T_map_base[None], self.grid.frame)[0]
         tiles = int(np.prod(box[1] - box[0] + 1))
         self._queue.append(kept.scan, T_map_base, tiles)
 
-    def render_slice(self, shown: OccupancyGrid) -> None:
-        """Render some scans, and update the shown grid, unless `grid` is complete now."""
+    def render_slice(self, shown: OccupancyGrid) -> list[str]:
+        """Render some scans, and update the shown grid, unless `grid` is complete now.
+
+        Returns why scans were left out whose corrected poses would make the map too large.
+        """
         scans = 0
         tiles = 0
+        refusals: list[str] = []
         while self._queue:
             tiles += self._queue.first.tiles
             if scans >= _SCANS_PER_SLICE and tiles > _TILES_PER_SLICE:
                 break
             task = self._queue.pop()
-            self.grid.add_scan(task.scan, task.T_map_base)
+            try:
+                self.grid.add_scan(task.scan, task.T_map_base)
+            except InputError as error:
+                refusals.append(str(error))
             scans += 1
         if self._queue:
             self._show_complete_rings(shown)
+        return refusals
 
     def _show_complete_rings(self, shown: OccupancyGrid) -> None:
         complete = self._queue.first.ring
@@ -159,7 +170,8 @@ class Rerendering:
         places = np.unique(np.vstack([shown.tiles(), self.grid.tiles()]), axis=0)
         rings = self._rings(places, places)
         completed = places[(rings >= self._complete_rings) & (rings < complete)]
-        shown.set_tiles(completed, self.grid, self._added)
+        with suppress(InputError):  # old and new rendering are too far apart for one map
+            shown.set_tiles(completed, self.grid, self._added)
         self._complete_rings = complete
 
     def _rings(self, low: _Cells, high: _Cells) -> _Cells:

@@ -39,11 +39,15 @@ class _Span(NamedTuple):
         return self.first <= other.first and other.end <= self.end
 
     def covering(self, other: '_Span') -> '_Span':
-        """The smallest span that holds this one and another."""
+        """The smallest span that holds this one, unless it is empty, and another."""
+        if self.length == 0:
+            return other
         return _Span(min(self.first, other.first), max(self.end, other.end))
 
     def grown_to(self, other: '_Span') -> '_Span':
         """A span that holds this one and another, with room to spare on each side that grew."""
+        if self.length == 0:
+            return other
         first, end = self.covering(other)
         room = max(_MIN_ROOM, int(_ROOM_SHARE * (end - first)))
         return _Span(
@@ -63,8 +67,20 @@ class TileStore:
     is copied into one that is longer by half.
     """
 
-    def __init__(self, dtype: DTypeLike = np.int16, per_cell: tuple[int, ...] = ()) -> None:
-        self.directory: NDArray[np.int32] = np.full((1, 1), NO_TILE, dtype=np.int32)
+    def __init__(
+        self,
+        dtype: DTypeLike = np.int16,
+        per_cell: tuple[int, ...] = (),
+        max_extent_tiles: int = _MAX_TILES,
+        begins_at_origin: bool = True,
+    ) -> None:
+        """max_extent_tiles: area of the largest bounding rectangle, of which most may be empty.
+
+        begins_at_origin: the rectangle always includes the origin; else only what is stored.
+        """
+        begin = int(begins_at_origin)
+        self._max_extent_tiles = max_extent_tiles
+        self.directory: NDArray[np.int32] = np.full((begin, begin), NO_TILE, dtype=np.int32)
         self.pool: NDArray[Any] = _empty_pool((TILE, TILE, *per_cell), dtype, _MIN_POOL_TILES)
         self.first_row = 0
         self.first_col = 0
@@ -81,16 +97,20 @@ class TileStore:
         height, width = self._spans()
         if height.covers(rows) and width.covers(cols):
             return
+        farthest = max(-row_a, row_b, -col_a, col_b)
+        if farthest > MAX_TILE_INDEX:
+            raise InputError(f'map {farthest} tiles from its origin: expected {MAX_TILE_INDEX}')
         taller = height.grown_to(rows)
         wider = width.grown_to(cols)
-        if taller.length * wider.length > _MAX_TILES:
+        limit = self._max_extent_tiles
+        if taller.length * wider.length > limit:
             # Unused spare room is given up.
             used_height, used_width = self._used_spans()
             taller = used_height.covering(rows)
             wider = used_width.covering(cols)
-        if taller.length * wider.length > _MAX_TILES:
+        if taller.length * wider.length > limit:
             size = f'{taller.length} x {wider.length}'
-            raise InputError(f'map of {size} tiles: expected {_MAX_TILES} at most')
+            raise InputError(f'map of {size} tiles: expected {limit} at most')
         self._rebuild_directory(taller, wider)
 
     def _spans(self) -> tuple['_Span', '_Span']:
@@ -121,13 +141,16 @@ class TileStore:
     def allocate(self, tiles: NDArray[np.int64]) -> None:
         """Allocate the tiles (N, 2), (row, col) in tile coordinates inside the directory.
 
-        New ones are stored in the given order; existing ones are unchanged.
+        New ones are stored in the given order; existing ones are unchanged. Raises InputError if
+        there would be more than of any building.
         """
         at = tiles - (self.first_row, self.first_col)
         missing = at[self.directory[at[:, 0], at[:, 1]] == NO_TILE]
         missing = np.array(list(dict.fromkeys(map(tuple, missing.tolist()))), dtype=np.int64)
         missing = missing.reshape(-1, 2)
         used = self.used + len(missing)
+        if used > _MAX_TILES:
+            raise InputError(f'map of {used} tiles: expected {_MAX_TILES} at most')
         if used > self.pool.shape[0]:
             least = max(used, self.used + self.used // 2)
             longer = _empty_pool(self.pool.shape[1:], self.pool.dtype, least)

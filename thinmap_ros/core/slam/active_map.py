@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
@@ -22,6 +23,7 @@ class ActiveMap:
         self.map = LocalMap(config)
         self.number = 0  # of the submap
         self.T_at_update: Array | None = None  # pose (3,) of the last scan that was added
+        self.refused = 0  # scans that lie too far from the others for one map
         self._loaded: Mapping[str, NDArray[Any]] | None = None
         self._pending: list[int] = []
 
@@ -29,10 +31,13 @@ class ActiveMap:
         """Set the cells of a `LocalMap.state` with which every re-rendered map starts."""
         self._loaded = given
 
-    def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
-        """Add surface points (N, 5), robot frame, of a scan at a pose (3,)."""
-        self.map.add_scan(points, T_base_laser, T_map_base)
+    def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> bool:
+        """Add surface points (N, 5), robot frame, of a scan at a pose (3,).
+
+        Returns False, and counts the scan in `refused`, if the map would become too large.
+        """
         self.T_at_update = T_map_base
+        return self._add(points, T_base_laser, T_map_base)
 
     def moved(self, T_map_base: Array) -> Array | None:
         """Motion (3,) from the last map update to a pose (3,); None before the first update."""
@@ -58,4 +63,12 @@ class ActiveMap:
         """Render up to `count` of the pending keyframes."""
         for _ in range(min(count, len(self._pending))):
             frame = keyframes[self._pending.pop()]
-            self.map.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
+            self._add(frame.points, frame.scan.T_base_laser, frame.T_map_base)
+
+    def _add(self, points: Array, T_base_laser: Array, T_map_base: Array) -> bool:
+        try:
+            self.map.add_scan(points, T_base_laser, T_map_base)
+        except InputError:
+            self.refused += 1
+            return False
+        return True

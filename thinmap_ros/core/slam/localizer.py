@@ -124,8 +124,11 @@ class Localizer:
 
     @property
     def rejected(self) -> int:
-        """Number of odometry poses and `set_pose` calls with invalid values."""
-        return self._rejected + self._prediction.rejected
+        """Number of odometry poses and `set_pose` calls with invalid values.
+
+        And of scans that lie too far from the others for one map.
+        """
+        return self._rejected + self._prediction.rejected + self._map.refused
 
     @property
     def pose(self) -> Array:
@@ -338,7 +341,10 @@ class Localizer:
         if self._tracking.needs_submap:
             self._start_submap()
         self._correct_heading(scan)
-        self._map.add_scan(points, scan.T_base_laser, self._pose)
+        if not self._map.add_scan(points, scan.T_base_laser, self._pose):
+            # No building is that large: the pose is wrong, or was.
+            self._start_submap()
+            self._map.add_scan(points, scan.T_base_laser, self._pose)
         # Motion errors are independent in each step. The error of a match is correlated with that
         # of the previous match as long as the same walls are observed.
         self._uncertainty.map_updated(min(1.0, path_m / _VIEW_M + turn))

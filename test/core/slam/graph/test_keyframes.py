@@ -288,3 +288,15 @@ def test_measured_headings_are_edges_from_the_first_keyframe():
     assert (edge.a, edge.b, edge.robust) == (0, 1, True)
     np.testing.assert_allclose(edge.T_a_b[2], 0.05)
     np.testing.assert_array_equal(edge.information, np.diag([0.0, 0.0, 1.0 / (1e-4 + MAP)]))
+
+
+def test_covariances_reach_what_lies_behind_a_pose_with_two_chains():
+    """Pose 1 is found by a bad edge first, and then by a better chain through pose 2."""
+    poses = np.array([[float(k), 0.0, 0.0] for k in range(5)])
+    variances = {(0, 1): 4.0, (0, 2): 0.1, (2, 1): 0.1, (1, 3): 9.0, (3, 4): 0.1}
+    edges = [
+        Edge(a, b, se2.between(poses[a], poses[b]), np.diag([1.0, 1.0, 1e6]) / variance, False)
+        for (a, b), variance in variances.items()
+    ]
+    found = covariances_from(0, poses, edges, np.full(5, np.inf))
+    np.testing.assert_allclose(found[:, 0, 0], [0.0, 0.2, 0.1, 9.2, 9.3], atol=1e-6)

@@ -3,8 +3,10 @@
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
+from contextlib import suppress
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
@@ -61,5 +63,6 @@ class Submaps:
             is_earlier = i <= j or path_m - frame.path_m > AGAIN_M
             if is_earlier and frame.submap == frames[j].submap:
                 T = se2.between(base, frame.T_map_base)
-                submap.add_scan(frame.points, frame.scan.T_base_laser, T)
+                with suppress(InputError):  # kilometres away: nothing to match there
+                    submap.add_scan(frame.points, frame.scan.T_base_laser, T)
         return base, submap

@@ -43,6 +43,7 @@ HERE = 100  # stored value of an offset of 0
 _SHIFT = TILE.bit_length() - 1
 TILE_MASK = TILE - 1
 _MOST_SEEN = 255
+_MAX_EXTENT_TILES = 1 << 20  # at cells of 0.05 m 3.3 km in each direction, mostly without tiles
 _FAR_M = 1e4  # distance from which the walls of an occupancy map are taken to be observed
 
 
@@ -106,7 +107,7 @@ class LocalMap:
 
     def __init__(self, config: LocalMapConfig | None = None) -> None:
         self.config = config or LocalMapConfig()
-        self.tiles = TileStore(CELL)
+        self.tiles = TileStore(CELL, max_extent_tiles=_MAX_EXTENT_TILES, begins_at_origin=False)
 
     @property
     def is_empty(self) -> bool:
@@ -133,7 +134,10 @@ class LocalMap:
         return min(int(cells), TILE - 1)
 
     def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
-        """Add surface points (N, 5), robot frame, of a scan at a pose (3,)."""
+        """Add surface points (N, 5), robot frame, of a scan at a pose (3,).
+
+        Raises InputError, and leaves the map unchanged, if it would become too large.
+        """
         if len(points) == 0:
             return
         laser = np.ascontiguousarray(T_base_laser[:2])

@@ -1,0 +1,97 @@
+"""One pose kilometres away on a live graph: refused and counted; map and localizer continue."""
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid, Odometry
+from sensor_msgs.msg import LaserScan
+from support.carmen_log import BEAMS, box_ranges
+from support.doctor import Doctor
+
+from thinmap_msgs.msg import ProbabilityGrid
+from thinmap_ros.core import se2
+from thinmap_ros.ros import messages, qos
+
+pytestmark = pytest.mark.live
+PERIOD_NS = 200_000_000
+LATER_NS = 1_000_000_000_000  # longer than any gap in which odometry may have come far
+STEP_M = 0.02
+
+
+class Robot:
+    """A robot that drives slowly in a square room: its scans, odometry, and poses in the map."""
+
+    def __init__(self, graph):
+        node = graph.node
+        self.publishers = [
+            node.create_publisher(Odometry, 'odom', qos.STREAM),
+            node.create_publisher(PoseWithCovarianceStamped, 'given_pose', qos.STREAM),
+            node.create_publisher(LaserScan, 'scan', qos.SENSOR),
+        ]
+        self.stamp_ns = 100_000_000_000
+        self.steps = 0
+
+    @property
+    def x(self):
+        """True position, m: 1 m there and back again."""
+        return STEP_M * abs((self.steps + 50) % 100 - 50)
+
+    def step(self, wild_m=0.0):
+        """Publish the next scan; its odometry and pose are off by so much."""
+        self.stamp_ns += PERIOD_NS
+        self.steps += 1
+        odometry = Odometry()
+        pose = PoseWithCovarianceStamped()
+        scan = LaserScan()
+        for message, frame in ((odometry, 'odom'), (pose, 'map'), (scan, 'laser')):
+            message.header.stamp = messages.time_msg(self.stamp_ns)
+            message.header.frame_id = frame
+        odometry.child_frame_id = 'base_link'
+        for message in (odometry, pose):
+            message.pose.pose = messages.pose_msg(se2.pose(self.x + wild_m, wild_m, 0.0))
+        scan.angle_min = -np.pi / 2
+        scan.angle_increment = np.pi / (BEAMS - 1)
+        scan.angle_max = np.pi / 2
+        scan.range_min = 0.05
+        scan.range_max = 20.0
+        scan.ranges = box_ranges(self.x, 0.0).astype(np.float32)
+        for publisher, message in zip(self.publishers, (odometry, pose, scan), strict=True):
+            publisher.publish(message)
+
+
+def since(heard, ns):
+    return [m for m in heard if messages.stamp_ns(m.header.stamp) > ns]
+
+
+def test_one_pose_kilometres_away_ends_neither_map_nor_localizer(graph):
+    doctor = Doctor(graph)
+    robot = Robot(graph)
+    windows = graph.heard('local_grid', ProbabilityGrid)
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    graph.start('localizer', laser_pose='0,0,0')
+    given = ('pose:=given_pose', 'slam_status:=given_status')
+    graph.start('grid_mapper', given, laser_pose='0,0,0')
+
+    def mapped(ns):
+        robot.step()
+        return len(since(windows, ns)) > 10 and len(since(poses, ns)) > 10 and maps
+
+    graph.until(lambda: mapped(0), 'map and poses')
+    before = maps[-1].info
+    robot.stamp_ns += LATER_NS
+    robot.step(wild_m=2e3)
+    wild_ns = robot.stamp_ns
+    graph.until(lambda: mapped(wild_ns), 'map and poses after the wild pose')
+    newest = since(poses, wild_ns)[-1]
+    assert abs(newest.pose.pose.position.x) < 1.5
+    assert abs(newest.pose.pose.position.y) < 0.2
+    seen = len(maps)
+    graph.until(lambda: len(maps) > seen, 'a map of later')
+    assert (maps[-1].info.width, maps[-1].info.height) == pytest.approx(
+        (before.width, before.height), abs=10
+    )
+    graph.until(lambda: doctor.number('grid_mapper', 'scan: rejected') == 1, 'the scan is counted')
+    assert 'map of' in graph.log('grid_mapper')
+    dropped = 'dropped: invalid scans or odometry'
+    graph.until(lambda: doctor.number('localizer', dropped) >= 1, 'the odometry is counted')
