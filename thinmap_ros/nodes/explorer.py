@@ -59,7 +59,7 @@ class ExplorerNode(ThinmapNode):
         self.reset_state()
         self._output = MissionPublishers(self, frames.map_frame, self._on_resume)
         self._goals = SingleGoalServer(
-            self, Explore, 'explore', self._on_goal, self._on_cancel, self._on_preempted
+            self, Explore, 'explore', self._on_goal, self._on_preempted
         )
         self.create_service(SaveMap, 'save_exploration', self._on_save)
         self.create_active_timer(_CHECK_PERIOD_S, self._on_timer)
@@ -106,12 +106,10 @@ class ExplorerNode(ThinmapNode):
     ) -> Mission:
         return Mission(goal, strategy, self._source.watchdog, self._now_s(), state)
 
-    def _on_cancel(self) -> None:
-        self._mission.request_cancel()
-
     def _on_preempted(self) -> Explore.Result:
         if self._mission.is_running:
-            self._mission.cancel('replaced by a newer goal')
+            is_canceled = self._goals.is_cancel_requested
+            self._mission.cancel('cancelled' if is_canceled else 'replaced by a newer goal')
         return Explore.Result(status=self._output.status_now(self._mission))
 
     def _on_resume(self, is_wanted: bool) -> None:
@@ -151,6 +149,9 @@ class ExplorerNode(ThinmapNode):
 
     def _on_timer(self) -> None:
         if not self._mission.is_running:
+            return
+        if self._goals.is_cancel_requested:
+            self._execute(self._mission.cancel('cancelled'))
             return
         self._execute(self._mission.check(self._now_s(), self._driver.is_driving))
         if self._mission.is_running:

@@ -42,9 +42,11 @@ class SingleGoalServer:
     Goals are accepted while the node is active. A new goal preempts the old one, which is aborted
     with the result of `preempted`. rclpy runs a goal in a coroutine, and one that waits keeps the
     executor busy; here the coroutine starts when the result is known, although the goal's status
-    is EXECUTING from its acceptance on, as clients of Nav2 expect. `on_cancel` records the
-    request: the node calls `finish` later, from another callback, when the goal's state has
-    changed. One server may serve several actions: there is one goal at a time among all of them.
+    is EXECUTING from its acceptance on, as clients of Nav2 expect. One server may serve several
+    actions: there is one goal at a time among all of them.
+
+    A goal for which a cancel was accepted ends CANCELED, whatever ends it: the node, which looks at
+    `is_cancel_requested` from time to time, or a newer goal. As in Nav2.
     """
 
     def __init__(
@@ -53,7 +55,6 @@ class SingleGoalServer:
         action: Any,
         name: str,
         on_goal: Callable[[Any], None],
-        on_cancel: Callable[[], None],
         preempted: Callable[[], Any],
         read: Callable[[Any], Any] = lambda request: request,
     ) -> None:
@@ -64,7 +65,6 @@ class SingleGoalServer:
         """
         self._node = node
         self._on_goal = on_goal
-        self._on_cancel = on_cancel
         self._preempted = preempted
         self._goal: _Goal | None = None
         self._endings: dict[bytes, tuple[Outcome, Any]] = {}
@@ -88,6 +88,11 @@ class SingleGoalServer:
     def active(self) -> bool:
         """Whether there is a goal."""
         return self._goal is not None
+
+    @property
+    def is_cancel_requested(self) -> bool:
+        """Whether a cancel of the goal was accepted: the node is to finish it."""
+        return self._goal is not None and self._goal.handle.is_cancel_requested
 
     def feedback(self, message: Any) -> None:
         """Publish feedback on the goal, if there is one."""
@@ -119,14 +124,15 @@ class SingleGoalServer:
         self._on_goal(request)
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        if self._goal is None or handle.goal_id != self._goal.handle.goal_id:
-            return CancelResponse.REJECT
-        self._on_cancel()
-        return CancelResponse.ACCEPT
+        is_current = self._goal is not None and handle.goal_id == self._goal.handle.goal_id
+        # Replaced just now, by a goal that was received together with the cancel.
+        outcome, _ = self._endings.get(bytes(handle.goal_id.uuid), (None, None))
+        is_cancelable = is_current or outcome is Outcome.ABORTED
+        return CancelResponse.ACCEPT if is_cancelable else CancelResponse.REJECT
 
     def _end(self, handle: ServerGoalHandle) -> Any:
         outcome, result = self._endings.pop(bytes(handle.goal_id.uuid))
-        if outcome is Outcome.CANCELED and handle.is_cancel_requested:
+        if handle.is_cancel_requested:
             handle.canceled()
         elif outcome is Outcome.SUCCEEDED:
             handle.succeed()

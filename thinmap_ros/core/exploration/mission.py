@@ -187,7 +187,6 @@ class Mission:
         self._watchdog = watchdog
         self._started_s = now_s
         self._return_failures = 0
-        self._is_cancel_requested = False
         watchdog.restart(now_s)
 
     def elapsed_s(self, now_s: float) -> float:
@@ -221,13 +220,11 @@ class Mission:
         return None if target is None else DriveTo(target.goal)
 
     def check(self, now_s: float, is_driving: bool) -> Action:
-        """Check requests, inputs and budgets, about once a second.
+        """Check inputs and budgets, about once a second.
 
         is_driving: whether the navigator reports on the goal that it was given.
         """
         self._start_clock(now_s)
-        if self._is_cancel_requested:
-            return self.cancel('cancelled')
         if self.is_paused:
             self._watchdog.restart(now_s)
             return None
@@ -257,10 +254,6 @@ class Mission:
         if self._return_failures < self.goal.return_attempts:
             return self._drive_to_start()
         return self._finish(self.end._replace(reason=f'{self.end.reason}; not home: {reason}'))
-
-    def request_cancel(self) -> None:
-        """Have the next check cancel the mission."""
-        self._is_cancel_requested = True
 
     def cancel(self, reason: str) -> Finish:
         """End the mission before it is done."""
