@@ -58,9 +58,7 @@ class ExplorerNode(ThinmapNode):
         self._driver = self._make_driver(frames.map_frame)
         self.reset_state()
         self._output = MissionPublishers(self, frames.map_frame, self._on_resume)
-        self._goals = SingleGoalServer(
-            self, Explore, 'explore', self._on_goal, self._on_preempted
-        )
+        self._goals = SingleGoalServer(self, Explore, 'explore', self._on_goal, self._on_preempted)
         self.create_service(SaveMap, 'save_exploration', self._on_save)
         self.create_active_timer(_CHECK_PERIOD_S, self._on_timer)
 

@@ -25,6 +25,7 @@ class Client:
         self.graph = graph
         self.process = graph.start(name, laser_pose='0,0,0')
         self._kind, action = ACTIONS[name]
+        self.is_explorer = self._kind is Explore
         self._client = ActionClient(graph.node, self._kind, action)
         graph.until(self._client.server_is_ready, 'action server')
 
@@ -55,12 +56,17 @@ class Client:
         return len(canceling.result().goals_canceling) == 1, result.result().status
 
 
-@pytest.fixture(params=list(ACTIONS))
-def client(graph, request):
-    return Client(graph, request.param)
+@pytest.mark.parametrize('name', ACTIONS)
+def test_a_goal_ends_cancelled_if_its_cancel_was_accepted_and_else_aborted_by_a_newer_one(
+    graph, name
+):
+    client = Client(graph, name)
+    cancelled_before_its_replacement(client)
+    cancelled_in_the_moment_of_its_replacement(client)
+    cancelled_after_its_replacement(client)
 
 
-def test_a_cancelled_goal_that_is_replaced_within_a_second_ends_cancelled(client):
+def cancelled_before_its_replacement(client):
     endings = []
     handle, result = client.accepted(client.send())
     for delay_s in DELAYS_S:
@@ -69,12 +75,18 @@ def test_a_cancelled_goal_that_is_replaced_within_a_second_ends_cancelled(client
         client.wait(delay_s)
         newer = client.send()
         endings.append(client.ended(canceling, result))
+        if client.is_explorer:
+            status = result.result().result.status
+            assert (status.reason_code, status.reason) == (
+                ExplorationStatus.CANCELLED,
+                'cancelled',
+            )
         handle, result = client.accepted(newer)
     assert endings == len(DELAYS_S) * [(True, GoalStatus.STATUS_CANCELED)]
 
 
-def test_a_goal_that_is_cancelled_in_the_moment_of_its_replacement_ends_as_the_answer_says(client):
-    """Both requests wait in the node when it goes on; either may have been sent first."""
+def cancelled_in_the_moment_of_its_replacement(client):
+    """Both requests wait in the node when it goes on; it may process either first."""
     endings = []
     for cancels_first in (True, False):
         handle, result = client.accepted(client.send())
@@ -85,23 +97,15 @@ def test_a_goal_that_is_cancelled_in_the_moment_of_its_replacement_ends_as_the_a
         client.process.send_signal(signal.SIGCONT)
         endings.append(client.ended(canceling, result))
         client.accepted(newer)
-    assert endings == 2 * [(True, GoalStatus.STATUS_CANCELED)]
+    assert set(endings) <= {
+        (True, GoalStatus.STATUS_CANCELED),
+        (False, GoalStatus.STATUS_ABORTED),
+    }
 
 
-def test_a_goal_that_is_cancelled_after_it_was_replaced_is_aborted_and_the_newer_one_goes_on(client):
+def cancelled_after_its_replacement(client):
     handle, result = client.accepted(client.send())
     _, newer = client.accepted(client.send())
     client.graph.until(result.done, 'the end of the replaced goal')
     assert client.ended(handle.cancel_goal_async(), result) == (False, GoalStatus.STATUS_ABORTED)
     assert not newer.done()
-
-
-def test_the_result_of_a_cancelled_exploration_says_so(graph):
-    client = Client(graph, 'explorer')
-    handle, result = client.accepted(client.send())
-    canceling = handle.cancel_goal_async()
-    client.graph.until(canceling.done, 'an answer to the cancel')
-    client.accepted(client.send())
-    client.graph.until(result.done, 'the end of the goal')
-    status = result.result().result.status
-    assert (status.reason_code, status.reason) == (ExplorationStatus.CANCELLED, 'cancelled')
