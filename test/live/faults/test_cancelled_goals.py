@@ -86,7 +86,7 @@ def cancelled_before_its_replacement(client):
 
 
 def cancelled_in_the_moment_of_its_replacement(client):
-    """Both requests wait in the node when it goes on; it may process either first."""
+    """Both requests wait in the node at its continuation; it may process either first."""
     endings = []
     for cancels_first in (True, False):
         handle, result = client.accepted(client.send())
