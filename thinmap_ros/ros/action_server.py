@@ -5,9 +5,12 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+from action_msgs.msg import GoalInfo
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.task import Future
+from unique_identifier_msgs.msg import UUID
 
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
@@ -67,6 +70,7 @@ class SingleGoalServer:
         self._on_goal = on_goal
         self._preempted = preempted
         self._goal: _Goal | None = None
+        self._servers: list[ActionServer] = []
         self._endings: dict[bytes, tuple[Outcome, Any]] = {}
         self.add_action(action, name, read)
 
@@ -83,6 +87,7 @@ class SingleGoalServer:
             cancel_callback=self._cancel,
             handle_accepted_callback=lambda handle: self._accept(_Goal(server, handle), read),
         )
+        self._servers.append(server)
 
     @property
     def active(self) -> bool:
@@ -90,9 +95,31 @@ class SingleGoalServer:
         return self._goal is not None
 
     @property
+    def goal_id(self) -> bytes:
+        """Id of the goal, 16 bytes; none without a goal."""
+        return b'' if self._goal is None else bytes(self._goal.handle.goal_id.uuid)
+
+    @property
     def is_cancel_requested(self) -> bool:
         """Whether a cancel of the goal was accepted: the node is to finish it."""
         return self._goal is not None and self._goal.handle.is_cancel_requested
+
+    def restore(self, goal_id: bytes) -> None:
+        """Accept a goal of the first action again, which a server of before had accepted.
+
+        For its client, its status, feedback and cancellation are as before. The result is sent to
+        those who ask from now on: what was asked for was lost with the server of before.
+        """
+        server = self._servers[0]
+        stamp = self._node.get_clock().now().to_msg()
+        info = GoalInfo(goal_id=UUID(uuid=list(goal_id)), stamp=stamp)
+        # What the server does with a request for a goal, without the answer to it.
+        handle = ServerGoalHandle(server, info, server.action_type.Goal())
+        server._goal_handles[goal_id] = handle
+        server._result_futures[goal_id] = Future()
+        server.add_future(server._result_futures[goal_id])
+        handle._update_state(rclpy_implementation.GoalEvent.EXECUTE)
+        self._goal = _Goal(server, handle)
 
     def feedback(self, message: Any) -> None:
         """Publish feedback on the goal, if there is one."""

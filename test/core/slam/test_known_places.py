@@ -1,4 +1,4 @@
-"""Places that enclose what a localizer knows: an initial pose far from them is an error."""
+"""Places that enclose the map of a localizer: an initial pose distant from them is an error."""
 
 import numpy as np
 import pytest

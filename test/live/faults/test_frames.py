@@ -136,7 +136,7 @@ def test_an_initial_pose_that_cannot_be_is_refused_and_the_robot_stays_where_it_
         assert errors_m(robot.localized()).max() < 0.05, text
     assert robot.is_tracking()
     assert 'localizer]: initialpose: frame' in graph.log('localizer')
-    # Not far off, and as exact as it says: it is believed, and the next scans correct it.
+    # Near, and as exact as it says: it is believed, and the next scans correct it.
     robot.place(initial_pose(HERE + (0.1, 0.0, 0.0)))
     graph.until(robot.is_tracking, 'tracking again')
     assert errors_m(robot.localized()).max() < 0.05

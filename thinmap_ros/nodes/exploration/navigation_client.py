@@ -82,6 +82,15 @@ class NavigationClient:
         """Whether the goal waits for the end of somebody else's."""
         return self._goal is not None and self._drive is None and self._others.is_taken()
 
+    @property
+    def goal_prefix(self) -> bytes:
+        """Bytes with which the ids of its goals begin."""
+        return self._others.prefix
+
+    def adopt(self, goal_prefix: bytes) -> None:
+        """Count goals of a killed client as own ones: they are replaced, not waited for."""
+        self._others.prefix = goal_prefix
+
     def drive_to(self, goal: Array) -> None:
         """Set the goal (3,), unless the server has about the same."""
         self._goal = goal
