@@ -23,7 +23,7 @@ TIME_LIMIT_S = 60.0  # simulated: ten times as fast as the machine's
 class Exploration:
     """A robot that stands in a room, a substitute for Nav2, and an explorer."""
 
-    def __init__(self, graph, drives=True):
+    def __init__(self, graph):
         self.graph = graph
         self.robot = RoomRobot(graph)
         self.status = graph.heard('exploration_status', ExplorationStatus, qos.LATCHED)
@@ -33,9 +33,11 @@ class Exploration:
         # It accepts goals and does not report on them: they stay until they are replaced.
         self._mode = graph.node.create_publisher(String, 'nav2_mode', qos.LATCHED)
         self._mode.publish(String(data='stall'))
-        if drives:
-            graph.start('nav2', package='support.peers', laser_pose='0,0,0', use_sim_time=True)
+        self.start_nav2()
         self.start()
+
+    def start_nav2(self):
+        self.graph.start('nav2', package='support.peers', laser_pose='0,0,0', use_sim_time=True)
 
     def start(self, recovery_timeout_s=RECOVER_S):
         self.graph.start(
@@ -104,7 +106,7 @@ def test_the_goal_of_a_killed_explorer_ends_with_the_result_of_the_whole_explora
 
 
 def test_an_ordinary_client_has_feedback_again_can_cancel_and_asks_again_for_the_result(graph):
-    exploration = Exploration(graph, drives=False)
+    exploration = Exploration(graph)
     feedback = []
     client = ActionClient(graph.node, Explore, 'explore')
     graph.until(client.server_is_ready, 'the explorer')
@@ -120,6 +122,11 @@ def test_an_ordinary_client_has_feedback_again_can_cancel_and_asks_again_for_the
     # Several, so that all endpoints of the new explorer are discovered.
     graph.until(lambda: len(feedback) > 10, 'feedback on the same goal')
     assert messages.seconds(feedback[-1].feedback.status.elapsed) > 10.0
+    # Nav2 is killed before it has reported on its goal: whoever takes its place gets it again.
+    drive = exploration.until_driving()
+    graph.stop('nav2', signal.SIGKILL)
+    exploration.start_nav2()
+    graph.until(lambda: exploration.until_driving() != drive, 'Nav2 has the goal again')
     assert len(graph.cancel(handle, AGAIN_S).goals_canceling) == 1
     ended = graph.result(handle, 'the goal', AGAIN_S)
     assert (ended.status, ended.result.status.reason) == (
