@@ -156,14 +156,14 @@ class Graph:
         self.until(client.server_is_ready, 'action server')
         return self._first(lambda: client.send_goal_async(goal), 'goal taken')
 
-    def _first(self, ask: Callable[[], Any], what: str) -> Any:
+    def _first(self, ask: Callable[[], Any], what: str, again_s: float = _ASK_AGAIN_S) -> Any:
         """First response; asks again if there is none for a while."""
         asked: list[Any] = []
         asked_at = -math.inf
 
         def is_answered() -> bool:
             nonlocal asked_at
-            if time.monotonic() - asked_at > _ASK_AGAIN_S:
+            if time.monotonic() - asked_at > again_s:
                 asked_at = time.monotonic()
                 asked.append(ask())
             return any(future.done() for future in asked)
@@ -176,9 +176,13 @@ class Graph:
         client = ActionClient(self.node, kind, name)
         return self.result(self.send_goal(client, goal), name)
 
-    def result(self, handle: Any, what: str) -> Any:
+    def result(self, handle: Any, what: str, again_s: float = _ASK_AGAIN_S) -> Any:
         """Result of an accepted goal, with status; asks again, as a response may be lost."""
-        return self._first(handle.get_result_async, f'{what} ends')
+        return self._first(handle.get_result_async, f'{what} ends', again_s)
+
+    def cancel(self, handle: Any, again_s: float = _ASK_AGAIN_S) -> Any:
+        """Answer to a cancel of an accepted goal; asks again, as it may be lost."""
+        return self._first(handle.cancel_goal_async, 'an answer to the cancel', again_s)
 
     def ended(self, process: subprocess.Popen[bytes]) -> int:
         """Exit code of a node that ends by itself."""

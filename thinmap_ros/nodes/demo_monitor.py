@@ -6,6 +6,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
+from action_msgs.msg import GoalStatus
 from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient
 from rclpy.clock import Clock, ClockType
@@ -19,6 +20,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.files import package_data
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
+from thinmap_ros.nodes.exploration.goal_result import GoalResult
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.robot import PRESETS
@@ -84,7 +86,7 @@ class DemoMonitorNode(Node):
         if future is not self._sent:
             return  # replaced by a newer goal
         self._accepted = True
-        future.result().get_result_async().add_done_callback(self._on_result)
+        GoalResult(self, 'explore', future.result(), self._on_result)
 
     def _on_map(self, message: OccupancyGrid) -> None:
         self._coverage = self._coverable.coverage(messages.grid_from_msg(message))
@@ -108,8 +110,10 @@ class DemoMonitorNode(Node):
         self._bar.n = 100.0 * self._coverage
         self._bar.refresh()
 
-    def _on_result(self, future: Future) -> None:
-        status: ExplorationStatus = future.result().result.status
+    def _on_result(self, ended: Any) -> None:
+        status: ExplorationStatus = ended.result.status
+        if ended.status == GoalStatus.STATUS_UNKNOWN:
+            status.reason = 'the explorer was started again, and does not know the exploration'
         self._show(status)
         if self._config.result:
             end_ns = messages.stamp_ns(status.header.stamp)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from thinmap_msgs.action import Explore
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.live.mission_state import mission_state, resumed_mission
 from thinmap_ros.core.exploration.mission import (
     Action,
     DriveTo,
@@ -15,7 +16,9 @@ from thinmap_ros.core.exploration.mission import (
 )
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import FinishCode, Strategy
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.exploration.checkpoint_state import ExplorerState
 from thinmap_ros.nodes.exploration.driver import Driver, ForeignDriver
 from thinmap_ros.nodes.exploration.mission_messages import mission_goal_from
 from thinmap_ros.nodes.exploration.mission_publishers import MissionPublishers
@@ -25,6 +28,7 @@ from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.nodes.exploration.strategy_source import StrategySource
 from thinmap_ros.ros import node_main, parameters
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
+from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
@@ -38,11 +42,12 @@ class ExplorerNode(ThinmapNode):
 
     Without thinmap's other nodes, /map and /tf are enough. An exploration is started by the action
     explore, by explore/resume, or by itself. Service save_exploration saves what was learned beside
-    the map and the graph of a session.
+    the map and the graph of a session. An explorer that was killed and is started again continues
+    with the exploration, and with the goal of its client, who has to ask again for the result.
     """
 
     def __init__(self) -> None:
-        super().__init__('explorer')
+        super().__init__('explorer', recovers=True)
         self._strategies = StrategySource(self)
         self._settings = parameters.declare_config(self, ExplorationSettings)
         frames = RobotFrames(parameters.declare_map_frame(self), LaserTransform(self))
@@ -58,11 +63,10 @@ class ExplorerNode(ThinmapNode):
         self._driver = self._make_driver(frames.map_frame)
         self.reset_state()
         self._output = MissionPublishers(self, frames.map_frame, self._on_resume)
-        self._goals = SingleGoalServer(
-            self, Explore, 'explore', self._on_goal, self._on_cancel, self._on_preempted
-        )
+        self._goals = SingleGoalServer(self, Explore, 'explore', self._on_goal, self._on_preempted)
         self.create_service(SaveMap, 'save_exploration', self._on_save)
         self.create_active_timer(_CHECK_PERIOD_S, self._on_timer)
+        self.enable_checkpoint(self._state, self._restore)
 
     def reset_state(self) -> None:
         """Discard map, graph and what was learned, or restore the session of the start."""
@@ -70,6 +74,28 @@ class ExplorerNode(ThinmapNode):
         strategy = self._strategies.initial(self._session)
         self._mission = self._make_mission(MissionGoal(), strategy, MissionState.IDLE)
         self._starts_itself = self._settings.autostart_exploration
+        self._stamp = StateStamp()
+
+    def _state(self) -> State:
+        return ExplorerState(
+            self._stamp.latest_ns or 0,
+            self._goals.goal_id,
+            self._driver.goal_prefix,
+            mission_state(self._mission, self._now_s()),
+            self._strategies.state(self._mission.strategy),
+        ).arrays()
+
+    def _restore(self, arrays: State) -> None:
+        """Continue with the mission of a killed explorer. Raises InputError where it is none."""
+        state = ExplorerState.from_arrays(arrays)
+        strategy = self._strategies.restored(state.strategy)
+        watchdog = self._source.watchdog
+        self._mission = resumed_mission(state.mission, strategy, watchdog, self._now_s())
+        self._starts_itself &= self._mission.state == MissionState.IDLE
+        self._stamp.restore(state.latest_ns)
+        self._driver.adopt(state.drive_prefix)
+        if state.goal_id and self._mission.is_running:
+            self._goals.restore(state.goal_id)
 
     def stop(self) -> None:
         """End the exploration."""
@@ -97,6 +123,7 @@ class ExplorerNode(ThinmapNode):
         strategy = self._strategies.next(self._mission, goal)
         self._mission = self._make_mission(goal, strategy)
         self._publish_progress()
+        self.checkpoint_now()
 
     def _make_mission(
         self,
@@ -106,12 +133,10 @@ class ExplorerNode(ThinmapNode):
     ) -> Mission:
         return Mission(goal, strategy, self._source.watchdog, self._now_s(), state)
 
-    def _on_cancel(self) -> None:
-        self._mission.request_cancel()
-
     def _on_preempted(self) -> Explore.Result:
         if self._mission.is_running:
-            self._mission.cancel('replaced by a newer goal')
+            is_canceled = self._goals.is_cancel_requested
+            self._mission.cancel('cancelled' if is_canceled else 'replaced by a newer goal')
         return Explore.Result(status=self._output.status_now(self._mission))
 
     def _on_resume(self, is_wanted: bool) -> None:
@@ -130,6 +155,11 @@ class ExplorerNode(ThinmapNode):
 
     def _on_observation(self, observation: Observation) -> None:
         """Have the mission process a scan that is in the map."""
+        stamp_ns = observation.scan.stamp_ns
+        if self._stamp.is_restarted_by(stamp_ns):
+            self.get_logger().warning('the robot was started again, too: state reset')
+            self._reset()
+        self._stamp.latest_ns = stamp_ns
         if self._starts_itself:
             self._start(MissionGoal())
         if self._mission.is_running:
@@ -151,6 +181,9 @@ class ExplorerNode(ThinmapNode):
 
     def _on_timer(self) -> None:
         if not self._mission.is_running:
+            return
+        if self._goals.is_cancel_requested:
+            self._execute(self._mission.cancel('cancelled'))
             return
         self._execute(self._mission.check(self._now_s(), self._driver.is_driving))
         if self._mission.is_running:
@@ -186,6 +219,7 @@ class ExplorerNode(ThinmapNode):
         if end.code == FinishCode.CANCELLED:
             outcome = Outcome.CANCELED
         self._goals.finish(outcome, Explore.Result(status=status))
+        self.checkpoint_now()
 
     def _publish_progress(self) -> None:
         self._output.progress(self._mission, self._driver.is_yielding)

@@ -33,6 +33,7 @@ from thinmap_ros.files.sessions import LOCALIZER
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.localization.given_map import GivenMap, config_at
 from thinmap_ros.nodes.localization.initial_poses import InitialPoses
+from thinmap_ros.nodes.localization.known_area import require_near_map
 from thinmap_ros.nodes.localization.map_source import load_localizer
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import ERROR, OK
@@ -206,6 +207,7 @@ class LocalizerNode(ThinmapNode):
         self._process(self._pairing.add_scan(scan))
 
     def _on_initial_pose(self, T_map_base: Array, covariance: Array) -> None:
+        require_near_map(T_map_base, self._localizer)
         self._localizer.set_pose(T_map_base, covariance)
         self._given.pose_set(covariance)
 

@@ -93,7 +93,6 @@ class NavigatorNode(ThinmapNode):
             NavigateToPose,
             'navigate_to_pose',
             self._on_task,
-            self._on_cancel,
             self._preempted,
             self._tasks.to_pose,
         )
@@ -112,7 +111,6 @@ class NavigatorNode(ThinmapNode):
         self._map.reset()
         self._robot = RobotState(self.get_clock(), self._odometry.source != NONE)
         self._task = NavigationTask(NavigateToPose, (), 0)
-        self._is_canceled = False
 
     def _on_config(self, config: NavigatorConfig) -> None:
         """Continue with other parameters: to the same goal, on a new path."""
@@ -148,7 +146,6 @@ class NavigatorNode(ThinmapNode):
         self._own_client.send_goal_async(NavigateToPose.Goal(pose=message))
 
     def _on_task(self, task: NavigationTask) -> None:
-        self._is_canceled = False
         self._task = task
         self._drive_to(task.poses)
 
@@ -160,15 +157,14 @@ class NavigatorNode(ThinmapNode):
 
     def _preempted(self) -> NavigateToPose.Result:
         # As in Nav2, an aborted goal without an error code was replaced.
-        return self._task.result(ErrorCode.NONE, 'replaced by a newer goal')
-
-    def _on_cancel(self) -> None:
-        self._is_canceled = True
+        is_canceled = self._goals.is_cancel_requested
+        reason = 'cancelled' if is_canceled else 'replaced by a newer goal'
+        return self._task.result(ErrorCode.NONE, reason)
 
     def _control(self) -> None:
         if not self._goals.active:
             return
-        if self._is_canceled:
+        if self._goals.is_cancel_requested:
             self._end(Outcome.CANCELED, ErrorCode.NONE, 'cancelled')
             return
         command = self._command()

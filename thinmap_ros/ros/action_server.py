@@ -5,9 +5,12 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+from action_msgs.msg import GoalInfo
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.task import Future
+from unique_identifier_msgs.msg import UUID
 
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
@@ -42,9 +45,11 @@ class SingleGoalServer:
     Goals are accepted while the node is active. A new goal preempts the old one, which is aborted
     with the result of `preempted`. rclpy runs a goal in a coroutine, and one that waits keeps the
     executor busy; here the coroutine starts when the result is known, although the goal's status
-    is EXECUTING from its acceptance on, as clients of Nav2 expect. `on_cancel` records the
-    request: the node calls `finish` later, from another callback, when the goal's state has
-    changed. One server may serve several actions: there is one goal at a time among all of them.
+    is EXECUTING from its acceptance on, as clients of Nav2 expect. One server may serve several
+    actions: there is one goal at a time among all of them.
+
+    A goal for which a cancel was accepted ends CANCELED, whatever ends it: the node, which looks at
+    `is_cancel_requested` from time to time, or a newer goal. As in Nav2.
     """
 
     def __init__(
@@ -53,7 +58,6 @@ class SingleGoalServer:
         action: Any,
         name: str,
         on_goal: Callable[[Any], None],
-        on_cancel: Callable[[], None],
         preempted: Callable[[], Any],
         read: Callable[[Any], Any] = lambda request: request,
     ) -> None:
@@ -64,9 +68,9 @@ class SingleGoalServer:
         """
         self._node = node
         self._on_goal = on_goal
-        self._on_cancel = on_cancel
         self._preempted = preempted
         self._goal: _Goal | None = None
+        self._servers: list[ActionServer] = []
         self._endings: dict[bytes, tuple[Outcome, Any]] = {}
         self.add_action(action, name, read)
 
@@ -83,11 +87,39 @@ class SingleGoalServer:
             cancel_callback=self._cancel,
             handle_accepted_callback=lambda handle: self._accept(_Goal(server, handle), read),
         )
+        self._servers.append(server)
 
     @property
     def active(self) -> bool:
         """Whether there is a goal."""
         return self._goal is not None
+
+    @property
+    def goal_id(self) -> bytes:
+        """Id of the goal, 16 bytes; none without a goal."""
+        return b'' if self._goal is None else bytes(self._goal.handle.goal_id.uuid)
+
+    @property
+    def is_cancel_requested(self) -> bool:
+        """Whether a cancel of the goal was accepted: the node is to finish it."""
+        return self._goal is not None and self._goal.handle.is_cancel_requested
+
+    def restore(self, goal_id: bytes) -> None:
+        """Accept a goal of the first action again, which a server of before had accepted.
+
+        For its client, its status, feedback and cancellation are as before. The result is sent to
+        those who ask from now on: what was asked for was lost with the server of before.
+        """
+        server = self._servers[0]
+        stamp = self._node.get_clock().now().to_msg()
+        info = GoalInfo(goal_id=UUID(uuid=list(goal_id)), stamp=stamp)
+        # What the server does with a request for a goal, without the answer to it.
+        handle = ServerGoalHandle(server, info, server.action_type.Goal())
+        server._goal_handles[goal_id] = handle
+        server._result_futures[goal_id] = Future()
+        server.add_future(server._result_futures[goal_id])
+        handle._update_state(rclpy_implementation.GoalEvent.EXECUTE)
+        self._goal = _Goal(server, handle)
 
     def feedback(self, message: Any) -> None:
         """Publish feedback on the goal, if there is one."""
@@ -119,14 +151,15 @@ class SingleGoalServer:
         self._on_goal(request)
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        if self._goal is None or handle.goal_id != self._goal.handle.goal_id:
-            return CancelResponse.REJECT
-        self._on_cancel()
-        return CancelResponse.ACCEPT
+        is_current = self._goal is not None and handle.goal_id == self._goal.handle.goal_id
+        # Replaced just now, by a goal that was received together with the cancel.
+        outcome, _ = self._endings.get(bytes(handle.goal_id.uuid), (None, None))
+        is_cancelable = is_current or outcome is Outcome.ABORTED
+        return CancelResponse.ACCEPT if is_cancelable else CancelResponse.REJECT
 
     def _end(self, handle: ServerGoalHandle) -> Any:
         outcome, result = self._endings.pop(bytes(handle.goal_id.uuid))
-        if outcome is Outcome.CANCELED and handle.is_cancel_requested:
+        if handle.is_cancel_requested:
             handle.canceled()
         elif outcome is Outcome.SUCCEEDED:
             handle.succeed()

@@ -1,5 +1,7 @@
 """The pose of the laser on the robot, from /tf_static or from a parameter."""
 
+import math
+
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
@@ -11,8 +13,13 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs.laser_mount import Mount, StaticTransforms
 from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros.diagnostics import WARN
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 _MAX_FRAMES = 1000
+# Smaller changes are of rounding, or of a calibration that was refined.
+_MAX_CHANGE_M = 0.01
+_MAX_CHANGE_RAD = 0.01
 
 
 class LaserTransform:
@@ -20,7 +27,8 @@ class LaserTransform:
 
     It is looked up in the static transforms, as for bags. For a robot that does not publish them,
     the parameter `laser_pose` [x m, y m, yaw rad] is used for every frame. There is no default.
-    base_frame: value of the parameter of this name.
+    The first pose of a frame is kept: the map was made with it. Another one is reported on
+    /diagnostics. base_frame: value of the parameter of this name.
     """
 
     def __init__(self, node: Node) -> None:
@@ -47,6 +55,9 @@ class LaserTransform:
         self._fixed = Mount(_parse_pose(str(given)), upside_down=False) if given else None
         self._transforms = StaticTransforms()
         self._mounts: dict[str, Mount] = {}
+        self._changes: dict[str, str] = {}
+        if isinstance(node, ThinmapNode):
+            node.diagnostics.add_check(WARN, lambda: '; '.join(self._changes.values()))
         if self._fixed is None:
             node.create_subscription(
                 TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
@@ -83,13 +94,38 @@ class LaserTransform:
         return self._mounts[frame_id]
 
     def _on_static(self, message: TFMessage) -> None:
-        self._mounts.clear()
         for transform in message.transforms:
             try:
                 if len(self._transforms.frames) < _MAX_FRAMES:
                     self._transforms.add(transform)
             except InputError:
                 continue  # the frame of an invalid transform stays unknown
+        self._changes = {
+            frame: f'static transform of laser {quoted(frame)} {change}: the first one is used; '
+            'expected a laser that does not move on the robot: restart the node for the new one'
+            for frame in self._mounts
+            if (change := self._change(frame))
+        }
+
+    def _change(self, frame_id: str) -> str:
+        """How the transform of a laser frame differs from the one that is used; '' if it does not.
+
+        While its chain of frames is not complete, nothing is known.
+        """
+        try:
+            found = self._transforms.laser_mount(frame_id, self.base_frame)
+        except InputError as error:
+            return f'has changed: {error}'
+        if found is None:
+            return ''
+        used = self._mounts[frame_id]
+        x, y, yaw = np.abs(se2.pose_difference(found.T_base_laser, used.T_base_laser)).tolist()
+        moved_m = math.hypot(x, y)
+        if found.upside_down != used.upside_down:
+            return 'has been turned over'
+        if moved_m <= _MAX_CHANGE_M and yaw <= _MAX_CHANGE_RAD:
+            return ''
+        return f'has changed by {moved_m:.2f} m, {yaw:.2f} rad'
 
 
 def _parse_pose(text: str) -> Array:

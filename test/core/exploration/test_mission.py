@@ -255,14 +255,6 @@ def test_the_next_mission_starts_its_timeouts_afresh():
     assert mission.check(110.1, True) is not None
 
 
-def test_a_requested_cancel_comes_before_all_else():
-    mission = mission_of(Scripted(GOAL), budget=Budget(time_s=1.0))
-    mission.request_cancel()
-    end = mission.check(1000.0, False)
-    assert end == Finish(FinishCode.CANCELLED, 'cancelled')
-    assert not end.is_success
-
-
 def test_the_strategy_sees_walls_outside_the_area():
     strategy = Scripted()
     mission_of(strategy, area=SQUARE).step(at(2.0, 2.0))
@@ -306,8 +298,10 @@ def test_while_it_is_paused_nothing_is_decided_and_no_timeout_runs():
 def test_a_paused_mission_can_be_cancelled():
     mission = mission_of(Scripted(GOAL))
     mission.is_paused = True
-    mission.request_cancel()
-    assert mission.check(1.0, False) == Finish(FinishCode.CANCELLED, 'cancelled')
+    end = mission.cancel('cancelled')
+    assert end == Finish(FinishCode.CANCELLED, 'cancelled')
+    assert not end.is_success
+    assert not mission.is_running
 
 
 def test_what_is_missing_is_named_when_a_mission_ends_for_want_of_it():

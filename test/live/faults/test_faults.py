@@ -68,6 +68,7 @@ def start_one(graph, name):
         # As in the papers: a graph of larger cells keeps more of its ids.
         'grid_mapper': {'recovery_timeout_s': RECOVER_S, 'resolution_m': 0.1},
         'topology_builder': {'recovery_timeout_s': RECOVER_S},
+        'explorer': {'recovery_timeout_s': RECOVER_S},
     }
     graph.start(name, use_sim_time=True, **own.get(name, {}))
 
@@ -565,10 +566,8 @@ def test_an_exploration_finishes_though_every_node_is_killed_once(graph):
     start_mapping(graph, rate=5.0)
     client = ActionClient(graph.node, Explore, 'explore')
 
-    def ask():
-        return graph.send_goal(client, Explore.Goal()).get_result_async()
-
-    ended = ask()
+    goal = graph.send_goal(client, Explore.Goal())
+    ended = goal.get_result_async()
     for name in names:
         metres = status[-1].distance_m + 1.0 if status else 1.0
         graph.until(
@@ -580,9 +579,10 @@ def test_an_exploration_finishes_though_every_node_is_killed_once(graph):
         time.sleep(1.0)
         start_one(graph, name)
         if name == 'explorer':
-            status.clear()
-            graph.until(lambda: 'finished' not in graph.log('explorer'), 'a new one')
-            ended = ask()
+            graph.until(lambda: 'restored the state' in graph.log('explorer'), 'it remembers')
+            graph.until(client.server_is_ready, 'a new explorer')
+    # The explorer that has accepted it was killed.
+    ended = goal.get_result_async()
     graph.until(ended.done, 'the exploration ends', 600.0)
     result = ended.result().result.status
     good = (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.UNREACHABLE)

@@ -9,6 +9,7 @@ from nav2_msgs.msg import ParticleCloud
 from nav2_msgs.srv import SetInitialPose
 from nav_msgs.msg import OccupancyGrid, Odometry
 from std_srvs.srv import Empty
+from support.doctor import Doctor
 from support.peers.foreign_map import write_foreign_map
 
 from thinmap_msgs.msg import LocalizationStatus, SlamStatus
@@ -172,6 +173,7 @@ def test_a_loaded_map_of_another_building_leads_to_lost(graph, tmp_path):
 def test_without_a_map_it_says_so_until_one_arrives_and_takes_poses_in_any_frame(graph, tmp_path):
     patch = read_map(write_foreign_map(tmp_path, WORLD))
     robot = Robot(graph)
+    doctor = Doctor(graph)
     robot.localize()
     graph.until(lambda: len(robot.status) > 5, 'states')
     assert robot.states() == {SlamStatus.NO_MAP}
@@ -195,6 +197,13 @@ def test_without_a_map_it_says_so_until_one_arrives_and_takes_poses_in_any_frame
     assert np.hypot(*(robot.pose() - robot.true_pose())[:2]) < 0.1
     robot.send_initial_pose(START, 'nowhere')
     graph.until(lambda: 'nowhere' in graph.log('localizer'), 'a warning')
+    graph.call(
+        SetInitialPose, 'set_initial_pose', SetInitialPose.Request(pose=pose_msg((1e5, 0.0, 0.0)))
+    )
+    graph.until(
+        lambda: doctor.number('localizer', 'set_initial_pose: rejected') == 1, 'it is counted'
+    )
+    assert 'set_initial_pose: pose at 100000.0, 0.0 m' in graph.log('localizer')
     robot.status.clear()
     graph.until(lambda: len(robot.status) >= 5, 'scans after it')
     assert robot.is_tracking()

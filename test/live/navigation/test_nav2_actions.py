@@ -226,7 +226,7 @@ def test_commands_have_the_type_of_the_parameter(graph, is_stamped):
         enable_stamped_cmd_vel=is_stamped,
         base_frame='base_footprint',
     )
-    StillRobot(graph)
+    StillRobot(graph, base_frame='base_footprint')
     client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
     before_ns = graph.node.get_clock().now().nanoseconds
     graph.send_goal(client, NavigateToPose.Goal(pose=pose_at(4.0, 0.0)))

@@ -21,8 +21,9 @@ class StillRobot:
     Its pose in the map is the origin; `odom` is at T_MAP_ODOM.
     """
 
-    def __init__(self, graph):
+    def __init__(self, graph, base_frame='base_link'):
         node = graph.node
+        self._base_frame = base_frame
         self._now = node.get_clock().now
         self._scan = node.create_publisher(LaserScan, 'scan', qos.STREAM)
         self._odometry = node.create_publisher(Odometry, 'odom', qos.STREAM)
@@ -37,11 +38,11 @@ class StillRobot:
         T_odom_base = -T_MAP_ODOM
         transforms = [
             messages.transform_msg(T_MAP_ODOM, 'map', 'odom', ns),
-            messages.transform_msg(T_odom_base, 'odom', 'base_link', ns),
+            messages.transform_msg(T_odom_base, 'odom', self._base_frame, ns),
         ]
         self._tf.publish(TFMessage(transforms=transforms))
         self._odometry.publish(
-            messages.odometry_msg(T_odom_base, (0.0, 0.0), ('odom', 'base_link'), ns)
+            messages.odometry_msg(T_odom_base, (0.0, 0.0), ('odom', self._base_frame), ns)
         )
         scan = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
         scan.header = messages.header('laser', ns)

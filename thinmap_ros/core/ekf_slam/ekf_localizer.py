@@ -207,6 +207,11 @@ class EkfLocalizer:
         """Stamps (0,) and poses (0, 3): the filter does not correct earlier poses."""
         return np.empty(0, dtype=np.int64), np.empty((0, 3))
 
+    def known_places(self) -> Array:
+        """Places (N, 2) that enclose what is known: the ends of the line features, m."""
+        ends = [end for feature in self.features for end in (feature.start, feature.end)]
+        return np.array(ends, dtype=np.float64).reshape(-1, 2)
+
     def _motion_noise(self, moved: Array) -> Array:
         """Covariance (3, 3) of an odometry motion (3,), robot frame before the motion."""
         return np.diag(_REPEATED**2 * odometry_variances(moved, self.config.odometry))

@@ -25,7 +25,10 @@ _EXPLORED = (FinishCode.ALL_RESOLVED, FinishCode.UNREACHABLE)
 
 @dataclass(eq=False)
 class Odometer:
-    """Distance driven, from poses (3,); noise of a robot that stands still does not count."""
+    """Distance driven, from poses (3,); noise of a robot that stands still does not count.
+
+    start: the first pose, unless another one was given.
+    """
 
     start: Array | None = None
     distance_m: float = 0.0
@@ -34,7 +37,7 @@ class Odometer:
     def add_pose(self, T_map_base: Array) -> None:
         """Add the present pose (3,)."""
         if self._last is None:
-            self.start = T_map_base
+            self.start = T_map_base if self.start is None else self.start
             self._last = T_map_base
             return
         step = float(np.hypot(*(T_map_base[:2] - self._last[:2])))
@@ -160,6 +163,27 @@ class InputWatchdog:
         return None
 
 
+@dataclass
+class _MissionClock:
+    """Time since the start of a mission, s, that began at started_s, before_s after its start."""
+
+    started_s: float
+    before_s: float
+
+    def start(self, now_s: float) -> bool:
+        """Start with the first message of a simulated clock, which stands at 0 before it.
+
+        Returns whether that is so.
+        """
+        is_first = self.started_s == 0.0
+        if is_first:
+            self.started_s = now_s
+        return is_first
+
+    def elapsed_s(self, now_s: float) -> float:
+        return self.before_s + now_s - self.started_s
+
+
 class Mission:
     """One exploration from its start to its end.
 
@@ -175,7 +199,9 @@ class Mission:
         watchdog: InputWatchdog,
         now_s: float,
         state: MissionState = MissionState.EXPLORING,
+        elapsed_s: float = 0.0,
     ) -> None:
+        """elapsed_s: time since the start of a mission that is continued."""
         self.goal = goal
         self.strategy = strategy
         self.state = state
@@ -185,14 +211,13 @@ class Mission:
         self.is_paused = False
         self.has_returned = False
         self._watchdog = watchdog
-        self._started_s = now_s
+        self._clock = _MissionClock(now_s, elapsed_s)
         self._return_failures = 0
-        self._is_cancel_requested = False
         watchdog.restart(now_s)
 
     def elapsed_s(self, now_s: float) -> float:
         """Time since the start."""
-        return now_s - self._started_s
+        return self._clock.elapsed_s(now_s)
 
     @property
     def is_running(self) -> bool:
@@ -221,13 +246,12 @@ class Mission:
         return None if target is None else DriveTo(target.goal)
 
     def check(self, now_s: float, is_driving: bool) -> Action:
-        """Check requests, inputs and budgets, about once a second.
+        """Check inputs and budgets, about once a second.
 
         is_driving: whether the navigator reports on the goal that it was given.
         """
-        self._start_clock(now_s)
-        if self._is_cancel_requested:
-            return self.cancel('cancelled')
+        if self._clock.start(now_s):
+            self._watchdog.restart(now_s)
         if self.is_paused:
             self._watchdog.restart(now_s)
             return None
@@ -258,19 +282,9 @@ class Mission:
             return self._drive_to_start()
         return self._finish(self.end._replace(reason=f'{self.end.reason}; not home: {reason}'))
 
-    def request_cancel(self) -> None:
-        """Have the next check cancel the mission."""
-        self._is_cancel_requested = True
-
     def cancel(self, reason: str) -> Finish:
         """End the mission before it is done."""
         return self._finish(Finish(FinishCode.CANCELLED, reason))
-
-    def _start_clock(self, now_s: float) -> None:
-        """Start with the first message of a simulated clock, which stands at 0 before it."""
-        if self._started_s == 0.0:
-            self._started_s = now_s
-            self._watchdog.restart(now_s)
 
     def _finish_exploring(self, end: Finish) -> Action:
         """Return to the start if that was asked for, else finish."""

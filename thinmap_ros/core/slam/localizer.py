@@ -254,6 +254,11 @@ class Localizer:
         """
         return self._loops.keyframes.path()
 
+    def known_places(self) -> Array:
+        """Places (N, 2) that enclose what is known: cells of the local map, and keyframes, m."""
+        keyframes = [frame.T_map_base[:2] for frame in self.keyframes]
+        return np.vstack([self._map.map.corners(), np.array(keyframes).reshape(-1, 2)])
+
     def _start_delocalized(self, given: Mapping[str, NDArray[Any]]) -> None:
         """Start in a loaded local map: delocalized until scans fit."""
         self._map.load(given)

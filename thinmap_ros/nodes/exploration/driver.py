@@ -9,6 +9,7 @@ from rclpy.node import Node
 
 from thinmap_ros.core.exploration.live.drive_progress import is_same_goal
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.nodes.exploration.goal_monitor import PREFIX_BYTES
 from thinmap_ros.ros import messages, qos
 
 _ARRIVED_M = 0.3
@@ -26,6 +27,13 @@ class Driver(Protocol):
     @property
     def is_yielding(self) -> bool:
         """Whether the goal waits for the end of somebody else's."""
+
+    @property
+    def goal_prefix(self) -> bytes:
+        """PREFIX_BYTES with which the ids of its goals begin."""
+
+    def adopt(self, goal_prefix: bytes) -> None:
+        """Count the goals of a killed driver as own ones, by their prefix."""
 
     def drive_to(self, goal: Array) -> None:
         """Set the goal (3,) in the map frame, instead of an earlier one."""
@@ -63,6 +71,7 @@ class ForeignDriver:
     """Somebody who drives to the published targets: the robot arrives, or the target changes."""
 
     is_yielding = False
+    goal_prefix = bytes(PREFIX_BYTES)
 
     def __init__(self, on_result: OnResult) -> None:
         self._on_result = on_result
@@ -72,6 +81,9 @@ class ForeignDriver:
     def is_driving(self) -> bool:
         """Whether the robot is still to arrive at the goal."""
         return self._goal is not None
+
+    def adopt(self, goal_prefix: bytes) -> None:
+        """Nothing: goals have no ids here."""
 
     def drive_to(self, goal: Array) -> None:
         """Set the goal (3,)."""

@@ -1,6 +1,5 @@
 """Goals that others have at the server that drives the robot."""
 
-from collections import deque
 from uuid import uuid4
 
 from action_msgs.msg import GoalStatus, GoalStatusArray
@@ -15,7 +14,13 @@ _ACTIVE = (
     GoalStatus.STATUS_CANCELING,
 )
 _THROUGH_POSES = 'navigate_through_poses'
-_MAX_OWN = 1000
+PREFIX_BYTES = 8
+
+
+def action_servers(node: Node, action: str) -> set[bytes]:
+    """Ids of the servers of an action that the graph knows: of their status publishers."""
+    infos = node.get_publishers_info_by_topic(f'{action}/_action/status')
+    return {bytes(info.endpoint_gid) for info in infos}
 
 
 class _GoalStatuses:
@@ -23,48 +28,53 @@ class _GoalStatuses:
 
     def __init__(self, node: Node, action: str) -> None:
         self._node = node
-        self._topic = f'{action}/_action/status'
+        self._action = action
         self._active: set[bytes] = set()
         self._servers: set[bytes] = set()
-        node.create_subscription(GoalStatusArray, self._topic, self._on_status, qos.LATCHED)
+        topic = f'{action}/_action/status'
+        node.create_subscription(GoalStatusArray, topic, self._on_status, qos.LATCHED)
 
     def active(self) -> set[bytes]:
         """Ids of the goals; none once the servers that reported them are gone."""
-        if self._active and self._servers and not self._servers & self._present_servers():
+        if (
+            self._active
+            and self._servers
+            and not self._servers & action_servers(self._node, self._action)
+        ):
             self._active.clear()
         return self._active
 
     def _on_status(self, message: GoalStatusArray) -> None:
-        self._servers = self._present_servers()
+        self._servers = action_servers(self._node, self._action)
         self._active = {
             bytes(status.goal_info.goal_id.uuid)
             for status in message.status_list
             if status.status in _ACTIVE
         }
 
-    def _present_servers(self) -> set[bytes]:
-        infos = self._node.get_publishers_info_by_topic(self._topic)
-        return {bytes(info.endpoint_gid) for info in infos}
-
 
 class GoalMonitor:
     """Whether the server of an action drives for somebody else.
 
     It looks at navigate_through_poses in the same namespace, too, as one robot serves both.
+    prefix: PREFIX_BYTES with which the ids of our own goals begin; that of a client that was killed
+    makes its goals our own.
     """
 
     def __init__(self, node: Node, action: str) -> None:
         """action: name of the action navigate_to_pose."""
-        self._own: deque[bytes] = deque(maxlen=_MAX_OWN)
+        self.prefix = uuid4().bytes[:PREFIX_BYTES]
         sibling = action[: action.rfind('/') + 1] + _THROUGH_POSES
         self._actions = [_GoalStatuses(node, name) for name in dict.fromkeys((action, sibling))]
 
     def new_id(self) -> UUID:
         """Id for a goal of our own."""
-        goal_id = uuid4().bytes
-        self._own.append(goal_id)
-        return UUID(uuid=list(goal_id))
+        return UUID(uuid=list(self.prefix + uuid4().bytes[PREFIX_BYTES:]))
 
     def is_taken(self) -> bool:
         """Whether somebody else has a goal there that is not at its end."""
-        return any(action.active().difference(self._own) for action in self._actions)
+        return any(
+            not goal_id.startswith(self.prefix)
+            for action in self._actions
+            for goal_id in action.active()
+        )

@@ -14,7 +14,7 @@ from thinmap_ros.core.exploration.live.drive_progress import Arrivals, DriveProg
 from thinmap_ros.core.exploration.live.drive_request import DriveRequest, Retries
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.nodes.exploration.driver import OnResult
-from thinmap_ros.nodes.exploration.goal_monitor import GoalMonitor
+from thinmap_ros.nodes.exploration.goal_monitor import GoalMonitor, action_servers
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -33,11 +33,13 @@ _STATUS_NAMES = {
 class _Drive:
     """A goal at the server.
 
-    failure: why it failed at failed_s, by the clock of the machine.
+    servers: ids of the servers that the graph knew when it was sent. failure: why it failed at
+    failed_s, by the clock of the machine.
     """
 
     request: DriveRequest
     progress: DriveProgress
+    servers: set[bytes]
     handle: ClientGoalHandle | None = None
     failure: str = ''
     failed_s: float = 0.0
@@ -81,6 +83,15 @@ class NavigationClient:
     def is_yielding(self) -> bool:
         """Whether the goal waits for the end of somebody else's."""
         return self._goal is not None and self._drive is None and self._others.is_taken()
+
+    @property
+    def goal_prefix(self) -> bytes:
+        """Bytes with which the ids of its goals begin."""
+        return self._others.prefix
+
+    def adopt(self, goal_prefix: bytes) -> None:
+        """Count goals of a killed client as own ones: they are replaced, not waited for."""
+        self._others.prefix = goal_prefix
 
     def drive_to(self, goal: Array) -> None:
         """Set the goal (3,), unless the server has about the same."""
@@ -136,7 +147,7 @@ class NavigationClient:
                 self._end(False, f'no answer for {drive.request.answer_timeout_s:.0f} s')
                 return False
             return True
-        is_gone = drive.request.is_accepted and not self._client.server_is_ready()
+        is_gone = drive.request.is_accepted and self._is_server_gone(drive)
         if is_gone or drive.request.is_silent(now_s):
             self._node.get_logger().warning(
                 'the navigator is silent: asking again', throttle_duration_sec=WARN_PERIOD_S
@@ -144,6 +155,16 @@ class NavigationClient:
             self._drive = None
             return True
         return not drive.request.is_same(goal)
+
+    def _is_server_gone(self, drive: _Drive) -> bool:
+        """Whether there is no server any more, or another one has come since the goal was sent.
+
+        A server that was killed counts as ready for a while.
+        """
+        return not self._client.server_is_ready() or bool(self._servers() - drive.servers)
+
+    def _servers(self) -> set[bytes]:
+        return action_servers(self._node, self._settings.navigate_to_pose_action)
 
     def _settle(self, drive: _Drive) -> bool:
         """Report a failure, unless somebody else has replaced the goal; then it is sent again."""
@@ -158,7 +179,7 @@ class NavigationClient:
     def _send(self, goal: Array) -> None:
         now_s = self._now_s()
         request = DriveRequest(goal, now_s, self._retries.answer_timeout_s)
-        drive = _Drive(request, DriveProgress(goal))
+        drive = _Drive(request, DriveProgress(goal), self._servers())
         self._drive = drive
         message = NavigateToPose.Goal()
         now_ns = self._node.get_clock().now().nanoseconds

@@ -5,6 +5,7 @@ from rclpy.node import Node
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.mission import Mission, MissionGoal
 from thinmap_ros.core.exploration.strategy import Strategy
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.files import sessions
 from thinmap_ros.ros import parameters
 from thinmap_ros.strategies import DEFAULT, NAMES, check_strategy, make_strategy
@@ -53,6 +54,21 @@ class StrategySource:
         if self._is_outdated or not last.is_resumed_by(goal):
             return self._new()
         return last.strategy
+
+    def state(self, strategy: Strategy) -> State:
+        """What a strategy has learned; empty where it cannot be saved."""
+        if self._name == DEFAULT and isinstance(strategy, Explorer):
+            return strategy.state()
+        return {}
+
+    def restored(self, state: State) -> Strategy:
+        """Strategy that continues with a `state`, if there is one; else new.
+
+        Raises InputError where the state is invalid.
+        """
+        if self._name == DEFAULT and state:
+            return Explorer.from_state(state, self._config)
+        return self._new()
 
     def save(self, path: str, strategy: Strategy) -> str:
         """Save what a strategy has learned, if it can be saved; returns what was done.

@@ -94,6 +94,7 @@ class AmclInterface:
         try:
             self._set_pose(request.pose)
         except InputError as error:
+            self._node.diagnostics.message_rejected('set_initial_pose', str(error))
             self._node.get_logger().warning(f'set_initial_pose: {error}')
         return response
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from thinmap_msgs.msg import SlamStatus
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
@@ -10,6 +11,7 @@ from thinmap_ros.core.slam.localizers import AnyLocalizer
 from thinmap_ros.nodes.localization.amcl_interface import AmclInterface
 from thinmap_ros.nodes.localization.config import GIVEN_COVARIANCE, LocalizationConfig
 from thinmap_ros.nodes.localization.initial_poses import InitialPoses
+from thinmap_ros.nodes.localization.known_area import require_near_map
 from thinmap_ros.nodes.localization.last_pose import LastPose
 from thinmap_ros.nodes.localization.map_source import MapSource
 from thinmap_ros.ros import parameters
@@ -69,10 +71,12 @@ class GivenMap:
     def with_new_map(self, localizer: AnyLocalizer) -> AnyLocalizer:
         """The localizer that follows another one in a map from its topic."""
         settings = self._settings
-        if self._given_covariance is not None:
-            placed = self._placed(localizer.pose, self._given_covariance)
-            self._given_covariance = None
-            return placed
+        covariance = self._given_covariance
+        self._given_covariance = None
+        if covariance is not None:
+            placed = self._placed(localizer.pose, covariance)
+            if self._is_near_map(placed):
+                return placed
         is_first = self._amcl is None or not self._amcl.has_published
         if is_first or (settings.set_initial_pose and settings.always_reset_initial_pose):
             return self.create_localizer()
@@ -98,6 +102,16 @@ class GivenMap:
         elif state == SlamStatus.LOST:
             text = 'lost: waits for initialpose, a global localization, or a scan that matches'
             logger.warning(text, throttle_duration_sec=_WARN_PERIOD_S)
+
+    def _is_near_map(self, placed: AnyLocalizer) -> bool:
+        """Whether the pose that a user gave before there was a map lies near it."""
+        try:
+            require_near_map(placed.pose, placed)
+        except InputError as error:
+            self._node.diagnostics.message_rejected('initialpose', str(error))
+            self._node.get_logger().warning(f'initialpose: {error}')
+            return False
+        return True
 
     def _placed(self, T_map_base: Array, covariance: Array) -> AnyLocalizer:
         localizer = self.create_localizer_at(T_map_base)

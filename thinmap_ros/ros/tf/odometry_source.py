@@ -14,6 +14,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded
+from thinmap_ros.ros.tf.odometry_frames import OdometryFrames
 from thinmap_ros.ros.tf.transform_listener import TransformBuffer
 
 TOPIC = 'topic'
@@ -27,8 +28,9 @@ class OdometryInputConfig(Config):
 
     odom_source: str = parameter(
         TOPIC,
-        'Source of the odometry. topic: nav_msgs/Odometry on odom. tf: the transform from '
-        'odom_frame to base_frame. none: the robot has no odometry; the localizer follows it by '
+        'Source of the odometry. topic: nav_msgs/Odometry on odom, in odom_frame and base_frame or '
+        'in frames that static transforms connect to these. tf: the transform from odom_frame to '
+        'base_frame. none: the robot has no odometry; the localizer follows it by '
         'scan matching alone and publishes odom_frame -> base_frame as identity.',
         choices=(TOPIC, TF, NONE),
     )
@@ -53,6 +55,12 @@ class OdometrySource:
             )
         )
         self.source = parameters.declare_config(node, OdometryInputConfig).odom_source
+        self._frames = OdometryFrames(
+            self.odom_frame,
+            base_frame,
+            self._subscribe_static,
+            lambda note: node.get_logger().info(f'odom: {note}'),
+        )
         self._transforms = TransformBuffer()
         self._last_ns: int | None = None
 
@@ -62,9 +70,7 @@ class OdometrySource:
         if self.source == TOPIC:
             subscribe_guarded(node, Odometry, 'odom', self._on_odometry, qos.STREAM)
         elif self.source == TF:
-            AdaptiveSubscription(
-                node, TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
-            )
+            self._subscribe_static()
             AdaptiveSubscription(node, TFMessage, '/tf', self._on_transforms, qos.TRANSFORMS)
             node.diagnostics.add_update_callback(self._report)
 
@@ -80,7 +86,12 @@ class OdometrySource:
 
     def _on_odometry(self, message: Odometry) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._process(stamp_ns, messages.pose_from_msg(message.pose.pose))
+        self._process(stamp_ns, self._frames.pose(message))
+
+    def _subscribe_static(self) -> None:
+        AdaptiveSubscription(
+            self._node, TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
+        )
 
     def _on_static(self, message: TFMessage, _info: dict[str, Any]) -> None:
         self._add(message, is_static=True)
@@ -103,6 +114,8 @@ class OdometrySource:
         for transform in message.transforms:
             try:
                 self._transforms.add(transform, is_static)
+                if is_static:
+                    self._frames.add_static(transform)
             except InputError as error:
                 self._node.diagnostics.message_rejected('/tf', str(error))
 

@@ -180,6 +180,14 @@ class LocalMap:
         cells['seen'] = np.maximum(cells['seen'], blocks[tuple(used.T)])
         self.tiles.write_tiles(places, cells)
 
+    def corners(self) -> Array:
+        """First and last corner (2, 2) of the box of its tiles, m, map frame; (0, 2) if empty."""
+        bounds = self.tiles.bounds()
+        if bounds is None:
+            return np.empty((0, 2))
+        row, col, end_row, end_col = bounds
+        return self.config.resolution_m * np.array([[col, row], [end_col, end_row]], dtype=float)
+
     def state(self) -> dict[str, NDArray[Any]]:
         """All cells as arrays by name, for `restore`."""
         tiles = self.tiles
