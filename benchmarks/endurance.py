@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 import psutil
 
+from benchmarks.faults.judge import Record
 from benchmarks.faults.kinds import KINDS
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.files import package_data
@@ -262,10 +263,18 @@ def _drive_with_faults(arguments: argparse.Namespace, path: Path, world: World) 
         out=arguments.out.resolve(),
         only=tuple(arguments.only),
     )
-    records = drive(setting, lambda record: print(report.line(record), flush=True))
+    records: list[Record] = []
     values = {'seed': arguments.seed, 'minutes': arguments.minutes, 'world': world.name}
-    report.write_json(arguments.out / 'faults.json', records, values)
-    print(report.table(records))
+
+    def add(record: Record) -> None:
+        records.append(record)
+        print(report.line(record), flush=True)
+        report.write_json(arguments.out / 'faults.json', records, values)
+
+    try:
+        drive(setting, add)
+    finally:
+        print(report.table(records))
     return not any(record.violations() for record in records)
 
 

@@ -29,6 +29,7 @@ _RECOVERY_S = 60.0
 _MOVING_S = 60.0
 _CENSUS_S = 60.0
 _REALIGN_S = 2.0
+_STOP_S = 2.5
 _SETTLED = 2  # diagnostics of each node with the same counts
 _TOPICS = ('scan', 'odom')
 
@@ -58,7 +59,6 @@ class FaultRun:
     """Drives a robot about and causes faults until the time is over."""
 
     def __init__(self, setting: Setting) -> None:
-        self.records: list[Record] = []
         self._setting = setting
         self._observer = Observer()
         self._processes = Processes(setting.out, SPEED_M_S)
@@ -90,7 +90,7 @@ class FaultRun:
             self._recover(fault)
             self._take_census()
             self._end_record(report)
-            if self.records[-1].violations() or fault.kind.resets:
+            if self._record.violations() or fault.kind.resets:
                 self._restart_all()
 
     def close(self) -> None:
@@ -178,7 +178,6 @@ class FaultRun:
         record = self._record
         if record.fault is None:
             record.driven_m = self._observer.track.travelled_m - record.driven_m
-        self.records.append(record)
         report(record)
 
     # Counts of messages.
@@ -236,9 +235,14 @@ class FaultRun:
 
     def _restart_all(self) -> None:
         """Start again with an empty map, elsewhere: the next fault is judged by itself."""
-        self._hold()
         for name in NODES:
             self._processes.kill(name)
+        # The robot stops without commands: it must not move before the first scan.
+        self._observer.order(is_free=True)
+        killed_s = self._observer.track.time_s
+        self._spin_until(lambda: self._observer.track.time_s > killed_s + _STOP_S)
+        self._observer.order(is_free=False)
+        self._hold()
         place = random_start(self._setting.world, self._rng)
         self._observer.teleport(place)
         self._goals.explore_again(_EXPLORATIONS)
@@ -292,8 +296,8 @@ class FaultRun:
                 raise ThinmapError(text)
 
 
-def drive(setting: Setting, report: Callable[[Record], None]) -> list[Record]:
-    """Run; all processes have ended when it returns."""
+def drive(setting: Setting, report: Callable[[Record], None]) -> None:
+    """Run; all processes have ended when it returns. report: is called with each record."""
     run = FaultRun(setting)
     try:
         run.run(report)
@@ -303,4 +307,3 @@ def drive(setting: Setting, report: Callable[[Record], None]) -> list[Record]:
         with suppress(KeyboardInterrupt):
             run.close()
         signal.signal(signal.SIGINT, before)
-    return run.records
