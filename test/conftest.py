@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from support.cpu_time import limited_cpu_time as limited_cpu_time
 from support.hidden_library import hide_ros
 from support.ros_domains import free_domain
 
