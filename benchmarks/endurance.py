@@ -29,7 +29,7 @@ import numpy as np
 import psutil
 
 from benchmarks.faults.judge import Record
-from benchmarks.faults.kinds import KINDS
+from benchmarks.faults.kinds import KINDS, random_faults
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
@@ -261,7 +261,7 @@ def _drive_with_faults(arguments: argparse.Namespace, path: Path, world: World) 
         rate=rate,
         seed=arguments.seed,
         out=arguments.out.resolve(),
-        only=tuple(arguments.only),
+        faults=random_faults(arguments.seed, arguments.only),
     )
     records: list[Record] = []
     values = {'seed': arguments.seed, 'minutes': arguments.minutes, 'world': world.name}

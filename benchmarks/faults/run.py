@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.faults.judge import Counts, Passed, Record, uncounted
-from benchmarks.faults.kinds import KILL, NODES, STOP, Fault, random_faults
+from benchmarks.faults.kinds import KILL, NODES, STOP, Fault
 from benchmarks.faults.observer import Observer
 from benchmarks.faults.processes import Processes
 from benchmarks.goal_client import GoalClient
@@ -36,7 +36,10 @@ _TOPICS = ('scan', 'odom')
 
 @dataclass(frozen=True)
 class Setting:
-    """The world (file and obstacles), duration, s (simulated), rate, seed, and folder for logs."""
+    """The world (file and obstacles), faults until a time, s (simulated), folder for logs.
+
+    rate: simulated seconds a second at most; seed: of noise and places.
+    """
 
     path: Path
     world: World
@@ -44,7 +47,7 @@ class Setting:
     rate: float
     seed: int
     out: Path
-    only: Sequence[str] = ()
+    faults: Iterable[Fault]
 
 
 @dataclass
@@ -79,7 +82,7 @@ class FaultRun:
             setting.path, setting.world.start, setting.rate, setting.seed
         )
         self._start_nodes(setting.world.start)
-        for fault in random_faults(setting.seed, setting.only):
+        for fault in setting.faults:
             if self._observer.track.time_s >= setting.seconds:
                 break
             self._begin_record(None)
