@@ -155,17 +155,20 @@ class FaultRun:
             self._record.pose.worst_m = 0.0
         self._drives = False
 
+        watch = self._record.pose
+
         def recovered() -> bool:
             self._drives = self._drives or track.speed_m_s() > DRIVES_M_S
-            watch = self._record.pose
-            return (
-                track.time_s > begun_s + _SETTLE_S and self._drives and watch.since_s is None
-            ) or watch.is_violated
+            is_settled = track.time_s > begun_s + _SETTLE_S
+            return is_settled and self._drives and watch.since_s is None
 
-        self._spin_until(lambda: recovered() or track.time_s > begun_s + _RECOVERY_S)
+        def ended() -> bool:
+            return recovered() or watch.is_violated or track.time_s > begun_s + _RECOVERY_S
+
+        self._spin_until(ended)
         if recovered():
             self._record.recovered_s = track.time_s - begun_s
-        else:
+        elif not watch.is_violated:
             faults = [f'{n}: {h.message}' for n, h in self._observer.health.items() if not h.is_ok]
             state = 'the pose is wrong' if self._drives else 'the robot does not drive'
             self._record.others.append(
