@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from support.cpu_time import limited_cpu_time as limited_cpu_time
 from support.hidden_library import hide_ros
 from support.ros_domains import free_domain
+from support.timeouts import limited_cpu_time as limited_cpu_time
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = next(

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.cpu_time import VARIABLE
+from support.timeouts import CPU_LIMIT
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -42,7 +42,7 @@ SPINS_AND_WAITS = """
 import itertools
 import time
 
-from support.cpu_time import limited_cpu_time
+from support.timeouts import limited_cpu_time
 
 def test_waits():
     time.sleep(1.0)
@@ -59,7 +59,7 @@ def test_a_test_is_limited_by_its_cpu_time(tmp_path: Path, name: str) -> None:
     done = subprocess.run(
         [sys.executable, '-m', 'pytest', '-p', 'no:cacheprovider', '-k', name, str(tmp_path)],
         cwd=tmp_path,
-        env={**os.environ, VARIABLE: '0.5', 'PYTHONPATH': str(ROOT / 'test')},
+        env={**os.environ, CPU_LIMIT: '0.5', 'PYTHONPATH': str(ROOT / 'test')},
         capture_output=True,
         text=True,
     )

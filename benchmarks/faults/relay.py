@@ -1,8 +1,8 @@
 """A node between simulator and robot: faults of laser, odometry and clock, and the pace of time.
 
 raw_scan, raw_odom, raw_clock in; scan, odom, /tf, /clock out. The simulator is in lockstep with
-`paced`: time goes on when the graph has processed a scan, or as the wall clock does while a fault
-prevents that, and stands still on request.
+`paced`: it continues when the graph has processed a scan, or with the wall clock while a fault
+prevents that, and pauses on request.
 
 Topics `relay_order` and `relay_state` (JSON) connect it with benchmarks/faults/observer.py;
 `relay_scan` tells the stamp and the true time of each scan.
@@ -36,7 +36,7 @@ _DEEP = 1000
 
 @dataclass
 class _Pace:
-    """Whether time may go on.
+    """Whether the simulation may continue.
 
     awaited_ns: stamp of the last scan at the simulator while it waits, and as it was passed on.
     """
@@ -58,7 +58,7 @@ class _Pace:
         self.is_done = self.is_done or stamp_ns == self.passed_ns
 
     def released(self) -> int | None:
-        """The awaited stamp, once time goes on."""
+        """The awaited stamp, once the simulation continues."""
         waited_s = monotonic() - self.since_s
         limit_s = _SCAN_S if self.is_free else _PATIENCE_S
         if self.holds or self.awaited_ns is None or not (self.is_done or waited_s > limit_s):

@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.faults.judge import Record
 
-_HEAD = ('fault', 'count', 'violations', 'worst error m', 'longest way m', 'recovery s')
+_HEAD = ('fault', 'count', 'violations', 'worst error m', 'most driven m', 'recovery s')
 
 
 def _row(name: str, records: Sequence[Record]) -> tuple[str, ...]:

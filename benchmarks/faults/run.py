@@ -23,7 +23,7 @@ SPEED_M_S = 0.5
 DRIVES_M_S = 0.1
 _EXPLORATIONS = 3
 _START_S = 300.0
-_STANDSTILL_S = 120.0  # of the machine, while time should go on
+_STANDSTILL_S = 120.0  # of the machine, without a new simulated time
 _SETTLE_S = 6.0
 _RECOVERY_S = 60.0
 _MOVING_S = 60.0
@@ -144,7 +144,7 @@ class FaultRun:
         self._goals.ask_again()
 
     def _recover(self, fault: Fault) -> None:
-        """Wait until the robot knows its pose and drives again."""
+        """Wait until the pose is right and the robot drives again."""
         track = self._observer.track
         begun_s = track.time_s
         if fault.kind.resets:

@@ -34,7 +34,7 @@ class _Recent(dict[int, Array]):
 
 
 class Track:
-    """Compares estimated with true poses, and measures the way of the robot.
+    """Compares estimated with true poses, and measures the distance travelled.
 
     The stamps of scans may be wrong: `add_scan` tells the true time of each.
     T_world_map (3,): where the map lies in the world.

@@ -41,8 +41,8 @@ class NodeInProcess:
 
     def __init__(self, make: Callable[[], Any], parameters: tuple[str, ...] = ()) -> None:
         words = [word for text in (*_PARAMETERS, *parameters) for word in ('-p', text)]
-        # A discovery of other graphs would only take time.
-        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        # Nobody else is on the graph.
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
         os.environ['ROS_DOMAIN_ID'] = _DOMAIN
         rclpy.init(
             args=['--ros-args', '--log-level', 'fatal', *words],
