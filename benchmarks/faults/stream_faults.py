@@ -32,6 +32,7 @@ class StreamFaults:
         self._rng = np.random.default_rng()
         self._T_new_odom: Array = np.zeros(3)
         self._frozen: array[float] | None = None
+        self._shift_ns = 0
         self._is_due = False
         self._recent: dict[str, deque[Any]] = {
             'scan': deque(maxlen=_MEMORY),
@@ -54,6 +55,9 @@ class StreamFaults:
             self.offset_ns += int(self._rng.uniform(1.0, 20.0) * SECOND_NS)
         elif kind == 'clock_back':
             self.offset_ns -= int(self._rng.uniform(2.0, 20.0) * SECOND_NS)
+        elif kind == 'odom_stamps':
+            size_s = 10.0 ** self._rng.uniform(-1.0, 1.0)
+            self._shift_ns = int(self._rng.choice([1, -1]) * size_s * SECOND_NS)
 
     def end(self) -> None:
         """End the fault."""
@@ -87,7 +91,7 @@ class StreamFaults:
         pose.position.y = float(T_new_base[1])
         pose.orientation = messages.quaternion_msg(float(T_new_base[2]))
         if self._kind == 'odom_stamps':
-            self._shift(message, int(_STAMPS_S * SECOND_NS))
+            self._shift(message, self._shift_ns)
         elif self._kind == 'odom_one_stamp' and self._is_due:
             self._is_due = False
             self._shift(message, int(_ONE_STAMP_S * SECOND_NS))

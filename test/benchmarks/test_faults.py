@@ -87,13 +87,26 @@ def test_stamps_of_scans_and_odometry_are_ahead_for_a_while_or_once() -> None:
     faults = StreamFaults(0)
     for kind, expected in (
         ('scan_stamps', [5.2, 5.4, 0.2, 0.4]),
-        ('odom_stamps', [0.2, 0.4, 5.2, 5.4]),
         ('odom_one_stamp', [0.2, 0.4, 9.2, 0.4]),
     ):
         faults.begin(kind, 1)
         sent = [faults.scan(scan_msg(k))[0] for k in (1, 2)]
         sent += [faults.odometry(odometry_msg(k))[0] for k in (1, 2)]
         assert [stamp_s(message) for message in sent] == pytest.approx(expected)
+
+
+def test_stamps_of_odometry_are_ahead_or_late_for_a_while() -> None:
+    faults = StreamFaults(100 * SECOND_NS)
+    shifts = []
+    for seed in range(20):
+        faults.begin('odom_stamps', seed)
+        sent = [stamp_s(faults.odometry(odometry_msg(k))[0]) for k in (1, 2)]
+        assert sent[1] - sent[0] == pytest.approx(0.2)
+        shifts.append(sent[0] - 100.2)
+        faults.end()
+        assert stamp_s(faults.odometry(odometry_msg(1))[0]) == pytest.approx(100.2)
+    assert min(shifts) < 0.0 < max(shifts)
+    assert all(0.1 <= abs(shift) <= 10.0 for shift in shifts)
 
 
 def test_clock_and_odometry_keep_their_jumps() -> None:
