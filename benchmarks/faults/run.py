@@ -22,6 +22,7 @@ from thinmap_ros.sim.world import World
 SPEED_M_S = 0.5
 DRIVES_M_S = 0.1
 _EXPLORATIONS = 3
+_UNDISTURBED = 2  # attempts to drive without a violation before a fault
 _START_S = 300.0
 _STANDSTILL_S = 120.0  # of the machine, without a new simulated time
 _SETTLE_S = 6.0
@@ -85,9 +86,7 @@ class FaultRun:
         for fault in setting.faults:
             if self._observer.track.time_s >= setting.seconds:
                 break
-            self._begin_record(None)
-            self._drive_until_it_moves(fault)
-            self._end_record(report)
+            self._drive_undisturbed(fault, report)
             self._begin_record(fault)
             self._cause(fault)
             self._recover(fault)
@@ -103,8 +102,18 @@ class FaultRun:
 
     # A fault.
 
+    def _drive_undisturbed(self, fault: Fault, report: Callable[[Record], None]) -> None:
+        """Drive before a fault; again after a new start, where something was left of the last."""
+        for _ in range(_UNDISTURBED):
+            self._begin_record(None)
+            self._drive_until_it_moves(fault)
+            self._end_record(report)
+            if not self._record.violations():
+                break
+            self._restart_all()
+
     def _drive_until_it_moves(self, fault: Fault) -> None:
-        """Undisturbed driving; a fault matters most while the robot drives."""
+        """Drive until the fault is due, and the robot moves, as a fault matters most then."""
         track = self._observer.track
         begun_s = track.time_s
         self._spin_until(lambda: track.time_s > begun_s + fault.gap_s)
