@@ -106,7 +106,7 @@ class FaultRelay(Node):
         for each in passed:
             self._out['scan'].publish(each)
         self._counts['scan'] += len(passed)
-        self._counts['dropped_scan'] += not passed
+        self._counts['dropped_scan'] += not passed and not self._faults.is_silent
         self._pace.scan(raw_ns, stamp_ns, is_done=False)
         self._release()
 

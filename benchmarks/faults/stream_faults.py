@@ -63,6 +63,11 @@ class StreamFaults:
         """End the fault."""
         self._kind = ''
 
+    @property
+    def is_silent(self) -> bool:
+        """Whether a sensor is silent, which is no loss of single messages."""
+        return self._kind.startswith('silent')
+
     def clock(self, stamp_ns: int) -> int:
         """Time of /clock."""
         return stamp_ns + self.offset_ns

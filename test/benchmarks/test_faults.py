@@ -78,6 +78,7 @@ def test_messages_are_dropped_repeated_and_silenced() -> None:
             change = faults.scan if stream == 'scan' else faults.odometry
             make = scan_msg if stream == 'scan' else odometry_msg
             counts[kind] = sum(len(change(make(k))) for k in range(100))
+            assert faults.is_silent == (kind == 'silent')
         assert 20 < counts['drop'] < 80
         assert 150 < counts['repeat'] < 350
         assert counts['silent'] == 0
