@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.faults.judge import Counts, Passed, Record, uncounted
+from benchmarks.faults.judge import Counts, Passed, PoseWatch, Record, uncounted
 from benchmarks.faults.kinds import KILL, NODES, STOP, Fault
 from benchmarks.faults.observer import Observer
 from benchmarks.faults.processes import Processes
@@ -70,7 +70,7 @@ class FaultRun:
         self._rng = np.random.default_rng([setting.seed, 1])
         self._census: _Census | None = None
         self._record = Record(None, 0.0)
-        self._drives = False
+        self._begun_m = 0.0
         self._collisions = 0
 
     def run(self, report: Callable[[Record], None]) -> None:
@@ -144,7 +144,7 @@ class FaultRun:
             self._spin_until(lambda: track.time_s > end_s)
             self._record.commands = self._observer.moving_commands - before
             self._observer.order(end=True)
-        self._record.driven_m = track.travelled_m - self._record.driven_m
+        self._record.driven_m = track.travelled_m - self._begun_m
 
     def _start_again(self, name: str) -> None:
         self._observer.health.pop(name, None)
@@ -159,17 +159,15 @@ class FaultRun:
         if fault.kind.resets:
             self._spin_until(lambda: track.time_s > begun_s + _REALIGN_S)
             self._observer.align_map()
-            self._record.pose.since_s = None
-            self._record.pose.longest_s = 0.0
-            self._record.pose.worst_m = 0.0
-        self._drives = False
-
+            self._record.pose = PoseWatch()
+        drives = False
         watch = self._record.pose
 
         def recovered() -> bool:
-            self._drives = self._drives or track.speed_m_s() > DRIVES_M_S
+            nonlocal drives
+            drives = drives or track.speed_m_s() > DRIVES_M_S
             is_settled = track.time_s > begun_s + _SETTLE_S
-            return is_settled and self._drives and watch.since_s is None
+            return is_settled and drives and watch.since_s is None
 
         def ended() -> bool:
             return recovered() or watch.is_violated or track.time_s > begun_s + _RECOVERY_S
@@ -179,7 +177,7 @@ class FaultRun:
             self._record.recovered_s = track.time_s - begun_s
         elif not watch.is_violated:
             faults = [f'{n}: {h.message}' for n, h in self._observer.health.items() if not h.is_ok]
-            state = 'the pose is wrong' if self._drives else 'the robot does not drive'
+            state = 'the pose is wrong' if drives else 'the robot does not drive'
             self._record.others.append(
                 f'not recovered in {_RECOVERY_S:.0f} s: {state} ({"; ".join(faults)})'
             )
@@ -187,12 +185,13 @@ class FaultRun:
 
     def _begin_record(self, fault: Fault | None) -> None:
         track = self._observer.track
-        self._record = Record(fault, track.time_s, driven_m=track.travelled_m)
+        self._record = Record(fault, track.time_s)
+        self._begun_m = track.travelled_m
 
     def _end_record(self, report: Callable[[Record], None]) -> None:
         record = self._record
         if record.fault is None:
-            record.driven_m = self._observer.track.travelled_m - record.driven_m
+            record.driven_m = self._observer.track.travelled_m - self._begun_m
         report(record)
 
     # Counts of messages.
