@@ -153,6 +153,13 @@ def test_a_planted_fault_is_found_again_by_its_seed(
     assert list((tmp_path / '8').glob('carmen-*/why.txt'))
 
 
+@pytest.mark.live
+def test_each_source_makes_and_tests_a_case(tmp_path: Path) -> None:
+    outcome = Runner(list(SOURCES.values()), 1, tmp_path).run(time.monotonic() + HOURS_S, 1)
+    assert outcome.failures == []
+    assert outcome.tried == dict.fromkeys(SOURCES, 1)
+
+
 def never_ends(self: Any, scan: Any) -> list[Any]:
     """A scan from the future blocks all later ones."""
     self._waiting.append(scan)
