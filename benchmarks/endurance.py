@@ -4,6 +4,11 @@ Usage: scripts/endurance [--minutes M] -o DIR. Time waits for the nodes, so that
 the machine can. Writes DIR/endurance.csv, a line for every few seconds of simulated time: memory of
 each node, its step time, CPU time of all nodes, scans without a pose. Ends with a verdict: growth
 from the second quarter of the drive to the last one, and lost scans.
+
+With --faults one fault after the other strikes the graph: nodes are killed or stopped, messages
+dropped or repeated, the laser is blind or frozen, odometry and clock jump. Each is judged by the
+true pose of the simulator. Writes DIR/faults.json and the logs of the nodes, and prints a table and
+each violation; the exit code is 1 if there are any.
 """
 
 import argparse
@@ -23,10 +28,11 @@ from typing import Any
 import numpy as np
 import psutil
 
+from benchmarks.faults.judge import Record
+from benchmarks.faults.kinds import KINDS, random_faults
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.sim.drives import random_start
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 
@@ -45,6 +51,10 @@ _START_S = 120.0
 _LAG = 5  # scans whose pose may not have arrived at the end
 _DEPTH = 1000
 _FEWEST_SAMPLES = 4  # a quarter of them is evaluated
+_MINUTES = 120.0
+_FAULTS_MINUTES = 5.0
+_RATE = 100.0
+_FAULTS_RATE = 2.0
 
 
 @dataclass
@@ -70,35 +80,22 @@ class Samples:
 
 
 class Driver:
-    """A client of the nodes: explores the world, then sends the robot to random places."""
+    """A client of the nodes: drives the robot about, and counts the poses of its scans."""
 
     def __init__(self, world: World, seed: int) -> None:
         import rclpy
-        from action_msgs.msg import GoalStatus
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PoseWithCovarianceStamped
-        from nav2_msgs.action import NavigateToPose
-        from rclpy.action import ActionClient
         from rclpy.qos import QoSProfile
 
-        from thinmap_msgs.action import Explore
+        from benchmarks.goal_client import GoalClient
         from thinmap_ros.ros import messages
 
         rclpy.init()
         self._rclpy = rclpy
         self._messages = messages
-        self._goal = NavigateToPose.Goal
-        self._succeeded = GoalStatus.STATUS_SUCCEEDED
-        self._world = world
-        self._chance = np.random.default_rng(seed)
         self._node = rclpy.create_node('endurance')
-        self._explore = ActionClient(self._node, Explore, 'explore')
-        self._navigate = ActionClient(self._node, NavigateToPose, 'navigate_to_pose')
-        self._explored = Explore.Goal()
-        self._busy = False
-        self.explores = True
-        self.goals = 0
-        self.reached = 0
+        self.client = GoalClient(self._node, world, seed)
         self.poses = 0
         self.first_s = 0.0
         self.simulated_s = 0.0
@@ -110,10 +107,8 @@ class Driver:
     def spin(self) -> None:
         """Process received messages, and send the next goal if the robot is idle."""
         self._rclpy.spin_once(self._node, timeout_sec=0.02)
-        client = self._explore if self.explores else self._navigate
-        if not self._busy and self.poses and client.server_is_ready():
-            self._busy = True
-            client.send_goal_async(self._next_goal()).add_done_callback(self._on_taken)
+        if self.poses:
+            self.client.step()
 
     def lost(self) -> int:
         """Scans without a pose since the first received one."""
@@ -123,27 +118,6 @@ class Driver:
         """Destroy the client."""
         self._node.destroy_node()
         self._rclpy.shutdown()
-
-    def _next_goal(self) -> Any:
-        if self.explores:
-            return self._explored
-        self.goals += 1
-        goal = self._goal()
-        place = random_start(self._world, self._chance)
-        goal.pose = self._messages.pose_stamped_msg(place, 'map', 0)
-        return goal
-
-    def _on_taken(self, future: Any) -> None:
-        if not future.result().accepted:
-            self._busy = False
-            return
-        future.result().get_result_async().add_done_callback(self._on_ended)
-
-    def _on_ended(self, future: Any) -> None:
-        self._busy = False
-        is_reached = future.result().status == self._succeeded
-        self.reached += not self.explores and is_reached
-        self.explores = False
 
     def _on_pose(self, message: Any) -> None:
         stamp_s = self._messages.stamp_ns(message.header.stamp) / 1e9
@@ -241,7 +215,7 @@ def verdict(samples: Samples, driver: Driver) -> bool:
     good = flat and lost == 0
     print(
         f'{"GOOD" if good else "BAD"}: {samples.rows[-1][0] / 60.0:.1f} min simulated, '
-        f'{driver.reached} of {driver.goals} places reached; '
+        f'{driver.client.reached} of {driver.client.goals} places reached; '
         f'memory {"flat within" if flat else "NOT flat within"} 5 % '
         f'(most: {max(memory.values()):.3f}), '
         f'step time at most {np.nanmax(list(steps.values())):.3f} of what it was, '
@@ -259,48 +233,114 @@ def stop(nodes: dict[str, psutil.Popen]) -> None:
         process.kill()
 
 
-def _work(arguments: argparse.Namespace) -> None:
-    if not arguments.minutes > 0.0 or arguments.samples < _FEWEST_SAMPLES:
-        given = f'--minutes {arguments.minutes}, --samples {arguments.samples}'
-        raise InputError(
-            f'{given}: expected more than 0 minutes and at least {_FEWEST_SAMPLES} samples'
-        )
-    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    path = package_data.world_path(arguments.world)
-    world = World.from_patch(*read_world(path))
-    arguments.out.mkdir(parents=True, exist_ok=True)
+def _drive(arguments: argparse.Namespace, path: Path, world: World) -> bool:
+    """Drive, measure and print the verdict; returns whether it is good."""
     driver = Driver(world, arguments.seed)
-    nodes = start_all(str(path), world.start, arguments.rate, arguments.seed)
+    rate = arguments.rate or _RATE
+    nodes = start_all(str(path), world.start, rate, arguments.seed)
     try:
         samples = measure(driver, nodes, arguments, arguments.out / 'endurance.csv')
     finally:
         stop(nodes)
         driver.close()
-    if not verdict(samples, driver):
+    return verdict(samples, driver)
+
+
+def _drive_with_faults(arguments: argparse.Namespace, path: Path, world: World) -> bool:
+    """Drive under faults and print the table; returns whether there was no violation."""
+    from benchmarks.faults import report
+    from benchmarks.faults.run import Setting, drive
+
+    # A node that is killed while it holds the lock of a shared memory port would block the others.
+    os.environ['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
+    rate = arguments.rate or _FAULTS_RATE
+    setting = Setting(
+        path=path.resolve(),
+        world=world,
+        seconds=60.0 * arguments.minutes,
+        rate=rate,
+        seed=arguments.seed,
+        out=arguments.out.resolve(),
+        faults=random_faults(arguments.seed, arguments.only),
+    )
+    records: list[Record] = []
+    values = {'seed': arguments.seed, 'minutes': arguments.minutes, 'world': world.name}
+
+    def add(record: Record) -> None:
+        records.append(record)
+        print(report.line(record), flush=True)
+        report.write_json(arguments.out / 'faults.json', records, values)
+
+    try:
+        drive(setting, add)
+    finally:
+        print(report.table(records))
+    return not any(record.violations() for record in records)
+
+
+def use_own_domain() -> None:
+    """Let nobody else be on the graph."""
+    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+
+def work(arguments: argparse.Namespace) -> None:
+    """Do what the command line asks for; ends the program with 1 where the result is bad."""
+    if arguments.minutes is None:
+        arguments.minutes = _FAULTS_MINUTES if arguments.faults else _MINUTES
+    if not arguments.minutes > 0.0 or arguments.samples < _FEWEST_SAMPLES:
+        given = f'--minutes {arguments.minutes}, --samples {arguments.samples}'
+        raise InputError(
+            f'{given}: expected more than 0 minutes and at least {_FEWEST_SAMPLES} samples'
+        )
+    path = package_data.world_path(arguments.world)
+    world = World.from_patch(*read_world(path))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    run = _drive_with_faults if arguments.faults else _drive
+    if not run(arguments, path, world):
         sys.exit(1)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Options of the command line."""
+    made = argparse.ArgumentParser(prog='endurance', description=__doc__)
+    made.add_argument(
+        '--minutes',
+        type=float,
+        help=f'simulated minutes (default {_MINUTES:g}; with --faults {_FAULTS_MINUTES:g})',
+    )
+    made.add_argument(
+        '--rate',
+        type=float,
+        help='simulated seconds a second at most '
+        f'(default {_RATE:g}; with --faults {_FAULTS_RATE:g})',
+    )
+    made.add_argument(
+        '--world', default='room_10x10', help='world or map YAML file, or a world of the package'
+    )
+    made.add_argument('--seed', type=int, default=0, help='decides places and noise (default 0)')
+    made.add_argument(
+        '--samples', type=int, default=240, help='lines of the CSV file (default 240)'
+    )
+    made.add_argument('--faults', action='store_true', help='drive under random faults')
+    made.add_argument(
+        '--only',
+        nargs='+',
+        choices=sorted(KINDS),
+        metavar='FAULT',
+        default=[],
+        help=f'with --faults: these kinds only, of {", ".join(sorted(KINDS))}',
+    )
+    made.add_argument(
+        '-o', '--out', type=Path, default=Path('out/endurance'), help='folder (out/endurance)'
+    )
+    return made
 
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='endurance', description=__doc__)
-    parser.add_argument(
-        '--minutes', type=float, default=120.0, help='simulated minutes (default 120)'
-    )
-    parser.add_argument(
-        '--rate', type=float, default=100.0, help='simulated seconds a second at most (default 100)'
-    )
-    parser.add_argument(
-        '--world', default='room_10x10', help='world or map YAML file, or a world of the package'
-    )
-    parser.add_argument('--seed', type=int, default=0, help='decides places and noise (default 0)')
-    parser.add_argument(
-        '--samples', type=int, default=240, help='lines of the CSV file (default 240)'
-    )
-    parser.add_argument(
-        '-o', '--out', type=Path, default=Path('out/endurance'), help='folder (out/endurance)'
-    )
-    cli.run(_work, parser)
+    use_own_domain()
+    cli.run(work, parser())
 
 
 if __name__ == '__main__':

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import settings
 from support.hidden_library import hide_ros
 from support.ros_domains import free_domain
+from support.timeouts import limited_cpu_time as limited_cpu_time
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = next(

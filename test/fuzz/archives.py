@@ -15,6 +15,7 @@ from fuzz.saved_states import KINDS, Explored, State, one_number_replaced, repla
 from fuzz.saved_states import check as check_state
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.files import sessions
+from thinmap_ros.files.snapshots import VERSION
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.ros.checkpoint import Checkpoint
@@ -96,7 +97,7 @@ def explored_archives(folder: Path) -> tuple[Explored, dict[str, dict[str, bytes
     found = Explored()
     for kind, state in found.states.items():
         named: dict[str, Any] = {
-            'thinmap_format': np.array(f'{kind} {_PARTS[kind].version}'),
+            'thinmap_format': np.array(f'{kind} {VERSION}'),
             **state,
         }
         np.savez_compressed(folder / f'a{_PARTS[kind].ending}', **named)

@@ -196,7 +196,7 @@ def navigate(shared: None, rng: np.random.Generator, folder: Path) -> None:
         if command is None:
             continue
         finite(command.v, command.w)
-        assert abs(command.v) <= config.max_speed_m_s + 1e-9
+        assert abs(command.v) <= config.controller.max_speed_m_s + 1e-9
         assert command.state in ('idle', 'driving', 'blocked', 'reached', 'failed')
         finite(navigator.distance_remaining_m)
         if navigator.path is not None:

@@ -1,9 +1,7 @@
 """All sources of cases, by name."""
 
-from fuzz import archives, core, files, heard
+from fuzz import archives, core, files, heard, stream_nodes
 from fuzz.cases import Source
 
-SOURCES: dict[str, Source] = {
-    source.name: source
-    for source in (*files.SOURCES, *archives.SOURCES, *heard.SOURCES, *core.SOURCES)
-}
+_PARTS = (files, archives, heard, core, stream_nodes)
+SOURCES: dict[str, Source] = {source.name: source for part in _PARTS for source in part.SOURCES}

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +16,12 @@ import pytest
 from fuzz.__main__ import main
 from fuzz.cases import Source, damaged_bytes, damaged_text, nothing, tried
 from fuzz.runner import Runner, rng_of
+from fuzz.sources import SOURCES
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.odometry import ScanOdometrySynchronizer
+from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.logs import carmen
+from thinmap_ros.nodes.mapping import scan_pairs
 
 ROOT = Path(__file__).resolve().parents[2]
 HOURS_S = 1e9
@@ -146,6 +151,57 @@ def test_a_planted_fault_is_found_again_by_its_seed(
     assert ' of carmen: LookupError: planted\n' in found[0]
     assert '--seed 8 --only carmen --first' in found[0]
     assert list((tmp_path / '8').glob('carmen-*/why.txt'))
+
+
+@pytest.mark.live
+def test_each_source_makes_and_tests_a_case(tmp_path: Path) -> None:
+    outcome = Runner(list(SOURCES.values()), 1, tmp_path).run(time.monotonic() + HOURS_S, 1)
+    assert outcome.failures == []
+    assert outcome.tried == dict.fromkeys(SOURCES, 1)
+
+
+def never_ends(self: Any, scan: Any) -> list[Any]:
+    """A scan from the future blocks all later ones."""
+    self._waiting.append(scan)
+    return list(self._ready())
+
+
+class NoScanTwice(StampMatcher[Any, Any]):
+    """Does not expect a stamp twice."""
+
+    def add_left(self, stamp_ns: int, value: Any) -> tuple[Any, Any] | None:
+        if stamp_ns in self._lefts:
+            raise LookupError('planted')
+        return super().add_left(stamp_ns, value)
+
+
+@pytest.mark.live
+@pytest.mark.parametrize(
+    ('where', 'name', 'planted', 'source', 'why'),
+    [
+        (ScanOdometrySynchronizer, 'add_scan', never_ends, 'odometry', 'not used after the fault'),
+        (scan_pairs, 'StampMatcher', NoScanTwice, 'mapper', 'LookupError: planted'),
+    ],
+)
+def test_streams_find_a_planted_fault(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    where: object,
+    name: str,
+    planted: object,
+    source: str,
+    why: str,
+) -> None:
+    kind = SOURCES[f'stream_{source}']
+    found = []
+    for is_planted in (False, True):
+        if is_planted:
+            monkeypatch.setattr(where, name, planted)
+        runner = Runner([kind], 7, tmp_path)
+        outcome = runner.run(time.monotonic() + HOURS_S, 30 if is_planted else 3)
+        found.append([text for _, _, text in outcome.failures])
+    assert found[0] == []
+    assert any(why in text for text in found[1])
 
 
 @pytest.mark.live

@@ -1,0 +1,1 @@
+"""A live graph under random faults: see scripts/endurance --faults."""

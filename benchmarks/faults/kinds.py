@@ -1,0 +1,93 @@
+"""Kinds of faults, and a random sequence of them from a seed."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
+KILL = 'kill'
+STOP = 'stop'
+_GAP_S = (10.0, 30.0)
+# Speed and deceleration of the robot are 0.5 m/s and 0.4 m/s^2: a stop takes 0.3 m.
+_SILENT_M = 0.75
+_POSE_M = 2.25  # the navigator drives for 3 s without a pose
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of fault.
+
+    seconds: shortest and longest duration (simulated). stop_m: how far the robot may drive while it
+    lasts. stand_s: after this time, all commands must be zero. resets: nodes discard their state,
+    as documented, so that all of them are started again afterwards.
+    """
+
+    name: str
+    seconds: tuple[float, float]
+    stop_m: float = math.inf
+    stand_s: float = math.inf
+    resets: bool = False
+    node: str = ''
+
+    @property
+    def signal(self) -> str:
+        """KILL or STOP for a fault of a process, '' for one of messages."""
+        return self.name.partition('_')[0] if self.node else ''
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault: after gap_s of undisturbed driving, for duration_s (simulated); seed: of details."""
+
+    number: int
+    kind: Kind
+    gap_s: float
+    duration_s: float
+    seed: int
+
+
+_STOP_M = {'localizer': _POSE_M, 'navigator': _SILENT_M}
+
+KINDS = {
+    kind.name: kind
+    for kind in (
+        *(
+            Kind(f'{what}_{node}', seconds, _STOP_M.get(node, math.inf), node=node)
+            for what, seconds in ((KILL, (0.5, 3.0)), (STOP, (1.0, 8.0)))
+            for node in NODES
+        ),
+        Kind('drop_scan', (5.0, 15.0)),
+        Kind('drop_odom', (5.0, 15.0)),
+        Kind('repeat_scan', (5.0, 15.0)),
+        Kind('repeat_odom', (5.0, 15.0)),
+        Kind('silent_scan', (2.0, 8.0), _SILENT_M, 2.0),
+        Kind('silent_odom', (2.0, 8.0), _SILENT_M, 2.0),
+        Kind('laser_nan', (3.0, 15.0), _SILENT_M, 2.0),
+        Kind('laser_zero', (3.0, 15.0), _SILENT_M, 2.0),
+        Kind('laser_inf', (5.0, 40.0), 2.0),
+        Kind('laser_max', (5.0, 40.0), 2.0),
+        Kind('laser_frozen', (3.0, 10.0), 1.0, 3.0),
+        Kind('scan_stamps', (2.0, 6.0), _SILENT_M, 2.0),
+        Kind('odom_jump', (1.0, 1.0)),
+        Kind('odom_stamps', (2.0, 6.0)),
+        Kind('odom_one_stamp', (1.0, 1.0)),
+        Kind('clock_ahead', (1.0, 1.0)),
+        Kind('clock_back', (1.0, 1.0), resets=True),
+    )
+}
+
+
+def random_faults(seed: int, only: Sequence[str] = ()) -> Iterator[Fault]:
+    """Faults without end: of all kinds, or of the named ones; each kind once before any again."""
+    rng = np.random.default_rng(seed)
+    names = list(only or KINDS)
+    number = 0
+    while True:
+        for index in rng.permutation(len(names)):
+            kind = KINDS[names[int(index)]]
+            gap_s = float(rng.uniform(*_GAP_S))
+            duration_s = float(rng.uniform(*kind.seconds))
+            yield Fault(number, kind, gap_s, duration_s, int(rng.integers(2**31)))
+            number += 1
