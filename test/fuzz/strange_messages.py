@@ -16,6 +16,7 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import ProbabilityGrid, TopologicalEdge, TopologicalMap, TopologicalNode
 from thinmap_ros.ros import messages
+from thinmap_ros.ros.decoding.topology_reader import topology_from_msg
 
 STRANGE = st.sampled_from(
     [
@@ -259,7 +260,7 @@ def check_grid(message):
 
 
 def check_topology(message):
-    found = messages.topology_from_msg(message)
+    found = topology_from_msg(message)
     assert len(found.nodes) == len(message.nodes) and len(found.edges) == len(message.edges)
     assert all(math.isfinite(node.x + node.y + node.clearance_m) for node in found.nodes.values())
     assert all(

@@ -10,7 +10,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 from thinmap_msgs.msg import EndNode, EndNodeArray, LineFeature, LineFeatureArray, TopologicalMap
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.nodes import markers
-from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros import qos
+from thinmap_ros.ros.decoding.topology_reader import topology_from_msg
 
 pytestmark = pytest.mark.live
 
@@ -33,7 +34,7 @@ def test_a_graph_as_lines_and_balls():
 
 def is_sound(message):
     try:
-        messages.topology_from_msg(message)
+        topology_from_msg(message)
     except InputError:
         return False
     return all(node.kind == 0 for node in message.nodes)

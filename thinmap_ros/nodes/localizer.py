@@ -36,6 +36,7 @@ from thinmap_ros.nodes.localization.initial_poses import InitialPoses
 from thinmap_ros.nodes.localization.known_area import require_near_map
 from thinmap_ros.nodes.localization.map_source import load_localizer
 from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.decoding.topology_reader import read_topology
 from thinmap_ros.ros.diagnostics import ERROR, OK
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -161,7 +162,9 @@ class LocalizerNode(ThinmapNode):
         self.diagnostics.check_sole_publisher('pose')
         # Before the scans: of messages that wait together, the executor processes the graph of the
         # last scan first.
-        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
+        subscribe_guarded(
+            self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED, read_topology
+        )
         self._odometry.subscribe()
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         poses = InitialPoses(self, self._output.map_frame, self._on_initial_pose)
@@ -216,9 +219,9 @@ class LocalizerNode(ThinmapNode):
         if self._relocation is None:
             self._localizer = self._given.with_new_map(self._localizer)
 
-    def _on_topology(self, message: TopologicalMap) -> None:
-        self._topology = messages.topology_from_msg(message)
-        set_topology(self._localizer, self._topology)
+    def _on_topology(self, topology: Graph) -> None:
+        self._topology = topology
+        set_topology(self._localizer, topology)
 
     def _process(self, ready: list[tuple[Scan, Array]]) -> None:
         if self._relocation is not None:

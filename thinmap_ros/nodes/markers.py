@@ -12,7 +12,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, TopologicalMap
 from thinmap_ros.core import validation
 from thinmap_ros.core.topology.graph import NodeKind
-from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros import node_main, parameters, qos
+from thinmap_ros.ros.decoding.topology_reader import topology_from_msg
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.view import palette
@@ -58,7 +59,7 @@ def topology(message: TopologicalMap) -> MarkerArray:
 
     Raises InputError as `topology_from_msg`.
     """
-    graph = messages.topology_from_msg(message)
+    graph = topology_from_msg(message)
     edges = _marker(message.header, 'edges', Marker.LINE_LIST, _EDGE.size_m, palette.EDGE)
     for edge in graph.edges.values():
         points = [_point(float(x), float(y), _EDGE.z_m) for x, y in edge.path]

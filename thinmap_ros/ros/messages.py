@@ -3,7 +3,6 @@
 import math
 import re
 from array import array
-from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
@@ -34,7 +33,7 @@ from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
-from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.graph import Edge, Node, TopologicalMap
 
 # A bag or a publisher cannot name anything else to import.
 _TYPE_NAME = re.compile(r'([a-z]\w*)/msg/([A-Z]\w*)', re.ASCII)
@@ -317,48 +316,3 @@ def _edge_msg(edge: Edge) -> TopologicalEdge:
         clearance_m=edge.clearance_m,
         path=[Point32(x=x, y=y) for x, y in edge.path.tolist()],
     )
-
-
-def topology_from_msg(message: TopologicalMapMsg) -> TopologicalMap:
-    """Topological map of a message.
-
-    Raises InputError where a kind is unknown, an edge has no node, an id occurs twice, or a number
-    is not finite.
-    """
-    validation.require_unique('nodes', [n.id for n in message.nodes])
-    validation.require_unique('edges', [e.id for e in message.edges])
-    known = {n.id for n in message.nodes}
-    for node in message.nodes:
-        if node.kind not in list(NodeKind):
-            raise InputError(
-                f'node {node.id}: kind {node.kind}: '
-                f'expected one of {[int(kind) for kind in NodeKind]}'
-            )
-        validation.require_bounded(
-            f'node {node.id}', (node.position.x, node.position.y, node.clearance_m)
-        )
-    for edge in message.edges:
-        if not {edge.node_a, edge.node_b} <= known:
-            raise InputError(
-                f'edge {edge.id} from node {edge.node_a} to {edge.node_b}: '
-                'expected nodes of this map'
-            )
-        validation.require_bounded(
-            f'edge {edge.id}',
-            (edge.length_m, edge.clearance_m, *(c for p in edge.path for c in (p.x, p.y))),
-        )
-        if not edge.path:
-            raise InputError(f'edge {edge.id}: empty path: expected points')
-    nodes = [
-        Node(n.id, NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m))
-        for n in message.nodes
-    ]
-    edges = [
-        Edge(e.id, e.node_a, e.node_b, _points(e.path), float(e.length_m), float(e.clearance_m))
-        for e in message.edges
-    ]
-    return TopologicalMap(nodes, edges)
-
-
-def _points(path: Sequence[Point32]) -> Array:
-    return np.array([[p.x, p.y] for p in path], dtype=np.float64).reshape(-1, 2)

@@ -3,6 +3,7 @@
 Invalid messages are counted, logged and dropped; messages lost on the way are counted.
 """
 
+import struct
 from collections import deque
 from collections.abc import Callable
 from time import monotonic
@@ -27,18 +28,26 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 WARN_PERIOD_S = 5.0  # between two warnings of the same kind
 _TIMEOUT_S = 3.0
+_ENCAPSULATION = 4  # bytes before the first field of a serialized message
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 
 def subscribe_guarded(
-    node: ThinmapNode, kind: type, topic: str, process: Callable[[Any], None], profile: QoSProfile
+    node: ThinmapNode,
+    kind: type,
+    topic: str,
+    process: Callable[[Any], None],
+    profile: QoSProfile,
+    read: Callable[[bytes], Any] | None = None,
 ) -> None:
     """Subscribe to a topic.
+
+    read: where given, `process` receives what it returns for the serialized message.
 
     A message for which `process` raises InputError is dropped with a throttled warning. Where a
     publisher offers less than the profile requests (best effort, volatile), less is requested.
     """
-    _GuardedSubscription(node, kind, topic, process, profile)
+    _GuardedSubscription(node, kind, topic, process, profile, read)
 
 
 class _GuardedSubscription:
@@ -51,10 +60,11 @@ class _GuardedSubscription:
         topic: str,
         process: Callable[[Any], None],
         profile: QoSProfile,
+        read: Callable[[bytes], Any] | None,
     ) -> None:
         self._node = node
         self._topic = topic
-        self._process = process
+        self._process = process if read is None else lambda data: process(read(data))
         self._is_scan = kind is LaserScan
         self._is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._latched_message: Any = None
@@ -63,7 +73,8 @@ class _GuardedSubscription:
         self._time_jumps = 0
         self._losses = MessageLossCounter()
         node.diagnostics.expect_topic(topic)
-        self._adaptive = AdaptiveSubscription(node, kind, topic, self._on_message, profile)
+        is_raw = read is not None
+        AdaptiveSubscription(node, kind, topic, self._on_message, profile, is_raw)
         if self._is_scan:
             node.diagnostics.add_timeout_check(topic, _TIMEOUT_S)
         if self._is_latched:
@@ -135,7 +146,10 @@ class AdaptiveSubscription:
         topic: str,
         on_message: Callable[[Any, dict[str, Any]], None],
         profile: QoSProfile,
+        is_raw: bool = False,
     ) -> None:
+        """is_raw: `on_message` receives serialized messages."""
+        self._is_raw = is_raw
         self._node = node
         self._kind = kind
         self._topic = topic
@@ -147,7 +161,12 @@ class AdaptiveSubscription:
     def _subscribe(self) -> Subscription:
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible_qos)
         return self._node.create_subscription(
-            self._kind, self._topic, self._on_message, self._profile, event_callbacks=events
+            self._kind,
+            self._topic,
+            self._on_message,
+            self._profile,
+            event_callbacks=events,
+            raw=self._is_raw,
         )
 
     def _on_incompatible_qos(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
@@ -219,5 +238,9 @@ class MessageLossCounter:
 
 
 def _stamp_ns(message: Any) -> int:
-    """Stamp of a message, unchecked."""
+    """Stamp of a message, unchecked; of a serialized one, too."""
+    if isinstance(message, bytes):
+        order = '<' if message[1:2] == b'\x01' else '>'
+        seconds, nanoseconds = struct.unpack_from(f'{order}iI', message, _ENCAPSULATION)
+        return int(SECOND_NS * seconds + nanoseconds)
     return int(SECOND_NS * message.header.stamp.sec + message.header.stamp.nanosec)

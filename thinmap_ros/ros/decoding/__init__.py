@@ -1,0 +1,1 @@
+"""Large messages, read from their serialized form."""
