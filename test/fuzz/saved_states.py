@@ -130,7 +130,7 @@ def check(explored: Explored, kind: str, state: State, what: str) -> bool:
         assert len(str(error)) <= LONGEST and str(error).isprintable(), (what, str(error))
         # No array determines whether later windows will be aligned with the saved lattice.
         beside = kind == 'topology' and str(error).startswith('window')
-        beside |= kind in ('grid', 'localizer') and str(error).startswith('map ')
+        beside |= kind in ('grid', 'localizer') and 'map ' in str(error)
         assert str(error).startswith('saved') or beside, (what, str(error))
         return True
     return False

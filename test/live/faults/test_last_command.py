@@ -65,4 +65,4 @@ def test_the_last_command_of_a_navigator_is_zero(graph, number):
     for name in robots.names:
         graph.until(lambda n=name: robots.stand() or robots.is_driven(n), f'{name} is driven')
         assert graph.stop(name, number) == 0
-        graph.until(lambda n=name: not robots.is_driven(n), f'{name} is told to stop', seconds=20.0)
+        graph.until(lambda n=name: not robots.is_driven(n), f'{name} stands', seconds=20.0)

@@ -122,7 +122,7 @@ def test_an_ordinary_client_has_feedback_again_can_cancel_and_asks_again_for_the
     # Several, so that all endpoints of the new explorer are discovered.
     graph.until(lambda: len(feedback) > 10, 'feedback on the same goal')
     assert messages.seconds(feedback[-1].feedback.status.elapsed) > 10.0
-    # Nav2 is killed before it has reported on its goal: whoever takes its place gets it again.
+    # Nav2 is killed before it has reported on its goal: the server in its place gets it again.
     drive = exploration.until_driving()
     graph.stop('nav2', signal.SIGKILL)
     exploration.start_nav2()
@@ -134,7 +134,7 @@ def test_an_ordinary_client_has_feedback_again_can_cancel_and_asks_again_for_the
         'cancelled',
     )
     assert not lost.done(), 'what was asked for before is lost: the client has to ask again'
-    # Without recovery the goal is not known any more, and a client that asks is told so.
+    # Without recovery the goal is not known any more, and a client that asks gets status UNKNOWN.
     exploration.kill()
     exploration.start(recovery_timeout_s=0.0)
     assert graph.result(handle, 'the goal', AGAIN_S).status == GoalStatus.STATUS_UNKNOWN
