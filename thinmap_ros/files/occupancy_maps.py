@@ -21,6 +21,7 @@ from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.files.limits import FILES
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.files.yaml import read_mapping
 
 if TYPE_CHECKING:
@@ -178,7 +179,10 @@ def _cells(path: Path, image: Path, shades: _Shades) -> NDArray[np.int8]:
         # Above its own, larger limit Pillow only warns: here this is an error.
         with warnings.catch_warnings():
             warnings.simplefilter('error', Image.DecompressionBombWarning)
-            with Image.open(image, formats=_FORMATS) as opened:
+            with (
+                open_regular_file(image) as stream,
+                Image.open(stream, formats=_FORMATS) as opened,
+            ):
                 width, height = opened.size
                 if width * height > FILES.image_pixels:
                     raise ValueError(
@@ -187,7 +191,7 @@ def _cells(path: Path, image: Path, shades: _Shades) -> NDArray[np.int8]:
                 opened.load()
                 return _cells_of(opened, shades)
     except Exception as error:  # Pillow raises many types for corrupt images
-        reason = one_line_reason(error)
+        reason = getattr(error, 'strerror', None) or one_line_reason(error)
         raise InputError(f'{image}: {reason}: expected an image that {path} names') from error
 
 

@@ -18,8 +18,8 @@ from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.files.atomic import atomic_write
-from thinmap_ros.files.npz import open_regular_file
 from thinmap_ros.files.occupancy_maps import read_map, read_resolution, write_map
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.files.snapshots import read_snapshot, write_snapshot
 
 _MAP_ENDING = '.yaml'

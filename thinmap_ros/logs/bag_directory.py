@@ -11,6 +11,7 @@ import zstandard
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.files.atomic import read_text
 from thinmap_ros.files.limits import FILES, LOGS, PIECE_BYTES
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.files.yaml import parse_yaml
 
 
@@ -98,7 +99,7 @@ def decompressed_files(
 
 def _unpack(file: Path, target: Path) -> None:
     try:
-        with file.open('rb') as packed, target.open('wb') as out:
+        with open_regular_file(file) as packed, target.open('wb') as out:
             reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
             while piece := reader.read(PIECE_BYTES):
                 if out.tell() + len(piece) > LOGS.file_bytes:

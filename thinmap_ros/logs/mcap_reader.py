@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.limits import LOGS, PIECE_BYTES
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.logs.mcap_records import (
     FIRST_PRIVATE_OPCODE,
     HEAD,
@@ -153,7 +154,7 @@ class McapFile:
         blocks = [
             b for b in self._chunk_spans if b.channel_ids is None or b.channel_ids & channel_ids
         ]
-        with self.path.open('rb') as stream:
+        with open_regular_file(self.path) as stream:
             for block in sorted(blocks, key=lambda b: b.first_ns):
                 yield from queue.before(block.first_ns)
                 try:
@@ -227,7 +228,7 @@ def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[ChunkS
     After a damaged part, reading continues at the next chunk of the summary. Raises InputError if
     the file does not begin with the magic bytes of MCAP.
     """
-    with path.open('rb') as stream:
+    with open_regular_file(path) as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             raise InputError(f'{path}: no MCAP file: expected it to begin with {MAGIC!r}')
         chunks = sorted(block.start for block in summary.blocks)
@@ -301,7 +302,7 @@ def _load(stream: BinaryIO, block: ChunkSpan) -> Records:
 def summary_of(path: Path) -> Summary:
     """Summary at the end of a file; empty if it is truncated or the summary is unreadable."""
     size = path.stat().st_size
-    with path.open('rb') as stream:
+    with open_regular_file(path) as stream:
         footer_at = size - len(MAGIC) - HEAD.size - _FOOTER.size
         stream.seek(max(footer_at, 0))
         footer = stream.read()
