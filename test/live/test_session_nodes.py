@@ -333,9 +333,13 @@ def test_a_builder_that_does_not_answer_is_reported_and_the_mapper_continues(gra
     assert graph.stop('grid_mapper') == 0
 
 
-@pytest.mark.parametrize('name', MAPPERS)
-def test_a_session_that_is_not_there_ends_the_start_with_one_clear_line(graph, name):
-    process = graph.start(name, session_path='/nowhere/room')
+@pytest.mark.parametrize(
+    ('name', 'values'),
+    [('grid_mapper', {}), ('topology_builder', {}), ('explorer', {})]
+    + [('localizer', {'slam': slam}) for slam in ('scan_matching', 'ekf_ti')],
+)
+def test_a_session_that_is_not_there_ends_the_start_with_one_clear_line(graph, name, values):
+    process = graph.start(name, session_path='/nowhere/room', **values)
     assert graph.ended(process) == 2
     lines = graph.log(name).strip().splitlines()
     assert '/nowhere/room' in lines[-1] and 'Traceback' not in graph.log(name)

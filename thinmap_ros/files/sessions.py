@@ -131,6 +131,14 @@ def stem_of(path: str) -> Path:
     return Path(path).absolute()
 
 
+def require_session(path: str) -> None:
+    """Raise InputError where a path names no session: none of its files, and no map, exists."""
+    stem = stem_of(path)
+    endings = [*(part.ending for part in PARTS), _MAP_ENDING]
+    if not any(_exists(_with_ending(stem, ending)) for ending in endings):
+        raise InputError(f'{stem}: no such session: expected one of {", ".join(endings)}')
+
+
 def save_grid(path: str, grid: OccupancyGrid, shown: GridPatch | None = None) -> str:
     """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written. Raises OSError.
 

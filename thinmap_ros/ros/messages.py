@@ -322,8 +322,8 @@ def _edge_msg(edge: Edge) -> TopologicalEdge:
 def topology_from_msg(message: TopologicalMapMsg) -> TopologicalMap:
     """Topological map of a message.
 
-    Raises InputError where a kind is unknown, an edge has no node, an id occurs twice, or a number
-    is not finite.
+    Raises InputError where a kind is unknown, an edge has no node, an id occurs twice, a number
+    is not finite, or a length is negative.
     """
     validation.require_unique('nodes', [n.id for n in message.nodes])
     validation.require_unique('edges', [e.id for e in message.edges])
@@ -334,19 +334,17 @@ def topology_from_msg(message: TopologicalMapMsg) -> TopologicalMap:
                 f'node {node.id}: kind {node.kind}: '
                 f'expected one of {[int(kind) for kind in NodeKind]}'
             )
-        validation.require_bounded(
-            f'node {node.id}', (node.position.x, node.position.y, node.clearance_m)
-        )
+        validation.require_bounded(f'node {node.id}', (node.position.x, node.position.y))
+        validation.require_lengths(f'node {node.id}: clearance', (node.clearance_m,))
     for edge in message.edges:
         if not {edge.node_a, edge.node_b} <= known:
             raise InputError(
                 f'edge {edge.id} from node {edge.node_a} to {edge.node_b}: '
                 'expected nodes of this map'
             )
-        validation.require_bounded(
-            f'edge {edge.id}',
-            (edge.length_m, edge.clearance_m, *(c for p in edge.path for c in (p.x, p.y))),
-        )
+        validation.require_bounded(f'edge {edge.id}', (c for p in edge.path for c in (p.x, p.y)))
+        lengths = (edge.length_m, edge.clearance_m)
+        validation.require_lengths(f'edge {edge.id}: length, clearance', lengths)
         if not edge.path:
             raise InputError(f'edge {edge.id}: empty path: expected points')
     nodes = [

@@ -142,8 +142,13 @@ def declare_map_frame(node: Node) -> str:
 
 
 def declare_session(node: Node) -> str:
-    """Declare the parameter `session_path` and return its value."""
-    return str(
+    """Declare the parameter `session_path` and return its value.
+
+    Raises InputError where it names no session.
+    """
+    from thinmap_ros.files.sessions import require_session  # imports most of core
+
+    path = str(
         declare_parameter(
             node,
             'session_path',
@@ -151,6 +156,9 @@ def declare_session(node: Node) -> str:
             'Path stem of the saved session to start from. Empty: start with an empty map.',
         )
     )
+    if path:
+        require_session(path)
+    return path
 
 
 def declare_recovery(node: Node) -> float:
