@@ -16,7 +16,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from thinmap_ros.core.config import Config, parameters_of, with_values
+from thinmap_ros.core.config import Config, parameters_of, require_number, with_values
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.ros.foreign.translation import is_known
 
@@ -105,14 +105,28 @@ class _Changes(Generic[AnyConfig]):
             self._changed(new)
 
 
-def declare_parameter(node: Node, name: str, default: Any, description: str) -> Any:
-    """Declare a read-only parameter of the node, and return its value."""
+def declare_parameter(
+    node: Node,
+    name: str,
+    default: Any,
+    description: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+) -> Any:
+    """Declare a read-only parameter of the node, and return its value.
+
+    low, high: inclusive bounds of a number.
+    Raises ConfigError where the value is outside of them, not finite, or of the wrong type.
+    """
     descriptor = ParameterDescriptor(description=description, read_only=True)
     _accept_integer(node, name, default)
     try:
-        return node.declare_parameter(name, default, descriptor).value
+        value = node.declare_parameter(name, default, descriptor).value
     except Exception as error:
         raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
+    require_number(name, value, low, high)
+    return value
 
 
 def _accept_integer(node: Node, name: str, default: Any) -> None:
@@ -170,6 +184,7 @@ def declare_recovery(node: Node) -> float:
             30.0,
             'Maximum age of a checkpoint that a restarted node resumes from (s). 0 disables '
             'recovery. Raise it where nodes restart slowly.',
+            low=0.0,
         )
     )
 
