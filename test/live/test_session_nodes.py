@@ -281,6 +281,39 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
     graph.until(lambda: maps and max(maps[-1].data) > 50, 'the session from elsewhere')
 
 
+def test_no_file_of_another_program_is_overwritten(graph, tmp_path):
+    (tmp_path / 'navigator.yaml').write_text('navigator:\n  ros__parameters: {}\n')
+    (tmp_path / 'photo.pgm').write_bytes(b'P5\n1 1\n255\n\0')
+    occupancy_maps.write_map(tmp_path / 'house', room_of()[0].known_area())
+    described = (tmp_path / 'house.yaml').read_text()
+    (tmp_path / 'house.yaml').write_text(described.split('\n', 1)[1])  # as another program has it
+    for part in sessions.PARTS:
+        (tmp_path / f'data{part.ending}').write_bytes(b'PK numbers of somebody else')
+    before = files_below(tmp_path)
+    for name in ('grid_mapper', 'topology_builder', 'localizer', 'explorer'):
+        graph.start(name)
+
+    def save(service, path):
+        return graph.call(SaveMap, service, SaveMap.Request(path=path))
+
+    for name in ('navigator', 'photo', 'house', 'data'):
+        response = save('save_map', name)
+        assert not response.success and 'expected another name' in response.message, response
+    for service in ('save_topology', 'save_localizer', 'save_exploration'):
+        response = save(service, 'data')
+        assert not response.success and 'expected another name' in response.message, response
+    assert files_below(tmp_path) == before
+    # Its own files are replaced, but not more often than a user would have it.
+    answers = [save('save_topology', 'room') for _ in range(21)]
+    assert [answer.success for answer in answers] == [True] * 20 + [False]
+    assert '20 saves within 60 s' in answers[-1].message
+    response = save('save_map', 'mine')
+    assert (tmp_path / 'mine.yaml').exists(), response.message
+    (tmp_path / 'mine.grid.npz').unlink()
+    assert 'another name' not in save('save_map', 'mine').message
+    assert (tmp_path / 'mine.grid.npz').exists()
+
+
 def test_a_session_of_nonsense_leaves_the_running_map_as_it_was(graph, tmp_path):
     grid, builder = room_of()
     save(tmp_path / 'room', grid, builder)

@@ -21,7 +21,10 @@ from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.files.images import read_cells
 from thinmap_ros.files.limits import FILES
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.files.yaml import read_mapping
+
+_MARK = '# written by thinmap'
 
 
 class _Grey(IntEnum):
@@ -44,8 +47,18 @@ def write_map(stem: Path, patch: GridPatch) -> Path:
     with atomic_write(image) as aside:
         Image.fromarray(grey[::-1]).save(aside, format='PPM')
         # The image is renamed last: if the disk is full, the old map remains unchanged.
-        write_text(description, yaml.safe_dump(_description(image.name, patch), sort_keys=False))
+        content = yaml.safe_dump(_description(image.name, patch), sort_keys=False)
+        write_text(description, f'{_MARK}\n{content}')
     return description
+
+
+def is_own_map(description: Path) -> bool:
+    """Whether a YAML file of a map was written by `write_map`."""
+    try:
+        with open_regular_file(description) as stream:
+            return stream.readline(len(_MARK) + 1) == f'{_MARK}\n'.encode()
+    except OSError:
+        return False
 
 
 def _description(image: str, patch: GridPatch) -> dict[str, Any]:

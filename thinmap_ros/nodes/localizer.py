@@ -288,7 +288,7 @@ class LocalizerNode(ThinmapNode):
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
-            path = self._save_directory.resolve(request.path)
+            path = self._save_directory.resolve_for_saving(request.path, LOCALIZER)
             return f'saved {LOCALIZER.save(path, self._localizer)}'
 
         return fill_response(response, save)

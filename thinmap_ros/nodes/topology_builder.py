@@ -157,7 +157,7 @@ class TopologyBuilderNode(ThinmapNode):
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
-            path = self._save_directory.resolve(request.path)
+            path = self._save_directory.resolve_for_saving(request.path, TOPOLOGY)
             saved = TOPOLOGY.save(path, self._builder)
             self._route_graph.graph_saved()
             return f'saved {saved}'
