@@ -3,6 +3,8 @@
 Saved sessions are restored after a restart, and mapping continues.
 """
 
+import os
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, Twist
@@ -252,7 +254,16 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
         (kind, name)
         for kind, names in (
             (SaveMap, ('save_map', 'save_topology', 'save_localizer', 'save_exploration')),
-            (LoadMap, ('load_map', 'load_topology', 'load_localizer')),
+            (
+                LoadMap,
+                (
+                    'load_map',
+                    'load_topology',
+                    'check_topology',
+                    'load_localizer',
+                    'check_localizer',
+                ),
+            ),
         )
         for name in names
     ]
@@ -279,6 +290,36 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
     maps = graph.heard('map', OccupancyGridMsg, qos.LATCHED)
     graph.start('grid_mapper', save_directory='maps', session_path=str(outside / 'room'))
     graph.until(lambda: maps and max(maps[-1].data) > 50, 'the session from elsewhere')
+
+
+def test_a_session_with_one_broken_part_is_not_loaded_in_parts(graph, tmp_path):
+    grid, builder = room_of()
+    save(tmp_path / 'room', grid, builder)
+    save(tmp_path / 'other', room_of(0.2)[0], room_of(0.2)[1])
+    (tmp_path / 'other.slam.npz').write_bytes(b'no archive')
+    os.mkfifo(tmp_path / 'pipe.yaml')
+    maps, graphs, _ = heard_maps(graph)
+    for name in MAPPERS:
+        graph.start(name, session_path=str(tmp_path / 'room'))
+    graph.start('localizer', label='localizer')
+    graph.until(lambda: maps and graphs, 'map and graph')
+    before = places(graphs[-1])
+
+    def load(name):
+        return graph.call(LoadMap, 'load_map', LoadMap.Request(path=name))
+
+    # The mapper may not have detected the others yet, but with them it loads nothing.
+    graph.until(lambda: 'not running' not in load('room').message, 'the mapper sees the others')
+    maps.clear(), graphs.clear()
+    response = load('other')
+    assert not response.success and 'other.slam.npz' in response.message, response.message
+    response = load('pipe')
+    assert not response.success and 'a named pipe' in response.message, response.message
+    assert load('room').success
+    graph.until(lambda: maps and graphs, 'the map and graph of the last request')
+    # Nothing of the broken session was published in between.
+    assert all(abs(found.info.resolution - 0.1) < 1e-6 for found in maps)
+    assert all(places(found) == before for found in graphs)
 
 
 def test_no_file_of_another_program_is_overwritten(graph, tmp_path):
