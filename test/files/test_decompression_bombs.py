@@ -175,22 +175,30 @@ def png(width: int, height: int, *extra: bytes) -> bytes:
     )
 
 
-def peak_mb(path: Path) -> tuple[float, str]:
+def peak_mb(
+    path: Path, module: str = 'thinmap_ros.files.occupancy_maps', reader: str = 'read_map'
+) -> tuple[float, str]:
     """Peak memory of reading a map, in MB above that of a small one, and its shape or error."""
     code = """
 import sys
+from importlib import import_module
 from pathlib import Path
-from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.core.errors import InputError
+
+def shape(path):
+    read = getattr(import_module(sys.argv[1]), sys.argv[2])
+    if sys.argv[2] == 'read_map':
+        return read(Path(path)).shape
+    return read(path).known_area().shape
 
 def peak_kb():
     # Not ru_maxrss: after a fork that is at least what the parent had.
     return int(Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0])
 
-read_map(Path(sys.argv[1]))
+shape(sys.argv[3])
 before = peak_kb()
 try:
-    said = str(read_map(Path(sys.argv[2])).shape)
+    said = str(shape(sys.argv[4]))
 except InputError as error:
     said = str(error)
 print((peak_kb() - before) / 1024.0, said)
@@ -199,7 +207,10 @@ print((peak_kb() - before) / 1024.0, said)
     small.write_text(yaml.safe_dump(MAP | {'image': 'small.png'}))
     (path.parent / 'small.png').write_bytes(png(8, 8))
     done = subprocess.run(
-        [sys.executable, '-c', code, small, path], capture_output=True, text=True, check=True
+        [sys.executable, '-c', code, module, reader, small, path],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     megabytes, said = done.stdout.split(' ', 1)
     return float(megabytes), said.strip()
@@ -215,24 +226,56 @@ BIG_HEADERS = {
 
 
 @pytest.mark.programs
-@pytest.mark.parametrize('size', [8_200, 23_000])
-def test_a_png_of_more_pixels_than_any_map_has(tmp_path: Path, size: int) -> None:
+@pytest.mark.parametrize('size', [(8192, 8192), (67_108_864, 1), (1, 67_108_864), (16_385, 64)])
+def test_a_png_of_more_pixels_than_any_map_has(tmp_path: Path, size: tuple[int, int]) -> None:
     path = tmp_path / 'm.yaml'
     path.write_text(yaml.safe_dump(MAP))
-    (tmp_path / 'm.png').write_bytes(png(size, size))
-    assert (tmp_path / 'm.png').stat().st_size < 100_000
+    (tmp_path / 'm.png').write_bytes(png(*size))
+    assert (tmp_path / 'm.png').stat().st_size < 200_000
     megabytes, said = peak_mb(path)
     assert megabytes < 50.0 and 'pixels' in said and len(said) <= LONGEST
 
 
 @pytest.mark.programs
-def test_the_largest_map_takes_a_few_bytes_a_pixel(tmp_path: Path) -> None:
+@pytest.mark.parametrize('size', [(5792, 5792), (16_384, 2048), (4000, 4000)])
+def test_large_maps_take_a_few_bytes_a_pixel(tmp_path: Path, size: tuple[int, int]) -> None:
     path = tmp_path / 'm.yaml'
     path.write_text(yaml.safe_dump(MAP))
-    (tmp_path / 'm.png').write_bytes(png(8192, 8192))
+    (tmp_path / 'm.png').write_bytes(png(*size))
     megabytes, said = peak_mb(path)
-    assert said == '(8192, 8192)'
-    assert megabytes < 8 * 64.0
+    assert said == str(size[::-1])
+    pixels = size[0] * size[1]
+    # The image, its cells, and one strip; without strips it was six times as much.
+    assert megabytes < 3.0 * pixels / 2**20 + 20.0
+    megabytes, said = peak_mb(path, 'thinmap_ros.files.sessions', 'load_grid')
+    assert said == str(size[::-1])
+    # Two bytes a cell of the grid, and the cells that it publishes.
+    assert megabytes < 9.0 * pixels / 2**20 + 20.0
+
+
+@pytest.mark.parametrize('magic', [b'P5', b'P2'])
+def test_a_pgm_whose_header_is_a_comment(tmp_path: Path, magic: bytes) -> None:
+    path = tmp_path / 'm.yaml'
+    path.write_text(yaml.safe_dump(MAP))
+    comment = 50 * 2**20 * b'#'
+    (tmp_path / 'm.png').write_bytes(magic + b'\n' + comment + b'\n2 2\n255\n' + 4 * b'0 ')
+    begun = time.process_time()
+    with pytest.raises(InputError, match=r'm\.png: .*expected an image'):
+        read_map(path)
+    # Byte by byte it took longer than a minute.
+    assert time.process_time() - begun < 5.0
+
+
+def test_a_pgm_with_comments_between_its_pixels(tmp_path: Path) -> None:
+    path = tmp_path / 'm.yaml'
+    path.write_text(yaml.safe_dump(MAP))
+    (tmp_path / 'm.png').write_bytes(b'P2\n# of a room\n2 2\n255\n0 # a wall\n0 255 255\n')
+    assert read_map(path).cells.tolist() == [[0, 0], [100, 100]]
+    (tmp_path / 'm.png').write_bytes(b'P2\n2 2\n255\n' + 2**20 * b'#\n' + b'0 0 255 255\n')
+    begun = time.process_time()
+    with pytest.raises(InputError, match='more than 100 comments'):
+        read_map(path)
+    assert time.process_time() - begun < 5.0
 
 
 @pytest.mark.programs

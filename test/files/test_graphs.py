@@ -1,6 +1,7 @@
 """Route graphs: the format of Nav2's reader, and lossless round trips."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +182,7 @@ def test_not_a_number_is_never_written(tmp_path: Path) -> None:
         (('geometry', 'coordinates'), [1.0], 'features.0'),
         (('geometry', 'coordinates'), [1.0, 'x'], 'no finite number'),
         (('geometry',), None, 'features.0'),
+        (('properties', 'metadata', 'clearance'), -0.5, r'features.0.: clearance: -0.5'),
     ],
 )
 def test_errors_are_reported(
@@ -195,6 +197,38 @@ def test_errors_are_reported(
     with pytest.raises(InputError, match=said) as error:
         read_geojson(tmp_path / 'g.geojson')
     assert str(tmp_path) in str(error.value)
+
+
+def changed(tmp_path: Path, change: Callable[[list[dict[str, Any]]], None]) -> str:
+    """Error of reading a changed graph."""
+    features = written(tmp_path)
+    change(features)
+    (tmp_path / 'g.geojson').write_text(json.dumps({'features': features}))
+    with pytest.raises(InputError) as error:
+        read_geojson(tmp_path / 'g.geojson')
+    return str(error.value)
+
+
+@pytest.mark.parametrize('name', ['length', 'clearance'])
+def test_lengths_of_edges_are_not_negative(tmp_path: Path, name: str) -> None:
+    def change(features: list[dict[str, Any]]) -> None:
+        for feature in features:
+            if feature['geometry']['type'] != 'Point':
+                feature['properties']['metadata'][name] = -1.0
+
+    assert f'{name}: -1.0: expected' in changed(tmp_path, change)
+
+
+@pytest.mark.parametrize('kind', ['Point', 'MultiLineString'])
+def test_an_id_stands_for_one_feature(tmp_path: Path, kind: str) -> None:
+    def change(features: list[dict[str, Any]]) -> None:
+        chosen = [f for f in features if f['geometry']['type'] == kind]
+        features.append(json.loads(json.dumps(chosen[0])))
+
+    said = changed(tmp_path, change)
+    twice = next(f for f in written(tmp_path) if f['geometry']['type'] == kind)
+    assert f'id {twice["properties"]["id"]}: expected an id that no other feature has' in said
+    assert 'features[' in said
 
 
 JSON = st.recursive(

@@ -120,6 +120,34 @@ def test_what_cannot_change_is_marked_and_refused(graph):
     assert graph.stop('grid_mapper') == 0
 
 
+@pytest.mark.usefixtures('ros_domain')
+@pytest.mark.parametrize(
+    ('node', 'name', 'number'),
+    [
+        ('global_localizer', 'lost_timeout_s', '-1.0e+9'),
+        ('global_localizer', 'lost_timeout_s', '.nan'),
+        ('global_localizer', 'lost_timeout_s', '1.0e+300'),
+        ('navigator', 'transform_tolerance', '.nan'),
+    ],
+)
+def test_numbers_that_make_no_sense_end_the_start_with_a_line(node, name, number):
+    command = [sys.executable, '-m', f'thinmap_ros.nodes.{node}', '--ros-args']
+    command += ['-p', f'{name}:={number}']
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    line = done.stderr.splitlines()[-1]
+    assert 'Traceback' not in done.stderr
+    assert done.returncode == 2 and f'{name} = ' in line and 'expected' in line
+
+
+def test_a_running_global_localizer_keeps_its_parameters(graph):
+    graph.start('global_localizer')
+    for wrong in (-1e9, float('nan'), 1e300):
+        result = change(graph, 'global_localizer', lost_timeout_s=wrong)
+        assert not result.successful and result.reason
+    assert current(graph, 'global_localizer', 'lost_timeout_s') == [3.0]
+    assert graph.stop('global_localizer') == 0
+
+
 @pytest.mark.parametrize(
     ('arguments', 'said'),
     [

@@ -3,6 +3,8 @@
 Saved sessions are restored after a restart, and mapping continues.
 """
 
+import os
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, Twist
@@ -252,7 +254,16 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
         (kind, name)
         for kind, names in (
             (SaveMap, ('save_map', 'save_topology', 'save_localizer', 'save_exploration')),
-            (LoadMap, ('load_map', 'load_topology', 'load_localizer')),
+            (
+                LoadMap,
+                (
+                    'load_map',
+                    'load_topology',
+                    'check_topology',
+                    'load_localizer',
+                    'check_localizer',
+                ),
+            ),
         )
         for name in names
     ]
@@ -279,6 +290,69 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
     maps = graph.heard('map', OccupancyGridMsg, qos.LATCHED)
     graph.start('grid_mapper', save_directory='maps', session_path=str(outside / 'room'))
     graph.until(lambda: maps and max(maps[-1].data) > 50, 'the session from elsewhere')
+
+
+def test_a_session_with_one_broken_part_is_not_loaded_in_parts(graph, tmp_path):
+    grid, builder = room_of()
+    save(tmp_path / 'room', grid, builder)
+    save(tmp_path / 'other', room_of(0.2)[0], room_of(0.2)[1])
+    (tmp_path / 'other.slam.npz').write_bytes(b'no archive')
+    os.mkfifo(tmp_path / 'pipe.yaml')
+    maps, graphs, _ = heard_maps(graph)
+    for name in MAPPERS:
+        graph.start(name, session_path=str(tmp_path / 'room'))
+    graph.start('localizer', label='localizer')
+    graph.until(lambda: maps and graphs, 'map and graph')
+    before = places(graphs[-1])
+
+    def load(name):
+        return graph.call(LoadMap, 'load_map', LoadMap.Request(path=name))
+
+    # The mapper may not have detected the others yet, but with them it loads nothing.
+    graph.until(lambda: 'not running' not in load('room').message, 'the mapper sees the others')
+    maps.clear(), graphs.clear()
+    response = load('other')
+    assert not response.success and 'other.slam.npz' in response.message, response.message
+    response = load('pipe')
+    assert not response.success and 'a named pipe' in response.message, response.message
+    assert load('room').success
+    graph.until(lambda: maps and graphs, 'the map and graph of the last request')
+    # Nothing of the broken session was published in between.
+    assert all(abs(found.info.resolution - 0.1) < 1e-6 for found in maps)
+    assert all(places(found) == before for found in graphs)
+
+
+def test_no_file_of_another_program_is_overwritten(graph, tmp_path):
+    (tmp_path / 'navigator.yaml').write_text('navigator:\n  ros__parameters: {}\n')
+    (tmp_path / 'photo.pgm').write_bytes(b'P5\n1 1\n255\n\0')
+    occupancy_maps.write_map(tmp_path / 'house', room_of()[0].known_area())
+    described = (tmp_path / 'house.yaml').read_text()
+    (tmp_path / 'house.yaml').write_text(described.split('\n', 1)[1])  # as another program has it
+    for part in sessions.PARTS:
+        (tmp_path / f'data{part.ending}').write_bytes(b'PK numbers of somebody else')
+    before = files_below(tmp_path)
+    for name in ('grid_mapper', 'topology_builder', 'localizer', 'explorer'):
+        graph.start(name)
+
+    def save(service, path):
+        return graph.call(SaveMap, service, SaveMap.Request(path=path))
+
+    for name in ('navigator', 'photo', 'house', 'data'):
+        response = save('save_map', name)
+        assert not response.success and 'expected another name' in response.message, response
+    for service in ('save_topology', 'save_localizer', 'save_exploration'):
+        response = save(service, 'data')
+        assert not response.success and 'expected another name' in response.message, response
+    assert files_below(tmp_path) == before
+    # Its own files are replaced, but not more often than a user would have it.
+    answers = [save('save_topology', 'room') for _ in range(21)]
+    assert [answer.success for answer in answers] == [True] * 20 + [False]
+    assert '20 saves within 60 s' in answers[-1].message
+    response = save('save_map', 'mine')
+    assert (tmp_path / 'mine.yaml').exists(), response.message
+    (tmp_path / 'mine.grid.npz').unlink()
+    assert 'another name' not in save('save_map', 'mine').message
+    assert (tmp_path / 'mine.grid.npz').exists()
 
 
 def test_a_session_of_nonsense_leaves_the_running_map_as_it_was(graph, tmp_path):
@@ -333,9 +407,13 @@ def test_a_builder_that_does_not_answer_is_reported_and_the_mapper_continues(gra
     assert graph.stop('grid_mapper') == 0
 
 
-@pytest.mark.parametrize('name', MAPPERS)
-def test_a_session_that_is_not_there_ends_the_start_with_one_clear_line(graph, name):
-    process = graph.start(name, session_path='/nowhere/room')
+@pytest.mark.parametrize(
+    ('name', 'values'),
+    [('grid_mapper', {}), ('topology_builder', {}), ('explorer', {})]
+    + [('localizer', {'slam': slam}) for slam in ('scan_matching', 'ekf_ti')],
+)
+def test_a_session_that_is_not_there_ends_the_start_with_one_clear_line(graph, name, values):
+    process = graph.start(name, session_path='/nowhere/room', **values)
     assert graph.ended(process) == 2
     lines = graph.log(name).strip().splitlines()
     assert '/nowhere/room' in lines[-1] and 'Traceback' not in graph.log(name)

@@ -15,6 +15,8 @@ from thinmap_ros.core.errors import ConfigError, quoted
 
 SAFE_LOWER = 'lower'
 SAFE_HIGHER = 'higher'
+# Of numbers whose range is not declared: seconds up to here are int64 nanoseconds.
+_LARGEST = 1e9
 
 
 def parameter(
@@ -149,12 +151,22 @@ def _check(field: 'dataclasses.Field[Any]', value: Any) -> None:
         raise ConfigError(f'{field.name} = {quoted(value)}: expected a {expected}')
     if choices is not None and value not in choices:
         raise ConfigError(f'{field.name} = {quoted(value)}: expected one of {", ".join(choices)}')
+    require_number(field.name, value, low, high)
+
+
+def require_number(name: str, value: Any, low: float | None, high: float | None) -> None:
+    """Raise ConfigError unless a number is finite and in its range; other types are not checked.
+
+    low, high: inclusive bounds; None: no more than the numbers that any parameter can have.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
     if not _is_finite(value):
-        raise ConfigError(f'{field.name} = {quoted(value)}: expected a finite number')
+        raise ConfigError(f'{name} = {quoted(value)}: expected a finite number')
     if (low is not None and value < low) or (high is not None and value > high):
-        raise ConfigError(f'{field.name} = {quoted(value)}: expected {_interval(low, high)}')
+        raise ConfigError(f'{name} = {quoted(value)}: expected {_interval(low, high)}')
+    if isinstance(value, float) and abs(value) > _LARGEST:
+        raise ConfigError(f'{name} = {quoted(value)}: expected {_interval(-_LARGEST, _LARGEST)}')
 
 
 def _is_finite(value: float) -> bool:

@@ -21,6 +21,13 @@ def require_bounded(what: str, values: Iterable[float], limit: float = MAX_COORD
             raise InputError(f'{what}: {value}: expected a number from {-limit:g} to {limit:g}')
 
 
+def require_lengths(what: str, lengths: Iterable[float]) -> None:
+    """Raise InputError unless all lengths (m) are from 0 to MAX_COORDINATE_M."""
+    for length in lengths:
+        if not 0.0 <= length <= MAX_COORDINATE_M:
+            raise InputError(f'{what}: {length} m: expected 0 to {MAX_COORDINATE_M:g} m')
+
+
 def quoted_name(text: str, longest: int = 80) -> str:
     """Shorten a topic, type or frame of a file for an error message.
 

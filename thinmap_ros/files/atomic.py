@@ -9,6 +9,7 @@ from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.files.limits import FILES
+from thinmap_ros.files.regular_files import open_regular_file
 
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
@@ -48,7 +49,7 @@ def write_text(path: Path, text: str) -> None:
 def read_text(path: Path, max_bytes: int = FILES.text_bytes) -> str:
     """Read a text file. Raises InputError if it is missing, not text, or above max_bytes."""
     try:
-        with path.open('rb') as stream:
+        with open_regular_file(path) as stream:
             content = stream.read(max_bytes + 1)
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         raise InputError(f'{path}: {getattr(error, "strerror", None) or error}') from error

@@ -229,15 +229,17 @@ def read_geojson(path: Path) -> TopologicalMap:
         raise InputError(f'{path}: features: {quoted(features)}: {expected}')
     topology = TopologicalMap()
     lines: list[tuple[int, dict[str, Any]]] = []
+    ids: set[int] = set()
     for i, feature in enumerate(features):
         try:
+            _add_id(ids, feature)
             if feature['geometry']['type'] == 'Point':
                 topology.put_node(_node(feature))
             else:
                 lines.append((i, feature))
         except _BAD_FEATURE as error:
             reason = one_line_reason(error)
-            expected = 'expected a node (point with id, class)'
+            expected = 'expected a node (point with id, class) or an edge'
             raise InputError(f'{path}: features[{i}]: {reason}: {expected}') from error
     for i, feature in lines:
         try:
@@ -305,12 +307,27 @@ def _id(value: Any) -> int:
     return value
 
 
+def _add_id(ids: set[int], feature: dict[str, Any]) -> None:
+    """Raise ValueError where another feature has the id; also the two directions of an edge."""
+    number = _id(feature['properties']['id'])
+    if number in ids:
+        raise ValueError(f'id {number}: expected an id that no other feature has')
+    ids.add(number)
+
+
+def _length(metadata: dict[str, Any], name: str) -> float:
+    value = _number(metadata[name])
+    if value < 0.0:
+        raise ValueError(f'{name}: {value}: expected no negative number of m')
+    return value
+
+
 def _node(feature: dict[str, Any]) -> Node:
     properties = feature['properties']
     (x, y) = feature['geometry']['coordinates']
     metadata = properties['metadata']
     kind = NodeKind[str(metadata['class']).upper()]
-    return Node(_id(properties['id']), kind, _number(x), _number(y), _number(metadata['clearance']))
+    return Node(_id(properties['id']), kind, _number(x), _number(y), _length(metadata, 'clearance'))
 
 
 def _edge(feature: dict[str, Any]) -> Edge:
@@ -321,7 +338,7 @@ def _edge(feature: dict[str, Any]) -> Edge:
         raise ValueError(f'a line of {len(path)} points')
     metadata = properties['metadata']
     ends = (_id(properties['startid']), _id(properties['endid']))
-    measures = (_number(metadata['length']), _number(metadata['clearance']))
+    measures = (_length(metadata, 'length'), _length(metadata, 'clearance'))
     return Edge(_id(properties['id']), *ends, path, *measures)
 
 

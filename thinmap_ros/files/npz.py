@@ -6,12 +6,7 @@ above the largest map of thinmap: 512 MiB in total, 64 arrays.
 """
 
 import math
-import os
-import stat
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import IO, Any
 
 from numpy.lib import format as npy
@@ -23,20 +18,6 @@ from thinmap_ros.files.limits import FILES
 _ENDING = '.npy'
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-_READ_ONLY = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK
-
-
-@contextmanager
-def open_regular_file(path: Path, flags: int = 0) -> Iterator[IO[bytes]]:
-    """Open a regular file for reading; flags: additional ones for os.open, such as O_NOFOLLOW.
-
-    Raises InputError if it is no regular file (a pipe would block), OSError as open.
-    """
-    number = os.open(path, _READ_ONLY | flags)
-    with os.fdopen(number, 'rb') as stream:
-        if not stat.S_ISREG(os.fstat(number).st_mode):
-            raise InputError('expected a regular file')
-        yield stream
 
 
 def read_arrays(stream: IO[bytes]) -> dict[str, NDArray[Any]]:

@@ -1,14 +1,13 @@
 """Reads and writes map_server maps: an image and a YAML file.
 
-Images are PGM (or another netpbm format), PNG, BMP or JPEG, of at most 8192 x 8192 pixels: a square
-of 400 m at 0.05 m a cell. The size in the image header is checked before pixels are decoded.
+Images are read within limits (`files/images.py`): at most 33,554,432 pixels, a square of 289 m at
+0.05 m a cell, and 16,384 on a side, 819 m. A rotated map has at most as many cells.
 """
 
-import warnings
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
@@ -20,16 +19,12 @@ from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 from thinmap_ros.files.atomic import atomic_write, write_text
+from thinmap_ros.files.images import read_cells
 from thinmap_ros.files.limits import FILES
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.files.yaml import read_mapping
 
-if TYPE_CHECKING:
-    from PIL import Image
-
-# Readers of other formats run programs, or decode before they check the size.
-_FORMATS = ('PPM', 'PNG', 'BMP', 'JPEG')
-_GREYS_8 = 1 << 8
-_GREYS_16 = 1 << 16
+_MARK = '# written by thinmap'
 
 
 class _Grey(IntEnum):
@@ -52,8 +47,18 @@ def write_map(stem: Path, patch: GridPatch) -> Path:
     with atomic_write(image) as aside:
         Image.fromarray(grey[::-1]).save(aside, format='PPM')
         # The image is renamed last: if the disk is full, the old map remains unchanged.
-        write_text(description, yaml.safe_dump(_description(image.name, patch), sort_keys=False))
+        content = yaml.safe_dump(_description(image.name, patch), sort_keys=False)
+        write_text(description, f'{_MARK}\n{content}')
     return description
+
+
+def is_own_map(description: Path) -> bool:
+    """Whether a YAML file of a map was written by `write_map`."""
+    try:
+        with open_regular_file(description) as stream:
+            return stream.readline(len(_MARK) + 1) == f'{_MARK}\n'.encode()
+    except OSError:
+        return False
 
 
 def _description(image: str, patch: GridPatch) -> dict[str, Any]:
@@ -84,7 +89,7 @@ def read_map(path: Path, folder: Path | None = None) -> GridPatch:
     origin = _origin(path, content)
     shades = _Shades.of(path, content)
     cells = _cells(path, image, shades)
-    return aligned_patch(origin, resolution, np.ascontiguousarray(cells[::-1]))
+    return aligned_patch(origin, resolution, cells, FILES.image_pixels)
 
 
 def read_resolution(path: Path) -> float:
@@ -171,33 +176,9 @@ class _Shades:
 
 
 def _cells(path: Path, image: Path, shades: _Shades) -> NDArray[np.int8]:
-    """Cells (H, W) of an image, top row first; transparent pixels are unknown."""
-    from PIL import Image
-
+    """Cells (H, W) of an image, bottom row first. Raises InputError where it cannot be read."""
     try:
-        # Above its own, larger limit Pillow only warns: here this is an error.
-        with warnings.catch_warnings():
-            warnings.simplefilter('error', Image.DecompressionBombWarning)
-            with Image.open(image, formats=_FORMATS) as opened:
-                width, height = opened.size
-                if width * height > FILES.image_pixels:
-                    raise ValueError(
-                        f'{width} x {height} pixels: expected at most {FILES.image_pixels}'
-                    )
-                opened.load()
-                return _cells_of(opened, shades)
+        return read_cells(image, shades.table)
     except Exception as error:  # Pillow raises many types for corrupt images
-        reason = one_line_reason(error)
+        reason = getattr(error, 'strerror', None) or one_line_reason(error)
         raise InputError(f'{image}: {reason}: expected an image that {path} names') from error
-
-
-def _cells_of(image: 'Image.Image', shades: _Shades) -> NDArray[np.int8]:
-    if image.mode.startswith(('I', 'F')):
-        greys = np.clip(np.asarray(image), 0, _GREYS_16 - 1).astype(np.uint16)
-        deep: NDArray[np.int8] = shades.table(_GREYS_16)[greys]
-        return deep
-    cells: NDArray[np.int8] = shades.table(_GREYS_8)[np.asarray(image.convert('L'))]
-    if 'A' in image.getbands():
-        transparent = np.asarray(image.getchannel('A')) == 0
-        cells[transparent] = UNKNOWN
-    return cells

@@ -18,9 +18,9 @@ from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.files.atomic import atomic_write
-from thinmap_ros.files.npz import open_regular_file
-from thinmap_ros.files.occupancy_maps import read_map, read_resolution, write_map
-from thinmap_ros.files.snapshots import read_snapshot, write_snapshot
+from thinmap_ros.files.occupancy_maps import is_own_map, read_map, read_resolution, write_map
+from thinmap_ros.files.regular_files import open_regular_file
+from thinmap_ros.files.snapshots import is_snapshot, read_snapshot, write_snapshot
 
 _MAP_ENDING = '.yaml'
 _IMAGE_ENDING = '.pgm'
@@ -129,6 +129,39 @@ def stem_of(path: str) -> Path:
         expected = 'expected the path of a session, without the endings of its files'
         raise InputError(f'{quoted(path)}: {expected}')
     return Path(path).absolute()
+
+
+def require_session(path: str) -> None:
+    """Raise InputError where a path names no session: none of its files, and no map, exists."""
+    stem = stem_of(path)
+    endings = [*(part.ending for part in PARTS), _MAP_ENDING]
+    if not any(_exists(_with_ending(stem, ending)) for ending in endings):
+        raise InputError(f'{stem}: no such session: expected one of {", ".join(endings)}')
+
+
+def require_own_files(path: str, part: SessionPart[Any, Any]) -> None:
+    """Raise InputError where saving a part would replace a file that thinmap has not written.
+
+    With the grid, the files of all parts are checked, and the map beside it.
+    """
+    stem = stem_of(path)
+    for each in PARTS if part is GRID else (part,):
+        for ending in (each.ending, each.ending + _ARCHIVED):
+            file = _with_ending(stem, ending)
+            if _exists(file) and not is_snapshot(file):
+                raise _foreign_error(file)
+    if part is not GRID or is_snapshot(GRID.file(path)):
+        return
+    description = _with_ending(stem, _MAP_ENDING)
+    for file in (description, _with_ending(stem, _IMAGE_ENDING)):
+        if _exists(file) and not is_own_map(description):
+            raise _foreign_error(file)
+
+
+def _foreign_error(file: Path) -> InputError:
+    return InputError(
+        f'{file}: exists, and was not written by thinmap: expected another name for the session'
+    )
 
 
 def save_grid(path: str, grid: OccupancyGrid, shown: GridPatch | None = None) -> str:

@@ -4,6 +4,8 @@ An archive holds the arrays of a state by name, and a label: what it is a state 
 of the format. The class of the state declares the arrays and validates them (`core/snapshot.py`).
 """
 
+import zipfile
+from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.npz import read_arrays
+from thinmap_ros.files.regular_files import open_regular_file
 
 VERSION = 2
 _LABEL = 'thinmap_format'
@@ -38,6 +41,15 @@ def read_snapshot(stream: IO[bytes], kind: str) -> dict[str, NDArray[Any]]:
     if label.shape or label.dtype.kind != 'U' or str(label) != _label(kind):
         raise InputError(f'holds {quoted(str(label))}: {expected} ({_label(kind)})')
     return arrays
+
+
+def is_snapshot(file: Path) -> bool:
+    """Whether a file is a saved state of any kind and version, by the name of its label."""
+    try:
+        with open_regular_file(file) as stream, zipfile.ZipFile(stream) as archive:
+            return f'{_LABEL}.npy' in archive.NameToInfo
+    except (OSError, ValueError, zipfile.BadZipFile):
+        return False
 
 
 def _label(kind: str) -> str:

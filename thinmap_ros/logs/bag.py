@@ -59,7 +59,7 @@ class Bag:
             for file in self._files.files:
                 self._add(self._opened(file))
         except OSError as error:
-            raise InputError(f'{path}: {error.strerror or error}') from error
+            raise InputError(f'{error.filename or path}: {error.strerror or error}') from error
         if self.damage and not any(storage.has_messages for storage in self._storages):
             expected = 'expected a rosbag2 folder or an MCAP file'
             raise InputError(f'{path}: {self.damage}: no intact message: {expected}')

@@ -10,6 +10,7 @@ import zstandard
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.files.atomic import read_text
 from thinmap_ros.files.limits import FILES, LOGS, PIECE_BYTES
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.files.yaml import parse_yaml
 
 
@@ -102,7 +103,7 @@ class DecompressedFile:
 def _unpack(file: Path, out: IO[bytes]) -> None:
     limit = LOGS.unpacked_bytes(file.stat().st_size)
     try:
-        with file.open('rb') as packed:
+        with open_regular_file(file) as packed:
             reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
             while piece := reader.read(PIECE_BYTES):
                 if out.tell() + len(piece) > limit:

@@ -9,9 +9,10 @@ import gzip
 import math
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import LATEST_S, SECOND_NS
 from thinmap_ros.files.limits import LOGS
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.logs.log import (
     Event,
     OdometryEvent,
@@ -223,12 +225,16 @@ def _check_length(words: list[str], count: int, expected: str) -> None:
         )
 
 
-def _open(path: Path) -> BinaryIO:
-    return gzip.open(path, 'rb') if _is_gzip(path) else path.open('rb')  # type: ignore[return-value]
+@contextmanager
+def _open(path: Path) -> Iterator[IO[bytes] | gzip.GzipFile]:
+    with open_regular_file(path) as stream:
+        is_zipped = stream.read(2) == b'\x1f\x8b'
+        stream.seek(0)
+        yield gzip.GzipFile(fileobj=stream) if is_zipped else stream
 
 
 def _is_gzip(path: Path) -> bool:
-    with path.open('rb') as stream:
+    with open_regular_file(path) as stream:
         return stream.read(2) == b'\x1f\x8b'
 
 

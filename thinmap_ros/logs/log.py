@@ -9,6 +9,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.logs.mcap_records import MAGIC as _MCAP
 
 if TYPE_CHECKING:
@@ -130,7 +131,7 @@ def is_mcap(path: Path) -> bool:
 def _begin(path: Path) -> bytes:
     """First bytes of a file; empty if it cannot be read: opening it reports the error."""
     try:
-        with path.open('rb') as stream:
+        with open_regular_file(path) as stream:
             return stream.read(16)
     except OSError:
         return b''

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.limits import LOGS, PIECE_BYTES
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.logs.mcap_records import (
     FIRST_PRIVATE_OPCODE,
     HEAD,
@@ -152,7 +153,7 @@ class McapFile:
         blocks = [
             b for b in self._chunk_spans if b.channel_ids is None or b.channel_ids & channel_ids
         ]
-        with self.path.open('rb') as stream:
+        with open_regular_file(self.path) as stream:
             for block in sorted(blocks, key=lambda b: b.first_ns):
                 yield from queue.before(block.first_ns)
                 records = _load_intact(stream, block, channel_ids, self.damage)
@@ -244,7 +245,7 @@ def _first_pass(
 @contextmanager
 def _opened(path: Path) -> Iterator[BinaryIO]:
     """The opened file. Raises InputError if it does not begin with the magic bytes of MCAP."""
-    with path.open('rb') as stream:
+    with open_regular_file(path) as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             raise InputError(f'{path}: no MCAP file: expected it to begin with {MAGIC!r}')
         yield stream
@@ -348,7 +349,7 @@ def _load(stream: BinaryIO, block: ChunkSpan, wanted: frozenset[int] | None) -> 
 def summary_of(path: Path) -> Summary:
     """Summary at the end of a file; empty if it is truncated or the summary is unreadable."""
     size = path.stat().st_size
-    with path.open('rb') as stream:
+    with open_regular_file(path) as stream:
         footer_at = size - len(MAGIC) - HEAD.size - _FOOTER.size
         stream.seek(max(footer_at, 0))
         footer = stream.read()

@@ -17,6 +17,7 @@ from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.limits import LOGS
+from thinmap_ros.files.regular_files import require_regular_file
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.mcap_reader import Damage, McapFile
 
@@ -127,7 +128,8 @@ class SqliteStorage:
 
 
 def storage_of(path: Path) -> Storage:
-    """Open a file of a bag. Raises InputError if it is invalid."""
+    """Open a file of a bag. Raises InputError if it is invalid, OSError if it is no file."""
+    require_regular_file(path)
     return SqliteStorage(path) if path.suffix == '.db3' else McapStorage(path)
 
 

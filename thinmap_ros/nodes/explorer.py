@@ -17,6 +17,7 @@ from thinmap_ros.core.exploration.mission import (
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import FinishCode, Strategy
 from thinmap_ros.core.snapshot import State
+from thinmap_ros.files.sessions import EXPLORATION
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.exploration.checkpoint_state import ExplorerState
 from thinmap_ros.nodes.exploration.driver import Driver, ForeignDriver
@@ -194,7 +195,7 @@ class ExplorerNode(ThinmapNode):
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
-            path = self._save_directory.resolve(request.path)
+            path = self._save_directory.resolve_for_saving(request.path, EXPLORATION)
             return self._strategies.save(path, self._mission.strategy)
 
         return fill_response(response, save)

@@ -228,9 +228,13 @@ class GridMapperNode(ThinmapNode):
     async def _on_save(
         self, request: SaveMap.Request, response: SaveMap.Response
     ) -> SaveMap.Response:
-        fill_response(response, lambda: self._save_grid(self._save_directory.resolve(request.path)))
+        folder = self._save_directory
+        fill_response(
+            response,
+            lambda: self._save_grid(folder.resolve_for_saving(request.path, sessions.GRID)),
+        )
         if response.success:
-            others = await self._session_client.save(self._save_directory.resolve(request.path))
+            others = await self._session_client.save(folder.resolve(request.path))
             response.success = others.success
             response.message = f'{response.message}; {others.message}'
         return response

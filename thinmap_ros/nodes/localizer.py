@@ -131,7 +131,8 @@ class LocalizerNode(ThinmapNode):
 
     /trajectory after a loop closure.
 
-    Services ~/pause, ~/reset, save_localizer, load_localizer. In a given map it is lost until
+    Services ~/pause, ~/reset, save_localizer, load_localizer, and check_localizer, which reads a
+    saved map without replacing the present one. In a given map it is lost until
     /initialpose arrives or a scan matches at its start pose. In mode localization the map does not
     change, and the node has AMCL's interface: amcl_pose, particle_cloud, set_initial_pose,
     reinitialize_global_localization, request_nomotion_update.
@@ -171,6 +172,7 @@ class LocalizerNode(ThinmapNode):
         self._given.source.subscribe(self, self._on_new_map)
         self._given.create_interface(self._output.map_frame, poses)
         self.create_service(SaveMap, 'save_localizer', self._on_save)
+        self.create_service(LoadMap, 'check_localizer', self._on_check)
         self.create_service(LoadMap, 'load_localizer', self._on_load)
 
     def _on_config(self, config: LocalizerConfig) -> None:
@@ -294,7 +296,7 @@ class LocalizerNode(ThinmapNode):
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
-            path = self._save_directory.resolve(request.path)
+            path = self._save_directory.resolve_for_saving(request.path, LOCALIZER)
             return f'saved {LOCALIZER.save(path, self._localizer)}'
 
         return fill_response(response, save)
@@ -302,11 +304,21 @@ class LocalizerNode(ThinmapNode):
     def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         return fill_response(response, lambda: self._load(request.path))
 
-    def _load(self, path: str) -> str:
-        """Replace the map by that of a session, or by any map_server map; lost until scans fit."""
+    def _on_check(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
+        def check() -> str:
+            return 'no map of the localizer' if self._read(request.path) is None else 'a map'
+
+        return fill_response(response, check)
+
+    def _read(self, path: str) -> AnyLocalizer | None:
+        """Localizer in a saved map, at the present pose; None where there is no such map."""
         config = config_at(self._config, self._localizer.pose)
         folder = self._save_directory
-        loaded = load_localizer(folder.resolve(path), config, folder.path)
+        return load_localizer(folder.resolve(path), config, folder.path)
+
+    def _load(self, path: str) -> str:
+        """Replace the map by that of a session, or by any map_server map; lost until scans fit."""
+        loaded = self._read(path)
         if loaded is None:
             return 'the session has no map of the localizer: it keeps its own'
         self._localizer = loaded

@@ -49,7 +49,8 @@ class _TopologyPublishers:
 class TopologyBuilderNode(ThinmapNode):
     """/local_grid and /pose in; /local_topology and /topology out.
 
-    Services save_topology and load_topology. Where Nav2's route server runs, it is given the graph
+    Services save_topology, load_topology and check_topology, which reads a saved graph without
+    replacing the present one. Where Nav2's route server runs, it is given the graph
     when it has changed, and when it is saved: client of route_server/set_route_graph.
     After a /trajectory the graph is rebuilt from the /grid that has undergone that correction;
     until it comes the graph stays as it is. Nodes keep their ids.
@@ -71,6 +72,7 @@ class TopologyBuilderNode(ThinmapNode):
         subscribe_guarded(self, ProbabilityGrid, 'local_grid', self._on_local_grid, qos.STREAM)
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         self.create_service(SaveMap, 'save_topology', self._on_save)
+        self.create_service(LoadMap, 'check_topology', self._on_check)
         self.create_service(LoadMap, 'load_topology', self._on_load)
         self.diagnostics.check_sole_publisher('topology')
         self._stamp = StateStamp()
@@ -157,7 +159,7 @@ class TopologyBuilderNode(ThinmapNode):
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
-            path = self._save_directory.resolve(request.path)
+            path = self._save_directory.resolve_for_saving(request.path, TOPOLOGY)
             saved = TOPOLOGY.save(path, self._builder)
             self._route_graph.graph_saved()
             return f'saved {saved}'
@@ -167,12 +169,21 @@ class TopologyBuilderNode(ThinmapNode):
     def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         return fill_response(response, lambda: self._load(request.path))
 
+    def _on_check(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
+        def check() -> str:
+            return f'graph of {len(self._read(request.path).map.nodes)} nodes'
+
+        return fill_response(response, check)
+
+    def _read(self, path: str) -> TopologyBuilder:
+        """Builder with a saved graph; without one if the path is empty."""
+        if not path:
+            return TopologyBuilder(self._config)
+        return load_topology(self._save_directory.resolve(path), self._config)
+
     def _load(self, path: str) -> str:
         """Replace the graph by a saved one; windows that were made before are discarded."""
-        loaded = TopologyBuilder(self._config)
-        if path:
-            inside = self._save_directory.resolve(path)
-            loaded = load_topology(inside, self._config)
+        loaded = self._read(path)
         self._builder = loaded
         self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)

@@ -11,7 +11,7 @@ from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.private_folder import private_folder, temporary_folder
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.atomic import atomic_write, partial_files
-from thinmap_ros.files.npz import open_regular_file
+from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.files.snapshots import read_snapshot, write_snapshot
 
 _FOLDER = 'THINMAP_STATE_DIR'

@@ -22,6 +22,7 @@ from thinmap_ros.core.config import (
     Config,
     check_safety,
     parameters_of,
+    require_number,
     with_values,
 )
 from thinmap_ros.core.errors import ConfigError
@@ -118,14 +119,28 @@ class _Changes(Generic[AnyConfig]):
             self._changed(new)
 
 
-def declare_parameter(node: Node, name: str, default: Any, description: str) -> Any:
-    """Declare a read-only parameter of the node, and return its value."""
+def declare_parameter(
+    node: Node,
+    name: str,
+    default: Any,
+    description: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+) -> Any:
+    """Declare a read-only parameter of the node, and return its value.
+
+    low, high: inclusive bounds of a number.
+    Raises ConfigError where the value is outside of them, not finite, or of the wrong type.
+    """
     descriptor = ParameterDescriptor(description=description, read_only=True)
     _accept_integer(node, name, default)
     try:
-        return node.declare_parameter(name, default, descriptor).value
+        value = node.declare_parameter(name, default, descriptor).value
     except Exception as error:
         raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
+    require_number(name, value, low, high)
+    return value
 
 
 def _accept_integer(node: Node, name: str, default: Any) -> None:
@@ -155,8 +170,13 @@ def declare_map_frame(node: Node) -> str:
 
 
 def declare_session(node: Node) -> str:
-    """Declare the parameter `session_path` and return its value."""
-    return str(
+    """Declare the parameter `session_path` and return its value.
+
+    Raises InputError where it names no session.
+    """
+    from thinmap_ros.files.sessions import require_session  # imports most of core
+
+    path = str(
         declare_parameter(
             node,
             'session_path',
@@ -164,6 +184,9 @@ def declare_session(node: Node) -> str:
             'Path stem of the saved session to start from. Empty: start with an empty map.',
         )
     )
+    if path:
+        require_session(path)
+    return path
 
 
 def declare_recovery(node: Node) -> float:
@@ -175,6 +198,7 @@ def declare_recovery(node: Node) -> float:
             30.0,
             'Maximum age of a checkpoint that a restarted node resumes from (s). 0 disables '
             'recovery. Raise it where nodes restart slowly.',
+            low=0.0,
         )
     )
 

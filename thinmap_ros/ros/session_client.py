@@ -37,6 +37,7 @@ class SessionClient:
 
         self._node = node
         self._save = {part.name: client(SaveMap, 'save', part) for part in _SAVED}
+        self._check = {part.name: client(LoadMap, 'check', part) for part in _LOADED}
         self._load = {part.name: client(LoadMap, 'load', part) for part in _LOADED}
 
     async def save(self, path: str) -> PartResult:
@@ -52,18 +53,35 @@ class SessionClient:
         return result
 
     async def load(self, path: str, load_grid: Callable[[], None]) -> PartResult:
-        """Load graph, grid and localizer; `load_grid` is called when the graph was accepted.
+        """Load graph, grid and localizer, after each node has checked its part, or nothing.
 
         A session without a graph clears the graph of the builder.
         Raises InputError where the path names no session.
         """
         stem = str(stem_of(path))
-        graph = await self._load_part(TOPOLOGY, stem if TOPOLOGY.exists(stem) else '')
-        if not graph.success:
+        paths = {part.name: stem for part in _LOADED}
+        if not TOPOLOGY.exists(stem):
+            paths[TOPOLOGY.name] = ''
+        for part in _LOADED:
+            checked = await self._check_part(part, paths[part.name])
+            if not checked.success:
+                return checked
+        graph = await self._load_part(TOPOLOGY, paths[TOPOLOGY.name])
+        if not graph.success:  # the file was replaced since
             return graph
         load_grid()
         maps = _joined(PartResult(True, 'grid loaded'), graph)
         return _joined(maps, await self._load_part(LOCALIZER, stem))
+
+    async def _check_part(self, part: Part, stem: str) -> PartResult:
+        """Have a node read its part; success where it is not running."""
+        client = self._check[part.name]
+        answer = await call(self._node, client, LoadMap.Request(path=stem))
+        if answer is not None:
+            return PartResult(answer.success, answer.message)
+        if self._load[part.name].service_is_ready():
+            return PartResult(False, f'{client.srv_name}: not found yet: expected a moment later')
+        return PartResult(True, '')
 
     async def _save_part(self, part: Part, stem: str, archives: bool) -> PartResult:
         answer = await call(self._node, self._save[part.name], SaveMap.Request(path=stem))

@@ -1,6 +1,7 @@
 """Common parts of command line programs: arguments, errors in one line, exit codes."""
 
 import argparse
+import signal
 import sys
 from collections.abc import Callable
 from dataclasses import fields
@@ -34,6 +35,7 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
     arguments = parser.parse_args()
     compilation = report_compilation()
     try:
+        _catch_interrupts()
         work(arguments)
     except (ThinmapError, OSError) as error:
         print(f'{parser.prog}: error: {" ".join(str(error).split())}', file=sys.stderr)
@@ -43,6 +45,12 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
         sys.exit(INTERRUPTED)
     finally:
         compilation.end()
+
+
+def _catch_interrupts() -> None:
+    """Have Ctrl-C raise KeyboardInterrupt, which ended the process while it imported modules."""
+    if callable(signal.getsignal(signal.SIGINT)):
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def add_config(parser: Options, config: type[Config], names: list[str] | None = None) -> None:

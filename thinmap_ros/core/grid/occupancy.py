@@ -160,9 +160,12 @@ class OccupancyGrid:
     def from_patch(patch: GridPatch, config: OccupancyConfig | None = None) -> 'OccupancyGrid':
         """Start from a finished map, with the same cells and resolution."""
         grid = OccupancyGrid(config, patch.frame)
-        clamped = np.clip(patch.cells / 100.0, grid.config.p_min, grid.config.p_max)
+        # A table takes a tenth of the memory that arithmetic on the cells of a large map takes.
+        values = np.arange(1 << 8, dtype=np.uint8).view(np.int8)
+        clamped = np.clip(values / 100.0, grid.config.p_min, grid.config.p_max)
         odds = np.round(_SCALE * np.log(clamped / (1.0 - clamped))).astype(np.int16)
-        grid._write(0, 0, np.where(patch.cells == UNKNOWN, 0, odds).astype(np.int16))
+        odds[values == UNKNOWN] = 0
+        grid._write(0, 0, odds[patch.cells.view(np.uint8)])
         return grid
 
     def state(self) -> dict[str, NDArray[Any]]:

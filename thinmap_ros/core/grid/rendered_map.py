@@ -8,6 +8,7 @@ from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.tiles import TileStore
 
 Bounds = tuple[int, int, int, int]
+_BAND_ROWS = 256  # rendered at once: a large map needs little more memory than its cells
 
 
 class RenderedMap:
@@ -29,7 +30,9 @@ class RenderedMap:
         """Copy of the bounding rectangle of the known cells; one unknown cell if there are none."""
         self._enlarge(tiles)
         if self._stale is not None:
-            self._refresh(tiles, *_intersection(self._stale, self._bounds))
+            row, col, end_row, end_col = _intersection(self._stale, self._bounds)
+            for top in range(row, end_row, _BAND_ROWS):
+                self._refresh(tiles, top, col, min(top + _BAND_ROWS, end_row), end_col)
             self._stale = None
         if self._known is None:
             return GridPatch(frame, np.full((1, 1), UNKNOWN, dtype=np.int8))
@@ -52,7 +55,7 @@ class RenderedMap:
         self._bounds = bounds
 
     def _refresh(self, tiles: TileStore, row: int, col: int, end_row: int, end_col: int) -> None:
-        if end_row <= row or end_col <= col:
+        if end_col <= col:
             return  # beyond all tiles
         odds = tiles.read(row, col, end_row - row, end_col - col)
         top, left = self._bounds[:2]

@@ -15,21 +15,23 @@ from thinmap_ros.core.se2 import Array
 _ALIGNED_RAD = 1e-6
 
 
-def aligned_patch(T_map_origin: Array, resolution_m: float, cells: NDArray[np.int8]) -> GridPatch:
+def aligned_patch(
+    T_map_origin: Array, resolution_m: float, cells: NDArray[np.int8], max_cells: int = MAX_CELLS
+) -> GridPatch:
     """Patch of cells (H, W) whose first corner and rows have a pose T_map_origin (3,) in the map.
 
     Rotated cells are resampled: each new cell has the value of the old cell at its centre, and one
     that contains the centre of an occupied cell is occupied, so that walls keep no gaps.
-    Raises InputError where the resampled map would be too large.
+    Raises InputError where the resampled map would have more than max_cells.
     """
     if abs(T_map_origin[2]) < _ALIGNED_RAD:
         x, y, _ = T_map_origin.tolist()
         return GridPatch(GridFrame(x, y, resolution_m), cells)
     frame, (rows, cols) = _bounds(T_map_origin, resolution_m, cells.shape)
-    if rows * cols > MAX_CELLS:
+    if rows * cols > max_cells:
         raise InputError(
             f'map rotated by {T_map_origin[2]:.3f} rad: {rows} x {cols} cells: '
-            f'expected {MAX_CELLS} at most'
+            f'expected {max_cells} at most'
         )
     resampled = np.full((rows, cols), UNKNOWN, dtype=np.int8)
     for row in range(rows):  # one at a time: a large map needs little more memory than its cells

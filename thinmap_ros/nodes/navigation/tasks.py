@@ -66,6 +66,7 @@ class TaskReader:
             'Age up to which a transform is used for a goal in another frame than the map, before '
             'the stamp of the goal (s). Raise it if goals are aborted because transforms are late, '
             'lower it if the robot moves far in this time.',
+            low=0.0,
         )
         self._tolerance_ns = round(float(tolerance_s) * SECOND_NS)
 

@@ -7,7 +7,6 @@ process. Here other threads run between nodes and edges, and paths are arrays fr
 
 import struct
 from collections.abc import Iterator
-from itertools import chain
 
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
@@ -31,7 +30,7 @@ def read_topology(data: bytes) -> TopologicalMap:
     """Topological map of a serialized thinmap_msgs/TopologicalMap.
 
     Raises InputError where it is truncated, a kind is unknown, an edge has no node, an id occurs
-    twice, or a number is not finite.
+    twice, a number is not finite, or a length is negative.
     """
     if data[:2] != _LITTLE_ENDIAN:
         return _read_other(data)
@@ -114,12 +113,14 @@ def _check(nodes: list[Node], edges: list[Edge]) -> None:
     validation.require_unique('edges', [edge.id for edge in edges])
     known = {node.id for node in nodes}
     for node in nodes:
-        validation.require_bounded(f'node {node.id}', (node.x, node.y, node.clearance_m))
+        validation.require_bounded(f'node {node.id}', (node.x, node.y))
+        validation.require_lengths(f'node {node.id}: clearance', (node.clearance_m,))
     for edge in edges:
         if edge.a not in known or edge.b not in known:
             raise InputError(
                 f'edge {edge.id} from node {edge.a} to {edge.b}: expected nodes of this map'
             )
-        extremes = (edge.path.min(), edge.path.max())
-        values = chain((edge.length_m, edge.clearance_m), map(float, extremes))
-        validation.require_bounded(f'edge {edge.id}', values)
+        lowest_highest = map(float, (edge.path.min(), edge.path.max()))
+        validation.require_bounded(f'edge {edge.id}', lowest_highest)
+        lengths = (edge.length_m, edge.clearance_m)
+        validation.require_lengths(f'edge {edge.id}: length, clearance', lengths)
