@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
+from weakref import WeakSet
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -19,6 +20,7 @@ from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compile
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.ros import parameters
 
+_CLOSED: WeakSet[Node] = WeakSet()  # nodes of this process
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -28,7 +30,7 @@ def run(make_node: Callable[[], Node]) -> None:
     The process ends with 0, or with 2 where the start fails with a ThinmapError.
 
     A node may have a method `start()`, called after its creation, and a method `close()`, called
-    last, whatever ended the node.
+    once, last, whatever ended the node.
     """
     run_all([make_node])
 
@@ -60,7 +62,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
     finally:
         _on_signals(signal.SIG_IGN)  # a second signal must not interrupt the end, which is short
         for node in reversed(nodes):
-            getattr(node, 'close', lambda: None)()
+            _close(node)
             node.destroy_node()
         rclpy.try_shutdown()
 
@@ -111,6 +113,19 @@ def _spin_one(
         failures.append(error)
     finally:
         stop_event.set()
+        _close(node)  # now: a robot that drives does not wait for the other nodes
+
+
+def _close(node: Node) -> None:
+    """Call `close()` of a node, once; an error is reported, and the other nodes are closed, too."""
+    close = getattr(node, 'close', None)
+    if close is None or node in _CLOSED:
+        return
+    _CLOSED.add(node)
+    try:
+        close()
+    except Exception as error:
+        node.get_logger().error(f'error at the end: {one_line_reason(error)}')
 
 
 def _on_signals(handler: Any) -> None:

@@ -26,7 +26,10 @@ class Robots:
         self.publishers = {}
         for k, name in enumerate(self.names):
             remap = (f'__ns:=/{name}',)
-            graph.start('navigator', label=name, remap=remap, laser_pose='0,0,0')
+            # The last one is beside other nodes, in one process.
+            program = 'navigator' if k < count - 1 else 'thinmap'
+            nodes = () if program == 'navigator' else ('explorer', 'navigator')
+            graph.start(program, label=name, remap=remap, arguments=nodes, laser_pose='0,0,0')
             self.commands[name] = graph.heard(f'{name}/cmd_vel', Twist)
             node = graph.node
             self.publishers[name] = (

@@ -25,7 +25,7 @@ class PathFollowerConfig(Config):
     )
     max_acceleration_m_s2: float = parameter(
         0.4,
-        'Maximum acceleration (m/s^2). Lower: smoother, longer stopping distances.',
+        'Maximum acceleration (m/s^2). Lower: smoother, and the robot brakes earlier.',
         low=0.01,
         high=10.0,
         safe=SAFE_LOWER,
