@@ -1,6 +1,7 @@
 """The package for colcon, rosdep and `ros2 run`."""
 
 import ast
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -132,9 +133,19 @@ def test_rosdep_knows_every_key():
 
 def names_in(path):
     """Names of requirements, as spelled by the package index, and their pinned versions."""
-    lines = [line.partition('#')[0].strip() for line in path.read_text().splitlines()]
+    lines = [line.partition('#')[0].strip(' \\') for line in path.read_text().splitlines()]
+    lines = [line for line in lines if not line.startswith('--hash=')]
     pairs = [line.partition('==') for line in lines if line]
-    return {name.lower().replace('_', '-'): pinned for name, _, pinned in pairs}
+    return {name.partition('[')[0].lower().replace('_', '-'): pinned for name, _, pinned in pairs}
+
+
+@pytest.mark.parametrize('lock', [*LOCKS, 'uv.txt'])
+def test_every_pinned_wheel_has_its_hashes(lock):
+    text = (ROOT / 'requirements' / lock).read_text().replace('\\\n', '')
+    for line in text.splitlines():
+        assert re.fullmatch(r'[\w.-]+(\[\w+\])?==\S+(\s+--hash=sha256:[0-9a-f]{64})+', line), line[
+            :80
+        ]
 
 
 def bare(requirements):

@@ -29,6 +29,7 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 WARN_PERIOD_S = 5.0  # between two warnings of the same kind
 _TIMEOUT_S = 3.0
 _ENCAPSULATION = 4  # bytes before the first field of a serialized message
+_STAMP_BYTES = 8
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 
@@ -240,6 +241,8 @@ class MessageLossCounter:
 def _stamp_ns(message: Any) -> int:
     """Stamp of a message, unchecked; of a serialized one, too."""
     if isinstance(message, bytes):
+        if len(message) < _ENCAPSULATION + _STAMP_BYTES:
+            return 0  # rejected when it is read
         order = '<' if message[1:2] == b'\x01' else '>'
         seconds, nanoseconds = struct.unpack_from(f'{order}iI', message, _ENCAPSULATION)
         return int(SECOND_NS * seconds + nanoseconds)

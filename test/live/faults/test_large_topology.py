@@ -90,3 +90,18 @@ def test_commands_keep_their_rate_while_a_huge_map_arrives(graph):
             )
     graph.until(lambda: robot.stand() or len(robot.commands) > 50, 'commands')
     assert robot.longest_gap_s() < max(0.5, 3.0 * usual_s)
+
+
+def test_a_truncated_map_is_refused(graph):
+    doctor = Doctor(graph)
+    graph.start('localizer', laser_pose='0,0,0')
+    publisher = graph.node.create_publisher(TopologicalMap, 'topology', qos.STREAM)
+    for data in (b'\x00\x01\x00\x00', b'\x00\x01\x00\x00' + bytes(8)):
+        before = doctor.number('localizer', 'topology: rejected')
+        graph.until(
+            lambda d=data, b=before: (
+                publisher.publish(d) or doctor.number('localizer', 'topology: rejected') > b
+            ),
+            'a rejected map',
+        )
+    assert graph.stop('localizer') == 0
