@@ -76,14 +76,14 @@ class RobotState:
             return f'laser blind ({self._blind_reason})'
         if not self.is_confirmed:
             return 'laser blind (it does not confirm the pose)'
-        if abs(self._stamp_offset_ns) > SENSOR_TIMEOUT_NS:
-            return f'stamps of laser and odometry {abs(self._stamp_offset_ns) / 1e9:.1f} s apart'
-        if self._scan_age_ns() > SENSOR_TIMEOUT_NS:
-            return 'laser silent'
         now_ns = self._clock.now().nanoseconds
         for source, limit_ns in self._timeouts_ns.items():
             if now_ns - self._received_ns.get(source, now_ns) > limit_ns:
                 return f'{source} silent'
+        if abs(self._stamp_offset_ns) > SENSOR_TIMEOUT_NS:
+            return f'stamps of laser and odometry {abs(self._stamp_offset_ns) / 1e9:.1f} s apart'
+        if self._scan_age_ns() > SENSOR_TIMEOUT_NS:
+            return 'laser silent'
         return ''
 
     def _scan_age_ns(self) -> int:
