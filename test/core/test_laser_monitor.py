@@ -126,3 +126,13 @@ def test_a_robot_that_was_carried_to_a_hall_sees_again_after_a_while():
         faults.append(monitor.checked(scan_in(short, START, rng, k * PERIOD_NS), START).fault)
     assert faults[0] == NO_RETURNS
     assert set(faults[12:]) == {''}
+
+
+@pytest.mark.parametrize(
+    ('step', 'count'), [(0.0, 1), (1e-30, 181), (-1e-30, 181), (3.0, 181), (1e-30, 1)]
+)
+def test_scans_of_odd_geometry_are_checked(step, count):
+    monitor = LaserMonitor()
+    monitor.checked(scan_in(ROOM, START), START)
+    scan = Scan.create(PERIOD_NS, np.full(count, np.inf), -1.57, step, 0.05, 8.0)
+    monitor.checked(scan, START)

@@ -13,6 +13,7 @@ from thinmap_ros.core.stamps import SECOND_NS
 FROZEN = 'the same ranges while the robot moves'
 NO_RETURNS = 'no returns from surfaces that it has just measured'
 _REACH = 0.9  # of range_max: a farther surface may have gone out of range
+_MIN_STEP_RAD = 1e-6
 _CONFIRMED_NS = 2 * SECOND_NS
 
 
@@ -75,8 +76,9 @@ class _Surfaces:
         bearings = np.arctan2(local[near, 1], local[near, 0]) - scan.angle_min_rad
         step = abs(scan.angle_increment_rad)
         ahead = bearings if scan.angle_increment_rad > 0.0 else -bearings
-        beams = np.rint(np.mod(ahead, 2.0 * math.pi) / step).astype(np.int64)
-        beams = beams[beams < scan.ranges_m.size]
+        # A single beam has no increment.
+        beams = np.rint(np.mod(ahead, 2.0 * math.pi) / max(step, _MIN_STEP_RAD))
+        beams = beams[beams < scan.ranges_m.size].astype(np.int64)
         return is_most_missed(scan, int(np.count_nonzero(scan.no_return[beams])))
 
 
