@@ -41,6 +41,7 @@ def is_running(process: psutil.Process) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_faults_strike_a_live_graph_and_are_judged(ros_domain: int, tmp_path: Path) -> None:
     path = package_data.world_path('room_10x10')
     faults = [
