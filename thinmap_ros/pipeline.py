@@ -76,7 +76,9 @@ class Pipeline:
                 self.corrections += self._grid.apply_correction(
                     *self.localizer.keyframe_trajectory(), scan.stamp_ns
                 )
-            moved = self._grid.update(None if estimate.is_lost else scan, estimate.T_map_base)
+            # As in grid_mapper: a lost robot is at no place of the map, a blind laser sees nothing.
+            is_mapped = not (estimate.is_lost or estimate.blind_reason)
+            moved = self._grid.update(scan if is_mapped else None, estimate.T_map_base)
             self.refusals += self._grid.take_refusals()
         if moved is not None:
             self._rebuild(moved)

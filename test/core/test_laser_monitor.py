@@ -129,10 +129,18 @@ def test_a_robot_that_was_carried_to_a_hall_sees_again_after_a_while():
 
 
 @pytest.mark.parametrize(
-    ('step', 'count'), [(0.0, 1), (1e-30, 181), (-1e-30, 181), (3.0, 181), (1e-30, 1)]
+    ('step', 'count', 'fault'),
+    [
+        (0.0, 1, ''),
+        (1e-30, 1, ''),
+        (1e-30, 181, ''),
+        (-1e-30, 181, ''),
+        (0.0175, 181, NO_RETURNS),
+    ],
 )
-def test_scans_of_odd_geometry_are_checked(step, count):
+def test_scans_of_odd_geometry_are_checked(step, count, fault):
+    """A beam that no surface lies on says nothing."""
     monitor = LaserMonitor()
     monitor.checked(scan_in(ROOM, START), START)
     scan = Scan.create(PERIOD_NS, np.full(count, np.inf), -1.57, step, 0.05, 8.0)
-    monitor.checked(scan, START)
+    assert monitor.checked(scan, START).fault == fault

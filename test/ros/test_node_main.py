@@ -32,3 +32,29 @@ def test_the_collector_need_not_look_at_what_the_start_has_made():
     command = [sys.executable, '-c', PROGRAM]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, 'True\n'), done.stderr
+
+
+CLOSING = """
+from rclpy.node import Node
+from thinmap_ros.ros import node_main
+
+
+class Closing(Node):
+    finished = True
+
+    def close(self):
+        print(self.get_name() + chr(10), end='', flush=True)  # in one piece
+        if self.get_name() == 'first':
+            raise ValueError('planted')
+
+
+node_main.run_all([lambda: Closing('first'), lambda: Closing('second')])
+"""
+
+
+@pytest.mark.usefixtures('ros_domain')
+def test_each_node_is_closed_once_whatever_becomes_of_the_others():
+    done = subprocess.run([sys.executable, '-c', CLOSING], capture_output=True, text=True)
+    assert sorted(done.stdout.split()) == ['first', 'second']
+    assert done.returncode == 1
+    assert 'ValueError: planted' in done.stderr

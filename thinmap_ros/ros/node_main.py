@@ -6,8 +6,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
-from weakref import WeakSet
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -20,8 +20,31 @@ from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compile
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.ros import parameters
 
-_CLOSED: WeakSet[Node] = WeakSet()  # nodes of this process
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@dataclass(eq=False)
+class _Running:
+    """Nodes of a process, and what has ended them.
+
+    failures: errors in the order in which they occurred.
+    """
+
+    nodes: list[Node]
+    stop_event: threading.Event = field(default_factory=threading.Event)
+    failures: list[BaseException] = field(default_factory=list)
+    _closed: list[Node] = field(default_factory=list)
+
+    def close(self, node: Node) -> None:
+        """Call `close()` of a node, once; an error does not keep other nodes from being closed."""
+        if node in self._closed:
+            return
+        self._closed.append(node)
+        try:
+            getattr(node, 'close', lambda: None)()
+        except Exception as error:
+            node.get_logger().error(f'error at the end: {one_line_reason(error)}')
+            self.failures.append(error)
 
 
 def run(make_node: Callable[[], Node]) -> None:
@@ -44,6 +67,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
     _on_signals(_leave)
     compilation = report_compilation()
     nodes: list[Node] = []
+    running = _Running(nodes)
     try:
         with parameters.shared_process(len(make_nodes)):
             nodes.extend(make() for make in make_nodes)
@@ -53,7 +77,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
         release_compiler_pages()
         # Objects of the start stay. With them, a full collection takes longer than a scan.
         gc.freeze()
-        _spin(nodes)
+        _spin(running)
     except ExternalShutdownException:
         pass
     except ThinmapError as error:
@@ -62,7 +86,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
     finally:
         _on_signals(signal.SIG_IGN)  # a second signal must not interrupt the end, which is short
         for node in reversed(nodes):
-            _close(node)
+            running.close(node)
             node.destroy_node()
         rclpy.try_shutdown()
 
@@ -76,56 +100,39 @@ def _init() -> None:
         sys.exit(2)
 
 
-def _spin(nodes: list[Node]) -> None:
-    stop_event = threading.Event()
+def _spin(running: _Running) -> None:
     # Only recorded: an exception raised in compiled code is replaced by another one, or lost.
-    _on_signals(lambda number, frame: stop_event.set())
-    failures: list[BaseException] = []
-    others = [
-        threading.Thread(target=_spin_one, args=(node, stop_event, failures)) for node in nodes[1:]
-    ]
-    for thread in others:
+    _on_signals(lambda number, frame: running.stop_event.set())
+    first, *others = running.nodes
+    threads = [threading.Thread(target=_spin_one, args=(node, running)) for node in others]
+    for thread in threads:
         thread.start()
     try:
-        _spin_one(nodes[0], stop_event, failures, compiler_memory_releaser())
+        _spin_one(first, running, compiler_memory_releaser())
     finally:
-        stop_event.set()
-        for thread in others:
+        running.stop_event.set()
+        for thread in threads:
             thread.join()
-    if failures:
-        raise failures[0]
+    if running.failures:
+        raise running.failures[0]
 
 
 def _spin_one(
-    node: Node,
-    stop_event: threading.Event,
-    failures: list[BaseException],
-    after_each_call: Callable[[], None] = lambda: None,
+    node: Node, running: _Running, after_each_call: Callable[[], None] = lambda: None
 ) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    stop_event = running.stop_event
     try:
         while rclpy.ok() and not stop_event.is_set() and not getattr(node, 'finished', False):
             # A bounded wait: Python handles signals only between calls.
             executor.spin_once(timeout_sec=0.25)
             after_each_call()
     except Exception as error:  # raised by the main thread
-        failures.append(error)
+        running.failures.append(error)
     finally:
         stop_event.set()
-        _close(node)  # now: a robot that drives does not wait for the other nodes
-
-
-def _close(node: Node) -> None:
-    """Call `close()` of a node, once; an error is reported, and the other nodes are closed, too."""
-    close = getattr(node, 'close', None)
-    if close is None or node in _CLOSED:
-        return
-    _CLOSED.add(node)
-    try:
-        close()
-    except Exception as error:
-        node.get_logger().error(f'error at the end: {one_line_reason(error)}')
+        running.close(node)  # now: a robot that drives does not wait for the other nodes
 
 
 def _on_signals(handler: Any) -> None:

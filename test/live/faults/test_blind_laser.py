@@ -8,17 +8,15 @@ from array import array
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
-from nav2_msgs.action import NavigateToPose
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import PoseStamped, Twist
 from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
 from support.doctor import Doctor
-from support.halls import empty_hall
+from support.standing_robot import StandingRobot
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import SlamStatus
-from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros import qos
 
 pytestmark = pytest.mark.live
 NODES = ('localizer', 'grid_mapper', 'topology_builder', 'explorer', 'navigator')
@@ -91,39 +89,20 @@ def test_a_blind_laser_pauses_an_exploration_until_ranges_return(graph):
     graph.until(lambda: commands[-1].linear.x > 0.3, 'it drives on')
 
 
-class Robot:
-    """A stationary robot in an empty hall with a navigator alone, and a goal ahead."""
+class Robot(StandingRobot):
+    """With a navigator alone, and a goal ahead."""
 
     def __init__(self, graph):
-        self.graph = graph
-        self.commands = graph.heard('cmd_vel', Twist)
-        self._scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
-        self._odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
-        self._pose = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
-        graph.node.create_publisher(type(empty_hall()), 'map', qos.LATCHED).publish(empty_hall())
-        self.client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
+        super().__init__(graph)
         self.drive()
 
     def drive(self):
         """Send the goal again."""
-        goal = NavigateToPose.Goal()
-        goal.pose.pose.position.x = 4.0
-        goal.pose.pose.orientation.w = 1.0
-        self.handle = self.graph.send_goal(self.client, goal)
-
-    def say(self, ranges):
-        ns = self.graph.node.get_clock().now().nanoseconds
-        still = messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), ns)
-        self._odometry.publish(still)
-        message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
-        message.header = messages.header('laser', ns)
-        message.ranges = array('f', np.asarray(ranges, dtype=np.float32))
-        self._scan.publish(message)
-        self._pose.publish(messages.pose_with_covariance_msg(np.zeros(3), np.eye(3), 'map', ns))
+        self.handle = self.drive_to(4.0)
 
     def until(self, ranges, condition, what):
         self.graph.until(
-            lambda: self.say(ranges) or (self.commands and condition(self.commands[-1])), what
+            lambda: self.stand(ranges) or (self.commands and condition(self.commands[-1])), what
         )
 
 
@@ -141,7 +120,7 @@ def test_a_robot_does_not_drive_where_half_of_the_laser_does_not_see(graph):
     half = np.full(61, math.inf)
     half[31:] = math.nan
     ended = robot.handle.get_result_async()
-    graph.until(lambda: robot.say(half) or ended.done(), 'the goal is given up')
+    graph.until(lambda: robot.stand(half) or ended.done(), 'the goal is given up')
     assert 'does not see' in ended.result().result.error_msg
     assert robot.commands
     assert not any(drives(command) for command in robot.commands)
@@ -165,7 +144,7 @@ def test_a_hall_in_which_nothing_is_near_is_not_blind(graph):
     few[6] = math.nan
     robot.until(few, stands, 'fewer than a tenth of the beams')
     graph.until(
-        lambda: robot.say(few) or 'blind' in doctor.status('navigator').message, 'it says so'
+        lambda: robot.stand(few) or 'blind' in doctor.status('navigator').message, 'it says so'
     )
 
 
@@ -179,7 +158,7 @@ def test_a_robot_stands_while_the_localizer_reports_a_laser_that_confirms_nothin
     blind = SlamStatus(state=SlamStatus.BLIND)
     robot.until(free, lambda c: status.publish(blind) or stands(c), 'it stands')
     graph.until(
-        lambda: robot.say(free) or 'does not confirm' in doctor.status('navigator').message,
+        lambda: robot.stand(free) or 'does not confirm' in doctor.status('navigator').message,
         'the reason',
     )
     confirmed = SlamStatus(state=SlamStatus.TRACKING)
@@ -192,7 +171,7 @@ def test_a_laser_that_is_blind_from_the_start_is_reported(graph):
     robot = Robot(graph)
     blind = np.full(61, math.nan)
     graph.until(
-        lambda: robot.say(blind) or 'blind' in doctor.status('navigator').message, 'it says so'
+        lambda: robot.stand(blind) or 'blind' in doctor.status('navigator').message, 'it says so'
     )
     assert not any(drives(command) for command in robot.commands)
 

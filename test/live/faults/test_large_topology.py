@@ -2,13 +2,9 @@
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Point32, PoseWithCovarianceStamped, TwistStamped
-from nav2_msgs.action import NavigateToPose
-from nav_msgs.msg import Odometry
-from rclpy.action import ActionClient
-from sensor_msgs.msg import LaserScan
+from geometry_msgs.msg import Point32, TwistStamped
 from support.doctor import Doctor
-from support.halls import empty_hall
+from support.standing_robot import StandingRobot
 
 from thinmap_msgs.msg import TopologicalEdge, TopologicalMap, TopologicalNode
 from thinmap_ros.ros import messages, qos
@@ -34,39 +30,10 @@ def huge_map():
     return message
 
 
-class Robot:
-    """A robot that stands in an empty hall, with a goal."""
-
-    def __init__(self, graph):
-        node = graph.node
-        self.graph = graph
-        self.commands = graph.heard('cmd_vel', TwistStamped)
-        self._scan = node.create_publisher(LaserScan, 'scan', qos.STREAM)
-        self._odometry = node.create_publisher(Odometry, 'odom', qos.STREAM)
-        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
-        hall = empty_hall()
-        node.create_publisher(type(hall), 'map', qos.LATCHED).publish(hall)
-        client = ActionClient(node, NavigateToPose, 'navigate_to_pose')
-        goal = NavigateToPose.Goal()
-        goal.pose.pose.position.x = 4.0
-        goal.pose.pose.orientation.w = 1.0
-        graph.send_goal(client, goal)
-
-    def stand(self):
-        ns = self.graph.node.get_clock().now().nanoseconds
-        scan = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
-        scan.header = messages.header('laser', ns)
-        scan.ranges = [float('inf')] * 61
-        self._scan.publish(scan)
-        odometry = messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), ns)
-        self._odometry.publish(odometry)
-        pose = messages.pose_with_covariance_msg(np.zeros(3), np.eye(3), 'map', ns)
-        self._pose.publish(pose)
-
-    def longest_gap_s(self):
-        """Between two commands, by their stamps: how busy the test is does not count."""
-        stamps = [messages.stamp_ns(command.header.stamp) for command in self.commands]
-        return max(np.diff(stamps)) / 1e9
+def longest_gap_s(robot):
+    """Between two commands, by their stamps: how busy the test is does not count."""
+    stamps = [messages.stamp_ns(command.header.stamp) for command in robot.commands]
+    return max(np.diff(stamps)) / 1e9
 
 
 def test_commands_keep_their_rate_while_a_huge_map_arrives(graph):
@@ -75,9 +42,10 @@ def test_commands_keep_their_rate_while_a_huge_map_arrives(graph):
     graph.start('thinmap', arguments=arguments, laser_pose='0,0,0', enable_stamped_cmd_vel=True)
     huge = huge_map()
     publisher = graph.node.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
-    robot = Robot(graph)
+    robot = StandingRobot(graph, command=TwistStamped)
+    robot.drive_to(4.0)
     graph.until(lambda: robot.stand() or len(robot.commands) > 50, 'commands')
-    usual_s = robot.longest_gap_s()
+    usual_s = longest_gap_s(robot)
     robot.commands.clear()
     for count in range(1, MAPS + 1):
         publisher.publish(huge)
@@ -89,7 +57,7 @@ def test_commands_keep_their_rate_while_a_huge_map_arrives(graph):
                 f'{node} receives map {count}',
             )
     graph.until(lambda: robot.stand() or len(robot.commands) > 50, 'commands')
-    assert robot.longest_gap_s() < max(0.5, 3.0 * usual_s)
+    assert longest_gap_s(robot) < max(0.5, 3.0 * usual_s)
 
 
 def test_a_truncated_map_is_refused(graph):
