@@ -30,6 +30,7 @@ import psutil
 
 from benchmarks.faults.judge import Record
 from benchmarks.faults.kinds import KINDS, random_faults
+from benchmarks.interruption import Interruption
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
@@ -87,11 +88,13 @@ class Driver:
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PoseWithCovarianceStamped
         from rclpy.qos import QoSProfile
+        from rclpy.signals import SignalHandlerOptions
 
         from benchmarks.goal_client import GoalClient
         from thinmap_ros.ros import messages
 
-        rclpy.init()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        self._interruption = Interruption()
         self._rclpy = rclpy
         self._messages = messages
         self._node = rclpy.create_node('endurance')
@@ -105,8 +108,12 @@ class Driver:
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, deep)
 
     def spin(self) -> None:
-        """Process received messages, and send the next goal if the robot is idle."""
+        """Process received messages, and send the next goal if the robot is idle.
+
+        Raises KeyboardInterrupt after Ctrl-C.
+        """
         self._rclpy.spin_once(self._node, timeout_sec=0.02)
+        self._interruption.check()
         if self.poses:
             self.client.step()
 

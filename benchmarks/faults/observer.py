@@ -14,6 +14,7 @@ from std_msgs.msg import String, UInt32
 
 from benchmarks.faults.judge import Counts, Passed
 from benchmarks.faults.track import Track
+from benchmarks.interruption import Interruption
 from thinmap_msgs.msg import SlamStatus
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages, qos
@@ -54,6 +55,7 @@ class Observer:
 
     def __init__(self) -> None:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        self._interruption = Interruption()
         self.node = rclpy.create_node('endurance')
         self.track = Track()
         self.health: dict[str, Health] = {}
@@ -108,8 +110,9 @@ class Observer:
             self.track.align(pose, stamp_ns)
 
     def spin(self) -> None:
-        """Process what was received."""
+        """Process what was received. Raises KeyboardInterrupt after Ctrl-C."""
         rclpy.spin_once(self.node, timeout_sec=0.02)
+        self._interruption.check()
 
     def close(self) -> None:
         """End the node."""

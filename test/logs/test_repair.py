@@ -74,6 +74,21 @@ def test_what_is_flushed_is_readable_at_once(tmp_path: Path) -> None:
     assert numbers(tmp_path / 'bag') == list(range(6))
 
 
+def test_a_topic_that_is_defined_before_its_first_message_is_read_without_a_summary(
+    tmp_path: Path,
+) -> None:
+    writer = BagWriter(tmp_path / 'bag', live=True)
+    topics = ['/map', '/map', '/said', '/map', '/said']
+    for i, topic in enumerate(topics):
+        if i == 1:  # as a recorder that subscribes
+            writer.add_topic('/said', STRING, [qos.recorded(7, False, False)])
+        writer.write(topic, STRING, 10**9 + i, text(writer, i))
+        writer.flush()
+    bag = Bag(tmp_path / 'bag')
+    assert [message.topic for message in bag.messages()] == topics
+    assert len(list(bag.messages({'/said'}))) == 2 and bag.is_truncated
+
+
 def record_ends(content: bytes) -> list[int]:
     """Ends of the records of an undamaged file, and the file."""
     ends = [len(MAGIC)]

@@ -75,7 +75,7 @@ class Definitions:
 
     def add(self, record: Definition) -> None:
         """Add a schema or channel. Raises InputError if their total size is too large."""
-        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+        known = self._like(record)
         if record == known.get(record.id):
             return
         known[record.id] = record
@@ -85,6 +85,14 @@ class Definitions:
         if self._bytes > LOGS.definitions_bytes:
             expected = f'expected at most {LOGS.definitions_bytes} bytes'
             raise InputError(f'{self.path}: schemas and channels: {expected}')
+
+    def add_missing(self, record: Definition) -> None:
+        """As `add`, unless there is one of this id."""
+        if record.id not in self._like(record):
+            self.add(record)
+
+    def _like(self, record: Definition) -> dict[int, Any]:
+        return self.schemas if isinstance(record, Schema) else self.channels
 
     def of(self, channel_id: int) -> tuple[Schema, Channel] | None:
         """Channel and its schema; None if one of them is unknown."""
@@ -223,12 +231,14 @@ def _first_pass(
     """Chunk spans with messages of a file; its definitions and damaged parts are added to these.
 
     A chunk is unpacked only if its message index names a channel that is not known yet, or if it
-    has no message index.
+    has no message index; or to look for a channel that a later chunk does not define itself.
     """
+    packed: list[ChunkSpan] = []
     with _opened(path) as stream:
         for block in _chunk_spans(stream, path, summary, damage):
             channel_ids = _indexed_channels(stream, block)
             if channel_ids and channel_ids <= definitions.channels.keys():
+                packed.append(block)
                 first_ns = _first_log_time(stream, block)
                 yield replace(block, first_ns=first_ns, channel_ids=channel_ids)
                 continue
@@ -237,6 +247,11 @@ def _first_pass(
                 continue
             for record in records.definitions:
                 definitions.add(record)
+            # A recorder defines a channel when it subscribes, some time before the first message.
+            while packed and any(definitions.of(k) is None for k in records.all_channel_ids):
+                earlier = _load_intact(stream, packed.pop(), frozenset(), damage)
+                for record in earlier.definitions if earlier else ():
+                    definitions.add_missing(record)
             if records.count:
                 channel_ids = records.all_channel_ids
                 yield replace(block, first_ns=records.first_ns, channel_ids=channel_ids)

@@ -12,7 +12,7 @@ from geometry_msgs.msg import PoseStamped, Twist
 from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
 from support.doctor import Doctor
-from support.standing_robot import StandingRobot
+from support.peers.standing_robot import StandingRobot
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import SlamStatus

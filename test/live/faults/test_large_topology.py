@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import Point32, TwistStamped
 from support.doctor import Doctor
-from support.standing_robot import StandingRobot
+from support.peers.standing_robot import StandingRobot
 
 from thinmap_msgs.msg import TopologicalEdge, TopologicalMap, TopologicalNode
 from thinmap_ros.ros import messages, qos

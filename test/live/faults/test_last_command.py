@@ -4,7 +4,7 @@ import signal
 
 import pytest
 from geometry_msgs.msg import Twist
-from support.standing_robot import StandingRobot
+from support.peers.standing_robot import StandingRobot
 
 pytestmark = pytest.mark.live
 

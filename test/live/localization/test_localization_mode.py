@@ -149,8 +149,9 @@ def test_it_is_lost_in_the_wrong_building(graph, tmp_path):
     robot = Robot(graph)
     robot.localize(map_file_name=str(path))
     robot.send_initial_pose(START)
-    robot.drive_until(lambda: robot.travelled_m() > 10.0, 'ten metres')
-    assert robot.status[-1].state == SlamStatus.LOST
+    robot.drive_until(lambda: robot.travelled_m() > 20.0, 'twenty metres')
+    # For three metres, a corner of this building looks like one of the other.
+    assert np.mean([status.state == SlamStatus.LOST for status in robot.status]) > 0.7
 
 
 def test_a_loaded_map_of_another_building_leads_to_lost(graph, tmp_path):
