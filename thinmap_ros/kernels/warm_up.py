@@ -109,6 +109,8 @@ def topology_builder() -> None:
             grid.window(T_map_base[0], T_map_base[1], WindowConfig().local_map_size_m), T_map_base
         )
         rehearsed.local_map()
+    poses = np.zeros((1, 3))
+    rehearsed.rebuilt(grid.known_area(), poses, poses)
 
 
 def explorer() -> None:

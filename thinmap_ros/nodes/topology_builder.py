@@ -1,4 +1,4 @@
-"""The topological map: the window of every scan is thinned and merged into the global graph."""
+"""The topological map: the cells of the grid that change are thinned and merged into the graph."""
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -52,8 +52,9 @@ class TopologyBuilderNode(ThinmapNode):
     Services save_topology, load_topology and check_topology, which reads a saved graph without
     replacing the present one. Where Nav2's route server runs, it is given the graph
     when it has changed, and when it is saved: client of route_server/set_route_graph.
-    After a /trajectory the graph is rebuilt from the /grid that has undergone that correction;
-    until it comes the graph stays as it is. Nodes keep their ids.
+    Cells outside of the windows are those of /grid. After a /trajectory the graph is rebuilt from
+    the /grid that has undergone that correction, in a thread; until then the graph stays as it is.
+    Nodes keep their ids.
     """
 
     def __init__(self) -> None:
@@ -98,6 +99,7 @@ class TopologyBuilderNode(ThinmapNode):
         """Discard the graph, or return to the session that the node was started with."""
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._newest_saved_id = 0
+        self._T_map_base: Array | None = None
         self._rebuilding = Rebuilding(from_the_start=not self._session)
         if self._session:
             self._builder = load_topology(self._session, self._config)
@@ -126,8 +128,9 @@ class TopologyBuilderNode(ThinmapNode):
             self.reset_state()
         self._stamp.latest_ns = stamp_ns
         window, T_map_base = pair
+        self._T_map_base = T_map_base
         with self.diagnostics.time_step('graph update'):
-            changed = self._rebuilding.accepts_window() and self._builder.update(window, T_map_base)
+            self._builder, changed = self._rebuilding.update(self._builder, window, T_map_base)
         self._rebuilding.add_pose(stamp_ns, T_map_base)
         if changed:
             self._publish(stamp_ns)
@@ -140,11 +143,19 @@ class TopologyBuilderNode(ThinmapNode):
             self._rebuilding.correct(corrected_ns, *messages.trajectory_from_msg(message))
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
-        if not self._rebuilding.awaits(messages.stamp_ns(message.correction_stamp)):
+        corrected_ns = messages.stamp_ns(message.correction_stamp)
+        patch = messages.grid_from_msg(message)
+        if self._rebuilding.awaits(corrected_ns):
+            self._builder = self._rebuilding.start(self._builder, patch)
             return
-        with self.diagnostics.time_step('graph rebuilt'):
-            self._rebuilding.rebuild(self._builder, messages.grid_from_msg(message))
-        self._publish(messages.stamp_ns(message.header.stamp))
+        # Beams may end outside of the windows.
+        shown = self._rebuilding.with_window(patch, corrected_ns)
+        if shown is None or self._T_map_base is None:
+            return
+        with self.diagnostics.time_step('whole map'):
+            changed = self._builder.update(shown, self._T_map_base)
+        if changed:
+            self._publish(messages.stamp_ns(message.header.stamp))
 
     def _publish(self, stamp_ns: int) -> None:
         self._checkpoint_new_ids()
