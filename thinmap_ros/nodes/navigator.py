@@ -8,6 +8,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import SlamStatus, TopologicalMap
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.planning.navigator import (
     CONTROL_PERIOD_S,
     Command,
@@ -16,7 +17,6 @@ from thinmap_ros.core.planning.navigator import (
 )
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
-from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.navigation.map_input import MapInput
 from thinmap_ros.nodes.navigation.robot_state import RobotState
@@ -35,6 +35,8 @@ from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
 _MIN_SPEED_M_S = 0.01
 _MIN_DISTANCE_M = 0.1
 _MAX_INT16 = 2**15 - 1
+# Of a serialized graph, which is read within one control period: about 50,000 m2 of a building.
+_MAX_TOPOLOGY_BYTES = 2_000_000
 
 
 class _NavigatorPublishers:
@@ -90,9 +92,7 @@ class NavigatorNode(ThinmapNode):
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._map.subscribe(self)
-        subscribe_guarded(
-            self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED, read_topology
-        )
+        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED, bytes)
         subscribe_guarded(self, PoseStamped, 'goal_pose', self._on_goal_pose, qos.STREAM)
         self._goals = SingleGoalServer(
             self,
@@ -149,8 +149,14 @@ class NavigatorNode(ThinmapNode):
     def _on_slam_status(self, message: SlamStatus) -> None:
         self._robot.is_confirmed = message.state != SlamStatus.BLIND
 
-    def _on_topology(self, topology: Topology) -> None:
-        self._navigator.topology = topology
+    def _on_topology(self, data: bytes) -> None:
+        if len(data) > _MAX_TOPOLOGY_BYTES:
+            self._navigator.topology = None
+            raise InputError(
+                f'topology of {len(data)} bytes: expected at most {_MAX_TOPOLOGY_BYTES}: distant '
+                'goals are planned without it'
+            )
+        self._navigator.topology = read_topology(data)
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._tasks.pose(message)  # raises for an invalid one, which is counted
