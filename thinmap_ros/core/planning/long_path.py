@@ -2,8 +2,8 @@
 
 The wave spreads only in a band around the route. Its first and last part lead from the robot to
 the graph and from the graph to the goal: the cells there are found on the grid. Edges that the grid
-or scan points contradict are left out. Where the graph knows no route, or a way along it is
-closed, and for goals that are near, the wavefront plans alone.
+or scan points contradict are left out. Where the graph has no route, or no path along it is
+open, and for goals that are near, the wavefront plans alone.
 Source: topological map paper section 3.2.
 """
 
@@ -49,7 +49,7 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class _Approach:
-    """A way from a point to a node: along an edge from one of its path points.
+    """A path from a point to a node: along an edge from one of its path points.
 
     length_m: to the node; path (K, 2): the part of the edge.
     """
@@ -128,7 +128,7 @@ class _Checked:
         return found
 
     def approaches(self, entries: list[_Entry]) -> dict[int, _Approach]:
-        """The shortest way to each node at the edges that are entered."""
+        """The shortest approach to each node at the edges that are entered."""
         best: dict[int, _Approach] = {}
         for entry in entries:
             edge = self.topology.edges[entry.edge_id]
