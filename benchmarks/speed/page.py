@@ -46,6 +46,8 @@ _ABOUT = {
     'nodes': 'What the ROS nodes of map and graph need for a scan.',
     'localization': 'Global localization from 5,000 samples.',
     'planning': 'The wavefront planner.',
+    'long_paths': 'Goals at least 20 m away in a straight line: A* on the graph with the wavefront '
+    'in a band around the route, against the wavefront alone.',
     'matching': 'A scan against ten others round its place: the scan matcher of the localizer, and '
     'that of OpenKarto (package karto-scanmatcher, where it is installed), which '
     'renders its map again for each match.',

@@ -129,9 +129,14 @@ def explorer() -> None:
 
 def navigator() -> None:
     """Warm up planning and driving."""
+    from thinmap_ros.core.planning.long_path import route_band
     from thinmap_ros.core.planning.navigator import Navigator
+    from thinmap_ros.core.planning.wavefront import WavefrontConfig
+    from thinmap_ros.core.topology.builder import TopologyConfig, build
 
     patch = _room()
+    topology = build(patch, (2.0, 2.0), TopologyConfig())
+    route_band(topology, patch, (2.0, 2.0), (4.0, 3.0), WavefrontConfig())
     rehearsed = Navigator()
     rehearsed.set_goal(4.0, 3.0, 0.0)
     for scan, T_map_base in _drive():
