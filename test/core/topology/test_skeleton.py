@@ -250,6 +250,22 @@ def test_as_many_loops_as_holes(seed):
     assert loops(build(patch, None, CONFIG)) == holes
 
 
+@pytest.mark.parametrize('name', ['kth/50052751', 'dungeon/d114', 'dungeon/d1573'])
+def test_every_free_place_sees_the_graph(shared_data, name):
+    """A straight line leads to one of the nearest nodes, along which route planners drive."""
+    patch, start = world(shared_data, name)
+    free = select_free_space(patch, start, CONFIG)
+    graph = build(patch, start, CONFIG)
+    nodes = patch.frame.cells_of(np.array([n.position for n in graph.nodes.values()]))
+    rng = np.random.default_rng(0)
+    places = np.argwhere(free)
+    hidden = 0
+    for at in places[rng.integers(0, len(places), 400)]:
+        nearest = nodes[np.argsort(((nodes - at) ** 2).sum(axis=1))[:12]]
+        hidden += not any(line_is_clear(free, *at, *node) for node in nearest)
+    assert hidden <= 2
+
+
 @pytest.mark.parametrize(
     'name', ['kth/50052751', 'kth/50052748', 'dungeon/d114', 'dungeon/d1848', 'dungeon/d3641']
 )

@@ -3,13 +3,14 @@
 import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.corners import corner_indices
+from thinmap_ros.core.topology.corners import corner_indices, with_middles
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.layers.clearances import (
     box_of,
@@ -20,9 +21,19 @@ from thinmap_ros.core.topology.layers.clearances import (
 from thinmap_ros.core.topology.layers.lattice import Cells, Lattice, rows_and_cols
 
 _OTHER_KIND = 0.5  # share of node_match_radius_m by which a node of another kind is farther away
+_LONGEST_BEND_M = 8.0
+_STRAIGHT_M = 0.5
 _NOWHERE = np.array([[0, 0, -1, -1]])
 _MORE_BOXES = 64
 Place = tuple[int, int]  # cell; hash of the edge of whose path it is a corner, or 0
+
+
+class _Limits(NamedTuple):
+    """Robot radius, and the longest edge that bends by more than `straight`, all in cells."""
+
+    radius: float
+    longest: float
+    straight: float
 
 
 @dataclass(eq=False)
@@ -40,14 +51,17 @@ class _Passage:
     edges: list[int] = field(default_factory=list)
 
     @staticmethod
-    def of(lattice: Lattice, cells: Cells, radius: float) -> '_Passage':
+    def of(lattice: Lattice, cells: Cells, limits: _Limits) -> '_Passage':
         # The line test asks whether the line stays in the room around this very path. A line that
         # is clear in the grid is not enough: a path through two rooms would become a line along the
         # corridor.
         squared = squared_clearances(lattice, cells)
         places = rows_and_cols(lattice, cells)
-        corners = corner_indices(places, np.sqrt(squared) - radius)
-        return _Passage(cells, places, squared, np.concatenate(([0], corners, [cells.size - 1])))
+        corners = corner_indices(places, np.sqrt(squared) - limits.radius)
+        stops = np.concatenate(([0], corners, [cells.size - 1]))
+        if cells.size > limits.longest:
+            stops = with_middles(places, stops, limits.longest, limits.straight)
+        return _Passage(cells, places, squared, stops)
 
     @property
     def corners(self) -> list[int]:
@@ -136,7 +150,8 @@ class Registry:
         self._predecessor = predecessor
         self._frame = frame
         self._match_radius_m = config.node_match_radius_m
-        self._radius = config.robot_radius_m / frame.resolution
+        lengths_m = (config.robot_radius_m, _LONGEST_BEND_M, _STRAIGHT_M)
+        self._limits = _Limits(*(length_m / frame.resolution for length_m in lengths_m))
         self._passages: dict[int, _Passage] = {}
         self._nodes: dict[Place, int] = {}
         self._boxes = _Boxes()
@@ -153,7 +168,7 @@ class Registry:
         first; so does an edge between the same nodes.
         """
         new = {
-            number: _Passage.of(lattice, cells, self._radius)
+            number: _Passage.of(lattice, cells, self._limits)
             for number, cells in changes.fresh.items()
         }
         new |= self._measured_again(lattice, changes)
@@ -183,7 +198,7 @@ class Registry:
         new = {}
         for number in self._boxes.touched(changes.places):
             if number in self._passages and number not in changes.gone:
-                again = _Passage.of(lattice, self._passages[number].cells, self._radius)
+                again = _Passage.of(lattice, self._passages[number].cells, self._limits)
                 if not again.is_same(self._passages[number]):
                     new[number] = again
         return new
