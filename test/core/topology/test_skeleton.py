@@ -149,11 +149,12 @@ def test_two_rooms_and_a_door():
         '#' * 17,
     ]
     graph = shape(*lines)
-    assert sorted(node.kind for node in graph.nodes.values()) == [E, E]
+    # From corners of the rooms, only a node between the two is seen.
+    assert sorted(node.kind for node in graph.nodes.values()) == [E, E, C]
     xs = sorted(node.x for node in graph.nodes.values())
-    assert xs[0] < 8.0 < 9.0 < xs[1]
-    (edge,) = graph.edges.values()
-    assert edge.clearance_m == pytest.approx(0.5, abs=0.11)
+    assert xs[0] < 8.0 < 9.0 < xs[2]
+    for edge in graph.edges.values():
+        assert edge.clearance_m == pytest.approx(0.5, abs=0.11)
 
 
 def test_pillar_hall_has_a_loop_for_each_pillar():

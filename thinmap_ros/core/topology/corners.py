@@ -27,19 +27,22 @@ def corner_indices(cells: Cells, room: Array) -> Cells:
     return found
 
 
-def with_middles(cells: Cells, stops: Cells, longest: float, straight: float) -> Cells:
-    """Indices `stops` of a chain's cells (K, 2), and between them those that split long bends.
+def with_middles(
+    cells: Cells, stops: Cells, clearances: Array, longest: float, even: float
+) -> Cells:
+    """Indices `stops` of a chain's cells (K, 2), and between them those that split long pieces.
 
-    A piece that is farther than `straight` cells from the line between its ends is split into equal
-    parts of at most `longest` cells. Around a long bend of a wide passage there are places from
-    which the nodes at both of its ends are out of sight.
+    A piece is split into equal parts of at most `longest` cells, unless it is a corridor: as
+    straight, and its clearances (K,) as equal, as `even` cells. Elsewhere there are places beside a
+    long piece from which the nodes at both of its ends are out of sight.
     """
     steps = np.hypot(*np.diff(cells, axis=0).T)
     path = np.concatenate(([0.0], np.cumsum(steps)))
     middles = [stops]
     for first, last in pairwise(stops.tolist()):
         count = int((path[last] - path[first]) / longest)
-        if count == 0 or _bend(cells[first : last + 1]) <= straight:
+        piece = slice(first, last + 1)
+        if count == 0 or max(_bend(cells[piece]), float(np.ptp(clearances[piece]))) <= even:
             continue
         shares = np.arange(1, count + 1) / (count + 1)
         middles.append(np.searchsorted(path, path[first] + shares * (path[last] - path[first])))

@@ -21,19 +21,19 @@ from thinmap_ros.core.topology.layers.clearances import (
 from thinmap_ros.core.topology.layers.lattice import Cells, Lattice, rows_and_cols
 
 _OTHER_KIND = 0.5  # share of node_match_radius_m by which a node of another kind is farther away
-_LONGEST_BEND_M = 8.0
-_STRAIGHT_M = 0.5
+_LONGEST_UNEVEN_M = 8.0
+_EVEN_M = 0.5
 _NOWHERE = np.array([[0, 0, -1, -1]])
 _MORE_BOXES = 64
 Place = tuple[int, int]  # cell; hash of the edge of whose path it is a corner, or 0
 
 
 class _Limits(NamedTuple):
-    """Robot radius, and the longest edge that bends by more than `straight`, all in cells."""
+    """Robot radius, and the longest edge that is not straight and `even` wide, all in cells."""
 
     radius: float
     longest: float
-    straight: float
+    even: float
 
 
 @dataclass(eq=False)
@@ -60,7 +60,7 @@ class _Passage:
         corners = corner_indices(places, np.sqrt(squared) - limits.radius)
         stops = np.concatenate(([0], corners, [cells.size - 1]))
         if cells.size > limits.longest:
-            stops = with_middles(places, stops, limits.longest, limits.straight)
+            stops = with_middles(places, stops, np.sqrt(squared), limits.longest, limits.even)
         return _Passage(cells, places, squared, stops)
 
     @property
@@ -150,7 +150,7 @@ class Registry:
         self._predecessor = predecessor
         self._frame = frame
         self._match_radius_m = config.node_match_radius_m
-        lengths_m = (config.robot_radius_m, _LONGEST_BEND_M, _STRAIGHT_M)
+        lengths_m = (config.robot_radius_m, _LONGEST_UNEVEN_M, _EVEN_M)
         self._limits = _Limits(*(length_m / frame.resolution for length_m in lengths_m))
         self._passages: dict[int, _Passage] = {}
         self._nodes: dict[Place, int] = {}
