@@ -18,6 +18,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.rebuild import Rebuilding
 from thinmap_ros.files.sessions import TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
 from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
@@ -47,7 +48,7 @@ class _TopologyPublishers:
 
 
 class TopologyBuilderNode(ThinmapNode):
-    """/local_grid and /pose in; /local_topology and /topology out.
+    """/local_grid, /grid and /pose in; /local_topology, /topology and /regions out.
 
     Services save_topology, load_topology and check_topology, which reads a saved graph without
     replacing the present one. Where Nav2's route server runs, it is given the graph
@@ -64,6 +65,9 @@ class TopologyBuilderNode(ThinmapNode):
         self._save_directory = SaveDirectory(self)
         self._route_graph = RouteGraphUpdates(
             self, self._output.frame_id, lambda: self._builder.map
+        )
+        self._regions = RegionUpdates(
+            self, self._output.frame_id, self._config.robot_radius_m, lambda: self._builder.map
         )
         parameters.reject_unknown(self)
         warm_up.topology_builder()
@@ -98,6 +102,7 @@ class TopologyBuilderNode(ThinmapNode):
         """Discard the graph, or return to the session that the node was started with."""
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._newest_saved_id = 0
+        self._regions.reset()
         self._rebuilding = Rebuilding(from_the_start=not self._session)
         if self._session:
             self._builder = load_topology(self._session, self._config)
