@@ -9,6 +9,7 @@ from thinmap_ros.core.regions.region_map import Door, RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
+_STEP_M = 0.05
 _REACH_M = 0.5  # of a point from the nearest region
 
 
@@ -37,14 +38,22 @@ def membership_of(topology: TopologicalMap, regions: RegionMap) -> Membership:
     of_edge = {}
     door_of = {}
     for edge in topology.edges.values():
-        ids = regions.ids_at(edge.path)
+        path = _sampled(edge.path)
+        ids = regions.ids_at(path)
         named = ids[ids > 0]
         of_edge[edge.id] = int(np.bincount(named).argmax()) if named.size else of_node[edge.a]
         ends = {of_node[edge.a], of_node[edge.b], *named.tolist()}
-        door = _door_on(edge.path, ends, regions)
+        door = _door_on(path, ends, regions)
         if door is not None:
             door_of[edge.id] = door
     return Membership(regions, _without_0(of_node), _without_0(of_edge), door_of)
+
+
+def _sampled(path: Array) -> Array:
+    """Points (N, 2) every _STEP_M along a path (K, 2)."""
+    along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
+    marks = np.linspace(0.0, along[-1], 2 + int(along[-1] / _STEP_M))
+    return np.column_stack([np.interp(marks, along, path[:, axis]) for axis in (0, 1)])
 
 
 def _door_on(path: Array, ids: set[int], regions: RegionMap) -> Door | None:

@@ -1,6 +1,6 @@
 """Regions of a growing map with ids that stay."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -26,13 +26,21 @@ FIELDS = {
 
 
 class _Memory:
-    """Remembered id of each cell (H, W) of a grid, and since how many updates it has another."""
+    """Ids of the cells (H, W) of a grid: remembered, and at the last update.
+
+    changed: since how many updates they differ.
+    """
 
     def __init__(
-        self, frame: GridFrame, labels: Labels, changed: NDArray[np.int16] | None = None
+        self,
+        frame: GridFrame,
+        labels: Labels,
+        last: Labels | None = None,
+        changed: NDArray[np.int16] | None = None,
     ) -> None:
         self.frame = frame
         self.labels = labels
+        self.last = labels if last is None else last
         self._changed = np.zeros(labels.shape, dtype=np.int16) if changed is None else changed
 
     def resampled(self, patch: GridPatch) -> '_Memory':
@@ -48,17 +56,15 @@ class _Memory:
             np.where((rows >= 0) & (rows < self.labels.shape[0]), rows, -1),
             np.where((cols >= 0) & (cols < self.labels.shape[1]), cols, -1),
         )
-        outside = ((0, 1), (0, 1))
-        return _Memory(
-            frame, np.pad(self.labels, outside)[here], np.pad(self._changed, outside)[here]
-        )
+        arrays = (self.labels, self.last, self._changed)
+        return _Memory(frame, *(np.pad(array, ((0, 1), (0, 1)))[here] for array in arrays))
 
     def updated(self, labels: Labels) -> '_Memory':
         """The memory after an update with the ids (H, W); cells in no region keep theirs."""
         changed = np.where((labels == self.labels) | (labels == 0), 0, self._changed + 1)
         is_new = (labels > 0) & ((self.labels == 0) | (changed >= _UPDATES))
         kept = np.where(is_new, labels, self.labels)
-        return _Memory(self.frame, kept, np.where(is_new, 0, changed).astype(np.int16))
+        return _Memory(self.frame, kept, labels, np.where(is_new, 0, changed).astype(np.int16))
 
 
 class RegionTracker:
@@ -82,7 +88,7 @@ class RegionTracker:
         found = segment(patch, self.config)
         before = self._memory or _Memory(patch.frame, np.zeros(patch.shape, dtype=np.int32))
         memory = before.resampled(patch)
-        self.regions = describe(found, self._ids(found.labels, memory.labels), self.config)
+        self.regions = describe(found, self._ids(found.labels, memory), self.config)
         self._memory = memory.updated(self.regions.labels)
         return self.regions
 
@@ -95,7 +101,8 @@ class RegionTracker:
         if self._memory is None:
             return {}
         frame = self._memory.frame
-        labels = self._memory.labels
+        last = self._memory.last
+        labels = np.where(last > 0, last, self._memory.labels)
         stride = max(1, round(_STRIDE_M / frame.resolution))
         coarse = GridFrame(frame.origin_x, frame.origin_y, stride * frame.resolution)
         return {
@@ -125,32 +132,31 @@ class RegionTracker:
         tracker._memory = _Memory(GridFrame(*checked['region_frame'].tolist()), labels)
         return tracker
 
-    def _ids(self, labels: Labels, before: Labels) -> NDArray[np.int64]:
-        """Ids (R + 1,) of the regions (H, W) of a grid, by number; before (H, W): earlier ids."""
+    def _ids(self, labels: Labels, memory: _Memory) -> NDArray[np.int64]:
+        """Ids (R + 1,) of the regions (H, W) of a grid, by number."""
         ids = np.zeros(1 + int(labels.max(initial=0)), dtype=np.int64)
-        for number, earlier in _continued(labels, before):
-            ids[number] = earlier
+        used = {0}
+        # What has been new since the last few updates is not remembered yet.
+        for number, earlier in [*_claims(labels, memory.labels), *_claims(labels, memory.last)]:
+            if ids[number] == 0 and earlier not in used:
+                ids[number] = earlier
+                used.add(earlier)
         for number in np.flatnonzero(ids == 0)[1:].tolist():
             ids[number] = self._next_id
             self._next_id += 1
         return ids
 
 
-def _continued(labels: Labels, before: Labels) -> list[tuple[int, int]]:
-    """Number of a region (H, W) and id of the earlier region (H, W) that it continues."""
+def _claims(labels: Labels, before: Labels) -> Iterator[tuple[int, int]]:
+    """The region (H, W) that overlaps each earlier one (H, W) most, largest overlap first."""
     both = (labels > 0) & (before > 0)
-    pairs, cells = np.unique(
-        np.column_stack([labels[both], before[both]]), axis=0, return_counts=True
-    )
-    order = np.argsort(-cells, kind='stable')
-    found = []
+    # A number of 64 bits for each pair: sorted in a tenth of the time.
+    pairs = (labels[both].astype(np.int64) << 32) + before[both]
+    values, cells = np.unique(pairs, return_counts=True)
     claimed: set[int] = set()
-    continued: set[int] = set()
-    for number, earlier in pairs[order].tolist():
-        if earlier in claimed:
-            continue
-        claimed.add(earlier)
-        if number not in continued:
-            continued.add(number)
-            found.append((number, earlier))
-    return found
+    for pair in values[np.argsort(-cells, kind='stable')].tolist():
+        number = pair >> 32
+        earlier = pair - (number << 32)
+        if earlier not in claimed:
+            claimed.add(earlier)
+            yield number, earlier
