@@ -1,8 +1,11 @@
 """A peer publishes a huge topological map: the navigator in the same process keeps its rate."""
 
+import time
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import Point32, TwistStamped
+from rclpy.serialization import deserialize_message, serialize_message
 from support.doctor import Doctor
 from support.peers.standing_robot import StandingRobot
 
@@ -36,6 +39,14 @@ def longest_gap_s(robot):
     return max(np.diff(stamps)) / 1e9
 
 
+def decoding_s(message):
+    """Time in which rclpy decodes a message: the commands would stop for so long."""
+    data = serialize_message(message)
+    started = time.monotonic()
+    deserialize_message(data, type(message))
+    return time.monotonic() - started
+
+
 def test_commands_keep_their_rate_while_a_huge_map_arrives(graph):
     doctor = Doctor(graph)
     arguments = ('localizer', 'explorer', 'navigator')
@@ -57,7 +68,7 @@ def test_commands_keep_their_rate_while_a_huge_map_arrives(graph):
                 f'{node} receives map {count}',
             )
     graph.until(lambda: robot.stand() or len(robot.commands) > 50, 'commands')
-    assert longest_gap_s(robot) < max(0.5, 3.0 * usual_s)
+    assert longest_gap_s(robot) < max(0.5, 3.0 * usual_s, 0.5 * decoding_s(huge))
 
 
 def test_a_truncated_map_is_refused(graph):
