@@ -19,7 +19,7 @@ class RegionConfig(Config):
     """
 
     robot_radius_m: float = 0.25
-    neck_ratio: float = 0.7
+    neck_ratio: float = 0.75
     min_door_width_m: float = 0.5
     max_door_depth_m: float = 2.0
     max_furniture_m: float = 2.0

@@ -108,7 +108,7 @@ def _flood(
             parent[uphill] = uphill
             peak[uphill] = flat[at]
             basins += 1
-        # Up the steepest path, so that a border runs through its saddle.
+        # Up the steepest path, so that a boundary runs through its saddle.
         own = _root(parent, uphill)
         basin[at] = own
         cells[own] += 1

@@ -1,4 +1,4 @@
-"""Outer border of a set of cells as a polygon."""
+"""Outer boundary of a set of cells as a polygon."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,23 +12,23 @@ Mask = NDArray[np.bool_]
 
 
 def outline_of(cells: Mask, frame: GridFrame) -> Array:
-    """Outer border (K, 2) of the largest edge-connected part of cells (H, W), m, map frame.
+    """Outer boundary (K, 2) of the largest edge-connected part of cells (H, W), m, map frame.
 
-    Counterclockwise and not closed, with a point at each corner of the border; (0, 2) of no cells.
+    Counterclockwise and not closed, with a point at each corner; (0, 2) of no cells.
     """
     parts, count = ndimage.label(cells)
     if not count:
         return np.empty((0, 2))
     largest = 1 + int(np.bincount(parts.ravel())[1:].argmax())
-    corners = _border(np.pad(parts == largest, 1)) - 1.0  # (column, row) of lower left corners
+    corners = _boundary(np.pad(parts == largest, 1)) - 1.0  # (column, row) of lower left corners
     return corners * frame.resolution + (frame.origin_x, frame.origin_y)
 
 
 @kernel
-def _border(cells: Mask) -> NDArray[np.float64]:
-    """Corners (K, 2), as (column, row), of the outer border of a connected part with a clear rim.
+def _boundary(cells: Mask) -> NDArray[np.float64]:
+    """Corners (K, 2), as (column, row), of the outer boundary of a connected part with a clear rim.
 
-    The cells lie on the left. Where two cells meet at a corner only, the border stays with its own.
+    The cells lie on the left. Where two cells meet at a corner only, it stays with its own.
     """
     cols = cells.shape[1]
     first = 0

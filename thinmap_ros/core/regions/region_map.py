@@ -24,7 +24,7 @@ class Region:
     """A room, corridor or hall.
 
     x, y: a free place far from walls, m, map frame; area_m2: free area; outline (K, 2): outer
-    border, counterclockwise and not closed, m, map frame.
+    boundary, counterclockwise and not closed, m, map frame.
     """
 
     id: int
