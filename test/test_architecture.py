@@ -16,6 +16,7 @@ ROOMS = {
     'core': {'core'},
     'core.grid': CORE,
     'core.topology': TOPOLOGY,
+    'core.regions': TOPOLOGY | {'core.regions'},
     'core.planning': TOPOLOGY | {'core.planning'},
     'core.exploration': TOPOLOGY | {'core.planning', 'core.exploration'},
     'core.ekf_slam': TOPOLOGY | {'core.ekf_slam'},

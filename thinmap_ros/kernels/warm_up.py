@@ -97,10 +97,12 @@ def grid_mapper() -> None:
 
 
 def topology_builder() -> None:
-    """Warm up thinning and the merging of local maps."""
+    """Warm up thinning, the merging of local maps, and the regions."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
+    from thinmap_ros.core.regions.segmentation import find_regions
     from thinmap_ros.core.topology.builder import TopologyBuilder
 
+    find_regions(_room())
     grid = OccupancyGrid()
     rehearsed = TopologyBuilder()
     for scan, T_map_base in _drive():
