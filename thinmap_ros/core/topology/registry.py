@@ -164,7 +164,7 @@ class Registry:
     def update(self, lattice: Lattice, changes: Changes) -> bool:
         """Publish the changes; returns whether there were any.
 
-        A new node takes over the id of a removed one within node_match_radius_m, nearest pairs
+        A new node gets the id of a removed one within node_match_radius_m, nearest pairs
         first; so does an edge between the same nodes.
         """
         new = {

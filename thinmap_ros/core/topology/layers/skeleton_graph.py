@@ -168,7 +168,7 @@ def _remove_chain(arrays: Arrays, number: int, loose: Cells, count: int) -> int:
 
 @kernel
 def _remove(arrays: Arrays, changed: Cells) -> tuple[Cells, Cells]:
-    """Remove what lies on changed cells or beside them.
+    """Remove vertices and chains with changed cells, or with cells beside them.
 
     Returns the cells that may belong to something new, and the vertices that lost a chain.
     """

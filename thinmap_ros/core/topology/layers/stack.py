@@ -1,4 +1,4 @@
-"""Layers from the grid to the edges of the map; each receives what the one before changed."""
+"""Layers from the grid to the edges of the map; each receives the cells that changed."""
 
 from typing import NamedTuple
 
