@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thinmap_ros.baselines.voronoi import VoronoiConfig, build_voronoi
+from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -104,7 +104,7 @@ def run(source: Source) -> Outcome:
 def _methods(patch: GridPatch, prune_m: float) -> Iterator[Callable[[], TopologicalMap]]:
     config = TopologyConfig(min_branch_length_m=prune_m, min_branch_ratio=0.0)
     yield lambda: build(patch, None, config)
-    yield lambda: build_voronoi(patch, VoronoiConfig(prune_m=prune_m))
+    yield lambda: build_voronoi(patch, config)
 
 
 def _timed(work: Callable[[], TopologicalMap]) -> tuple[float, TopologicalMap]:
