@@ -102,8 +102,8 @@ def _rows(figures: dict[str, _Figures]) -> Iterator[Row]:
         'free places that see a node, mean and least': lambda one: _mean_and(one.sight, min),
         'pairs joined, mean and least': lambda one: _mean_and(one.joined, min),
         'lengths against best on the grid, mean and most': lambda one: _mean_and(one.lengths, max),
-        'skeleton': lambda one: f'{1e3 * sum(one.skeleton_s):.3g} ms',
-        'graph': lambda one: f'{1e3 * sum(one.graph_s):.3g} ms',
+        'skeleton': lambda one: f'{sum(one.skeleton_s):.3g} s',
+        'graph': lambda one: f'{sum(one.graph_s):.3g} s',
     }
     for what, text in shown.items():
         for name, one in figures.items():
