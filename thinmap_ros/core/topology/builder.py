@@ -21,7 +21,7 @@ from thinmap_ros.core.topology.layers.lattice import Cells
 from thinmap_ros.core.topology.layers.stack import Layers, Span
 from thinmap_ros.core.topology.registry import Registry
 
-__all__ = ['TopologyBuilder', 'TopologyConfig', 'build']
+__all__ = ['TopologyBuilder', 'TopologyConfig', 'build', 'build_along']
 
 _OFF_LATTICE = 1e-3  # of a cell: windows farther off do not belong to the same grid
 
@@ -30,8 +30,22 @@ def build(
     patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig
 ) -> TopologicalMap:
     """Topological map of a whole grid: what can be reached from seed_xy (m, map frame), or all."""
+    return build_along(patch, select_free_space(patch, seed_xy, config), None, config)
+
+
+def build_along(
+    patch: GridPatch,
+    free: NDArray[np.bool_],
+    lines: NDArray[np.bool_] | None,
+    config: TopologyConfig,
+) -> TopologicalMap:
+    """Topological map of a whole grid along lines (H, W); None: along its thinned free space.
+
+    free (H, W): traversable cells. The lines are cells among these, up to a few cells wide, from
+    another method than thinning: nodes and edges along them follow the same rules.
+    """
     layers = Layers(patch.frame.resolution, config)
-    layers.fill(patch, (0, 0), select_free_space(patch, seed_xy, config))
+    layers.fill(patch, (0, 0), free, lines)
     registry = Registry(patch.frame, config)
     registry.update(layers.lattice, layers.edge_changes(set(), is_everywhere=True))
     return registry.map

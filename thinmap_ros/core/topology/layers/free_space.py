@@ -63,11 +63,18 @@ class FreeSpace:
         """Whether no cell has ever been known."""
         return len(self.lattice.tiles) == 1
 
-    def fill(self, patch: GridPatch, free: NDArray[np.bool_] | None, row: int, col: int) -> Cells:
+    def fill(
+        self,
+        patch: GridPatch,
+        free: NDArray[np.bool_] | None,
+        row: int,
+        col: int,
+        lines: NDArray[np.bool_] | None = None,
+    ) -> Cells:
         """Set all cells at once by a patch whose first cell is at (row, col).
 
         The layer is empty before. free (H, W): traversable cells; None: all where the robot fits.
-        Returns the cells of the skeleton.
+        lines (H, W): cells that are thinned instead of these. Returns the cells of the skeleton.
         """
         reach = self._reach
         cells = np.pad(patch.cells, reach, constant_values=UNKNOWN_PERCENT)
@@ -75,7 +82,7 @@ class FreeSpace:
         discs = _count_all_discs(known, _half_widths(self._disc))
         self._store.add(row, col, patch.cells >= 0)
         fits = discs == len(self._disc) if free is None else np.pad(free, reach)
-        times = deletion_times(fits)
+        times = deletion_times(fits if lines is None else np.pad(lines, reach))
         columns = column_distance(known)
         fields = _Fields(cells, known, fits, columns, discs, times)
         _write_fields(self.lattice, fields, row - reach, col - reach)

@@ -67,12 +67,19 @@ class Layers:
         """The cells, for kernels; valid until the next update."""
         return self._space.lattice
 
-    def fill(self, patch: GridPatch, place: Place, free: NDArray[np.bool_] | None = None) -> None:
+    def fill(
+        self,
+        patch: GridPatch,
+        place: Place,
+        free: NDArray[np.bool_] | None = None,
+        lines: NDArray[np.bool_] | None = None,
+    ) -> None:
         """Set all cells at once by a patch whose first cell is at a place; empty before.
 
-        free (H, W): traversable cells; None: all where the robot fits.
+        free (H, W): traversable cells; None: all where the robot fits. lines (H, W): cells that are
+        thinned instead of these.
         """
-        kept = self._space.fill(patch, free, *place)
+        kept = self._space.fill(patch, free, *place, lines)
         self._skeleton.update(self.lattice, kept)
 
     def update_free_space(self, window: GridPatch, place: Place) -> int:
