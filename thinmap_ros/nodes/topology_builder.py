@@ -159,6 +159,7 @@ class TopologyBuilderNode(ThinmapNode):
     def _on_grid(self, message: ProbabilityGrid) -> None:
         corrected_ns = messages.stamp_ns(message.correction_stamp)
         patch = messages.grid_from_msg(message)
+        self._regions.add_grid(messages.stamp_ns(message.header.stamp), patch)
         if self._rebuilding.awaits(corrected_ns):
             self._builder = self._rebuilding.start(self._builder, patch)
             return

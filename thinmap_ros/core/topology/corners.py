@@ -27,6 +27,18 @@ def corner_indices(cells: Cells, room: Array) -> Cells:
     return found
 
 
+def corners_between(cells: Cells, room: Array, stops: Cells) -> Cells:
+    """Indices `stops` of a chain's cells (K, 2), and the corners of the pieces between them.
+
+    room (K,): see `corner_indices`.
+    """
+    found = [stops]
+    for first, last in pairwise(stops.tolist()):
+        piece = slice(first, last + 1)
+        found.append(first + corner_indices(cells[piece], room[piece]))
+    return np.unique(np.concatenate(found))
+
+
 def with_middles(
     cells: Cells, stops: Cells, clearances: Array, longest: float, even: float
 ) -> Cells:

@@ -10,7 +10,7 @@ import numpy as np
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.corners import corner_indices, with_middles
+from thinmap_ros.core.topology.corners import corners_between, with_middles
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.layers.clearances import (
     box_of,
@@ -57,10 +57,13 @@ class _Passage:
         # corridor.
         squared = squared_clearances(lattice, cells)
         places = rows_and_cols(lattice, cells)
-        corners = corner_indices(places, np.sqrt(squared) - limits.radius)
-        stops = np.concatenate(([0], corners, [cells.size - 1]))
+        clearances = np.sqrt(squared)
+        room = clearances - limits.radius
+        stops = corners_between(places, room, np.array([0, cells.size - 1]))
         if cells.size > limits.longest:
-            stops = with_middles(places, stops, np.sqrt(squared), limits.longest, limits.even)
+            middles = with_middles(places, stops, clearances, limits.longest, limits.even)
+            # The lines to the middles are other lines.
+            stops = corners_between(places, room, middles)
         return _Passage(cells, places, squared, stops)
 
     @property

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from rclpy.clock import Clock, ClockType
 
-from thinmap_msgs.msg import ProbabilityGrid, RegionArray
+from thinmap_msgs.msg import RegionArray
 from thinmap_ros.core.config import Config, parameter, part
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.config import RegionConfig
@@ -15,9 +15,8 @@ from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.nodes.mapping.region_messages import region_array_msg
-from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros import parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.subscription import subscribe_guarded
 
 _POLL_S = 0.1
 
@@ -38,7 +37,7 @@ class RegionUpdatesConfig(Config):
 
 
 class RegionUpdates:
-    """/grid in, /regions out: all regions of the newest grid, with nodes and edges in them.
+    """/regions out: all regions of the newest grid, with nodes and edges in them.
 
     Regions are computed in a thread of their own, so that no scan waits for them.
     """
@@ -63,7 +62,6 @@ class RegionUpdates:
         if config.region_update_period_s > 0.0:
             self._worker = ThreadPoolExecutor(1, thread_name_prefix='regions')
             self._publisher = node.create_publisher(RegionArray, 'regions', qos.LATCHED)
-            subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
             wall = Clock(clock_type=ClockType.STEADY_TIME)
             node.create_active_timer(config.region_update_period_s, self._begin, clock=wall)
             node.create_active_timer(_POLL_S, self._publish, clock=wall)
@@ -84,9 +82,9 @@ class RegionUpdates:
         self._pending = None
         self._newest = None
 
-    def _on_grid(self, message: ProbabilityGrid) -> None:
-        stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._newest = (stamp_ns, messages.grid_from_msg(message))
+    def add_grid(self, stamp_ns: int, patch: GridPatch) -> None:
+        """The newest grid, whose regions are to be published."""
+        self._newest = (stamp_ns, patch)
 
     def _begin(self) -> None:
         """Begin to compute the regions of the newest grid."""
