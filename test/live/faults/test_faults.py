@@ -530,6 +530,7 @@ def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
     assert sorted(before) == [
         'room.grid.npz',
         'room.pgm',
+        'room.regions.npz',
         'room.slam.npz',
         'room.topology.npz',
         'room.yaml',
