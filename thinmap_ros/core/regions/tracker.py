@@ -98,11 +98,11 @@ class RegionTracker:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Arrays by name, empty before the first update; `from_state` continues from them."""
-        if self._memory is None:
+        memory = self._memory  # another thread may replace it by one of other cells
+        if memory is None:
             return {}
-        frame = self._memory.frame
-        last = self._memory.last
-        labels = np.where(last > 0, last, self._memory.labels)
+        frame = memory.frame
+        labels = np.where(memory.last > 0, memory.last, memory.labels)
         stride = max(1, round(_STRIDE_M / frame.resolution))
         coarse = GridFrame(frame.origin_x, frame.origin_y, stride * frame.resolution)
         return {
