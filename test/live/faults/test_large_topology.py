@@ -40,7 +40,7 @@ def longest_gap_s(robot):
 
 
 def decoding_s(message):
-    """Time in which rclpy decodes a message: the commands would stop for so long."""
+    """Time in which rclpy decodes a message: reading it so stopped commands for a fifth of that."""
     data = serialize_message(message)
     started = time.monotonic()
     deserialize_message(data, type(message))
@@ -68,7 +68,7 @@ def test_commands_keep_their_rate_while_a_huge_map_arrives(graph):
                 f'{node} receives map {count}',
             )
     graph.until(lambda: robot.stand() or len(robot.commands) > 50, 'commands')
-    assert longest_gap_s(robot) < max(0.5, 3.0 * usual_s, 0.5 * decoding_s(huge))
+    assert longest_gap_s(robot) < max(0.5, 3.0 * usual_s, decoding_s(huge) / 12.0)
 
 
 def test_a_truncated_map_is_refused(graph):

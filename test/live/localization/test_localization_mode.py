@@ -152,6 +152,7 @@ def test_it_is_lost_in_the_wrong_building(graph, tmp_path):
     robot.drive_until(lambda: robot.travelled_m() > 20.0, 'twenty metres')
     # For three metres, a corner of this building looks like one of the other.
     assert np.mean([status.state == SlamStatus.LOST for status in robot.status]) > 0.7
+    assert robot.status[-1].state == SlamStatus.LOST
 
 
 def test_a_loaded_map_of_another_building_leads_to_lost(graph, tmp_path):
