@@ -4,12 +4,13 @@ import argparse
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from benchmarks.graphs import compactness, map_to_graph, voronoi
 from benchmarks.speed import (
     ekf_step,
     exploration,
     global_localization,
     growth,
-    map_to_graph,
+    long_paths,
     map_update,
     node_load,
     planning,
@@ -25,11 +26,14 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'thinning': thinning.run,
     'mapping': map_update.run,
     'graphs': map_to_graph.run,
+    'compactness': compactness.run,
+    'voronoi': voronoi.run,
     'online': topology_update.run,
     'nodes': node_load.run,
     'localization': global_localization.run,
     'matching': scan_matching.run,
     'planning': planning.run,
+    'long_paths': long_paths.run,
     'exploration': exploration.run,
     'slam': ekf_step.run,
     'growth': growth.run,

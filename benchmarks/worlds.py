@@ -4,7 +4,9 @@ map_server maps in a folder, with places to start from.
 """
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -40,3 +42,14 @@ def floors(folder: Path, wanted: str = '') -> list[Floor]:
             Floor(name, path, World.from_patch(*read_world(path)), np.array(known[name]['starts']))
         )
     return found
+
+
+def groups(folder: Path, wanted: str = '') -> Iterator[tuple[str, list[Floor]]]:
+    """The worlds of each kind: the first part of their names, and they."""
+    known = sorted(floors(folder, wanted), key=_kind)
+    for kind, some in groupby(known, _kind):
+        yield kind, list(some)
+
+
+def _kind(floor: Floor) -> str:
+    return floor.name.partition('/')[0]

@@ -155,6 +155,7 @@ class ClosedLoop:
             self.pipeline.topology.map, self.pipeline.grid.known_area(), scan, estimate.T_map_base
         )
         self._observation = observation
+        self.navigator.topology = observation.topology
         # Processor time of this thread: other processes do not count.
         began = time.thread_time()
         self.decision = self.strategy.step(*observation)

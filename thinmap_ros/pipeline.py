@@ -97,18 +97,16 @@ class Pipeline:
     def _thin(self, T_map_base: Array) -> GridPatch:
         """Update the graph, unless the map is only partly corrected."""
         with self._timed('topology'):
-            window = self.grid.window(
-                T_map_base[0], T_map_base[1], self.config.window.local_map_size_m
-            )
-            if not self._grid.is_rerendering and self.topology.update(window, T_map_base):
+            changes = None if self._grid.is_rerendering else self.grid.take_changes()
+            if changes is not None and self.topology.update(changes, T_map_base):
                 set_topology(self.localizer, self.topology.map)
-        return window
+        return self.grid.window(T_map_base[0], T_map_base[1], self.config.window.local_map_size_m)
 
     def _rebuild(self, moved: CorrectedPoses) -> None:
         """Rebuild the graph after a correction of the grid."""
         with self._timed('rebuild'):
-            size = self.config.window.local_map_size_m
-            self.topology.rebuild(lambda x, y: self.grid.window(x, y, size), *moved)
+            self.grid.take_changes()
+            self.topology = self.topology.rebuilt(self.grid.known_area(), *moved)
             set_topology(self.localizer, self.topology.map)
 
     @contextmanager

@@ -14,6 +14,9 @@ from tqdm import tqdm
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.odometry import ScanOdometrySynchronizer
+from thinmap_ros.core.regions.config import RegionConfig
+from thinmap_ros.core.regions.membership import membership_of
+from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizers import line_features
@@ -122,9 +125,14 @@ def write_outputs(
     final = list(pipeline.localizer.optimized_trajectory())[: len(poses)]
     trajectories.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
     occupancy_maps.write_map(folder / 'map', patch)
-    graphs.write_geojson(folder / 'topology.geojson', pipeline.topology.map)
+    topology = pipeline.topology.map
+    robot_radius_m = pipeline.config.topology.robot_radius_m
+    regions = find_regions(patch, RegionConfig(robot_radius_m=robot_radius_m))
+    graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
     release_compiler_pages()  # before matplotlib is loaded
-    figures.summary_figure(folder / 'summary.png', patch, pipeline.topology.map, poses, title=title)
+    figures.summary_figure(
+        folder / 'summary.png', patch, topology, poses, title=title, regions=regions
+    )
     report = _report(result, poses, seconds)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
     return report

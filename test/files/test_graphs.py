@@ -12,8 +12,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.regions.membership import Membership, membership_of
+from thinmap_ros.core.regions.region_map import Door, Region, RegionKind, RegionMap
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
-from thinmap_ros.files.graphs import read_geojson, write_geojson, write_graphml, write_tmap2
+from thinmap_ros.files.graphs import (
+    read_geojson,
+    write_geojson,
+    write_graph,
+    write_graphml,
+    write_tmap2,
+)
 
 
 def edge(edge_id: int, a: int, b: int, *points: tuple[float, float]) -> Edge:
@@ -37,7 +46,7 @@ def example() -> TopologicalMap:
 
 
 def written(tmp_path: Path) -> list[dict[str, Any]]:
-    write_geojson(tmp_path / 'g.geojson', example(), 'floor')
+    write_geojson(tmp_path / 'g.geojson', example(), frame_id='floor')
     content = json.loads((tmp_path / 'g.geojson').read_text())
     assert content['type'] == 'FeatureCollection'
     features: list[dict[str, Any]] = content['features']
@@ -86,7 +95,7 @@ def small() -> TopologicalMap:
 
 
 def test_it_is_what_topological_navigation_reads(tmp_path: Path) -> None:
-    write_tmap2(tmp_path / 'g.tmap2.yaml', small(), 'floor')
+    write_tmap2(tmp_path / 'g.tmap2.yaml', small(), frame_id='floor')
     content = yaml.safe_load((tmp_path / 'g.tmap2.yaml').read_text())
     upright = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
     assert content['transformation'] == {
@@ -270,3 +279,54 @@ def test_arbitrary_bytes(tmp_path: Path, content: bytes) -> None:
     (tmp_path / 'g.geojson').write_bytes(content)
     with pytest.raises(InputError):
         read_geojson(tmp_path / 'g.geojson')
+
+
+def region(number: int, kind: RegionKind, x: float) -> Region:
+    outline = np.array([(x, -1.0), (x + 1.0, -1.0), (x + 1.0, 4.0), (x, 4.0)])
+    return Region(number, kind, x + 0.5, 1.0, 5.0, outline)
+
+
+def with_regions() -> Membership:
+    """A corridor on the left of x = 1 m, a room on the right, and a door between them."""
+    labels = np.repeat([[4, 8, 8]], 5, axis=0).astype(np.int32)
+    door = Door(4, 8, 1.0, 0.5, 0.9)
+    regions = {4: region(4, RegionKind.CORRIDOR, 0.0), 8: region(8, RegionKind.ROOM, 1.0)}
+    found = RegionMap(GridFrame(0.0, -1.0, 1.0), labels, regions, (door,))
+    return membership_of(small(), found)
+
+
+def test_geojson_holds_regions_and_is_read_as_without(tmp_path: Path) -> None:
+    path = tmp_path / 'g.geojson'
+    write_graph(path, small(), with_regions())
+    features = json.loads(path.read_text())['features']
+    polygons = [f for f in features if f['geometry']['type'] == 'Polygon']
+    assert [f['properties'] for f in polygons] == [
+        {'id': 4, 'kind': 'corridor', 'area_m2': 5.0, 'neighbours': [8]},
+        {'id': 8, 'kind': 'room', 'area_m2': 5.0, 'neighbours': [4]},
+    ]
+    (ring,) = polygons[0]['geometry']['coordinates']
+    assert ring == [[0.0, -1.0], [1.0, -1.0], [1.0, 4.0], [0.0, 4.0], [0.0, -1.0]]
+    metadata = {
+        f['properties']['id']: f['properties']['metadata'] for f in features if f not in polygons
+    }
+    assert (metadata[1]['region'], metadata[3]['region']) == (4, 8)
+    for number in (2, 5):  # both directions of the edge
+        assert metadata[number]['region'] in (4, 8)
+        assert (metadata[number]['door'], metadata[number]['width_m']) == (True, 0.9)
+    found = read_geojson(path)
+    assert (found.nodes.keys(), found.edges.keys()) == ({1, 3}, {2})
+
+
+def test_graphml_holds_the_regions_of_nodes_and_edges(tmp_path: Path) -> None:
+    path = tmp_path / 'g.graphml'
+    write_graph(path, small(), with_regions())
+    text = path.read_text()
+    for line in (
+        '<data key="node_region">4</data>',
+        '<data key="node_region">8</data>',
+        '<data key="edge_door">true</data>',
+        '<data key="edge_width_m">0.9</data>',
+    ):
+        assert line in text
+    write_graph(path, small())
+    assert '<data key="node_region">' not in path.read_text()

@@ -125,8 +125,8 @@ def test_inconsistent_states_are_reported(tmp_path: Path) -> None:
         TOPOLOGY.read(tmp_path / 'a.npz')
     again = GRID.read(tmp_path / 'a.npz', OccupancyConfig(resolution_m=0.05))
     assert again.frame.resolution == grid.frame.resolution
-    with pytest.raises(InputError, match='window_memory_m'):
-        TOPOLOGY.read(tmp_path / 'b.npz', TopologyConfig(window_memory_m=20.0))
+    # Another robot fits elsewhere: the graph is that of the same cells.
+    assert not TOPOLOGY.read(tmp_path / 'b.npz', TopologyConfig(robot_radius_m=3.0)).map.nodes
 
 
 @pytest.mark.parametrize('end', ['', '.grid.npz', '.topology.npz', '.yaml', '.pgm'])
@@ -197,7 +197,7 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
         builder.update(drifted.window(wrong[0], wrong[1], 10.0), wrong)
         straight.update(corrected.window(T[0], T[1], 10.0), T)
     before = dict(builder.map.nodes)
-    builder.rebuild(lambda x, y: corrected.window(x, y, 10.0), np.array(believed), np.array(poses))
+    builder = builder.rebuilt(corrected.known_area(), np.array(believed), np.array(poses))
     after = builder.map
     wanted = straight.map
     places = np.array([node.position for node in wanted.nodes.values()])
@@ -213,11 +213,9 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
 
 
 def test_a_correction_before_the_first_window() -> None:
-    builder = TopologyBuilder()
-    builder.rebuild(
-        lambda x, y: OccupancyGrid().window(x, y, 10.0), np.empty((0, 3)), np.empty((0, 3))
-    )
-    assert not builder.map.nodes
+    nowhere = np.empty((0, 3))
+    rebuilt = TopologyBuilder().rebuilt(OccupancyGrid().known_area(), nowhere, nowhere)
+    assert not rebuilt.map.nodes
 
 
 def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):

@@ -86,7 +86,7 @@ def test_ids_and_cells_survive_a_restart_and_mapping_continues(graph, tmp_path):
     response = save_all()
     assert response.success, response.message
     assert all(word in response.message for word in ('.pgm', '.yaml', '.grid.npz', '.topology.npz'))
-    ends = ['.grid.npz', '.pgm', '.topology.npz', '.yaml']
+    ends = ['.grid.npz', '.pgm', '.regions.npz', '.topology.npz', '.yaml']
     assert sorted(file.name for file in stem.parent.iterdir()) == [f'room{end}' for end in ends]
     for name in MAPPERS:
         assert graph.stop(name) == 0
@@ -361,7 +361,7 @@ def test_a_session_of_nonsense_leaves_the_running_map_as_it_was(graph, tmp_path)
     save(tmp_path / 'bad', grid, builder)
     with np.load(tmp_path / 'bad.topology.npz') as archive:
         arrays = dict(archive)
-    arrays['cells'][5, 0] = 10**9
+    arrays['tiles'][0, 0] = 10**9
     np.savez(tmp_path / 'bad.topology.npz', **arrays)
     maps, graphs, _ = heard_maps(graph)
     for name in MAPPERS:
@@ -372,7 +372,7 @@ def test_a_session_of_nonsense_leaves_the_running_map_as_it_was(graph, tmp_path)
     def refused():
         response = graph.call(LoadMap, 'load_map', LoadMap.Request(path='bad'))
         return (
-            not response.success and 'bad.topology.npz: saved topology: cells' in response.message
+            not response.success and 'bad.topology.npz: saved topology: tiles' in response.message
         )
 
     graph.until(refused, 'the reason')

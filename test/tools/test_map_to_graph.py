@@ -57,9 +57,12 @@ def test_three_formats_and_a_picture_of_one_graph(
     points = {
         f['properties']['id']: f['geometry']['coordinates']
         for f in features
-        if 'startid' not in f['properties']
+        if f['geometry']['type'] == 'Point'
     }
+    polygons = [f for f in features if f['geometry']['type'] == 'Polygon']
     graph = networkx.read_graphml(tmp_path / 'g.graphml', node_type=int)
+    regions = {d['region'] for d in graph.nodes.values()}
+    assert regions == {f['properties']['id'] for f in polygons} and regions
     assert {k: [d['x'], d['y']] for k, d in graph.nodes.items()} == points
     assert sorted(d['kind'] for d in graph.nodes.values()) == ['branch', 'end', 'end', 'end']
     assert all(d['clearance'] >= 0.25 and d['length'] > 1.0 for d in graph.edges.values())

@@ -12,10 +12,11 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.view import rerun_sinks
+from thinmap_ros.view import palette, rerun_sinks
 from thinmap_ros.view.message_view import MessageView, recording_from_bag
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
@@ -332,3 +333,36 @@ def test_local_area_is_where_its_features_are_stored():
     ]
     feed.show('line_features', stamped(features=features))
     assert diary.near == [[1.0, 0.0], [2.0, 0.0]]
+
+
+def test_regions_are_shown_in_the_colour_of_their_kind():
+    shown = []
+
+    class Outlines(NullView):
+        def regions(self, ns, outlines, colours):
+            shown.append((ns, [o.tolist() for o in outlines], list(colours)))
+
+    points = [plain(x=float(x), y=float(y)) for x, y in ((0, 0), (2, 0), (2, 1))]
+    region = plain(id=5, kind=1, outline=plain(points=points))
+    feed = MessageView(Outlines(), lambda frame: None)
+    feed.show('regions', stamped(regions=[region], doors=[]))
+    ((ns, (outline,), (colour,)),) = shown
+    assert ns == 3 * S and outline == [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0]]
+    assert colour in palette.REGIONS[RegionKind.CORRIDOR]
+    region.kind = 7
+    with pytest.raises(InputError, match='7 is not a valid RegionKind'):
+        feed.show('regions', stamped(regions=[region], doors=[]))
+    region.kind = 1
+    points[0].x = float('nan')
+    with pytest.raises(InputError, match='region 5'):
+        feed.show('regions', stamped(regions=[region], doors=[]))
+
+
+@needs_rerun
+def test_regions_are_closed_lines(tmp_path):
+    view = View(tmp_path / 'a.rrd')
+    view.regions(START, [np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0]])], ['#C9DFF2'])
+    view.close()
+    ((_, row),) = read_back(tmp_path / 'a.rrd')[0]['/map/regions']
+    points = np.array(row['LineStrips3D:strips']).reshape(-1, 3)
+    assert len(points) == 4 and points[0].tolist() == points[-1].tolist()

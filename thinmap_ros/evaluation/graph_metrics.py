@@ -1,4 +1,4 @@
-"""Metrics of topological maps: drivable edges, completeness, agreement."""
+"""Metrics of topological maps: drivable edges, completeness, sight, agreement."""
 
 import math
 from typing import Any
@@ -16,11 +16,17 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 Mask = NDArray[np.bool_]
 _SAMPLE_CELLS = 0.1  # sampling step of straight lines
 _ATTACH = 8  # nearest nodes to which a cell is connected
+_IN_SIGHT = 12  # nearest nodes that are looked for in a straight line
 
 
 def loop_count(graph: TopologicalMap) -> int:
     """Number of independent cycles of a graph."""
     return len(graph.edges) - len(graph.nodes) + len(graph.components())
+
+
+def hole_count(free: Mask) -> int:
+    """Number of parts of the other cells that free cells (H, W), joined over corners, enclose."""
+    return int(ndimage.label(~np.pad(free, 1))[1]) - 1
 
 
 def clearance_m(patch: GridPatch) -> Array:
@@ -31,17 +37,40 @@ def clearance_m(patch: GridPatch) -> Array:
 
 def drivable_share(patch: GridPatch, graph: TopologicalMap, radius_m: float) -> float:
     """Share of edges with a straight line at least a radius from obstacles (0.1 cell steps)."""
-    clearance = clearance_m(patch)
-    good = 0
-    for edge in graph.edges.values():
-        a = graph.nodes[edge.a].position
-        b = graph.nodes[edge.b].position
-        count = max(
-            2, math.ceil(float(np.hypot(*(b - a))) / (_SAMPLE_CELLS * patch.frame.resolution)) + 1
-        )
-        cells = patch.frame.cells_of(a + np.linspace(0.0, 1.0, count)[:, None] * (b - a))
-        good += bool((clearance[cells[:, 0], cells[:, 1]] >= radius_m - 1e-9).all())
+    standing = clearance_m(patch) >= radius_m - 1e-9
+    good = sum(
+        _is_drivable(patch, standing, graph.nodes[edge.a].position, graph.nodes[edge.b].position)
+        for edge in graph.edges.values()
+    )
     return good / max(len(graph.edges), 1)
+
+
+def sight_share(
+    patch: GridPatch, graph: TopologicalMap, free: Mask, count: int, seed: int
+) -> float:
+    """Share of random cells that one of the 12 nearest nodes can be driven to in a straight line.
+
+    free (H, W): traversable cells, among which the cells are and the lines stay (0.1 cell steps).
+    """
+    cells = np.argwhere(free)
+    if not len(cells) or not graph.nodes:
+        return 0.0
+    chosen = cells[np.random.default_rng(seed).integers(0, len(cells), count)]
+    places = patch.frame.centres_of(chosen)
+    nodes = np.array([node.position for node in graph.nodes.values()])
+    nearest = np.asarray(cKDTree(nodes).query(places, min(_IN_SIGHT, len(nodes)))[1])
+    seeing = sum(
+        any(_is_drivable(patch, free, place, nodes[k]) for k in row)
+        for place, row in zip(places, nearest.reshape(count, -1), strict=True)
+    )
+    return seeing / count
+
+
+def _is_drivable(patch: GridPatch, standing: Mask, a: Array, b: Array) -> bool:
+    """Whether the straight line between two points stays on cells (H, W)."""
+    steps = math.ceil(float(np.hypot(*(b - a))) / (_SAMPLE_CELLS * patch.frame.resolution)) + 1
+    cells = patch.frame.cells_of(a + np.linspace(0.0, 1.0, max(2, steps))[:, None] * (b - a))
+    return bool(standing[cells[:, 0], cells[:, 1]].all())
 
 
 def agreement(one: TopologicalMap, other: TopologicalMap, reach_m: float) -> tuple[float, float]:

@@ -12,6 +12,8 @@ from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.regions.membership import membership_of
+from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus, exploration_report
@@ -94,7 +96,9 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     report = _report(recording, seen, result)
     patch = recording.maps[-1][1]
     occupancy_maps.write_map(out / 'map', patch)
-    graphs.write_geojson(out / 'topology.geojson', recording.topology)
+    topology = recording.topology
+    regions = find_regions(patch)
+    graphs.write_geojson(out / 'topology.geojson', topology, membership_of(topology, regions))
     estimated = np.array(list(recording.estimated.values()))
     trajectories.write_tum(out / 'trajectory.tum', list(recording.estimated), list(estimated))
     true = np.array(list(recording.true.values()))
@@ -102,7 +106,7 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
         f'{world.name}: {100.0 * report["coverage"]:.1f} % seen, '
         f'{report["distance"]:.1f} m, {report["time"]:.0f} s'
     )
-    figures.summary_figure(out / 'summary.png', patch, recording.topology, estimated, true, title)
+    figures.summary_figure(out / 'summary.png', patch, topology, estimated, true, title, regions)
     if rerun_sinks.is_installed():
         recording_from_bag(out / 'bag', out / 'recording.rrd')
     else:

@@ -5,7 +5,8 @@ straight from node to node). Its edges are directed, so each edge is written in 
 are unsigned and unique over nodes and edges. Metadata are flat and without nulls, because the
 reader throws on them. `class`, by which the route server's SemanticScorer weighs, is end, branch or
 corner of a node, and dead_end (to an end node) or passage of an edge. Lengths and clearances are in
-m everywhere.
+m everywhere. Rooms, corridors and halls are polygons, which the route server skips; with them, a
+node has its `region`, and an edge its `region` and, where it passes one, `door` and `width_m`.
 """
 
 import json
@@ -22,27 +23,37 @@ import yaml
 
 from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted
+from thinmap_ros.core.regions.membership import Membership
+from thinmap_ros.core.regions.region_map import Region, RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.files.atomic import read_text, write_text
 from thinmap_ros.files.limits import FILES
 
+Writer = Callable[[Path, TopologicalMap, Membership | None], None]
 _MAX_ID = 2**32 - 1
+_REGION = 'Polygon'  # type of the geometry of regions
+_GRAPHML_KEYS = {
+    'node': ('x', 'y', 'kind', 'clearance', 'region'),
+    'edge': ('length', 'clearance', 'path', 'region', 'door', 'width_m'),
+}
+_GRAPHML_TYPES = {'kind': 'string', 'path': 'string', 'region': 'int', 'door': 'boolean'}
 _BAD_FEATURE = (KeyError, TypeError, ValueError, InputError)
 _ARRIVED_M = 0.3  # distance at which topological_navigation counts a node as reached
 _UPRIGHT = {'w': 1.0, 'x': 0.0, 'y': 0.0, 'z': 0.0}
 _SIDES = 8  # of the polygon around a node in which the robot counts as arrived
 
 
-def write_graph(path: Path, topology: TopologicalMap) -> None:
+def write_graph(path: Path, topology: TopologicalMap, regions: Membership | None = None) -> None:
     """Write a topological map atomically, in the format given by the file name extension.
 
+    regions: written too, in GeoJSON and GraphML.
     Raises InputError if the extension is unknown, or the format cannot hold the map.
     """
-    writer_of(path)(path, topology)
+    writer_of(path)(path, topology, regions)
 
 
-def writer_of(path: Path) -> Callable[[Path, TopologicalMap], None]:
+def writer_of(path: Path) -> Writer:
     """Writer of the format given by a file name extension.
 
     Raises InputError if the extension is unknown.
@@ -54,7 +65,12 @@ def writer_of(path: Path) -> Callable[[Path, TopologicalMap], None]:
 
 
 def write_geojson(
-    path: Path, topology: TopologicalMap, frame_id: str = 'map', *, with_paths: bool = True
+    path: Path,
+    topology: TopologicalMap,
+    regions: Membership | None = None,
+    frame_id: str = 'map',
+    *,
+    with_paths: bool = True,
 ) -> None:
     """Write a topological map atomically.
 
@@ -66,34 +82,38 @@ def write_geojson(
     highest = max([0, *topology.nodes, *topology.edges])
     if highest + max([0, *topology.edges]) > _MAX_ID:
         raise InputError(f'{path}: id {highest}: expected ids whose sum stays below {_MAX_ID}')
-    features = [_node_feature(node, frame_id) for node in topology.nodes.values()]
+    features = [_node_feature(node, frame_id, regions) for node in topology.nodes.values()]
     for edge in topology.edges.values():
         ends = (topology.nodes[edge.a].kind, topology.nodes[edge.b].kind)
         edge_class = 'dead_end' if NodeKind.END in ends else 'passage'
         line = edge.path if with_paths else edge.path[[0, -1]]
-        features.append(_edge_feature(edge, line, edge.id, edge.a, edge_class))
-        features.append(_edge_feature(edge, line[::-1], highest + edge.id, edge.b, edge_class))
+        metadata = _edge_metadata(edge, edge_class, regions)
+        features.append(_edge_feature(edge, line, edge.id, edge.a, metadata))
+        features.append(_edge_feature(edge, line[::-1], highest + edge.id, edge.b, metadata))
+    if regions is not None:
+        features += [
+            _region_feature(region, regions.regions) for region in regions.regions.regions.values()
+        ]
     collection = {'type': 'FeatureCollection', 'name': path.stem, 'features': features}
     indent = 1 if with_paths else None
     write_text(path, json.dumps(collection, indent=indent, allow_nan=False) + '\n')
 
 
-def write_graphml(path: Path, topology: TopologicalMap) -> None:
+def write_graphml(path: Path, topology: TopologicalMap, regions: Membership | None = None) -> None:
     """Write an undirected GraphML graph.
 
     Nodes have x, y, kind and clearance; edges have length, clearance and path. A path is a list of
-    points in one string: "x y x y ...".
+    points in one string: "x y x y ...". With regions, both have region, and edges that pass one
+    have door and width_m.
     """
     root = ElementTree.Element('graphml', xmlns='http://graphml.graphdrawing.org/xmlns')
-    keys = {'node': ('x', 'y', 'kind', 'clearance'), 'edge': ('length', 'clearance', 'path')}
-    for owner, names in keys.items():
+    for owner, names in _GRAPHML_KEYS.items():
         for name in names:
-            kind = 'string' if name in ('kind', 'path') else 'double'
             attributes = {
                 'id': f'{owner}_{name}',
                 'for': owner,
                 'attr.name': name,
-                'attr.type': kind,
+                'attr.type': _GRAPHML_TYPES.get(name, 'double'),
             }
             ElementTree.SubElement(root, 'key', attributes)
     graph = ElementTree.SubElement(root, 'graph', id='topology', edgedefault='undirected')
@@ -108,6 +128,7 @@ def write_graphml(path: Path, topology: TopologicalMap) -> None:
                 'y': y,
                 'kind': node.kind.name.lower(),
                 'clearance': round(node.clearance_m, 3),
+                **_node_region(node, regions),
             },
         )
     for edge in topology.edges.values():
@@ -118,6 +139,7 @@ def write_graphml(path: Path, topology: TopologicalMap) -> None:
             'length': round(edge.length_m, 3),
             'clearance': round(edge.clearance_m, 3),
             'path': path_text,
+            **_edge_region(edge, regions),
         }
         _put_data(at, 'edge', values)
     ElementTree.indent(root)
@@ -126,11 +148,21 @@ def write_graphml(path: Path, topology: TopologicalMap) -> None:
 
 def _put_data(element: ElementTree.Element, owner: str, values: dict[str, Any]) -> None:
     for name, value in values.items():
-        ElementTree.SubElement(element, 'data', key=f'{owner}_{name}').text = str(value)
+        ElementTree.SubElement(element, 'data', key=f'{owner}_{name}').text = _text(value)
 
 
-def write_tmap2(path: Path, topology: TopologicalMap, frame_id: str = 'map') -> None:
-    """Write a map for topological_navigation (LCAS).
+def _text(value: Any) -> str:
+    """A value as XML Schema writes it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def write_tmap2(
+    path: Path,
+    topology: TopologicalMap,
+    regions: Membership | None = None,
+    frame_id: str = 'map',
+) -> None:
+    """Write a map for topological_navigation (LCAS), which has no regions.
 
     Waypoints are named NODE<id>; edges lead in both directions, with Nav2 as action. A robot is at
     a node within the clearance of the node.
@@ -215,7 +247,7 @@ def _tmap2_node(
 
 
 def read_geojson(path: Path) -> TopologicalMap:
-    """Read a topological map that `write_geojson` wrote, of at most 256 MiB.
+    """Read a topological map that `write_geojson` wrote, of at most 256 MiB, without its regions.
 
     Raises InputError naming the file and the feature.
     """
@@ -232,8 +264,11 @@ def read_geojson(path: Path) -> TopologicalMap:
     ids: set[int] = set()
     for i, feature in enumerate(features):
         try:
+            kind = feature['geometry']['type']
+            if kind == _REGION:
+                continue
             _add_id(ids, feature)
-            if feature['geometry']['type'] == 'Point':
+            if kind == 'Point':
                 topology.put_node(_node(feature))
             else:
                 lines.append((i, feature))
@@ -259,8 +294,9 @@ def _integer(digits: str) -> int:
     return int(digits)
 
 
-def _node_feature(node: Node, frame_id: str) -> dict[str, Any]:
+def _node_feature(node: Node, frame_id: str, regions: Membership | None) -> dict[str, Any]:
     metadata = {'class': node.kind.name.lower(), 'clearance': round(float(node.clearance_m), 3)}
+    metadata |= _node_region(node, regions)
     return {
         'type': 'Feature',
         'properties': {'id': int(node.id), 'frame': frame_id, 'metadata': metadata},
@@ -269,14 +305,8 @@ def _node_feature(node: Node, frame_id: str) -> dict[str, Any]:
 
 
 def _edge_feature(
-    edge: Edge, line: Array, feature_id: int, start: int, edge_class: str
+    edge: Edge, line: Array, feature_id: int, start: int, metadata: dict[str, Any]
 ) -> dict[str, Any]:
-    metadata = {
-        'class': edge_class,
-        'edge': int(edge.id),
-        'length': round(float(edge.length_m), 3),
-        'clearance': round(float(edge.clearance_m), 3),
-    }
     return {
         'type': 'Feature',
         'properties': {
@@ -287,6 +317,44 @@ def _edge_feature(
         },
         'geometry': {'type': 'MultiLineString', 'coordinates': [_rounded(line)]},
     }
+
+
+def _edge_metadata(edge: Edge, edge_class: str, regions: Membership | None) -> dict[str, Any]:
+    return {
+        'class': edge_class,
+        'edge': int(edge.id),
+        'length': round(float(edge.length_m), 3),
+        'clearance': round(float(edge.clearance_m), 3),
+        **_edge_region(edge, regions),
+    }
+
+
+def _region_feature(region: Region, regions: RegionMap) -> dict[str, Any]:
+    properties = {
+        'id': region.id,
+        'kind': region.kind.name.lower(),
+        'area_m2': round(region.area_m2, 2),
+        'neighbours': regions.neighbours(region.id),
+    }
+    ring = _rounded(np.concatenate([region.outline, region.outline[:1]]))
+    geometry = {'type': _REGION, 'coordinates': [ring]}
+    return {'type': 'Feature', 'properties': properties, 'geometry': geometry}
+
+
+def _node_region(node: Node, regions: Membership | None) -> dict[str, Any]:
+    if regions is None or node.id not in regions.of_node:
+        return {}
+    return {'region': regions.of_node[node.id]}
+
+
+def _edge_region(edge: Edge, regions: Membership | None) -> dict[str, Any]:
+    if regions is None or edge.id not in regions.of_edge:
+        return {}
+    found: dict[str, Any] = {'region': regions.of_edge[edge.id]}
+    door = regions.door_of.get(edge.id)
+    if door is not None:
+        found |= {'door': True, 'width_m': round(door.width_m, 2)}
+    return found
 
 
 def _rounded(points: Array) -> list[list[float]]:
@@ -342,7 +410,7 @@ def _edge(feature: dict[str, Any]) -> Edge:
     return Edge(_id(properties['id']), *ends, path, *measures)
 
 
-_WRITERS: dict[str, Callable[[Path, TopologicalMap], None]] = {
+_WRITERS: dict[str, Writer] = {
     '.geojson': write_geojson,
     '.graphml': write_graphml,
     '.tmap2.yaml': write_tmap2,

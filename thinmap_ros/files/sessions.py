@@ -13,6 +13,7 @@ from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import State
@@ -109,10 +110,12 @@ def _restore_localizer(state: State, config: LocalizerConfig | None) -> AnyLocal
 
 GRID = SessionPart('grid', 'grid_mapper', '.grid.npz', OccupancyGrid.from_state)
 TOPOLOGY = SessionPart('topology', 'topology_builder', '.topology.npz', TopologyBuilder.from_state)
+# Ids of the regions: the node of the topology saves and loads them with it.
+REGIONS = SessionPart('regions', 'topology_builder', '.regions.npz', RegionTracker.from_state)
 # Line features or local map, by the configured localizer.
 LOCALIZER = SessionPart('localizer', 'localizer', '.slam.npz', _restore_localizer)
 EXPLORATION = SessionPart('exploration', 'explorer', '.exploration.npz', Explorer.from_state)
-PARTS: tuple[SessionPart[Any, Any], ...] = (GRID, TOPOLOGY, LOCALIZER, EXPLORATION)
+PARTS: tuple[SessionPart[Any, Any], ...] = (GRID, TOPOLOGY, REGIONS, LOCALIZER, EXPLORATION)
 _FILE_ENDINGS = (*(part.ending for part in PARTS), _MAP_ENDING, _IMAGE_ENDING)
 # Of all files that a session may consist of, or that are archived when it is saved.
 ENDINGS = (*_FILE_ENDINGS, *(part.ending + _ARCHIVED for part in PARTS))

@@ -97,10 +97,12 @@ def grid_mapper() -> None:
 
 
 def topology_builder() -> None:
-    """Warm up thinning and the merging of local maps."""
+    """Warm up thinning, the merging of local maps, and the regions."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
+    from thinmap_ros.core.regions.segmentation import find_regions
     from thinmap_ros.core.topology.builder import TopologyBuilder
 
+    find_regions(_room())
     grid = OccupancyGrid()
     rehearsed = TopologyBuilder()
     for scan, T_map_base in _drive():
@@ -109,6 +111,8 @@ def topology_builder() -> None:
             grid.window(T_map_base[0], T_map_base[1], WindowConfig().local_map_size_m), T_map_base
         )
         rehearsed.local_map()
+    poses = np.zeros((1, 3))
+    rehearsed.rebuilt(grid.known_area(), poses, poses)
 
 
 def explorer() -> None:
@@ -127,9 +131,14 @@ def explorer() -> None:
 
 def navigator() -> None:
     """Warm up planning and driving."""
+    from thinmap_ros.core.planning.long_path import route_band
     from thinmap_ros.core.planning.navigator import Navigator
+    from thinmap_ros.core.planning.wavefront import WavefrontConfig
+    from thinmap_ros.core.topology.builder import TopologyConfig, build
 
     patch = _room()
+    topology = build(patch, (2.0, 2.0), TopologyConfig())
+    route_band(topology, patch, (2.0, 2.0), (4.0, 3.0), WavefrontConfig())
     rehearsed = Navigator()
     rehearsed.set_goal(4.0, 3.0, 0.0)
     for scan, T_map_base in _drive():

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.core import se2
+from thinmap_ros.core import se2, validation
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
@@ -57,6 +57,13 @@ def topology(message: Any) -> TopologicalMap:
         for e in message.edges
     ]
     return TopologicalMap(nodes, edges)
+
+
+def outline(region: Any) -> Array:
+    """Outline (K, 2) of a thinmap_msgs/Region. Raises InputError where it is not finite."""
+    points = _points(region.outline.points)
+    validation.require_bounded(f'region {region.id}', points.ravel().tolist())
+    return points
 
 
 def _points(path: Any) -> Array:

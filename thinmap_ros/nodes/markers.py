@@ -1,4 +1,4 @@
-"""Graph, end nodes and line features as markers, for RViz and Foxglove."""
+"""Graph, regions, end nodes and line features as markers, for RViz and Foxglove."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,9 +9,12 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, TopologicalMap
+from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, Region, RegionArray, TopologicalMap
 from thinmap_ros.core import validation
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.topology.graph import NodeKind
+from thinmap_ros.logs import decode
 from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.decoding.topology_reader import topology_from_msg
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -19,6 +22,7 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.view import palette
 
 _END = palette.NODES[NodeKind.END]
+_KINDS = {int(kind): kind for kind in RegionKind}
 _REMOTE = '#999999'
 _TEXT_COLOUR = '#000000'
 
@@ -33,17 +37,20 @@ class _Style:
 
 _EDGE = _Style(size_m=0.04, z_m=0.02)
 _LINE = _Style(size_m=0.06, z_m=0.04)
+_REGION = _Style(size_m=0.1, z_m=0.01)
+_DOOR = _Style(size_m=0.3, z_m=0.03)
 _NODE = _Style(size_m=0.2, z_m=0.05)
 _TEXT = _Style(size_m=0.3, z_m=0.4)
 
 
 class MarkersNode(ThinmapNode):
-    """/topology, /end_nodes, /line_features in; as markers on /topology_markers, ... out."""
+    """/topology, /regions, /end_nodes and /line_features in; /topology_markers, ... out."""
 
     def __init__(self) -> None:
         super().__init__('markers')
         parameters.reject_unknown(self)
         self._show(TopologicalMap, 'topology', topology)
+        self._show(RegionArray, 'regions', regions)
         self._show(EndNodeArray, 'end_nodes', end_nodes)
         self._show(LineFeatureArray, 'line_features', line_features)
 
@@ -70,6 +77,41 @@ def topology(message: TopologicalMap) -> MarkerArray:
         nodes.points.append(_point(node.x, node.y, _NODE.z_m))
         nodes.colors.append(_colour(palette.NODES[node.kind]))
     return _shown([edges, nodes])
+
+
+def regions(message: RegionArray) -> MarkerArray:
+    """Outlines of regions in the colour of their kind, their ids, and doors as spheres.
+
+    Raises InputError where a kind is unknown or a position is out of range.
+    """
+    outlines = _marker(message.header, 'regions', Marker.LINE_LIST, _REGION.size_m, palette.EDGE)
+    names = []
+    for region in message.regions:
+        if region.kind not in _KINDS:
+            raise InputError(f'region {region.id}: kind {region.kind}: expected 0 to 2')
+        corners = [_point(x, y, _REGION.z_m) for x, y in decode.outline(region).tolist()]
+        ends = [point for pair in pairwise([*corners, *corners[:1]]) for point in pair]
+        outlines.points += ends
+        colour = _colour(palette.region(_KINDS[region.kind], region.id))
+        outlines.colors += len(ends) * [colour]
+        names.append(_region_name(message.header, region))
+    doors = _marker(message.header, 'doors', Marker.SPHERE_LIST, _DOOR.size_m, palette.ESTIMATE)
+    for door in message.doors:
+        place = (door.position.x, door.position.y)
+        validation.require_bounded(f'door {door.region_a}-{door.region_b}', place)
+        doors.points.append(_point(*place, _DOOR.z_m))
+    return _shown([outlines, doors, *names])
+
+
+def _region_name(header: Header, region: Region) -> Marker:
+    """Id of a region, as text at its centre."""
+    place = (region.center.x, region.center.y)
+    validation.require_bounded(f'region {region.id}', place)
+    text = _marker(header, 'region_names', Marker.TEXT_VIEW_FACING, _TEXT.size_m, _TEXT_COLOUR)
+    text.id = region.id % 2**31
+    text.text = f'{_KINDS[region.kind].name.lower()} {region.id}'
+    text.pose.position = _point(*place, _TEXT.z_m)
+    return text
 
 
 def end_nodes(message: EndNodeArray) -> MarkerArray:

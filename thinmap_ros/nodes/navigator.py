@@ -1,4 +1,4 @@
-"""Navigation: goals in, velocity commands out, along wavefront paths on the map."""
+"""Navigation: goals in, velocity commands out, by A* on the graph and wavefront on the map."""
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
@@ -7,7 +7,8 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import SlamStatus
+from thinmap_msgs.msg import SlamStatus, TopologicalMap
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.planning.navigator import (
     CONTROL_PERIOD_S,
     Command,
@@ -22,6 +23,7 @@ from thinmap_ros.nodes.navigation.robot_state import RobotState
 from thinmap_ros.nodes.navigation.tasks import ErrorCode, NavigationTask, TaskReader
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
+from thinmap_ros.ros.decoding.topology_reader import read_topology
 from thinmap_ros.ros.diagnostics import OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -33,6 +35,8 @@ from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
 _MIN_SPEED_M_S = 0.01
 _MIN_DISTANCE_M = 0.1
 _MAX_INT16 = 2**15 - 1
+# Of a serialized graph, which is read within one control period: about 50,000 m2 of a building.
+_MAX_TOPOLOGY_BYTES = 2_000_000
 
 
 class _NavigatorPublishers:
@@ -64,7 +68,8 @@ class NavigatorNode(ThinmapNode):
 
     Actions navigate_to_pose and navigate_through_poses, as Nav2's: one goal at a time, a newer one
     replaces it. /goal_pose sends a goal to navigate_to_pose. Goals in other frames than the map's
-    are transformed when they arrive.
+    are transformed when they arrive. Where somebody publishes /topology, distant goals are planned
+    on it.
     """
 
     def __init__(self) -> None:
@@ -87,6 +92,7 @@ class NavigatorNode(ThinmapNode):
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._map.subscribe(self)
+        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED, bytes)
         subscribe_guarded(self, PoseStamped, 'goal_pose', self._on_goal_pose, qos.STREAM)
         self._goals = SingleGoalServer(
             self,
@@ -104,7 +110,7 @@ class NavigatorNode(ThinmapNode):
         self.create_active_timer(CONTROL_PERIOD_S, self._control)
 
     def reset_state(self) -> None:
-        """Discard the map and the pose of the robot."""
+        """Discard the map, the graph and the pose of the robot."""
         self._odometry.reset()
         self._tasks.reset()
         self._navigator = Navigator(self._config)
@@ -116,7 +122,9 @@ class NavigatorNode(ThinmapNode):
         """Continue with other parameters: to the same goal, on a new path."""
         remaining = self._navigator.waypoints_remaining + 1
         self._config = config
+        topology = self._navigator.topology
         self._navigator = Navigator(config)
+        self._navigator.topology = topology
         if self._goals.active:
             self._drive_to(self._task.poses[-remaining:])
 
@@ -140,6 +148,15 @@ class NavigatorNode(ThinmapNode):
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         self._robot.is_confirmed = message.state != SlamStatus.BLIND
+
+    def _on_topology(self, data: bytes) -> None:
+        if len(data) > _MAX_TOPOLOGY_BYTES:
+            self._navigator.topology = None
+            raise InputError(
+                f'topology of {len(data)} bytes: expected at most {_MAX_TOPOLOGY_BYTES}: distant '
+                'goals are planned without it'
+            )
+        self._navigator.topology = read_topology(data)
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._tasks.pose(message)  # raises for an invalid one, which is counted

@@ -16,6 +16,7 @@ from thinmap_msgs.msg import (
     EndNodeArray,
     ExplorationStatus,
     LineFeatureArray,
+    RegionArray,
     SlamStatus,
     TopologicalMap,
 )
@@ -36,6 +37,7 @@ _TOPICS = {
     'odom': (Odometry, qos.STREAM),
     'ground_truth': (PoseStamped, qos.STREAM),
     'topology': (TopologicalMap, qos.LATCHED),
+    'regions': (RegionArray, qos.LATCHED),
     'end_nodes': (EndNodeArray, qos.LATCHED),
     'line_features': (LineFeatureArray, qos.LATCHED),
     'plan': (PathMsg, qos.LATCHED),

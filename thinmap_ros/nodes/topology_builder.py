@@ -1,4 +1,4 @@
-"""The topological map: the window of every scan is thinned and merged into the global graph."""
+"""The topological map: the cells of the grid that change are thinned and merged into the graph."""
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -10,14 +10,17 @@ from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.regions.tracker import FIELDS as REGION_FIELDS
+from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.rebuild import Rebuilding
-from thinmap_ros.files.sessions import TOPOLOGY, load_topology
+from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
 from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
@@ -47,13 +50,14 @@ class _TopologyPublishers:
 
 
 class TopologyBuilderNode(ThinmapNode):
-    """/local_grid and /pose in; /local_topology and /topology out.
+    """/local_grid, /grid and /pose in; /local_topology, /topology and /regions out.
 
     Services save_topology, load_topology and check_topology, which reads a saved graph without
     replacing the present one. Where Nav2's route server runs, it is given the graph
     when it has changed, and when it is saved: client of route_server/set_route_graph.
-    After a /trajectory the graph is rebuilt from the /grid that has undergone that correction;
-    until it comes the graph stays as it is. Nodes keep their ids.
+    Cells outside of the windows are those of /grid. After a /trajectory the graph is rebuilt from
+    the /grid that has undergone that correction, in a thread; until then the graph stays as it is.
+    Nodes keep their ids.
     """
 
     def __init__(self) -> None:
@@ -64,6 +68,9 @@ class TopologyBuilderNode(ThinmapNode):
         self._save_directory = SaveDirectory(self)
         self._route_graph = RouteGraphUpdates(
             self, self._output.frame_id, lambda: self._builder.map
+        )
+        self._regions = RegionUpdates(
+            self, self._output.frame_id, self._config.robot_radius_m, lambda: self._builder.map
         )
         parameters.reject_unknown(self)
         warm_up.topology_builder()
@@ -82,13 +89,19 @@ class TopologyBuilderNode(ThinmapNode):
     def _state(self) -> State | None:
         if self._stamp.latest_ns is None:
             return None
-        return {**self._builder.state(), 'latest_ns': np.array(self._stamp.latest_ns)}
+        latest_ns = np.array(self._stamp.latest_ns)
+        return {**self._builder.state(), **self._regions.tracker.state(), 'latest_ns': latest_ns}
 
     def _restore(self, state: State) -> None:
         """Continue with the graph of a killed builder. Raises InputError where it is no graph."""
-        latest_ns, graph = snapshot.split_stamp(state)
+        latest_ns, rest = snapshot.split_stamp(state)
+        regions = {name: array for name, array in rest.items() if name in REGION_FIELDS}
+        graph = {name: array for name, array in rest.items() if name not in REGION_FIELDS}
         builder = TopologyBuilder.from_state(graph, self._config)
-        builder.skip_ids(_ID_RESERVE)
+        tracker = RegionTracker.from_state(regions, self._regions.config)
+        for restored in (builder, tracker):
+            restored.skip_ids(_ID_RESERVE)
+        self._regions.reset(tracker)
         self._stamp.restore(latest_ns)
         self._builder = builder
         self._rebuilding = Rebuilding(from_the_start=False)
@@ -98,11 +111,14 @@ class TopologyBuilderNode(ThinmapNode):
         """Discard the graph, or return to the session that the node was started with."""
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._newest_saved_id = 0
+        self._T_map_base: Array | None = None
         self._rebuilding = Rebuilding(from_the_start=not self._session)
         if self._session:
             self._builder = load_topology(self._session, self._config)
+            self._regions.reset(REGIONS.load_optional(self._session, self._regions.config))
         else:
             self._builder = TopologyBuilder(self._config)
+            self._regions.reset()
         if self._session or self._output.has_published:
             self._publish(self.get_clock().now().nanoseconds)
 
@@ -126,8 +142,9 @@ class TopologyBuilderNode(ThinmapNode):
             self.reset_state()
         self._stamp.latest_ns = stamp_ns
         window, T_map_base = pair
+        self._T_map_base = T_map_base
         with self.diagnostics.time_step('graph update'):
-            changed = self._rebuilding.accepts_window() and self._builder.update(window, T_map_base)
+            self._builder, changed = self._rebuilding.update(self._builder, window, T_map_base)
         self._rebuilding.add_pose(stamp_ns, T_map_base)
         if changed:
             self._publish(stamp_ns)
@@ -140,11 +157,20 @@ class TopologyBuilderNode(ThinmapNode):
             self._rebuilding.correct(corrected_ns, *messages.trajectory_from_msg(message))
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
-        if not self._rebuilding.awaits(messages.stamp_ns(message.correction_stamp)):
+        corrected_ns = messages.stamp_ns(message.correction_stamp)
+        patch = messages.grid_from_msg(message)
+        self._regions.add_grid(messages.stamp_ns(message.header.stamp), patch)
+        if self._rebuilding.awaits(corrected_ns):
+            self._builder = self._rebuilding.start(self._builder, patch)
             return
-        with self.diagnostics.time_step('graph rebuilt'):
-            self._rebuilding.rebuild(self._builder, messages.grid_from_msg(message))
-        self._publish(messages.stamp_ns(message.header.stamp))
+        # Beams may end outside of the windows.
+        shown = self._rebuilding.with_window(patch, corrected_ns)
+        if shown is None or self._T_map_base is None:
+            return
+        with self.diagnostics.time_step('whole map'):
+            changed = self._builder.update(shown, self._T_map_base)
+        if changed:
+            self._publish(messages.stamp_ns(message.header.stamp))
 
     def _publish(self, stamp_ns: int) -> None:
         self._checkpoint_new_ids()
@@ -161,6 +187,7 @@ class TopologyBuilderNode(ThinmapNode):
         def save() -> str:
             path = self._save_directory.resolve_for_saving(request.path, TOPOLOGY)
             saved = TOPOLOGY.save(path, self._builder)
+            REGIONS.save(path, self._regions.tracker)
             self._route_graph.graph_saved()
             return f'saved {saved}'
 
@@ -171,20 +198,23 @@ class TopologyBuilderNode(ThinmapNode):
 
     def _on_check(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         def check() -> str:
-            return f'graph of {len(self._read(request.path).map.nodes)} nodes'
+            return f'graph of {len(self._read(request.path)[0].map.nodes)} nodes'
 
         return fill_response(response, check)
 
-    def _read(self, path: str) -> TopologyBuilder:
-        """Builder with a saved graph; without one if the path is empty."""
+    def _read(self, path: str) -> tuple[TopologyBuilder, RegionTracker | None]:
+        """Saved graph and regions; empty ones if the path is empty."""
         if not path:
-            return TopologyBuilder(self._config)
-        return load_topology(self._save_directory.resolve(path), self._config)
+            return TopologyBuilder(self._config), None
+        resolved = self._save_directory.resolve(path)
+        graph = load_topology(resolved, self._config)
+        return graph, REGIONS.load_optional(resolved, self._regions.config)
 
     def _load(self, path: str) -> str:
         """Replace the graph by a saved one; windows that were made before are discarded."""
-        loaded = self._read(path)
+        loaded, regions = self._read(path)
         self._builder = loaded
+        self._regions.reset(regions)
         self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)
         self._publish(self.get_clock().now().nanoseconds)

@@ -211,10 +211,10 @@ def _exits(plan: FloorPlan) -> list[Array]:
     return found
 
 
-def _corners(wing: Wing, skeleton_keep_margin_m: float) -> Array:
-    low = -skeleton_keep_margin_m
-    width = wing.plan.width + skeleton_keep_margin_m
-    depth = wing.plan.depth + skeleton_keep_margin_m
+def _corners(wing: Wing, margin_m: float) -> Array:
+    low = -margin_m
+    width = wing.plan.width + margin_m
+    depth = wing.plan.depth + margin_m
     corners = np.array([(low, low), (width, low), (width, depth), (low, depth)])
     return se2.transform_points(wing.T_world_wing, corners)
 

@@ -12,6 +12,8 @@ from tqdm import tqdm
 from thinmap_ros.closed_loop import ClosedLoop, Options
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.regions.membership import membership_of
+from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.files import graphs, occupancy_maps, package_data, trajectories
@@ -36,14 +38,17 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
     folder.mkdir(parents=True, exist_ok=True)
     trajectories.write_tum(folder / 'trajectory.tum', log.stamps_ns, log.poses)
     occupancy_maps.write_map(folder / 'map', patch)
-    graphs.write_geojson(folder / 'topology.geojson', topology)
+    regions = find_regions(patch)
+    graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
     title = (
         f'{report["world"]}: {report["coverage"]:.1%} in {report["time"]:.0f} s, '
         f'{report["distance"]:.0f} m'
     )
     poses = np.array(log.poses)
     true_poses = np.array(log.true_poses)
-    figures.summary_figure(folder / 'summary.png', patch, topology, poses, true_poses, title=title)
+    figures.summary_figure(
+        folder / 'summary.png', patch, topology, poses, true_poses, title, regions
+    )
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
 
 

@@ -8,6 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.regions.config import RegionConfig
+from thinmap_ros.core.regions.membership import membership_of
+from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.files import graphs, occupancy_maps
 from thinmap_ros.tools import cli
@@ -47,10 +50,16 @@ def _work(arguments: argparse.Namespace) -> None:
     config = _config(arguments)
     patch = occupancy_maps.read_map(arguments.map)
     topology = build(patch, start, config)
-    graphs.write_graph(arguments.out, topology)
+    regions = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius))
+    graphs.write_graph(arguments.out, topology, membership_of(topology, regions))
     if arguments.picture is not None:
         figures.summary_figure(
-            arguments.picture, patch, topology, np.empty((0, 2)), title=arguments.map.stem
+            arguments.picture,
+            patch,
+            topology,
+            np.empty((0, 2)),
+            title=arguments.map.stem,
+            regions=regions,
         )
     if not topology.nodes:
         place = 'no free place' if start is None else f'no free place round {start}'
@@ -62,7 +71,7 @@ def _work(arguments: argparse.Namespace) -> None:
     parts = len(topology.components())
     print(
         f'{arguments.out}: {len(topology.nodes)} nodes, {len(topology.edges)} edges, '
-        f'connected parts: {parts}'
+        f'connected parts: {parts}, regions: {len(regions.regions)}'
     )
 
 

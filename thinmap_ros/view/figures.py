@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.files.atomic import atomic_write
@@ -29,8 +30,12 @@ def summary_figure(
     estimated: Array,
     true: Array | None = None,
     title: str = '',
+    regions: RegionMap | None = None,
 ) -> None:
-    """Write a PNG: map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven."""
+    """Write a PNG: map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven.
+
+    regions: of the grid, in pale colours.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -41,7 +46,7 @@ def summary_figure(
     )
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    draw_map(axes, patch)
+    draw_map(axes, patch, regions)
     draw_graph(axes, topology)
     if true is not None and len(true):
         axes.plot(
@@ -77,10 +82,18 @@ def summary_figure(
         figure.savefig(aside, format='png', bbox_inches='tight')
 
 
-def draw_map(axes: 'Axes', patch: GridPatch) -> None:
-    """Draw the cells of a grid: free white, occupied black, unknown grey."""
+def draw_map(axes: 'Axes', patch: GridPatch, regions: RegionMap | None = None) -> None:
+    """Draw the cells of a grid: free white or by region, occupied black, unknown grey.
+
+    regions: of this grid.
+    """
     shade = np.full((*patch.shape, 3), _GREY, dtype=np.uint8)
     shade[patch.free] = 255
+    if regions is not None:
+        colours = np.full((1 + max(regions.regions, default=0), 3), 255, dtype=np.uint8)
+        for region in regions.regions.values():
+            colours[region.id] = palette.rgb(palette.region(region.kind, region.id))
+        shade[patch.free] = colours[regions.labels[patch.free]]
     shade[patch.occupied] = 0
     rows, cols = patch.shape
     x = patch.frame.origin_x + patch.frame.resolution * np.arange(cols + 1)

@@ -9,6 +9,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamp_matcher import StampMatcher
@@ -16,6 +17,7 @@ from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.laser_mount import StaticTransforms
+from thinmap_ros.view import palette
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
@@ -49,6 +51,7 @@ class MessageView:
             'odom': self._on_odometry,
             'ground_truth': self._on_truth,
             'topology': self._on_topology,
+            'regions': self._on_regions,
             'end_nodes': self._on_end_nodes,
             'line_features': self._on_lines,
             'plan': self._on_plan,
@@ -120,6 +123,11 @@ class MessageView:
         self._places = {node.id: node.position for node in topology.nodes.values()}
         self._view.topology(ns, topology)
         self._view.scalar(ns, 'count', 'nodes', len(topology.nodes))
+
+    def _on_regions(self, ns: int, message: Any) -> None:
+        outlines = [decode.outline(region) for region in message.regions]
+        colours = [palette.region(RegionKind(r.kind), int(r.id)) for r in message.regions]
+        self._view.regions(ns, outlines, colours)
 
     def _on_end_nodes(self, ns: int, message: Any) -> None:
         places = np.array([[n.position.x, n.position.y] for n in message.end_nodes]).reshape(-1, 2)

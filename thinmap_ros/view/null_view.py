@@ -1,5 +1,7 @@
 """The interface of views, and a view that shows nothing."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +34,9 @@ class NullView:
 
     def topology(self, ns: int, topology: TopologicalMap) -> None:
         """Show the skeleton, and the nodes coloured by kind."""
+
+    def regions(self, ns: int, outlines: Sequence[Array], colours: Sequence[str]) -> None:
+        """Show the outlines (K, 2) of regions in their colours, `#RRGGBB`."""
 
     def end_nodes(self, ns: int, places: Array, probabilities: Array) -> None:
         """Show end nodes at places (N, 2) with their position probabilities (N,), 0 to 1."""

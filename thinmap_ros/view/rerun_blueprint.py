@@ -14,7 +14,8 @@ LEGEND = """**orange** end node, with its position probability; **grey** it will
 **dark blue** branch · **amber** corner · **green** skeleton ·
 **blue** features of the local area, its nodes ringed;
 **pale blue** other features · **red dots** scan · **pink** pose and its 95 % · **sky** truth ·
-**yellow** path and target · **purple** samples"""
+**yellow** path and target · **purple** samples ·
+**pale outlines** rooms (blue), corridors (sand), halls (green)"""
 # Each curve: name in the legend and colour, by plot.
 _PLOTS = {
     'error': ('pose: error, 2 sigma', ('position, cm', 'heading, deg', '2 sigma, cm')),

@@ -1,6 +1,6 @@
 """Shows core values in rerun, live or in an .rrd file."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ _STAYS = '#7D7D7D'  # an end node with position probability 1
 _TRAILS = {'estimate': palette.ESTIMATE, 'truth': palette.TRUTH, 'odometry': _ODOMETRY}
 # Heights above the map, m, in the order of importance.
 _Z = {
+    'regions': 0.01,
     'skeleton': 0.02,
     'lines': 0.03,
     'samples': 0.035,
@@ -188,6 +189,20 @@ class View(NullView):
             self._log('map/nodes', self._rr.Points3D(places, colors=shades, radii=[self._px(4.0)]))
 
         self._throttled('topology', ns, draw)
+
+    def regions(self, ns: int, outlines: Sequence[Array], colours: Sequence[str]) -> None:
+        """Show the outlines (K, 2) of regions in their colours, at most once a second."""
+
+        def draw() -> None:
+            closed = [np.concatenate([outline, outline[:1]]) for outline in outlines]
+            strips = self._rr.LineStrips3D(
+                [_lifted(outline, _Z['regions']) for outline in closed],
+                colors=[rgb(colour) for colour in colours],
+                radii=[self._px(3.0)],
+            )
+            self._log('map/regions', strips)
+
+        self._throttled('regions', ns, draw)
 
     def end_nodes(self, ns: int, places: Array, probabilities: Array) -> None:
         """Show end nodes (N, 2) with their position probabilities (N,), at most once a second."""

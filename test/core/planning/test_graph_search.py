@@ -9,8 +9,8 @@ from thinmap_ros.core.planning.graph_search import (
     access,
     path_lengths_to_nodes,
     path_points,
-    route_path,
     shortest_path,
+    shortest_route,
 )
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
@@ -77,15 +77,11 @@ def test_costs_equal_floyd_and_warshall_s(count, seed):
         assert (np.inf if route is None else route.cost_m) == pytest.approx(best[a, b])
 
 
-def test_between_any_points_the_path_joins_the_edges_at_the_nearest_points():
-    path = route_path(square(), (1.0, -0.5), (1.0, 3.2))
-    np.testing.assert_allclose(path[[0, -1]], [[1.0, -0.5], [1.0, 3.2]])
-    assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(0.5 + 3.0 + 3.0 + 3.0 + 0.2)
-
-
-def test_between_two_points_of_one_edge_the_path_stays_on_it():
-    path = route_path(square(), (3.5, 0.1), (1.5, 0.1))
-    assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(2.2)
+def test_a_route_between_points_uses_the_cheapest_ends_and_no_avoided_edge():
+    route = shortest_route(square(), {1: 1.0, 2: 3.0}, {3: 2.0, 4: 1.0}, (1.0, 3.0))
+    assert (route.node_ids, route.edge_ids) == ((2, 3), (11,))
+    assert route.cost_m == pytest.approx(8.0)
+    assert shortest_route(square(), {1: 1.0}, {3: 1.0}, (4.0, 3.0), {11}) is None
 
 
 def test_costs_from_a_point_reach_what_is_joined():
@@ -97,16 +93,9 @@ def test_a_loop_is_left_by_the_shorter_side():
     ring = [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1), (0, 0)]
     topology = TopologicalMap([node(1, 0, 0)], [edge(2, 1, 1, ring)])
     assert access(topology, 1.0, 1.0).to_node_m == pytest.approx({1: 2.0})
-    assert np.hypot(
-        *np.diff(route_path(topology, (1.0, 1.0), (1.0, 0.0)), axis=0).T
-    ).sum() == pytest.approx(3.0)
 
 
 def test_a_map_without_edges_and_an_empty_one():
     lone = TopologicalMap([node(7, 1.0, 1.0)])
     assert path_lengths_to_nodes(lone, 1.0, 3.0) == {7: 2.0}
-    np.testing.assert_allclose(
-        route_path(lone, (1.0, 3.0), (0.0, 1.0))[[0, -1]], [[1.0, 3.0], [0.0, 1.0]]
-    )
     assert path_lengths_to_nodes(TopologicalMap(), 0.0, 0.0) == {}
-    assert route_path(TopologicalMap(), (0.0, 0.0), (1.0, 1.0)) is None

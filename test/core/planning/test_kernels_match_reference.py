@@ -14,11 +14,11 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.grid_search import downsample_mask, upsample_mask
-from thinmap_ros.core.planning.navigator import _collides
 from thinmap_ros.core.planning.obstacle_points import _arc, _clear_steps, _points_around
 from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.traversability import (
     near_true_cell,
+    path_collides,
     reachable_cells,
     traversable_cells,
     update_traversable_cells,
@@ -80,8 +80,8 @@ def test_whether_something_has_come_near_a_path(seed):
     cells = np.where(rng.random((50, 50)) < 0.01, 100, 0).astype(np.int8)
     path = np.clip(np.cumsum(rng.integers(-1, 2, (30, 2)), axis=0) + 25, 0, 49)
     away = ndimage.distance_transform_edt(cells < 65)[path[:, 0], path[:, 1]].min()
-    at = (-1.0, 2.0, 0.1)
-    assert _collides(cells, at, GridFrame(*at).centres_of(path), 2.5) == (away < 2.5)
+    patch = GridPatch(GridFrame(-1.0, 2.0, 0.1), cells)
+    assert path_collides(patch, patch.frame.centres_of(path), 0.25) == (away < 2.5)
 
 
 def plain_smoothed(ranges):

@@ -39,7 +39,7 @@ def test_the_graph_goes_where_the_grid_has_gone_and_its_nodes_keep_their_ids(fro
     moved = POSES + [1.0, 0.0, 0.0]
     rebuilding.correct(9, STAMPS, moved)
     assert rebuilding.awaits(9) and not rebuilding.awaits(8)
-    rebuilding.rebuild(builder, hall(1.0))
+    builder = rebuilding.result(rebuilding.start(builder, hall(1.0)))
     assert len(builder.map.nodes) == len(before)
     if from_the_start:
         for i, place in before.items():
@@ -54,10 +54,37 @@ def test_between_the_news_and_the_grid_nothing_is_taken_nor_what_is_out_of_date(
     rebuilding.correct(9, STAMPS, POSES)
     rebuilding.window(hall(), 0)
     assert not rebuilding.accepts_window()
-    rebuilding.rebuild(builder, hall())
+    rebuilding.start(builder, hall())
     assert not rebuilding.accepts_window(), 'cut out before'
     rebuilding.window(hall(), 9)
     assert rebuilding.accepts_window()
+
+
+def test_windows_that_come_while_the_graph_is_rebuilt_are_added_to_the_new_one():
+    rebuilding = Rebuilding()
+    old = built(rebuilding)
+    rebuilding.correct(9, STAMPS, POSES)
+    assert rebuilding.start(old, hall()) is old
+    closed = hall()
+    closed.cells[30:71, 60:] = 100
+    rebuilding.window(closed, 9)
+    builder, _ = rebuilding.update(old, closed, POSES[-1])
+    builder = rebuilding.result(builder)
+    assert builder is not old
+    assert max(node.x for node in builder.map.nodes.values()) < 6.0
+    far = max(node.x for node in old.map.nodes.values())
+    assert far > 6.0, 'the old one is as it was'
+
+
+def test_cells_outside_of_the_windows_are_those_of_the_grid():
+    rebuilding = Rebuilding()
+    built(rebuilding)
+    window = GridPatch(GridFrame(3.0, 3.0, 0.1), np.full((20, 20), 100, dtype=np.int8))
+    rebuilding.window(window, 0)
+    shown = rebuilding.with_window(hall(), 0)
+    assert shown.shape == hall().shape
+    assert (shown.cells[30:50, 30:50] == 100).all() and shown.cells[60, 60] == 0
+    assert rebuilding.with_window(hall(), 7) is None, 'of another correction'
 
 
 def test_a_builder_that_is_new_takes_windows_of_a_grid_that_was_corrected_before():
@@ -70,7 +97,7 @@ def test_a_mapper_that_begins_anew_after_a_correction_is_followed():
     rebuilding = Rebuilding()
     builder = built(rebuilding)
     rebuilding.correct(9, STAMPS, POSES)
-    rebuilding.rebuild(builder, hall())
+    rebuilding.start(builder, hall())
     for corrected_ns in (9, 0):
         rebuilding.window(hall(), corrected_ns)
         assert rebuilding.accepts_window()

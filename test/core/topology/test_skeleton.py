@@ -149,11 +149,12 @@ def test_two_rooms_and_a_door():
         '#' * 17,
     ]
     graph = shape(*lines)
-    assert sorted(node.kind for node in graph.nodes.values()) == [E, E]
+    # From corners of the rooms, only a node between the two is seen.
+    assert sorted(node.kind for node in graph.nodes.values()) == [E, E, C]
     xs = sorted(node.x for node in graph.nodes.values())
-    assert xs[0] < 8.0 < 9.0 < xs[1]
-    (edge,) = graph.edges.values()
-    assert edge.clearance_m == pytest.approx(0.5, abs=0.11)
+    assert xs[0] < 8.0 < 9.0 < xs[2]
+    for edge in graph.edges.values():
+        assert edge.clearance_m == pytest.approx(0.5, abs=0.11)
 
 
 def test_pillar_hall_has_a_loop_for_each_pillar():
@@ -248,6 +249,22 @@ def test_as_many_loops_as_holes(seed):
     free = select_free_space(patch, None, CONFIG)
     holes = ndimage.label(np.pad(~free, 1, constant_values=True))[1] - 1
     assert loops(build(patch, None, CONFIG)) == holes
+
+
+@pytest.mark.parametrize('name', ['kth/50052751', 'dungeon/d114', 'dungeon/d1573'])
+def test_every_free_place_sees_the_graph(shared_data, name):
+    """A straight line leads to one of the nearest nodes, along which route planners drive."""
+    patch, start = world(shared_data, name)
+    free = select_free_space(patch, start, CONFIG)
+    graph = build(patch, start, CONFIG)
+    nodes = patch.frame.cells_of(np.array([n.position for n in graph.nodes.values()]))
+    rng = np.random.default_rng(0)
+    places = np.argwhere(free)
+    hidden = 0
+    for at in places[rng.integers(0, len(places), 400)]:
+        nearest = nodes[np.argsort(((nodes - at) ** 2).sum(axis=1))[:12]]
+        hidden += not any(line_is_clear(free, *at, *node) for node in nearest)
+    assert hidden <= 2
 
 
 @pytest.mark.parametrize(

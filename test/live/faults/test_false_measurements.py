@@ -186,6 +186,7 @@ def test_a_laser_without_returns_or_with_frozen_ranges_is_blind(graph):
         robot.recovers()
 
 
+@pytest.mark.slow
 def test_stamps_of_another_time_stop_the_robot_and_do_not_move_its_pose(graph):
     robot = Exploration(graph)
     graph.until(robot.drives_far, 'it drives to a place that is not near')

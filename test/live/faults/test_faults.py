@@ -215,7 +215,6 @@ def test_a_killed_node_with_other_parameters_is_reset_and_reports_why(graph):
     graph.until(lambda: len(list(state.glob('[!.]*.npz'))) == 3, 'all is kept')
     changed = {
         'grid_mapper': ({'resolution_m': 0.05}, 'expected 0.05 m (resolution_m)'),
-        'topology_builder': ({'window_memory_m': 20.0}, '(window_memory_m, update_context_m)'),
     }
     for name, (values, said) in changed.items():
         kill(graph, name)
@@ -531,6 +530,7 @@ def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
     assert sorted(before) == [
         'room.grid.npz',
         'room.pgm',
+        'room.regions.npz',
         'room.slam.npz',
         'room.topology.npz',
         'room.yaml',

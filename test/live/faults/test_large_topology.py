@@ -47,6 +47,7 @@ def decoding_s(message):
     return time.monotonic() - started
 
 
+@pytest.mark.slow
 def test_commands_keep_their_rate_while_a_huge_map_arrives(graph):
     doctor = Doctor(graph)
     arguments = ('localizer', 'explorer', 'navigator')

@@ -29,7 +29,9 @@ def is_driven(robot):
     return abs(last.linear.x) + abs(last.angular.z) > 0.0
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    'number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_the_last_command_of_a_navigator_is_zero(graph, number):
     robots = start_robots(graph, 4)
     for name, robot in robots.items():

@@ -1,4 +1,4 @@
-"""Messages of a robot that stands at the origin of an empty hall, whatever it is commanded."""
+"""Messages of a robot that stands at the origin of a hall, whatever it is commanded."""
 
 from array import array
 
@@ -21,7 +21,7 @@ class StillRobot:
     Its pose in the map is the origin; `odom` is at T_MAP_ODOM.
     """
 
-    def __init__(self, graph, base_frame='base_link'):
+    def __init__(self, graph, base_frame='base_link', hall=None):
         node = graph.node
         self._base_frame = base_frame
         self._now = node.get_clock().now
@@ -30,7 +30,7 @@ class StillRobot:
         self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self._tf = node.create_publisher(TFMessage, '/tf', qos.TRANSFORMS)
         self._map = node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
-        self._map.publish(empty_hall())
+        self._map.publish(empty_hall() if hall is None else hall)
         node.create_timer(PERIOD_S, self.publish)
 
     def publish(self):

@@ -150,6 +150,7 @@ class OccupancyGrid:
         self._tiles = TileStore()
         self._percent = _percent_table()
         self._rendered = RenderedMap(self._percent)
+        self._changed: tuple[int, int, int, int] | None = None
         self._increments: NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
         self._beam_geometry: tuple[int, float, float] = (0, 0.0, 0.0)
         self._cosines = self._sines = np.empty(0)
@@ -194,7 +195,7 @@ class OccupancyGrid:
 
     def _write(self, row: int, col: int, odds: NDArray[np.int16]) -> None:
         self._tiles.write(row, col, odds)
-        self._rendered.mark_dirty(row, col, row + odds.shape[0], col + odds.shape[1])
+        self._mark_changed(row, col, row + odds.shape[0], col + odds.shape[1])
 
     def add_scan(self, scan: Scan, T_map_base: Array) -> None:
         """Add a scan made at a robot pose T_map_base (3,).
@@ -250,7 +251,7 @@ class OccupancyGrid:
         tiles = self._tiles
         row = tile_row * TILE
         col = tile_col * TILE
-        self._rendered.mark_dirty(row + box[0], col + box[2], row + box[1] + 1, col + box[3] + 1)
+        self._mark_changed(row + box[0], col + box[2], row + box[1] + 1, col + box[3] + 1)
         place = (tile_row - tiles.first_row, tile_col - tiles.first_col)
         _keep_grazed_walls(
             tiles.pool,
@@ -285,7 +286,7 @@ class OccupancyGrid:
         self._tiles.write_tiles(tiles, np.clip(odds, low, high))
         row, col = (tiles.min(axis=0) * TILE).tolist()
         end_row, end_col = ((tiles.max(axis=0) + 1) * TILE).tolist()
-        self._rendered.mark_dirty(row, col, end_row, end_col)
+        self._mark_changed(row, col, end_row, end_col)
 
     def window(self, x: float, y: float, size_m: float) -> GridPatch:
         """Square of size_m around a point, aligned with the cells, copied out of the tiles."""
@@ -296,6 +297,24 @@ class OccupancyGrid:
     def known_area(self) -> GridPatch:
         """Bounding rectangle of all known cells; one unknown cell if there are none."""
         return self._rendered.render(self._tiles, self.frame)
+
+    def take_changes(self) -> GridPatch | None:
+        """Rectangle of all cells that may have changed since the last call; None if none has."""
+        if self._changed is None:
+            return None
+        row, col, end_row, end_col = self._changed
+        self._changed = None
+        return self._cut(row, col, end_row - row, end_col - col)
+
+    def _mark_changed(self, row: int, col: int, end_row: int, end_col: int) -> None:
+        """The cells [row, end_row) x [col, end_col) may have changed."""
+        self._rendered.mark_dirty(row, col, end_row, end_col)
+        if self._changed is not None:
+            row = min(row, self._changed[0])
+            col = min(col, self._changed[1])
+            end_row = max(end_row, self._changed[2])
+            end_col = max(end_col, self._changed[3])
+        self._changed = (row, col, end_row, end_col)
 
     def _cut(self, row: int, col: int, rows: int, cols: int) -> GridPatch:
         odds = self._tiles.read(row, col, rows, cols)

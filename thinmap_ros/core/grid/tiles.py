@@ -13,8 +13,8 @@ from thinmap_ros.core.se2 import MAX_COORDINATE_M
 
 TILE = 64  # cells along the edge of a tile
 NO_TILE = -1
-_MAX_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
-MAX_CELLS = _MAX_TILES * TILE * TILE
+MAX_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
+MAX_CELLS = MAX_TILES * TILE * TILE
 MAX_TILE_INDEX = int(MAX_COORDINATE_M / MIN_RESOLUTION_M) // TILE  # of the finest cells
 _MIN_POOL_TILES = 64  # minimum capacity of a pool, tiles
 # Room beyond what is needed, on a side of the directory that grows: a share of its length, and at
@@ -71,12 +71,14 @@ class TileStore:
         self,
         dtype: DTypeLike = np.int16,
         per_cell: tuple[int, ...] = (),
-        max_extent_tiles: int = _MAX_TILES,
+        max_extent_tiles: int = MAX_TILES,
         begins_at_origin: bool = True,
+        reserved: int = 0,
     ) -> None:
         """max_extent_tiles: area of the largest bounding rectangle, of which most may be empty.
 
         begins_at_origin: the rectangle always includes the origin; else only what is stored.
+        reserved: number of slots at the beginning of the pool that hold no tile.
         """
         begin = int(begins_at_origin)
         self._max_extent_tiles = max_extent_tiles
@@ -84,7 +86,7 @@ class TileStore:
         self.pool: NDArray[Any] = _empty_pool((TILE, TILE, *per_cell), dtype, _MIN_POOL_TILES)
         self.first_row = 0
         self.first_col = 0
-        self.used = 0
+        self.used = reserved
 
     def grow_to(self, row_a: int, col_a: int, row_b: int, col_b: int) -> None:
         """Extend the directory to the tiles from (row_a, col_a) to (row_b, col_b), inclusive.
@@ -131,12 +133,13 @@ class TileStore:
 
     def _rebuild_directory(self, height: '_Span', width: '_Span') -> None:
         """Rebuild the directory with these rows and columns, which include all existing tiles."""
-        places = self.tile_coordinates()
+        found = np.argwhere(self.directory != NO_TILE)
+        slots = self.directory[found[:, 0], found[:, 1]]
+        at = found + (self.first_row - height.first, self.first_col - width.first)
         self.directory = np.full((height.length, width.length), NO_TILE, dtype=np.int32)
+        self.directory[at[:, 0], at[:, 1]] = slots
         self.first_row = height.first
         self.first_col = width.first
-        at = places - (self.first_row, self.first_col)
-        self.directory[at[:, 0], at[:, 1]] = np.arange(len(at))
 
     def allocate(self, tiles: NDArray[np.int64]) -> None:
         """Allocate the tiles (N, 2), (row, col) in tile coordinates inside the directory.
@@ -149,8 +152,8 @@ class TileStore:
         missing = np.array(list(dict.fromkeys(map(tuple, missing.tolist()))), dtype=np.int64)
         missing = missing.reshape(-1, 2)
         used = self.used + len(missing)
-        if used > _MAX_TILES:
-            raise InputError(f'map of {used} tiles: expected {_MAX_TILES} at most')
+        if used > MAX_TILES:
+            raise InputError(f'map of {used} tiles: expected {MAX_TILES} at most')
         if used > self.pool.shape[0]:
             least = max(used, self.used + self.used // 2)
             longer = _empty_pool(self.pool.shape[1:], self.pool.dtype, least)
@@ -265,5 +268,5 @@ def _empty_pool(tile: tuple[int, ...], dtype: DTypeLike, least: int) -> NDArray[
     """
     if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
         with suppress(MemoryError):
-            return np.zeros((_MAX_TILES, *tile), dtype=dtype)
+            return np.zeros((MAX_TILES, *tile), dtype=dtype)
     return np.zeros((least, *tile), dtype=dtype)

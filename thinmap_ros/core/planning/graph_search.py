@@ -4,7 +4,8 @@ Source: topological map paper section 3.2: the length of the edges is the cost o
 """
 
 import heapq
-from collections.abc import Iterator
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,33 +38,51 @@ class GraphAccess:
 
 
 def shortest_path(topology: TopologicalMap, start_id: int, goal_id: int) -> Route | None:
-    """Shortest route between two nodes, by A*; None if no edges connect them.
+    """Shortest route between two nodes, by A*; None if no edges connect them."""
+    goal = topology.nodes[goal_id]
+    return shortest_route(topology, {start_id: 0.0}, {goal_id: 0.0}, (goal.x, goal.y))
 
+
+def shortest_route(
+    topology: TopologicalMap,
+    starts: Mapping[int, float],
+    goals: Mapping[int, float],
+    goal_xy: tuple[float, float],
+    avoided: Collection[int] = (),
+) -> Route | None:
+    """Shortest route from a point to another, by A*; None if no edges connect them.
+
+    starts, goals: length of the path from each node to the point at this end, m. avoided: ids of
+    edges that the route must not use.
     The heuristic is the straight distance to the goal. It is admissible because no edge is shorter
     than the distance between its nodes.
     """
-    goal = topology.nodes[goal_id]
     reached_by: dict[int, tuple[int, int]] = {}
-    costs = {start_id: 0.0}
-    open_nodes = [(0.0, start_id)]
+    costs = dict(starts)
+    open_nodes = [(cost + _away(topology, i, goal_xy), i) for i, cost in costs.items()]
+    heapq.heapify(open_nodes)
     closed: set[int] = set()
+    last_id = 0
+    best_m = np.inf
     while open_nodes:
-        _, node_id = heapq.heappop(open_nodes)
-        if node_id == goal_id:
-            return _route(start_id, goal_id, reached_by, costs[goal_id])
+        at_least_m, node_id = heapq.heappop(open_nodes)
+        if at_least_m >= best_m:
+            break
         if node_id in closed:
             continue
         closed.add(node_id)
+        total_m = costs[node_id] + goals.get(node_id, np.inf)
+        if total_m < best_m:
+            best_m = total_m
+            last_id = node_id
         for edge in topology.edges_at(node_id):
             other = edge.other(node_id)
             cost = costs[node_id] + edge.length_m
-            if cost < costs.get(other, np.inf):
+            if edge.id not in avoided and cost < costs.get(other, np.inf):
                 costs[other] = cost
                 reached_by[other] = (node_id, edge.id)
-                there = topology.nodes[other]
-                rest = ((there.x - goal.x) ** 2 + (there.y - goal.y) ** 2) ** 0.5
-                heapq.heappush(open_nodes, (cost + rest, other))
-    return None
+                heapq.heappush(open_nodes, (cost + _away(topology, other, goal_xy), other))
+    return _route(last_id, reached_by, best_m) if last_id else None
 
 
 def access(topology: TopologicalMap, x: float, y: float) -> GraphAccess | None:
@@ -135,66 +154,6 @@ def path_points(topology: TopologicalMap, route: Route) -> Array:
     return np.concatenate(parts)
 
 
-def route_path(
-    topology: TopologicalMap, start_xy: tuple[float, float], goal_xy: tuple[float, float]
-) -> Array | None:
-    """Path (K, 2) along edges between any two points, m, map frame.
-
-    It leads straight from each point to the nearest edge. None if the map is empty or does not
-    connect the points.
-    """
-    start = access(topology, *start_xy)
-    goal = access(topology, *goal_xy)
-    if start is None or goal is None:
-        return None
-    best: tuple[float, Array] | None = None
-    for cost, points in _candidate_paths(topology, start, goal):
-        if best is None or cost < best[0]:
-            best = (cost, points)
-    if best is None:
-        return None
-    return np.concatenate([[start_xy], best[1], [goal_xy]])
-
-
-def _candidate_paths(
-    topology: TopologicalMap, start: GraphAccess, goal: GraphAccess
-) -> Iterator[tuple[float, Array]]:
-    """Length and points of a path for each pair of nodes at the start and the goal.
-
-    Also the path along a common edge.
-    """
-    if start.edge_id is not None and start.edge_id == goal.edge_id:
-        edge = topology.edges[start.edge_id]
-        piece = _piece(edge, start.index, goal.index)
-        yield start.approach_m + goal.approach_m + _length(piece), piece
-    for a, to_a in start.to_node_m.items():
-        for b, to_b in goal.to_node_m.items():
-            route = shortest_path(topology, a, b)
-            if route is not None:
-                parts = [
-                    _to_node(topology, start, a),
-                    path_points(topology, route),
-                    _to_node(topology, goal, b)[::-1],
-                ]
-                yield to_a + route.cost_m + to_b, np.concatenate(parts)
-
-
-def _to_node(topology: TopologicalMap, point: GraphAccess, node_id: int) -> Array:
-    """Path points from a connection on an edge to one of its nodes, without the node."""
-    if point.edge_id is None:
-        return np.empty((0, 2))
-    edge = topology.edges[point.edge_id]
-    last = 0 if node_id == edge.a else len(edge.path) - 1
-    if edge.a == edge.b and point.index > len(edge.path) // 2:
-        last = len(edge.path) - 1
-    return _piece(edge, point.index, last)[:-1]
-
-
-def _piece(edge: Edge, first: int, last: int) -> Array:
-    """Path points from one index to another, both included, in that order."""
-    return edge.path[first : last + 1] if first <= last else edge.path[last : first + 1][::-1]
-
-
 def _leaving(edge: Edge, node_id: int) -> Array:
     return edge.path if node_id == edge.a else edge.path[::-1]
 
@@ -204,16 +163,16 @@ def _along(edge: Edge) -> Array:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(edge.path, axis=0).T))])
 
 
-def _length(points: Array) -> float:
-    return float(np.hypot(*np.diff(points, axis=0).T).sum())
+def _away(topology: TopologicalMap, node_id: int, xy: tuple[float, float]) -> float:
+    """Straight distance from a node to a point, m."""
+    node = topology.nodes[node_id]
+    return math.hypot(node.x - xy[0], node.y - xy[1])
 
 
-def _route(
-    start_id: int, goal_id: int, reached_by: dict[int, tuple[int, int]], cost: float
-) -> Route:
-    nodes = [goal_id]
+def _route(last_id: int, reached_by: dict[int, tuple[int, int]], cost: float) -> Route:
+    nodes = [last_id]
     edges = []
-    while nodes[-1] != start_id:
+    while nodes[-1] in reached_by:
         node_id, edge_id = reached_by[nodes[-1]]
         nodes.append(node_id)
         edges.append(edge_id)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import SAFE_HIGHER, Config, parameter, part
-from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
-from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.long_path import LONG_PATH_M, Obstacles, route_band
 from thinmap_ros.core.planning.obstacle_points import ObstaclePoints
 from thinmap_ros.core.planning.path_follower import (
     PathFollower,
@@ -20,9 +20,11 @@ from thinmap_ros.core.planning.path_follower import (
     nearest_point,
 )
 from thinmap_ros.core.planning.recent_path import RecentPath
+from thinmap_ros.core.planning.traversability import path_collides
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologicalMap
 
 # Of the nodes that drive the robot: a stop within half a second after the last scan or odometry.
 CONTROL_PERIOD_S = 0.1
@@ -112,7 +114,7 @@ class _Progress:
     """Progress towards a goal: age of the path, time at standstill, remaining path length.
 
     standstills: number of them without progress; recoveries: all of them, up to the last waypoint
-    too; nearest_m: smallest remaining length.
+    too; nearest_m: smallest remaining length; is_near: whether the target has been near.
     """
 
     path_age_s: float = 0.0
@@ -121,6 +123,7 @@ class _Progress:
     standstills: int = 0
     recoveries: int = 0
     nearest_m: float = math.inf
+    is_near: bool = False
 
 
 class Navigator:
@@ -129,6 +132,8 @@ class Navigator:
     def __init__(self, config: NavigatorConfig | None = None) -> None:
         self.config = config or NavigatorConfig()
         self.path: Array | None = None
+        # Of the map: long paths are planned on it. None: all paths by wavefront alone.
+        self.topology: TopologicalMap | None = None
         self._follower = PathFollower(self.config.controller)
         self._recent_path = RecentPath()
         self._obstacles = ObstaclePoints()
@@ -260,35 +265,16 @@ class Navigator:
     def _is_blocked(self, first: int, patch: GridPatch) -> bool:
         """Whether an obstacle is closer to the next metres of the path than the robot radius."""
         assert self.path is not None
-        frame = patch.frame
-        ahead = self.path[
-            first : first + max(1, int(2.0 * self.config.check_ahead_m / frame.resolution))
-        ]
-        at = (frame.origin_x, frame.origin_y, frame.resolution)
-        radius = self.config.planner.robot_radius_m / frame.resolution - 1e-6
-        return _collides(patch.cells, at, ahead, radius)
+        steps = int(2.0 * self.config.check_ahead_m / patch.frame.resolution)
+        ahead = self.path[first : first + max(1, steps)]
+        return path_collides(patch, ahead, self.config.planner.robot_radius_m)
 
     def _plan(self, T_map_base: Array, patch: GridPatch) -> str:
         """Replan; returns why there is no path, or an empty text.
 
         While the robot is blocked, scan points count as obstacles, too.
         """
-        points = (
-            self._obstacles.query_radius(T_map_base, self.config.scan_obstacle_range_m)
-            if self._progress.blocked_s > 0.0
-            else None
-        )
-        start = float(T_map_base[0]), float(T_map_base[1])
-        trail = self._recent_path.cells(patch.frame, patch.shape)
-        path = plan(
-            patch,
-            start,
-            self._target,
-            self.config.planner,
-            points,
-            self.config.stop_radius_m,
-            trail,
-        )
+        path = self._find_path(T_map_base, patch)
         first = self.path is None
         self._progress.path_age_s = 0.0
         if path is None:
@@ -298,6 +284,42 @@ class Navigator:
             return f'no path to {where}' if never else f'the path to {where} is blocked'
         self.path = path
         return ''
+
+    def _find_path(self, T_map_base: Array, patch: GridPatch) -> Array | None:
+        """Path to the target, along a route on the graph if it is far; None: no path."""
+        start = float(T_map_base[0]), float(T_map_base[1])
+        obstacles = None
+        if self._progress.blocked_s > 0.0:
+            points = self._obstacles.query_radius(T_map_base, self.config.scan_obstacle_range_m)
+            obstacles = Obstacles(points, self.config.stop_radius_m)
+        # Not along a route again after the target was near: two paths could alternate.
+        self._progress.is_near |= math.dist(start, self._target) < LONG_PATH_M
+        if self.topology is not None and not self._progress.is_near:
+            config = self.config.planner
+            band = route_band(self.topology, patch, start, self._target, config, obstacles)
+            path = None if band is None else self._spread(start, band.patch, obstacles, band.cells)
+            if path is not None:
+                return path
+        return self._spread(start, patch, obstacles)
+
+    def _spread(
+        self,
+        start: tuple[float, float],
+        patch: GridPatch,
+        obstacles: Obstacles | None,
+        band: NDArray[np.bool_] | None = None,
+    ) -> Array | None:
+        """Path to the target by wavefront; over the cells (H, W) of a band only, if given."""
+        return plan(
+            patch,
+            start,
+            self._target,
+            self.config.planner,
+            None if obstacles is None else obstacles.points,
+            self.config.stop_radius_m,
+            self._recent_path.cells(patch.frame, patch.shape),
+            band,
+        )
 
     def _wait(self, reason: str, dt_s: float) -> Command:
         """Stop; abort the goal if there was never a path, or after blocked_timeout_s."""
@@ -388,31 +410,3 @@ class Navigator:
         free_m = self._obstacles.free_arc_length_m(T_map_base, w / v, needed, radius_m)
         late = self.config.reaction_time_s
         return min(v, braking * (math.sqrt(late * late + 2.0 * free_m / braking) - late))
-
-
-@kernel
-def _collides(
-    cells: NDArray[np.int8], frame: tuple[float, float, float], path: Array, radius: float
-) -> bool:
-    """Whether an occupied cell of a map (H, W) is within a radius, cells, of a path (K, 2), m.
-
-    frame: origin x, origin y and resolution of the map, m.
-    """
-    reach = int(math.ceil(radius))
-    last_row = -1
-    last_col = -1
-    for k in range(path.shape[0]):
-        row = int(math.floor((path[k, 1] - frame[1]) / frame[2]))
-        col = int(math.floor((path[k, 0] - frame[0]) / frame[2]))
-        if row == last_row and col == last_col:
-            continue
-        last_row = row
-        last_col = col
-        for r in range(max(row - reach, 0), min(row + reach + 1, cells.shape[0])):
-            for c in range(max(col - reach, 0), min(col + reach + 1, cells.shape[1])):
-                if (
-                    cells[r, c] >= OCCUPIED_AT_LEAST
-                    and (r - row) ** 2 + (c - col) ** 2 < radius * radius
-                ):
-                    return True
-    return False

@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.free_space import column_distance, standing_room
 
 Mask = NDArray[np.bool_]
@@ -89,6 +91,13 @@ def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[in
     return int(best[0]), int(best[1])
 
 
+def path_collides(patch: GridPatch, path: Array, radius_m: float) -> bool:
+    """Whether an occupied cell is closer to a path (K, 2), m, map frame, than a radius."""
+    frame = patch.frame
+    at = (frame.origin_x, frame.origin_y, frame.resolution)
+    return bool(_collides(patch.cells, at, path, radius_m / frame.resolution - 1e-6))
+
+
 @kernel
 def near_true_cell(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mask:
     """Whether a true cell of a mask (H, W) lies within `reach` cells of each cell (N, 2), (N,)."""
@@ -142,3 +151,31 @@ def _reachable_cells(allowed: Mask, start_row: int, start_col: int) -> Mask:
                 stack[count] = to
                 count += 1
     return found[1:-1, 1:-1].copy()
+
+
+@kernel
+def _collides(
+    cells: NDArray[np.int8], frame: tuple[float, float, float], path: Array, radius: float
+) -> bool:
+    """Whether an occupied cell of a map (H, W) is within a radius, cells, of a path (K, 2), m.
+
+    frame: origin x, origin y and resolution of the map, m.
+    """
+    reach = int(math.ceil(radius))
+    last_row = -1
+    last_col = -1
+    for k in range(path.shape[0]):
+        row = int(math.floor((path[k, 1] - frame[1]) / frame[2]))
+        col = int(math.floor((path[k, 0] - frame[0]) / frame[2]))
+        if row == last_row and col == last_col:
+            continue
+        last_row = row
+        last_col = col
+        for r in range(max(row - reach, 0), min(row + reach + 1, cells.shape[0])):
+            for c in range(max(col - reach, 0), min(col + reach + 1, cells.shape[1])):
+                if (
+                    cells[r, c] >= OCCUPIED_AT_LEAST
+                    and (r - row) ** 2 + (c - col) ** 2 < radius * radius
+                ):
+                    return True
+    return False

@@ -83,13 +83,15 @@ def plan(
     points: Array | None = None,
     stop_radius_m: float = 0.0,
     trail: NDArray[np.int64] | None = None,
+    band: Mask | None = None,
 ) -> Array | None:
     """Path (K, 2) from start to goal, m, map frame, points half a cell apart; None: no path.
 
     The path ends at the goal, or at the nearest allowed cell within goal_search_radius_m. It stays
     stop_radius_m away from obstacle points (N, 2), which the map need not contain. Points are not
     rounded to cells: noise would make walls one cell thicker, and passages too narrow. trail: cells
-    (N, 2) of the recent path; the robot may return over them unless they are occupied now.
+    (N, 2) of the recent path; the robot may return over them unless they are occupied now. band:
+    cells (H, W) that the path may use; all, if None.
     """
     cells = patch.frame.cells_of(np.array([start_xy, goal_xy]))
     if not patch.contains(np.array([start_xy, goal_xy])).all():
@@ -116,6 +118,8 @@ def plan(
     if trail is not None:
         back = trail[~occupied[trail[:, 0], trail[:, 1]]]
         cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], config.escape_cost)
+    if band is not None:
+        cost[~band] = np.inf
     goal = nearest_true(
         reachable_cells(np.isfinite(cost), start),
         wished,

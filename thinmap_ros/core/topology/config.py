@@ -45,34 +45,6 @@ class TopologyConfig(Config):
         low=0.0,
         high=5.0,
     )
-    update_window_m: float = parameter(
-        10.0,
-        'Side length of the window that is thinned at every scan (m). Raise it for a long-range '
-        'laser, lower it to save time.',
-        low=2.0,
-        high=50.0,
-    )
-    update_context_m: float = parameter(
-        6.0,
-        'Width of the margin that is thinned with the window (m). Raise it if the graph differs '
-        'from that of the whole map, lower it to save time.',
-        low=0.0,
-        high=50.0,
-    )
-    window_memory_m: float = parameter(
-        50.0,
-        'Distance up to which earlier windows are remembered (m). Raise it for large halls, lower '
-        'it to save memory.',
-        low=0.0,
-        high=200.0,
-    )
-    skeleton_keep_margin_m: float = parameter(
-        2.0,
-        'Distance outside the visible area up to which the previous skeleton is kept (m). Raise '
-        'it if nodes at the edge of the view flicker.',
-        low=0.0,
-        high=50.0,
-    )
     node_match_radius_m: float = parameter(
         0.5,
         'A node that moved less than this keeps its id (m). Raise it if ids change while the map '

@@ -1,5 +1,7 @@
 """Corner nodes: where chains of cells break so that straight lines stay where the robot fits."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +25,48 @@ def corner_indices(cells: Cells, room: Array) -> Cells:
     broken = _split(np.ascontiguousarray(cells), np.maximum(room, 0.0))
     found: Cells = np.flatnonzero(broken)
     return found
+
+
+def corners_between(cells: Cells, room: Array, stops: Cells) -> Cells:
+    """Indices `stops` of a chain's cells (K, 2), and the corners of the pieces between them.
+
+    room (K,): see `corner_indices`.
+    """
+    found = [stops]
+    for first, last in pairwise(stops.tolist()):
+        piece = slice(first, last + 1)
+        found.append(first + corner_indices(cells[piece], room[piece]))
+    return np.unique(np.concatenate(found))
+
+
+def with_middles(
+    cells: Cells, stops: Cells, clearances: Array, longest: float, even: float
+) -> Cells:
+    """Indices `stops` of a chain's cells (K, 2), and between them those that split long pieces.
+
+    A piece is split into equal parts of at most `longest` cells, unless it is a corridor: as
+    straight, and its clearances (K,) as equal, as `even` cells. Elsewhere there are places beside a
+    long piece from which the nodes at both of its ends are out of sight.
+    """
+    steps = np.hypot(*np.diff(cells, axis=0).T)
+    path = np.concatenate(([0.0], np.cumsum(steps)))
+    middles = [stops]
+    for first, last in pairwise(stops.tolist()):
+        count = int((path[last] - path[first]) / longest)
+        piece = slice(first, last + 1)
+        if count == 0 or max(_bend(cells[piece]), float(np.ptp(clearances[piece]))) <= even:
+            continue
+        shares = np.arange(1, count + 1) / (count + 1)
+        middles.append(np.searchsorted(path, path[first] + shares * (path[last] - path[first])))
+    return np.unique(np.concatenate(middles))
+
+
+def _bend(cells: Cells) -> float:
+    """Largest distance of cells (K, 2) from the line through the first and the last one."""
+    line = (cells[-1] - cells[0]).astype(np.float64)
+    off = cells - cells[0]
+    length = max(float(np.hypot(*line)), 1.0)
+    return float(np.abs(off[:, 0] * line[1] - off[:, 1] * line[0]).max() / length)
 
 
 @inlined

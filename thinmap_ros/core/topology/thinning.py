@@ -5,7 +5,9 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import inlined, kernel
 
+KEPT = 32767  # deletion time of the cells of the skeleton
 Words = NDArray[np.uint64]
+Times = NDArray[np.int16]
 Cells = NDArray[np.int64]
 Index = np.uintp  # unsigned: compiled code then asks no question about indices below zero
 _WORD = 64
@@ -27,8 +29,19 @@ def thin(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     p2).
     """
     words, stride = _pack(np.ascontiguousarray(free, dtype=np.bool_))
-    _thin_words(words, stride)
+    _thin_words(words, stride, np.empty((0, 0), dtype=np.int16))
     return _unpack(words, stride, free.shape)
+
+
+def deletion_times(free: NDArray[np.bool_]) -> Times:
+    """Sub-iteration that deletes each cell (H, W), from 1 on; KEPT in the skeleton, else 0.
+
+    free (H, W) bool, see `thin`.
+    """
+    words, stride = _pack(np.ascontiguousarray(free, dtype=np.bool_))
+    times = np.where(free, np.int16(KEPT), np.int16(0))
+    _thin_words(words, stride, times)
+    return times
 
 
 def _pack(free: NDArray[np.bool_]) -> tuple[Words, int]:
@@ -94,8 +107,10 @@ def _find(
 
 
 @kernel
-def _thin_words(words: Words, stride: int) -> None:
+def _thin_words(words: Words, stride: int, times: Times) -> None:
     """Delete in place, `stride` words a row, until nothing changes.
+
+    times (H, W): the sub-iteration of each deletion is written into it, unless it is empty.
 
     A cell is looked at only when one beside it, or itself, changed in one of the last two
     sub-iterations: before that, the same sub-iteration has already seen these very cells and left
@@ -148,6 +163,8 @@ def _thin_words(words: Words, stride: int) -> None:
             low = due[i, 1]
             high = due[i, 2]
             rim = (band - 1) * _BAND + 1, min(band * _BAND, rows)
+            if times.size > 0:
+                _record(deleted, stride, rim, (low, high), times, min(turn + 1, KEPT - 1))
             _delete_band(
                 words, deleted, stride, rim, (low, high), first[which, band], end[which, band]
             )
@@ -172,6 +189,26 @@ def _columns(first: Cells, end: Cells, band: int, stride: int) -> tuple[int, int
             high, end[which, band - 1, _BOTTOM], end[which, band, _ANY], end[which, band + 1, _TOP]
         )
     return max(low - 1, 1), min(high + 1, stride - 1)
+
+
+@inlined
+def _record(
+    deleted: Words,
+    stride: int,
+    rim: tuple[int, int],
+    columns: tuple[int, int],
+    times: Times,
+    time: int,
+) -> None:
+    """Write the time of the bits that are deleted in some columns of a band."""
+    for row in range(rim[0], rim[1] + 1):
+        for word in range(columns[0], columns[1]):
+            bits = deleted[row * stride + word]
+            if bits == 0:
+                continue
+            for bit in range(_WORD):
+                if (bits >> np.uint64(bit)) & np.uint64(1):
+                    times[row - 1, (word - 1) * _WORD + bit] = time
 
 
 @inlined

@@ -90,7 +90,7 @@ class RouteGraphUpdates:
         try:
             with self._node.diagnostics.time_step('route graph'):
                 path = self._path()
-                write_geojson(path, topology, self._frame_id, with_paths=False)
+                write_geojson(path, topology, frame_id=self._frame_id, with_paths=False)
         except (InputError, OSError) as error:
             self._warn(f'route graph not written: {one_line_reason(error)}')
             return

@@ -1,0 +1,125 @@
+"""Regions of a known floor: kinds, areas, doors, outlines, nodes and edges; and of a noisy one."""
+
+import numpy as np
+import pytest
+from core.regions.floors import CELL_M, noisy, office, patch_of
+
+from thinmap_ros.core.regions.config import RegionConfig
+from thinmap_ros.core.regions.membership import membership_of
+from thinmap_ros.core.regions.outline import outline_of
+from thinmap_ros.core.regions.region_map import RegionKind, RegionMap
+from thinmap_ros.core.regions.segmentation import find_regions
+from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologicalMap
+
+CORRIDOR = (7.0, 3.2)
+LEFT = (3.0, 7.0)
+RIGHT = (11.0, 7.0)
+
+
+def at(found: RegionMap, *points: tuple[float, float]) -> list[int]:
+    ids = found.ids_at(np.array(points)).tolist()
+    assert all(ids)
+    return ids
+
+
+def area_of(polygon: np.ndarray) -> float:
+    """Signed: positive counterclockwise."""
+    x, y = polygon.T
+    return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+
+
+def test_two_rooms_on_a_corridor() -> None:
+    found = find_regions(patch_of(office()))
+    corridor, left, right = at(found, CORRIDOR, LEFT, RIGHT)
+    assert found.regions.keys() == {corridor, left, right}
+    kinds = {number: region.kind for number, region in found.regions.items()}
+    room = RegionKind.ROOM
+    assert kinds == {corridor: RegionKind.CORRIDOR, left: room, right: room}
+    assert found.regions[left].area_m2 == pytest.approx(39.0, rel=0.05)
+    assert found.regions[corridor].area_m2 == pytest.approx(32.0, rel=0.05)
+    assert found.neighbours(corridor) == sorted([left, right])
+    assert found.neighbours(left) == [corridor]
+    assert sorted((round(door.x, 1), round(door.width_m, 1)) for door in found.doors) == [
+        pytest.approx((2.5, 1.0), abs=0.2),
+        pytest.approx((11.5, 1.0), abs=0.2),
+    ]
+
+
+def test_centre_and_outline_lie_in_the_region() -> None:
+    found = find_regions(patch_of(office()))
+    for region in found.regions.values():
+        assert at(found, (region.x, region.y)) == [region.id]
+        assert area_of(region.outline) == pytest.approx(region.area_m2, rel=0.05)
+
+
+def test_a_wide_room_is_a_hall_and_a_wide_door_separates_only_up_to_a_width() -> None:
+    cells = office()
+    cells[22, 30:54] = 0
+    narrow = find_regions(patch_of(cells), RegionConfig(max_door_width_m=1.5, min_hall_width_m=4.0))
+    corridor, left, right = at(narrow, CORRIDOR, LEFT, RIGHT)
+    assert corridor == left != right
+    assert narrow.regions[right].kind == RegionKind.HALL
+
+
+def test_noise_changes_no_region(rng: np.random.Generator) -> None:
+    found = find_regions(patch_of(noisy(office(), rng)))
+    assert len(set(at(found, CORRIDOR, LEFT, RIGHT))) == len(found.regions) == 3
+    assert len(found.doors) == 2
+
+
+def test_a_table_makes_no_door_and_a_thin_wall_does() -> None:
+    cells = office()
+    cells[43:53, 30:42] = 100
+    assert len(find_regions(patch_of(cells)).regions) == 3
+    cells[23:45, 38] = 100
+    cells[54:73, 38] = 100
+    assert len(find_regions(patch_of(cells)).regions) == 4
+
+
+def test_corridors_that_meet_are_one_region() -> None:
+    cells = np.full((160, 200), 100, dtype=np.int8)
+    cells[2:27, 2:198] = 0
+    cells[27:158, 90:106] = 0
+    cells[140:158, 2:198] = 0
+    found = find_regions(patch_of(cells))
+    assert [region.kind for region in found.regions.values()] == [RegionKind.CORRIDOR]
+    assert not found.doors
+
+
+def test_a_map_without_free_space_has_no_regions() -> None:
+    found = find_regions(patch_of(np.full((30, 40), 100, dtype=np.int8)))
+    assert not found.regions
+    assert not found.doors
+    assert not found.labels.any()
+    assert membership_of(TopologicalMap(), found).of_node == {}
+
+
+def test_nodes_and_edges_know_their_region() -> None:
+    patch = patch_of(office())
+    found = find_regions(patch)
+    topology = build(patch, None, TopologyConfig())
+    member = membership_of(topology, found)
+    assert member.of_node.keys() == topology.nodes.keys()
+    assert member.of_edge.keys() == topology.edges.keys()
+    for number, node in topology.nodes.items():
+        assert at(found, (node.x, node.y)) == [member.of_node[number]]
+    through = {number for door in found.doors for number in member.edges_through(door)}
+    assert through == member.door_of.keys() and len(through) == 2
+    assert all(member.edges_through(door) for door in found.doors)
+
+
+def test_outline_of_a_ring_is_its_outer_border() -> None:
+    frame = patch_of(office()).frame
+    cells = np.ones((4, 5), dtype=np.bool_)
+    cells[1:3, 1:4] = False
+    corners = np.round((outline_of(cells, frame) - (-1.0, 2.0)) / CELL_M)
+    assert corners.tolist() == [[0, 0], [5, 0], [5, 4], [0, 4]]
+    assert outline_of(np.zeros((2, 2), dtype=np.bool_), frame).shape == (0, 2)
+
+
+def test_outline_stays_with_the_largest_part_where_cells_meet_at_a_corner() -> None:
+    frame = patch_of(office()).frame
+    cells = np.array([[1, 1, 0], [0, 1, 0], [0, 0, 1]], dtype=np.bool_)
+    corners = np.round((outline_of(cells, frame) - (-1.0, 2.0)) / CELL_M)
+    assert corners.tolist() == [[0, 0], [2, 0], [2, 2], [1, 2], [1, 1], [0, 1]]

@@ -1,0 +1,52 @@
+"""Rooms on a live graph: topology_builder publishes them with the nodes of its graph."""
+
+import numpy as np
+import pytest
+from core.regions.floors import office, patch_of
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from visualization_msgs.msg import MarkerArray
+
+from thinmap_msgs.msg import ProbabilityGrid, Region, RegionArray, TopologicalMap
+from thinmap_ros.ros import messages, qos
+
+pytestmark = pytest.mark.live
+S = 1_000_000_000
+HERE = np.array([3.0, 3.2, 0.0])
+
+
+def test_regions_name_the_nodes_of_the_graph(graph):
+    patch = patch_of(office())
+    grids = graph.node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
+    windows = graph.node.create_publisher(ProbabilityGrid, 'local_grid', qos.LATCHED)
+    poses = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
+    heard = graph.heard('regions', RegionArray, qos.LATCHED)
+    graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
+    markers = graph.heard('regions_markers', MarkerArray, qos.LATCHED)
+    graph.start('topology_builder', region_update_period_s=0.2)
+    graph.start('markers')
+    ns = S
+
+    def is_complete():
+        nonlocal ns
+        ns += S
+        grids.publish(messages.probability_grid_msg(patch, 'map', ns))
+        windows.publish(messages.probability_grid_msg(patch, 'map', ns))
+        poses.publish(messages.pose_with_covariance_msg(HERE, np.eye(3), 'map', ns))
+        return (
+            graphs
+            and heard
+            and {n.id for n in graphs[-1].nodes}
+            == {i for r in heard[-1].regions for i in r.node_ids}
+            and len(graphs[-1].nodes) > 0
+        )
+
+    graph.until(is_complete, 'regions of all nodes')
+    message = heard[-1]
+    assert message.header.frame_id == 'map'
+    assert sorted(r.kind for r in message.regions) == [Region.ROOM, Region.ROOM, Region.CORRIDOR]
+    edges = {edge.id for edge in graphs[-1].edges}
+    assert {number for r in message.regions for number in r.edge_ids} == edges
+    assert len(message.doors) == 2
+    assert all(door.edge_ids and set(door.edge_ids) <= edges for door in message.doors)
+    graph.until(lambda: markers and len(markers[-1].markers) == 6, 'outlines, doors and names')
+    assert graph.stop('topology_builder') == graph.stop('markers') == 0

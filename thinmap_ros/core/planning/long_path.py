@@ -1,0 +1,303 @@
+"""Long paths: A* on the topological map finds the route, the wavefront the path along it.
+
+The wave spreads only in a band around the route. Its first and last part lead from the robot to
+the graph and from the graph to the goal: the cells there are found on the grid. Edges that the grid
+or scan points contradict are left out. Where the graph has no route, or no path along it is
+open, and for goals that are near, the wavefront plans alone.
+Source: topological map paper section 3.2.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.planning.graph_search import path_points, shortest_route
+from thinmap_ros.core.planning.grid_search import distance_field_from
+from thinmap_ros.core.planning.traversability import nearest_true, path_collides
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologicalMap
+
+Mask = NDArray[np.bool_]
+XY = tuple[float, float]
+# Straight distance from which the wavefront in a band costs less than the wavefront alone.
+LONG_PATH_M = 20.0
+_BAND_M = 3.0  # half of its width: wide enough for the shortest path through most halls
+_ACCESS_M = 6.0  # the graph is looked for so far from the robot and from the goal
+_MAX_ROUTES = 6  # that are tried, each without the contradicted edges of those before
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacles:
+    """Points (N, 2), m, map frame, that the map need not contain, and the distance to keep, m."""
+
+    points: Array
+    radius_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The part of a map in which a path is looked for, and those of its cells (H, W) that count."""
+
+    patch: GridPatch
+    cells: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class _Approach:
+    """A path from a point to a node: along an edge from one of its path points.
+
+    length_m: to the node; path (K, 2): the part of the edge.
+    """
+
+    node_id: int
+    length_m: float
+    path: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Entry:
+    """The point of an edge's path that is nearest to a point over traversable cells."""
+
+    edge_id: int
+    index: int
+    length_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Surroundings:
+    """Path lengths, m, to the cells (H, W) around a point; row, col: of the first cell."""
+
+    row: int
+    col: int
+    lengths_m: Array
+
+
+class _Checked:
+    """A topological map, and what the grid and scan points say about its edges."""
+
+    def __init__(
+        self,
+        topology: TopologicalMap,
+        patch: GridPatch,
+        config: WavefrontConfig,
+        obstacles: Obstacles | None,
+    ) -> None:
+        self.topology = topology
+        self.patch = patch
+        self.config = config
+        self._obstacles = obstacles
+        edges = list(topology.edges.values())
+        self._points = np.concatenate([edge.path for edge in edges])
+        self._ids = np.array([edge.id for edge in edges])
+        self._ends = np.cumsum([len(edge.path) for edge in edges])
+
+    def is_drivable(self, path: Array) -> bool:
+        """Whether a path (K, 2) keeps its distance from occupied cells and scan points."""
+        if path_collides(self.patch, path, self.config.robot_radius_m):
+            return False
+        if self._obstacles is None or self._obstacles.points.size == 0:
+            return True
+        radius_m = self._obstacles.radius_m
+        points = self._obstacles.points
+        low = points.min(axis=0) - radius_m
+        near = path[((path >= low) & (path <= points.max(axis=0) + radius_m)).all(axis=1)]
+        away = np.hypot(*(near[:, None] - points[None]).transpose(2, 0, 1))
+        return not bool((away < radius_m).any())
+
+    def entries(self, around: _Surroundings) -> list[_Entry]:
+        """Where each edge that passes through the surroundings of a point is entered."""
+        cells = self.patch.frame.cells_of(self._points) - (around.row, around.col)
+        inside = ((cells >= 0) & (cells < around.lengths_m.shape)).all(axis=1)
+        at = np.flatnonzero(inside)
+        lengths = around.lengths_m[cells[at, 0], cells[at, 1]]
+        order = np.lexsort((lengths, np.searchsorted(self._ends, at, side='right')))
+        edges, first = np.unique(
+            np.searchsorted(self._ends, at[order], side='right'), return_index=True
+        )
+        found = []
+        for edge, k in zip(edges.tolist(), order[first].tolist(), strict=True):
+            if math.isfinite(lengths[k]):
+                begin = int(self._ends[edge - 1]) if edge else 0
+                index = int(at[k]) - begin
+                found.append(_Entry(int(self._ids[edge]), index, float(lengths[k])))
+        return found
+
+    def approaches(self, entries: list[_Entry]) -> dict[int, _Approach]:
+        """The shortest approach to each node at the edges that are entered."""
+        best: dict[int, _Approach] = {}
+        for entry in entries:
+            edge = self.topology.edges[entry.edge_id]
+            back = edge.path[entry.index :: -1]
+            for node_id, path in ((edge.a, back), (edge.b, edge.path[entry.index :])):
+                length_m = entry.length_m + _length(path)
+                known = best.get(node_id)
+                if (known is None or length_m < known.length_m) and self.is_drivable(path):
+                    best[node_id] = _Approach(node_id, length_m, path)
+        return best
+
+
+def route_band(
+    topology: TopologicalMap,
+    patch: GridPatch,
+    start_xy: XY,
+    goal_xy: XY,
+    config: WavefrontConfig,
+    obstacles: Obstacles | None = None,
+) -> Band | None:
+    """The band around the shortest route on the graph from start to goal (m, map frame).
+
+    None if the graph does not connect them, or not by edges that the grid confirms.
+    """
+    if not topology.edges or not patch.contains(np.array([start_xy, goal_xy])).all():
+        return None
+    checked = _Checked(topology, patch, config, obstacles)
+    ends = []
+    for xy, reach_m in (
+        (start_xy, config.start_escape_distance_m),
+        (goal_xy, config.goal_search_radius_m),
+    ):
+        around = _surroundings(patch, xy, reach_m, config)
+        if around is None:
+            return None
+        ends.append((around, checked.entries(around)))
+    route = _route(checked, ends[0][1], ends[1][1], goal_xy)
+    if route is None:
+        return None
+    path, first_m, last_m = route
+    access = [(ends[0][0], first_m), (ends[1][0], last_m)]
+    return _band(patch, np.concatenate([[start_xy], path, [goal_xy]]), access, config)
+
+
+def _surroundings(
+    patch: GridPatch, xy: XY, reach_m: float, config: WavefrontConfig
+) -> _Surroundings | None:
+    """Path lengths around a point, or around the traversable cell nearest to it within reach_m."""
+    resolution = patch.frame.resolution
+    row, col = patch.frame.cells_of(np.array([xy]))[0].tolist()
+    size = math.ceil(_ACCESS_M / resolution)
+    part = _crop(patch, max(row - size, 0), max(col - size, 0), row + size + 1, col + size + 1)
+    first_row = max(row - size, 0)
+    first_col = max(col - size, 0)
+    allowed = np.isfinite(cost_of_cells(part, config))
+    start = nearest_true(allowed, (row - first_row, col - first_col), reach_m / resolution)
+    if start is None:
+        return None
+    lengths = distance_field_from(allowed, start) * resolution
+    return _Surroundings(first_row, first_col, lengths)
+
+
+def _route(
+    checked: _Checked, starts: list[_Entry], goals: list[_Entry], goal_xy: XY
+) -> tuple[Array, float, float] | None:
+    """Points (K, 2) on edges of the shortest drivable route, and its lengths to and from them."""
+    first = checked.approaches(starts)
+    last = checked.approaches(goals)
+    direct = _on_one_edge(checked, starts, goals)
+    topology = checked.topology
+    avoided: set[int] = set()
+    for _ in range(_MAX_ROUTES):
+        route = shortest_route(
+            topology,
+            {i: approach.length_m for i, approach in first.items()},
+            {i: approach.length_m for i, approach in last.items()},
+            goal_xy,
+            avoided,
+        )
+        if direct is not None and (route is None or direct[0] <= route.cost_m):
+            return direct[1:]
+        if route is None:
+            return None
+        paths = {i: topology.edges[i].path for i in route.edge_ids}
+        closed = {i for i, path in paths.items() if not checked.is_drivable(path)}
+        if not closed:
+            begin = first[route.node_ids[0]]
+            end = last[route.node_ids[-1]]
+            parts = [begin.path, path_points(topology, route), end.path[::-1]]
+            return (
+                np.concatenate(parts),
+                begin.length_m - _length(begin.path),
+                end.length_m - _length(end.path),
+            )
+        avoided |= closed
+    return None
+
+
+def _on_one_edge(
+    checked: _Checked, starts: list[_Entry], goals: list[_Entry]
+) -> tuple[float, Array, float, float] | None:
+    """Length and points of the shortest drivable path along an edge that passes both ends."""
+    best: tuple[float, Array, float, float] | None = None
+    by_edge = {entry.edge_id: entry for entry in goals}
+    for start in starts:
+        goal = by_edge.get(start.edge_id)
+        if goal is None:
+            continue
+        low = min(start.index, goal.index)
+        path = checked.topology.edges[start.edge_id].path[low : max(start.index, goal.index) + 1]
+        length_m = start.length_m + _length(path) + goal.length_m
+        if (best is None or length_m < best[0]) and checked.is_drivable(path):
+            ordered = path if start.index <= goal.index else path[::-1]
+            best = (length_m, ordered, start.length_m, goal.length_m)
+    return best
+
+
+def _band(
+    patch: GridPatch,
+    path: Array,
+    access: list[tuple[_Surroundings, float]],
+    config: WavefrontConfig,
+) -> Band:
+    """Cells within _BAND_M of a path, and those between the ends and the graph."""
+    resolution = patch.frame.resolution
+    at = patch.frame.cells_of(path)
+    # The costs of its cells depend on obstacles beside the band.
+    beside_m = max(config.inflation_radius_m, config.robot_radius_m)
+    margin = math.ceil((_BAND_M + beside_m) / resolution) + 1
+    margin = max(margin, math.ceil(_ACCESS_M / resolution) + 1)
+    low = np.maximum(at.min(axis=0) - margin, 0)
+    high = np.minimum(at.max(axis=0) + margin + 1, patch.shape)
+    part = _crop(patch, *low.tolist(), *high.tolist())
+    cells = np.zeros(part.shape, dtype=np.bool_)
+    _paint_discs(cells, at - low, _BAND_M / resolution)
+    for around, length_m in access:
+        rows, cols = around.lengths_m.shape
+        row = around.row - int(low[0])
+        col = around.col - int(low[1])
+        cells[row : row + rows, col : col + cols] |= around.lengths_m <= length_m
+    return Band(part, cells)
+
+
+def _crop(patch: GridPatch, top: int, left: int, bottom: int, right: int) -> GridPatch:
+    return GridPatch(patch.frame.with_origin_at(top, left), patch.cells[top:bottom, left:right])
+
+
+def _length(path: Array) -> float:
+    return float(np.hypot(*np.diff(path, axis=0).T).sum())
+
+
+@kernel
+def _paint_discs(cells: Mask, centres: NDArray[np.int64], radius: float) -> None:
+    """Mark the cells (H, W) within a radius, cells, of a path of cells (K, 2).
+
+    Discs lie a third of their radius apart.
+    """
+    reach = int(radius)
+    last_row = -1000000
+    last_col = -1000000
+    for k in range(centres.shape[0]):
+        row = centres[k, 0]
+        col = centres[k, 1]
+        moved = max(abs(row - last_row), abs(col - last_col))
+        if 3 * moved < radius and k < centres.shape[0] - 1:
+            continue
+        last_row = row
+        last_col = col
+        for r in range(max(row - reach, 0), min(row + reach + 1, cells.shape[0])):
+            half = int(math.sqrt(radius * radius - (r - row) ** 2))
+            for c in range(max(col - half, 0), min(col + half + 1, cells.shape[1])):
+                cells[r, c] = True

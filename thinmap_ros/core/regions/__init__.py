@@ -1,0 +1,1 @@
+"""Rooms, corridors and halls of a map, and the doors between them."""

@@ -1,0 +1,242 @@
+"""Zhang-Suen thinning of a map that changes: for each cell, the sub-iteration that deletes it.
+
+A cell c is deleted at sub-iteration t = 1, 2, ... if it was not deleted before and the rule of t
+(odd: step 1, even: step 2) holds for those of its neighbours that exist at t: the ones with a
+deletion time of t or later. So the deletion times T solve, cell by cell,
+
+    T(c) = min { t >= 1 : rule(t, {n : T(n) >= t}) },
+
+KEPT where there is no such t, 0 if the cell is not free.
+
+Whether c is deleted at t depends only on which neighbours were deleted *before* t. Hence the
+solution is unique, it is exactly that of thinning the whole map at once, and after a change it is
+repaired in causal order: of all cells at which T and the right-hand side differ, take the one at
+which they first differ in time. All earlier times are final, so this cell gets its value, and only
+its neighbours can be inconsistent now, at later times. The order is that of LPA* (Koenig, Likhachev
+and Furcy, 2004) and of Ramalingam and Reps, 1996; causality takes the place of monotony. The
+skeleton is the cells with T = KEPT.
+Source: topological map paper section 2.1, steps 1 and 2.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.core.topology.layers.lattice import (
+    Cells,
+    Lattice,
+    cells_at,
+    find_neighbours,
+    is_inner,
+    moved,
+    shift,
+    sorted_unique,
+)
+from thinmap_ros.core.topology.thinning import KEPT
+
+_NEVER = 1 << 20
+_BUCKETS = 1 << 12  # times up to here are processed in order; later ones only take longer
+_SQUARE = 4  # cells of the last square of a part
+
+
+def _delays() -> NDArray[np.int64]:
+    """[t & 1, neighbours as bits]: sub-iterations from t until the rule holds; _NEVER."""
+    deletes = np.zeros((2, 256), dtype=np.bool_)
+    for code in range(256):
+        p = [code >> k & 1 for k in range(8)]  # p2 ... p9
+        rises = sum(p[k] < p[(k + 1) % 8] for k in range(8))
+        if 2 <= sum(p) <= 6 and rises == 1:
+            deletes[1, code] = p[0] * p[2] * p[4] == 0 and p[2] * p[4] * p[6] == 0
+            deletes[0, code] = p[0] * p[2] * p[6] == 0 and p[0] * p[4] * p[6] == 0
+    return np.where(deletes, 0, np.where(deletes[::-1], 1, _NEVER)).astype(np.int64)
+
+
+_DELAYS = _delays()
+
+
+def update_skeleton(lattice: Lattice, flipped: Cells) -> Cells:
+    """Repair the deletion times after cells (N,) became traversable, or ceased to be.
+
+    Returns the cells that enter or leave the skeleton, each once. They are not changed yet, so that
+    what was traced along the old skeleton can be removed.
+    """
+    return sorted_unique(_skeleton_changes(lattice, sorted_unique(_repair(lattice, flipped))))
+
+
+def skeleton_cells(lattice: Lattice, times: NDArray[np.int16], row: int, col: int) -> Cells:
+    """Cells of the skeleton by the deletion times (H, W) of all cells, the first at (row, col)."""
+    first = times[:-1, :-1]
+    square = (first > 0) & (first < KEPT) & (first == times[1:, 1:])
+    square &= (first == times[1:, :-1]) & (first == times[:-1, 1:])
+    places = np.concatenate((np.argwhere(times == KEPT), np.argwhere(square)))
+    return _kept_of(lattice, cells_at(lattice, places + (row, col)))
+
+
+@kernel
+def _kept_of(lattice: Lattice, cells: Cells) -> Cells:
+    """The cells among some (N,) that belong to the skeleton by the deletion times."""
+    found = np.empty(cells.size, dtype=np.int64)
+    count = 0
+    for at in cells:
+        if _is_kept(lattice, at):
+            found[count] = at
+            count += 1
+    return found[:count].copy()
+
+
+@inlined
+def _deletion_time(lattice: Lattice, at: int, near: Cells) -> int:
+    """Sub-iteration that deletes a cell, by the times of its neighbours; near (8,): scratch."""
+    cells = lattice.cells
+    if not cells[at]['free']:
+        return 0
+    find_neighbours(lattice, at, near)
+    for k in range(8):
+        near[k] = cells[near[k]]['time']
+    t = 1
+    while True:
+        code = 0
+        following = KEPT
+        for k in range(8):
+            if near[k] >= t:
+                code |= 1 << k
+                following = min(following, int(near[k]))
+        due = t + int(_DELAYS[t & 1, code])
+        if due <= following:
+            return due
+        if following == KEPT:
+            return KEPT
+        t = following + 1
+
+
+@kernel
+def _repair(lattice: Lattice, flipped: Cells) -> Cells:
+    """Make the times consistent again; returns the cells whose time changed, some repeatedly."""
+    cells = lattice.cells
+    first = np.full(_BUCKETS, -1, dtype=np.int64)
+    queue = np.empty((4 * flipped.size + 1024, 2), dtype=np.int64)  # cell, next of its bucket
+    touched = np.empty(4 * flipped.size + 1024, dtype=np.int64)
+    around = np.empty(8, dtype=np.int64)
+    near = np.empty(8, dtype=np.int64)
+    queued = 0
+    for at in flipped:
+        queued = _enqueue(first, queue, queued, at, 0)
+    changes = 0
+    now = 0
+    last = 0
+    while now <= last:
+        entry = first[now]
+        if entry < 0:
+            now += 1
+            continue
+        first[now] = queue[entry, 1]
+        at = queue[entry, 0]
+        time = _deletion_time(lattice, at, near)
+        if time == cells[at]['time']:
+            continue
+        if queue.shape[0] - queued < 10:
+            queue = np.concatenate((queue, np.empty_like(queue)))
+        key = _first_difference(time, cells[at]['time'])
+        if key > now:  # a neighbour has changed since: they differ only later now
+            queued = _enqueue(first, queue, queued, at, key)
+            last = max(last, key)
+            continue
+        if time > cells[at]['time']:
+            # Not deleted now; when it will be is not final. Until it is, it counts as kept: with
+            # its present estimate two cells could postpone each other again and again.
+            cells[at]['time'] = KEPT
+            if time < KEPT:
+                queued = _enqueue(first, queue, queued, at, time)
+                last = max(last, time)
+        else:
+            cells[at]['time'] = time
+        if changes == touched.size:
+            touched = np.concatenate((touched, np.empty_like(touched)))
+        touched[changes] = at
+        changes += 1
+        find_neighbours(lattice, at, around)
+        for k in range(8):
+            to = around[k]
+            if cells[to]['time'] <= now:  # deleted before anything changes here
+                continue
+            time = _deletion_time(lattice, to, near)
+            if time != cells[to]['time']:
+                key = _first_difference(time, cells[to]['time'])
+                queued = _enqueue(first, queue, queued, to, key)
+                last = max(last, key)
+    return touched[:changes].copy()
+
+
+@inlined
+def _first_difference(time: int, other: int) -> int:
+    """First sub-iteration in which it matters which of two times a cell has."""
+    return min(int(time), int(other), _BUCKETS - 1)
+
+
+@inlined
+def _enqueue(first: Cells, queue: Cells, queued: int, at: int, key: int) -> int:
+    queue[queued, 0] = at
+    queue[queued, 1] = first[key]
+    first[key] = queued
+    return queued + 1
+
+
+@inlined
+def _is_kept(lattice: Lattice, at: int) -> bool:
+    """Whether a cell is kept, or is the first of four cells that were all that was left of a part.
+
+    The paper's rules delete a square of 2 x 2 cells at once; nothing else vanishes completely.
+    """
+    cells = lattice.cells
+    time = cells[at]['time']
+    if time == KEPT or time == 0:
+        return bool(time == KEPT)
+    return bool(
+        cells[moved(lattice, at, 0, 1)]['time'] == time
+        and cells[moved(lattice, at, 1, 0)]['time'] == time
+        and _is_last_square(lattice, at)
+    )
+
+
+@kernel
+def _is_last_square(lattice: Lattice, at: int) -> bool:
+    """Whether four cells from this one on have its time, and the cells around them earlier ones."""
+    cells = lattice.cells
+    time = cells[at]['time']
+    for row in range(-1, 3):
+        for col in range(-1, 3):
+            other = cells[moved(lattice, at, row, col)]['time']
+            is_inside = 0 <= row <= 1 and 0 <= col <= 1
+            if is_inside and other != time:
+                return False
+            if not is_inside and other >= time:
+                return False
+    return True
+
+
+@kernel
+def _skeleton_changes(lattice: Lattice, touched: Cells) -> Cells:
+    """Cells that enter or leave the skeleton after the times of some cells (N,) changed."""
+    cells = lattice.cells
+    found = np.empty(touched.size * 2 + 1024, dtype=np.int64)
+    count = 0
+    for at in touched:
+        if found.size - count < 4 * _SQUARE + 1:
+            found = np.concatenate((found, np.empty_like(found)))
+        if cells[at]['time'] == KEPT and not cells[at]['kept']:
+            found[count] = at
+            count += 1
+        # It may also begin or end a last square to which it belongs, or which it touches.
+        is_easy = is_inner(at, 3)
+        for row in range(-2, 2):
+            for col in range(-2, 2):
+                to = at + shift(row, col) if is_easy else moved(lattice, at, row, col)
+                time = cells[to]['time']
+                if time == KEPT:
+                    continue
+                if is_easy and not cells[to]['kept'] and cells[to + 1]['time'] != time:
+                    continue
+                if _is_kept(lattice, to) != cells[to]['kept']:
+                    found[count] = to
+                    count += 1
+    return found[:count].copy()

@@ -1,0 +1,380 @@
+"""Free space of the whole map, kept up to date from the cells that change."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.patch import (
+    FREE_AT_MOST,
+    OCCUPIED_AT_LEAST,
+    GridPatch,
+)
+from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_PERCENT
+from thinmap_ros.core.grid.tiles import TILE
+from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.free_space import column_distance, known_free
+from thinmap_ros.core.topology.layers.deletion_times import skeleton_cells
+from thinmap_ros.core.topology.layers.lattice import (
+    COLS,
+    FREE,
+    OCCUPIED,
+    ROWS,
+    UNKNOWN,
+    Cells,
+    Lattice,
+    LatticeStore,
+    cell_at,
+    col_of,
+    moved,
+    row_of,
+)
+from thinmap_ros.core.topology.thinning import deletion_times
+
+_MIN_FRONTIER_CELLS = 3
+
+
+class FreeSpace:
+    """States of cells -> known free cells -> traversable cells, of the whole map.
+
+    Known is what is free, or an unknown gap between two free cells of a row or column: specks
+    between beams. A cell is traversable if every cell whose centre is nearer than the robot's
+    radius is known. The known cells of each disc are counted, so that a change costs the disc and
+    not the map. The rules are those of `free_space`.
+    Source: exploration paper section 2.1, "selection of free space"; the gaps are ours.
+    """
+
+    def __init__(self, config: TopologyConfig, resolution_m: float) -> None:
+        self._config = config
+        self._disc = _disc(config.robot_radius_m / resolution_m)
+        self._gap = int(config.max_unknown_gap_m / resolution_m + 1e-6)
+        self._reach = max(int(np.abs(self._disc).max()), 2 * self._gap) + 2
+        self._store = LatticeStore(self._reach)
+
+    @property
+    def lattice(self) -> Lattice:
+        """The cells, for kernels; valid until the next update."""
+        return self._store.view
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no cell has ever been known."""
+        return len(self.lattice.tiles) == 1
+
+    def fill(
+        self,
+        patch: GridPatch,
+        free: NDArray[np.bool_] | None,
+        row: int,
+        col: int,
+        lines: NDArray[np.bool_] | None = None,
+    ) -> Cells:
+        """Set all cells at once by a patch whose first cell is at (row, col).
+
+        The layer is empty before. free (H, W): traversable cells; None: all where the robot fits.
+        lines (H, W): cells that are thinned instead of these. Returns the cells of the skeleton.
+        """
+        reach = self._reach
+        cells = np.pad(patch.cells, reach, constant_values=UNKNOWN_PERCENT)
+        known = known_free(GridPatch(patch.frame, cells), self._config)
+        discs = _count_all_discs(known, _half_widths(self._disc))
+        self._store.add(row, col, patch.cells >= 0)
+        fits = discs == len(self._disc) if free is None else np.pad(free, reach)
+        times = deletion_times(fits if lines is None else np.pad(lines, reach))
+        columns = column_distance(known)
+        fields = _Fields(cells, known, fits, columns, discs, times)
+        _write_fields(self.lattice, fields, row - reach, col - reach)
+        return skeleton_cells(self.lattice, times, row - reach, col - reach)
+
+    def states(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Row and column (N, 2) of the tiles with known states, and these (N, TILE, TILE)."""
+        return self._store.states()
+
+    def update(self, percent: NDArray[np.int8], row: int, col: int) -> tuple[Cells, Cells]:
+        """Update cells (H, W) of the grid, the first at (row, col).
+
+        Returns the cells whose state changed, and those that became, or ceased to be, traversable.
+        """
+        self._store.add(row, col, percent >= 0)
+        lattice = self.lattice
+        changed = _set_states(lattice, percent, row, col)
+        known = _close_gaps(lattice, changed, self._gap)
+        _update_columns(lattice, known)
+        return changed, _count_discs(lattice, known, self._disc)
+
+
+class _Fields(NamedTuple):
+    """Values (H, W) of cells; percent: as in a patch of the grid."""
+
+    percent: NDArray[np.int8]
+    known: NDArray[np.bool_]
+    free: NDArray[np.bool_]
+    column: NDArray[np.int16]
+    discs: NDArray[np.int16]
+    time: NDArray[np.int16]
+
+
+def _disc(radius: float) -> Cells:
+    """Rows and columns (N, 2) of the cells nearer than a radius, in cells."""
+    reach = math.ceil(radius)
+    steps = np.arange(-reach, reach + 1)
+    places = np.stack(np.meshgrid(steps, steps, indexing='ij'), axis=-1).reshape(-1, 2)
+    inside = (places**2).sum(axis=1) < radius * radius - 1e-9
+    return np.ascontiguousarray(places[inside | (places == 0).all(axis=1)])
+
+
+def _half_widths(disc: Cells) -> Cells:
+    """Largest column of each row of a disc (N, 2), first to last row."""
+    rows = np.arange(disc[:, 0].min(), disc[:, 0].max() + 1)
+    return np.array([disc[disc[:, 0] == row, 1].max() for row in rows], dtype=np.int64)
+
+
+@kernel
+def _count_all_discs(known: NDArray[np.bool_], half_widths: Cells) -> NDArray[np.int16]:
+    """Known cells (H, W) within the disc around each cell."""
+    rows, cols = known.shape
+    counts = np.zeros((rows, cols), dtype=np.int16)
+    sums = np.zeros((rows, cols + 1), dtype=np.int32)
+    for row in range(rows):
+        for col in range(cols):
+            sums[row, col + 1] = sums[row, col] + known[row, col]
+    reach = half_widths.size // 2
+    for row in range(rows):
+        for k in range(half_widths.size):
+            source = row + k - reach
+            width = half_widths[k]
+            if not 0 <= source < rows:
+                continue
+            for col in range(cols):
+                high = sums[source, min(col + width + 1, cols)]
+                counts[row, col] += high - sums[source, max(col - width, 0)]
+    return counts
+
+
+@inlined
+def _state_of(percent: int) -> int:
+    if percent < 0:
+        return UNKNOWN
+    if percent <= FREE_AT_MOST:
+        return FREE
+    return OCCUPIED if percent >= OCCUPIED_AT_LEAST else UNKNOWN
+
+
+@kernel
+def _write_fields(lattice: Lattice, fields: _Fields, row: int, col: int) -> None:
+    """Set the cells (H, W) of tiles, the first at (row, col)."""
+    for i in range(fields.percent.shape[0]):
+        at = 0
+        for j in range(fields.percent.shape[1]):
+            if j == 0 or (col + j) % TILE == 0:
+                at = cell_at(lattice, row + i, col + j)
+            elif at > 0:
+                at += 1
+            if at > 0:
+                cell = lattice.cells[at]
+                cell['state'] = _state_of(fields.percent[i, j])
+                cell['known'] = fields.known[i, j]
+                cell['free'] = fields.free[i, j]
+                cell['column'] = fields.column[i, j]
+                cell['discs'] = fields.discs[i, j]
+                cell['time'] = fields.time[i, j]
+
+
+@kernel
+def _set_states(lattice: Lattice, percent: NDArray[np.int8], row: int, col: int) -> Cells:
+    """Set the states of cells (H, W), the first at (row, col); returns the cells that changed."""
+    changed = np.empty(percent.size, dtype=np.int64)
+    count = 0
+    for i in range(percent.shape[0]):
+        at = 0
+        for j in range(percent.shape[1]):
+            if j == 0 or (col + j) % TILE == 0:
+                at = cell_at(lattice, row + i, col + j)
+            elif at > 0:
+                at += 1
+            state = _state_of(percent[i, j])
+            if at > 0 and lattice.cells[at]['state'] != state:
+                lattice.cells[at]['state'] = state
+                changed[count] = at
+                count += 1
+    return changed[:count].copy()
+
+
+@inlined
+def _is_gap(lattice: Lattice, at: int, rows: int, cols: int, longest: int) -> bool:
+    """Whether an unknown cell is in a run of at most `longest` between two free cells."""
+    length = 1
+    for sign in (-1, 1):
+        to = moved(lattice, at, sign * rows, sign * cols)
+        while lattice.cells[to]['state'] == UNKNOWN and length <= longest:
+            to = moved(lattice, to, sign * rows, sign * cols)
+            length += 1
+        if lattice.cells[to]['state'] != FREE:
+            return False
+    return length <= longest
+
+
+@kernel
+def _close_gaps(lattice: Lattice, changed: Cells, gap: int) -> Cells:
+    """Update the known cells near changed cells; returns those that changed."""
+    found = np.empty(changed.size * (4 * gap + 2), dtype=np.int64)
+    count = 0
+    for at in changed:
+        for down in range(2):
+            for k in range(-gap, gap + 1):
+                to = moved(lattice, at, k * down, k * (1 - down))
+                state = lattice.cells[to]['state']
+                is_known = state == FREE
+                if state == UNKNOWN and gap > 0:
+                    is_known = _is_gap(lattice, to, 0, 1, gap) or _is_gap(lattice, to, 1, 0, gap)
+                if is_known != lattice.cells[to]['known']:
+                    lattice.cells[to]['known'] = is_known
+                    found[count] = to
+                    count += 1
+    return found[:count].copy()
+
+
+@kernel
+def _update_columns(lattice: Lattice, changed: Cells) -> None:
+    """Update the distances along columns to cells that are not known."""
+    cells = lattice.cells
+    for at in changed:
+        if not cells[at]['known']:
+            cells[at]['column'] = 0
+            for sign in (-1, 1):
+                k = 1
+                to = moved(lattice, at, sign, 0)
+                while cells[to]['column'] > k:
+                    cells[to]['column'] = k
+                    k += 1
+                    to = moved(lattice, to, sign, 0)
+            continue
+        top = moved(lattice, at, -1, 0)
+        above = 1
+        while cells[top]['known']:
+            top = moved(lattice, top, -1, 0)
+            above += 1
+        below = 1
+        to = moved(lattice, at, 1, 0)
+        while cells[to]['known']:
+            to = moved(lattice, to, 1, 0)
+            below += 1
+        to = moved(lattice, top, 1, 0)
+        for k in range(1 - above, below):
+            cells[to]['column'] = min(k + above, below - k)
+            to = moved(lattice, to, 1, 0)
+
+
+@kernel
+def _count_discs(lattice: Lattice, changed: Cells, disc: Cells) -> Cells:
+    """Update the counts and the traversable cells; returns those that changed."""
+    cells = lattice.cells
+    for at in changed:
+        gain = 1 if cells[at]['known'] else -1
+        for k in range(len(disc)):
+            cells[moved(lattice, at, disc[k, 0], disc[k, 1])]['discs'] += gain
+    flipped = np.empty(changed.size * len(disc), dtype=np.int64)
+    count = 0
+    for at in changed:
+        for k in range(len(disc)):
+            to = moved(lattice, at, disc[k, 0], disc[k, 1])
+            is_free = cells[to]['discs'] == len(disc)
+            if is_free != cells[to]['free']:
+                cells[to]['free'] = is_free
+                flipped[count] = to
+                count += 1
+    return flipped[:count].copy()
+
+
+@inlined
+def squared_clearance(lattice: Lattice, at: int) -> int:
+    """Squared distance, in cells, from a cell to the nearest one that is not known."""
+    best = np.int64(lattice.cells[at]['column']) ** 2
+    left = at
+    right = at
+    step = 1
+    while step * step < best:
+        left = moved(lattice, left, 0, -1)
+        right = moved(lattice, right, 0, 1)
+        near = np.int64(min(lattice.cells[left]['column'], lattice.cells[right]['column']))
+        best = min(best, step * step + near * near)
+        step += 1
+    return int(best)
+
+
+@kernel
+def borders_unknown(lattice: Lattice, at: int, squared: int) -> bool:
+    """Whether the free space around a cell ends at unknown cells, not only at obstacles.
+
+    squared: squared clearance of the cell; some cells of the frontier within it, and one cell more,
+    are enough.
+    """
+    reach = int(math.sqrt(squared) + 1.0)
+    limit = (math.sqrt(squared) + 1.0) ** 2
+    row = row_of(lattice, at)
+    col = col_of(lattice, at)
+    count = 0
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            if i * i + j * j > limit:
+                continue
+            to = cell_at(lattice, row + i, col + j)
+            if not lattice.cells[to]['known']:
+                continue
+            for k in range(0, 8, 2):
+                beside = lattice.cells[moved(lattice, to, ROWS[k], COLS[k])]
+                if beside['state'] == UNKNOWN and not beside['known']:
+                    count += 1
+                    break
+            if count >= _MIN_FRONTIER_CELLS:
+                return True
+    return False
+
+
+@kernel
+def nearest_free(lattice: Lattice, row: int, col: int, reach: int) -> int:
+    """The traversable cell nearest to a cell, within a reach in cells; 0: none."""
+    at = cell_at(lattice, row, col)
+    if lattice.cells[at]['free']:
+        return at
+    best = 0
+    best_squared = reach * reach + 1
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            squared = i * i + j * j
+            if squared < best_squared:
+                to = cell_at(lattice, row + i, col + j)
+                if lattice.cells[to]['free']:
+                    best = to
+                    best_squared = squared
+    return best
+
+
+@kernel
+def nearest_kept(lattice: Lattice, at: int, reach: int) -> int:
+    """The skeleton cell that the fewest steps over traversable cells lead to; 0: none."""
+    side = 2 * reach + 1
+    first_row = row_of(lattice, at) - reach
+    first_col = col_of(lattice, at) - reach
+    seen = np.zeros(side * side, dtype=np.bool_)
+    queue = np.empty(side * side, dtype=np.int64)
+    queue[0] = at
+    count = 1
+    head = 0
+    while head < count:
+        cell = queue[head]
+        head += 1
+        if lattice.cells[cell]['kept']:
+            return int(cell)
+        for k in range(8):
+            to = moved(lattice, cell, ROWS[k], COLS[k])
+            row = row_of(lattice, to) - first_row
+            col = col_of(lattice, to) - first_col
+            inside = 0 <= row < side and 0 <= col < side
+            if inside and lattice.cells[to]['free'] and not seen[row * side + col]:
+                seen[row * side + col] = True
+                queue[count] = to
+                count += 1
+    return 0

@@ -1,0 +1,162 @@
+"""Layers from the grid to the edges of the map; each receives the cells that changed."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.layers.deletion_times import update_skeleton
+from thinmap_ros.core.topology.layers.free_space import FreeSpace
+from thinmap_ros.core.topology.layers.lattice import Cells, Lattice, rows_and_cols
+from thinmap_ros.core.topology.layers.pruning import (
+    COLUMNS,
+    Limits,
+    Paths,
+    edge_cells,
+    find_paths,
+    measure,
+    node_hash,
+    prune,
+)
+from thinmap_ros.core.topology.layers.robot_places import RobotPlaces
+from thinmap_ros.core.topology.layers.skeleton_graph import CELL, NONE, A, SkeletonGraph, components
+from thinmap_ros.core.topology.registry import Changes
+
+_NOWHERE = np.array([0, 0, -1, -1])
+Place = tuple[int, int]  # row and column of a cell
+
+
+class Span(NamedTuple):
+    """A rectangle of cells."""
+
+    row: int
+    col: int
+    rows: int
+    cols: int
+
+    def bounds_m(self, lattice: GridFrame) -> Array:
+        """x, y, end x and end y, m, map frame."""
+        low = np.array([lattice.origin_x, lattice.origin_y])
+        corners = np.array([self.col, self.row, self.col + self.cols, self.row + self.rows])
+        return np.concatenate((low, low)) + corners * lattice.resolution
+
+
+class Layers:
+    """Free space, deletion times and skeleton graph of the whole map, and the robot's places.
+
+    `lattice`: the cells, valid until the next update.
+    """
+
+    def __init__(self, resolution_m: float, config: TopologyConfig) -> None:
+        self._space = FreeSpace(config, resolution_m)
+        self._skeleton = SkeletonGraph(self._space.lattice)
+        self._limits = Limits.of(config, resolution_m)
+        self._robot = RobotPlaces(round(config.seed_search_radius_m / resolution_m))
+        self._measured = np.full((0, COLUMNS), NONE, dtype=np.int64)
+        # Since the last changes of the edges: cells of the grid that changed.
+        self._changed: Cells = np.empty(0, dtype=np.int64)
+        self._flipped: Cells = np.empty(0, dtype=np.int64)
+        self._has_new_place = False
+
+    @property
+    def lattice(self) -> Lattice:
+        """The cells, for kernels; valid until the next update."""
+        return self._space.lattice
+
+    def fill(
+        self,
+        patch: GridPatch,
+        place: Place,
+        free: NDArray[np.bool_] | None = None,
+        lines: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Set all cells at once by a patch whose first cell is at a place; empty before.
+
+        free (H, W): traversable cells; None: all where the robot fits. lines (H, W): cells that are
+        thinned instead of these.
+        """
+        kept = self._space.fill(patch, free, *place, lines)
+        self._skeleton.update(self.lattice, kept)
+
+    def update_free_space(self, window: GridPatch, place: Place) -> int:
+        """Update the free space by a window whose first cell is at a place.
+
+        Returns the number of cells that changed.
+        """
+        if self._space.is_empty:
+            self.fill(window, place)
+            return window.cells.size
+        self._changed, self._flipped = self._space.update(window.cells, *place)
+        return self._changed.size
+
+    def update_skeleton(self) -> None:
+        """Thin the free space where it changed, and trace the skeleton again there."""
+        changed = update_skeleton(self.lattice, self._flipped)
+        self._flipped = self._flipped[:0]
+        self._skeleton.update(self.lattice, changed)
+
+    def mark_robot(self, place: Place) -> None:
+        """Add a place of the robot: only parts of the map where it has been are published."""
+        self._has_new_place |= self._robot.add(self.lattice, *place)
+
+    def has_new_parts(self) -> bool:
+        """Whether the robot has been at a new place since the last changes of the edges."""
+        return self._has_new_place
+
+    def robot_places(self) -> Cells:
+        """Row and column (N, 2) of the places of the robot."""
+        return rows_and_cols(self.lattice, self._robot.cells)
+
+    def states(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Row and column (N, 2) of the tiles with known states, and these (N, TILE, TILE)."""
+        return self._space.states()
+
+    def edge_changes(self, known: set[int], is_everywhere: bool = False) -> Changes:
+        """Changes of the edges since those with the known hashes.
+
+        is_everywhere: also parts in which the robot has not been.
+        """
+        places = rows_and_cols(self.lattice, self._changed)
+        self._changed = self._changed[:0]
+        self._has_new_place = False
+        paths, degree = self._paths(places)
+        arrays = self._skeleton.arrays
+        is_shown = arrays.vertices[:, CELL] != NONE
+        if not is_everywhere:
+            is_shown &= self._is_reached()
+        edges = paths.edges[is_shown[paths.ends[paths.edges, 0]]]
+        rows = dict(zip(paths.hashes[edges].tolist(), edges.tolist(), strict=True))
+        lone = arrays.vertices[(degree == 0) & is_shown, CELL].tolist()
+        cells = {int(node_hash(arrays, cell)): cell for cell in lone}
+        fresh = {key: edge_cells(arrays, paths, rows[key]) for key in rows.keys() - known}
+        fresh |= {key: np.array([cells[key]]) for key in cells.keys() - known}
+        return Changes(fresh, known - rows.keys() - cells.keys(), places)
+
+    def _paths(self, places: Cells) -> tuple[Paths, Cells]:
+        """Paths between nodes, and the degree of each vertex (V,); places (K, 2) have changed."""
+        arrays = self._skeleton.arrays
+        missing = len(arrays.vertices) - len(self._measured)
+        if missing > 0:
+            blank = np.full((missing, COLUMNS), NONE, dtype=np.int64)
+            self._measured = np.concatenate((self._measured, blank))
+        box = _NOWHERE
+        if len(places):
+            box = np.concatenate((places.min(axis=0), places.max(axis=0)))
+        measure(arrays, self._measured, box)
+        alive, degree = prune(arrays, self._measured, self._limits)
+        paths = find_paths(arrays, self._measured, alive, degree, self._limits.merge_distance)
+        return paths, degree
+
+    def _is_reached(self) -> NDArray[np.bool_]:
+        """Whether each vertex (V,) belongs to a part in which the robot has been."""
+        arrays = self._skeleton.arrays
+        part = components(arrays)
+        owners = self._robot.owners(self.lattice)
+        reached = np.zeros(part.max(initial=0) + 1, dtype=np.bool_)
+        reached[part[arrays.chains[owners[owners > 0] - 1, A]]] = True
+        reached[part[-owners[owners < 0] - 1]] = True
+        return np.asarray(reached[part])

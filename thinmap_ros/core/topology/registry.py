@@ -1,0 +1,325 @@
+"""Ids that stay: the published map, changed only where edges of the skeleton graph changed."""
+
+import math
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.corners import corners_between, with_middles
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.layers.clearances import (
+    box_of,
+    least_between,
+    squared_clearances,
+    touched_boxes,
+)
+from thinmap_ros.core.topology.layers.lattice import Cells, Lattice, rows_and_cols
+
+_OTHER_KIND = 0.5  # share of node_match_radius_m by which a node of another kind is farther away
+_LONGEST_UNEVEN_M = 8.0
+_EVEN_M = 0.5
+_NOWHERE = np.array([[0, 0, -1, -1]])
+_MORE_BOXES = 64
+Place = tuple[int, int]  # cell; hash of the edge of whose path it is a corner, or 0
+
+
+class _Limits(NamedTuple):
+    """Robot radius, and the longest edge that is not straight and `even` wide, all in cells."""
+
+    radius: float
+    longest: float
+    even: float
+
+
+@dataclass(eq=False)
+class _Passage:
+    """A path between two vertices as published: cells, squared clearances, ids of its edges.
+
+    places (K, 2): rows and columns of the cells; stops: indices of its first cell, of its corners,
+    and of its last cell.
+    """
+
+    cells: Cells
+    places: Cells
+    squared: Cells
+    stops: Cells
+    edges: list[int] = field(default_factory=list)
+
+    @staticmethod
+    def of(lattice: Lattice, cells: Cells, limits: _Limits) -> '_Passage':
+        # The line test asks whether the line stays in the room around this very path. A line that
+        # is clear in the grid is not enough: a path through two rooms would become a line along the
+        # corridor.
+        squared = squared_clearances(lattice, cells)
+        places = rows_and_cols(lattice, cells)
+        clearances = np.sqrt(squared)
+        room = clearances - limits.radius
+        stops = corners_between(places, room, np.array([0, cells.size - 1]))
+        if cells.size > limits.longest:
+            middles = with_middles(places, stops, clearances, limits.longest, limits.even)
+            # The lines to the middles are other lines.
+            stops = corners_between(places, room, middles)
+        return _Passage(cells, places, squared, stops)
+
+    @property
+    def corners(self) -> list[int]:
+        """Cells of the corner nodes."""
+        return [int(cell) for cell in self.cells[self.stops[1:-1]]]
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        """Cells of its first and last node."""
+        return int(self.cells[0]), int(self.cells[-1])
+
+    def is_same(self, other: '_Passage') -> bool:
+        """Whether two measurements of one path publish the same."""
+        if not np.array_equal(self.stops, other.stops):
+            return False
+        if not np.array_equal(self.squared[self.stops], other.squared[other.stops]):
+            return False
+        own = least_between(self.squared, self.stops)
+        return np.array_equal(own, least_between(other.squared, other.stops))
+
+
+class _Boxes:
+    """For each path the box in which changed cells may concern it."""
+
+    def __init__(self) -> None:
+        self._boxes = np.empty((0, 4), dtype=np.int64)  # rows that are not used are empty boxes
+        self._unused: list[int] = []
+        self._hashes: dict[int, int] = {}
+        self._rows: dict[int, int] = {}
+
+    def put(self, number: int, box: Cells) -> None:
+        """Set the box of the path with a hash."""
+        if not self._unused:
+            count = len(self._boxes)
+            self._boxes = np.concatenate((self._boxes, np.tile(_NOWHERE, (count + _MORE_BOXES, 1))))
+            self._unused += range(count, len(self._boxes))
+        row = self._unused.pop()
+        self._boxes[row] = box
+        self._hashes[row] = number
+        self._rows[number] = row
+
+    def remove(self, number: int) -> None:
+        """Remove the box of a path."""
+        row = self._rows.pop(number)
+        del self._hashes[row]
+        self._unused.append(row)
+        self._boxes[row] = _NOWHERE
+
+    def touched(self, places: Cells) -> list[int]:
+        """Hashes of the paths that changed cells (K, 2) may concern."""
+        if not len(places):
+            return []
+        rows = np.flatnonzero(touched_boxes(self._boxes, places))
+        return [self._hashes[row] for row in rows.tolist()]
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """Changes of the edges of the skeleton graph, by the hashes of their paths.
+
+    fresh: cells of new paths (one cell: a node without edges); gone: paths that no longer exist;
+    places (K, 2): rows and columns of the cells of the grid that changed.
+    """
+
+    fresh: dict[int, Cells]
+    gone: set[int]
+    places: Cells
+
+
+class Registry:
+    """The published map, and which of its ids belong to which paths (by hash) and cells.
+
+    next_id: smallest number that no node or edge has had.
+    """
+
+    def __init__(
+        self,
+        frame: GridFrame,
+        config: TopologyConfig,
+        predecessor: TopologicalMap | None = None,
+        next_id: int = 1,
+    ) -> None:
+        """predecessor: map whose ids continue, its nodes at the places where they are now."""
+        self.map = TopologicalMap()
+        self.next_id = next_id
+        self._predecessor = predecessor
+        self._frame = frame
+        self._match_radius_m = config.node_match_radius_m
+        lengths_m = (config.robot_radius_m, _LONGEST_UNEVEN_M, _EVEN_M)
+        self._limits = _Limits(*(length_m / frame.resolution for length_m in lengths_m))
+        self._passages: dict[int, _Passage] = {}
+        self._nodes: dict[Place, int] = {}
+        self._boxes = _Boxes()
+
+    @property
+    def hashes(self) -> set[int]:
+        """Hashes of the published paths."""
+        return set(self._passages)
+
+    def update(self, lattice: Lattice, changes: Changes) -> bool:
+        """Publish the changes; returns whether there were any.
+
+        A new node gets the id of a removed one within node_match_radius_m, nearest pairs
+        first; so does an edge between the same nodes.
+        """
+        new = {
+            number: _Passage.of(lattice, cells, self._limits)
+            for number, cells in changes.fresh.items()
+        }
+        new |= self._measured_again(lattice, changes)
+        gone = changes.gone | (new.keys() & self._passages.keys())
+        if not new and not gone:
+            return False
+        loose = {cell for number in gone for cell in self._passages[number].ends}
+        old_edges = self._remove_edges(gone)
+        kept = {cell for passage in new.values() for cell in passage.ends}
+        old_nodes = self._remove_nodes(gone, loose - kept)
+        if self._predecessor is not None:
+            old_edges += self._predecessor.edges.values()
+            old_nodes += self._predecessor.nodes.values()
+            self._predecessor = None
+        wanted = {(cell, 0) for cell in kept}
+        for number, passage in new.items():
+            wanted |= {(cell, number) for cell in passage.corners}
+        self._put_nodes(lattice, wanted - self._nodes.keys(), old_nodes)
+        self._put_passages(new, old_edges)
+        for cell in loose | kept:
+            if (cell, 0) in self._nodes:
+                self._put_vertex(lattice, cell)
+        return True
+
+    def _measured_again(self, lattice: Lattice, changes: Changes) -> dict[int, _Passage]:
+        """Paths whose corners or clearances are changed by changed cells around them."""
+        new = {}
+        for number in self._boxes.touched(changes.places):
+            if number in self._passages and number not in changes.gone:
+                again = _Passage.of(lattice, self._passages[number].cells, self._limits)
+                if not again.is_same(self._passages[number]):
+                    new[number] = again
+        return new
+
+    def _remove_edges(self, gone: set[int]) -> list[Edge]:
+        """Remove the edges of paths from the map."""
+        old = [self.map.edges[edge] for number in gone for edge in self._passages[number].edges]
+        for edge in old:
+            self.map.drop_edge(edge.id)
+        return old
+
+    def _remove_nodes(self, gone: set[int], loose: set[int]) -> list[Node]:
+        """Remove the corners of paths, and vertices without edges, from the map."""
+        places: list[Place] = []
+        for number in gone:
+            self._boxes.remove(number)
+            places += [(cell, number) for cell in self._passages.pop(number).corners]
+        for cell in loose:
+            if not self.map.edges_at(self._nodes[cell, 0]):
+                places.append((cell, 0))
+        old = [self.map.nodes[self._nodes.pop(place)] for place in places]
+        for node in old:
+            self.map.drop_node(node.id)
+        return old
+
+    def _put_nodes(self, lattice: Lattice, fresh: set[Place], old: list[Node]) -> None:
+        """Put new nodes into the map, with the ids of old ones that they continue."""
+        if not fresh:
+            return
+        array = np.array(list(fresh), dtype=np.int64)
+        rows_cols = rows_and_cols(lattice, array[:, 0])
+        order = np.lexsort((array[:, 1], rows_cols[:, 1], rows_cols[:, 0]))
+        places = [(int(cell), int(number)) for cell, number in array[order]]
+        nodes = [
+            self._node(0, NodeKind.CORNER if number else NodeKind.END, lattice, cell)
+            for cell, number in places
+        ]
+        ids = self._continued(nodes, old)
+        for k, place in enumerate(places):
+            self._nodes[place] = ids.get(k) or self._new_id()
+            self.map.put_node(replace(nodes[k], id=self._nodes[place]))
+
+    def _continued(self, fresh: list[Node], old: list[Node]) -> dict[int, int]:
+        """Ids of old nodes by the index of the new node that continues each."""
+        if not fresh or not old:
+            return {}
+        new_xy, old_xy = (np.array([(node.x, node.y) for node in some]) for some in (fresh, old))
+        distance = np.hypot(*np.moveaxis(new_xy[:, None] - old_xy, 2, 0))
+        corner, old_corner = (
+            np.array([node.kind is NodeKind.CORNER for node in some]) for some in (fresh, old)
+        )
+        penalty = _OTHER_KIND * self._match_radius_m * (corner[:, None] != old_corner)
+        cost = distance + penalty * (distance > 0.1 * self._frame.resolution)
+        pairs = np.argwhere(distance <= self._match_radius_m)
+        ids: dict[int, int] = {}
+        used: set[int] = set()
+        for i, j in pairs[np.argsort(cost[pairs[:, 0], pairs[:, 1]], kind='stable')].tolist():
+            if i not in ids and old[j].id not in used:
+                ids[i] = old[j].id
+                used.add(old[j].id)
+        return ids
+
+    def _put_passages(self, new: dict[int, _Passage], old: list[Edge]) -> None:
+        """Put the edges of new paths into the map."""
+        between: dict[tuple[int, int], list[Edge]] = {}
+        for edge in old:
+            between.setdefault((min(edge.a, edge.b), max(edge.a, edge.b)), []).append(edge)
+        for number, passage in new.items():
+            self._passages[number] = passage
+            self._boxes.put(number, box_of(passage.places, passage.squared))
+            if passage.cells.size > 1:
+                self._put_edges(number, passage, between)
+
+    def _put_edges(
+        self, number: int, passage: _Passage, between: dict[tuple[int, int], list[Edge]]
+    ) -> None:
+        """Put the edges of a path into the map, with the ids of old ones between the same nodes."""
+        owners = [0, *[number] * (len(passage.stops) - 2), 0]
+        cells = passage.cells[passage.stops].tolist()
+        ids = [self._nodes[place] for place in zip(cells, owners, strict=True)]
+        points = self._frame.centres_of(passage.places)
+        least = least_between(passage.squared, passage.stops).tolist()
+        stops = pairwise(passage.stops.tolist())
+        for (a, b), (first, last), squared in zip(pairwise(ids), stops, least, strict=True):
+            path = points[first : last + 1]
+            edge_id = _taken_over(between.get((min(a, b), max(a, b)), []), path)
+            length = float(np.hypot(*np.diff(path, axis=0).T).sum())
+            clearance = math.sqrt(squared) * self._frame.resolution
+            edge = Edge(edge_id or self._new_id(), a, b, path, length, clearance)
+            self.map.put_edge(edge)
+            passage.edges.append(edge.id)
+
+    def _put_vertex(self, lattice: Lattice, cell: int) -> None:
+        """Update the kind and the clearance of the node of a vertex."""
+        node_id = self._nodes[cell, 0]
+        degree = sum(1 + (edge.a == edge.b) for edge in self.map.edges_at(node_id))
+        kind = NodeKind.BRANCH
+        if degree <= 2:
+            kind = NodeKind.END if degree < 2 else NodeKind.CORNER
+        node = self._node(node_id, kind, lattice, cell)
+        if node != self.map.nodes[node_id]:
+            self.map.put_node(node)
+
+    def _node(self, node_id: int, kind: NodeKind, lattice: Lattice, cell: int) -> Node:
+        cells = np.array([cell])
+        x, y = self._frame.centres_of(rows_and_cols(lattice, cells))[0].tolist()
+        squared = float(squared_clearances(lattice, cells)[0])
+        return Node(node_id, kind, x, y, math.sqrt(squared) * self._frame.resolution)
+
+    def _new_id(self) -> int:
+        self.next_id += 1
+        return self.next_id - 1
+
+
+def _taken_over(same: list[Edge], path: Array) -> int:
+    """Id of the old edge between the same nodes whose middle is nearest; 0: none. It is removed."""
+    if not same:
+        return 0
+    middle = path[len(path) // 2]
+    middles = np.array([edge.path[len(edge.path) // 2] for edge in same])
+    return same.pop(int(np.hypot(*(middles - middle).T).argmin())).id

@@ -1,0 +1,106 @@
+"""Rooms, corridors, halls and doors of the map, published while it grows."""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+from rclpy.clock import Clock, ClockType
+
+from thinmap_msgs.msg import RegionArray
+from thinmap_ros.core.config import Config, parameter, part
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.regions.config import RegionConfig
+from thinmap_ros.core.regions.membership import membership_of
+from thinmap_ros.core.regions.region_map import RegionMap
+from thinmap_ros.core.regions.tracker import RegionTracker
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.nodes.mapping.region_messages import region_array_msg
+from thinmap_ros.ros import parameters, qos
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+
+_POLL_S = 0.1
+
+
+@dataclass(frozen=True)
+class RegionUpdatesConfig(Config):
+    """When the regions are computed, and what counts as one."""
+
+    region_update_period_s: float = parameter(
+        5.0,
+        'Least time between two updates of the topic regions (s). Raise it for maps of more than '
+        '5000 m2 on a slow computer, lower it for names of rooms as soon as they are seen. '
+        '0: no regions.',
+        low=0.0,
+        high=3600.0,
+    )
+    regions: RegionConfig = part(RegionConfig)
+
+
+class RegionUpdates:
+    """/regions out: all regions of the newest grid, with nodes and edges in them.
+
+    Regions are computed in a thread of their own, so that no scan waits for them.
+    """
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        frame_id: str,
+        robot_radius_m: float,
+        topology: Callable[[], TopologicalMap],
+    ) -> None:
+        """Declare the parameters; topology: returns the present graph, in the frame frame_id."""
+        self._node = node
+        self._frame_id = frame_id
+        self._topology = topology
+        config = parameters.declare_config(node, RegionUpdatesConfig)
+        self._config = replace(config.regions, robot_radius_m=robot_radius_m)
+        self._tracker = RegionTracker(self._config)
+        self._newest: tuple[int, GridPatch] | None = None
+        self._pending: Future[RegionMap] | None = None
+        self._pending_ns = 0
+        if config.region_update_period_s > 0.0:
+            self._worker = ThreadPoolExecutor(1, thread_name_prefix='regions')
+            self._publisher = node.create_publisher(RegionArray, 'regions', qos.LATCHED)
+            wall = Clock(clock_type=ClockType.STEADY_TIME)
+            node.create_active_timer(config.region_update_period_s, self._begin, clock=wall)
+            node.create_active_timer(_POLL_S, self._publish, clock=wall)
+
+    @property
+    def config(self) -> RegionConfig:
+        """What counts as a region."""
+        return self._config
+
+    @property
+    def tracker(self) -> RegionTracker:
+        """The regions and their ids."""
+        return self._tracker
+
+    def reset(self, tracker: RegionTracker | None = None) -> None:
+        """Forget the grid, and continue with the ids of a tracker; None: of none."""
+        self._tracker = tracker or RegionTracker(self._config)
+        self._pending = None
+        self._newest = None
+
+    def add_grid(self, stamp_ns: int, patch: GridPatch) -> None:
+        """The newest grid, whose regions are to be published."""
+        self._newest = (stamp_ns, patch)
+
+    def _begin(self) -> None:
+        """Begin to compute the regions of the newest grid."""
+        if self._newest is None or self._pending is not None:
+            return
+        self._pending_ns, patch = self._newest
+        self._newest = None
+        self._pending = self._worker.submit(self._tracker.update, patch)
+
+    def _publish(self) -> None:
+        """Publish the regions that were computed, with the nodes and edges of the present graph."""
+        if self._pending is None or not self._pending.done():
+            return
+        regions = self._pending.result()
+        self._pending = None
+        with self._node.diagnostics.time_step('regions published'):
+            membership = membership_of(self._topology(), regions)
+            message = region_array_msg(membership, self._frame_id, self._pending_ns)
+        self._publisher.publish(message)
