@@ -5,6 +5,7 @@ import pytest
 from thinmap_ros.baselines.exploration import NearestFrontier
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
 from thinmap_ros.core.exploration.strategy import Strategy
 from thinmap_ros.strategies import DEFAULT, NAMES, make_strategy
 
@@ -42,9 +43,9 @@ def test_the_config_is_of_the_own_strategies():
     first = make_strategy(DEFAULT, config)
     paper = make_strategy('paper', config)
     assert isinstance(first, Explorer)
-    assert isinstance(paper, Explorer)
     assert first.config == config
-    assert (paper.config.mode, paper.config.probability_threshold) == ('paper', 0.8)
+    assert isinstance(paper, PaperExplorer)
+    assert paper.config.probability_threshold == 0.8
     assert isinstance(make_strategy('nearest_frontier', config), NearestFrontier)
 
 

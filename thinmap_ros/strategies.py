@@ -5,12 +5,12 @@ that takes nothing and returns a `core.exploration.strategy.Strategy`.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from importlib import import_module
 
 from thinmap_ros.core.errors import ConfigError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
 from thinmap_ros.core.exploration.strategy import Strategy
 
 DEFAULT = 'position_probability'
@@ -22,6 +22,7 @@ _BASELINES = {
     'explore_lite': 'ExploreLite',
     'information_gain': 'InformationGain',
     'distance_advantage': 'DistanceAdvantage',
+    'bounded_tour': 'BoundedTour',
 }
 NAMES = (DEFAULT, _PAPER, *_BASELINES)
 _EXPECTED = f'expected one of {", ".join(NAMES)}, or package.module:factory'
@@ -52,7 +53,7 @@ def _factory(name: str, config: ExplorerConfig) -> Callable[[], object]:
     if name == DEFAULT:
         return partial(Explorer, config)
     if name == _PAPER:
-        return partial(Explorer, replace(config, mode=_PAPER))
+        return partial(PaperExplorer, config)
     if name in _BASELINES:
         return _imported(name, 'thinmap_ros.baselines.exploration', _BASELINES[name])
     module, colon, attribute = name.partition(':')

@@ -1,6 +1,7 @@
 """Baseline strategies: each finishes a small world, and chooses targets as documented."""
 
 import math
+from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from thinmap_ros.baselines.exploration import (
     InformationGain,
     NearestFrontier,
     VisitAllEndNodes,
+    shortest_rest,
 )
 from thinmap_ros.baselines.frontier_map import Frontier
 from thinmap_ros.closed_loop import Options
@@ -59,8 +61,8 @@ def test_the_literal_scheme_sets_out_and_stops_by_itself() -> None:
 def after_a_look(strategy: FrontierExplorer, cells: np.ndarray, pose: np.ndarray) -> list[Frontier]:
     """Frontiers of a map as the strategy finds them from a pose."""
     scan = Scan.create(0, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
-    strategy.map.update(GridPatch(GridFrame(0.0, 0.0, 0.1), cells.astype(np.int8)), scan, pose)
-    return strategy.map.find(pose)
+    strategy.finder.update(GridPatch(GridFrame(0.0, 0.0, 0.1), cells.astype(np.int8)), scan, pose)
+    return strategy.finder.find(pose)
 
 
 def corridor() -> np.ndarray:
@@ -210,3 +212,17 @@ def test_who_drives_along_the_graph_goes_back_where_it_came_through() -> None:
         ]
     assert min(middles[NearestFrontier]) > 6.2
     assert min(middles[VisitAllEndNodes]) < 1.0
+
+
+@pytest.mark.parametrize('count', [1, 2, 5, 6])
+def test_the_bounded_tour_is_the_shortest_of_all_orders(count: int) -> None:
+    places = np.random.default_rng(count).random((count, 2))
+    between = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+    expected = [
+        min(
+            sum(between[a, b] for a, b in pairwise((first, *order)))
+            for order in permutations(set(range(count)) - {first})
+        )
+        for first in range(count)
+    ]
+    assert shortest_rest(between) == pytest.approx(expected)

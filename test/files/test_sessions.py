@@ -11,6 +11,8 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, pose
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.topology.builder import TopologyBuilder
@@ -222,15 +224,17 @@ def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
     explorer = Explorer()
     stem = str(tmp_path / 'room')
     assert EXPLORATION.load_optional(stem) is None
-    explorer.surveyor.follow({7: (1.0, 2.0), 9: (3.0, 2.5)})
-    explorer.surveyor.tracker.tracks[9].probability = 0.8
+    seen = np.full((60, 60), -1, dtype=np.int8)
+    seen[:40, :40] = 0
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), seen)
+    scan = Scan.create(0, np.full(181, np.inf), -1.57, math.radians(1.0), 0.05, 8.0)
+    explorer.step(TopologicalMap(), patch, scan, pose(2.0, 2.0, 0.0))
     EXPLORATION.save(stem, explorer)
     again = EXPLORATION.load_optional(stem)
     assert again is not None
-    assert {i: (t.x, t.y, t.probability) for i, t in again.surveyor.tracker.tracks.items()} == {
-        7: (1.0, 2.0, 0.5),
-        9: (3.0, 2.5, 0.8),
-    }
+    saved = explorer.state()
+    assert len(saved['places'])
+    assert all((again.state()[name] == array).all() for name, array in saved.items())
     (tmp_path / 'room.exploration.npz').write_bytes(b'no archive')
     with pytest.raises(InputError, match=r'room\.exploration\.npz'):
         EXPLORATION.load_optional(stem)

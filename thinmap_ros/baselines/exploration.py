@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.baselines.frontier_map import Frontier, FrontierMap
+from thinmap_ros.baselines.frontier_map import Frontier, FrontierFinder
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.strategy import (
     FIRST_FRONTIER_ID,
@@ -89,10 +89,10 @@ class FrontierExplorer(ABC):
 
     def __init__(self, config: TargetConfig | None = None) -> None:
         self.config = config or TargetConfig()
-        self.map = FrontierMap()
+        self.finder = FrontierFinder()
         self.target: Frontier | None = None
         self._survey_ns = 0
-        self._frame = self.map.borders.frame
+        self._frame = self.finder.map.frame
         self._at_goal = self._nothing_left = self._number = 0
         self._failures: list[tuple[float, float]] = []
 
@@ -104,11 +104,11 @@ class FrontierExplorer(ABC):
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
         """Choose a target; see core/exploration/strategy.Strategy."""
-        self.map.update(patch, scan, T_map_base)
+        self.finder.update(patch, scan, T_map_base)
         self._drop_unchanged_target(T_map_base)
         if self._is_due(scan.stamp_ns):
             self._survey_ns = scan.stamp_ns
-            self._frame = self.map.borders.frame
+            self._frame = self.finder.map.frame
             self._choose(T_map_base)
         self._nothing_left = self._nothing_left + 1 if self.target is None else 0
         return _decision(
@@ -122,21 +122,21 @@ class FrontierExplorer(ABC):
     def target_failed(self, reason: str) -> None:
         """Store the position of a target that could not be reached."""
         if self.target is not None:
-            self._failures.append(
-                (float(self.target.viewpoint[0]), float(self.target.viewpoint[1]))
-            )
+            self._failures.append(_place(self.target.viewpoint))
         self.target = None
 
     def _is_due(self, stamp_ns: int) -> bool:
         gone = (
             self.target is None
-            or self._frame != self.map.borders.frame
-            or not self.map.is_open(self.target)
+            or self._frame != self.finder.map.frame
+            or not self.finder.is_open(self.target)
         )
         return gone or stamp_ns - self._survey_ns >= SECOND_NS * self.config.choice_period_s
 
     def _choose(self, T_map_base: Array) -> None:
-        left = [f for f in self.map.find(T_map_base) if self._tries(f) < self.config.max_failures]
+        left = [
+            f for f in self.finder.find(T_map_base) if self._tries(f) < self.config.max_failures
+        ]
         fewest = min((self._tries(f) for f in left), default=0)
         left = [f for f in left if self._tries(f) == fewest]
         before = self.target
@@ -165,16 +165,14 @@ class FrontierExplorer(ABC):
 
     def _drop_unchanged_target(self, T_map_base: Array) -> None:
         """Drop a target that stays unknown although the robot is at its viewpoint."""
-        if self.target is None or self._frame != self.map.borders.frame:
+        if self.target is None or self._frame != self.finder.map.frame:
             return
         goal = self.target.goal
         near = math.dist(T_map_base[:2], goal[:2]) <= self.config.goal_tolerance_m
         looks = near and _turn(T_map_base, goal[2]) <= self.config.goal_tolerance_rad
         self._at_goal = self._at_goal + 1 if looks else 0
         if self._at_goal >= self.config.max_looks:
-            self.map.borders.exhaust(
-                self.target.cells, (float(T_map_base[0]), float(T_map_base[1]))
-            )
+            self.finder.give_up(self.target, T_map_base[:2])
             self.target = None
             self._at_goal = 0
 
@@ -223,7 +221,7 @@ class ExploreLite(FrontierExplorer):
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
         """Weighted distance minus weighted size."""
-        frame = self.map.borders.frame
+        frame = self.finder.map.frame
         nearest = [
             np.hypot(*(frame.centres_of(f.cells) - T_map_base[:2]).T).min() for f in frontiers
         ]
@@ -245,10 +243,10 @@ class InformationGain(FrontierExplorer):
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
         """Negative discounted gain."""
-        assert self.map.patch is not None
-        frame = self.map.borders.frame
+        assert self.finder.patch is not None
+        frame = self.finder.map.frame
         cells = frame.cells_of(np.array([f.viewpoint for f in frontiers]))
-        areas = _unknown_in_sight(self.map.patch.cells, cells, self.range_m / frame.resolution)
+        areas = _unknown_in_sight(self.finder.patch.cells, cells, self.range_m / frame.resolution)
         return -(areas + 1.0) * np.exp(
             -self.discount_per_m * np.array([f.path_length_m for f in frontiers])
         )
@@ -267,9 +265,33 @@ class DistanceAdvantage(FrontierExplorer):
         places = np.array([f.viewpoint for f in frontiers])
         if len(frontiers) < 2:
             return lengths
-        between = np.array([self.map.path_lengths_from(place, places) for place in places])
+        between = np.array([self.finder.path_lengths_from(place, places) for place in places])
         between = np.where(np.isfinite(between), between, 0.0)
         return np.asarray(lengths - between.sum(axis=0) / (len(frontiers) - 1))
+
+
+class BoundedTour(FrontierExplorer):
+    """The frontier with which the shortest open path through the nearest ones begins.
+
+    The order of the `max_places` nearest frontiers is exact, by dynamic programming over the sets
+    of visited ones; all others come later.
+    Source: Held and Karp, "A dynamic programming approach to sequencing problems", 1962; the order
+    of the package frontier_exploration_ros2, 2026.
+    """
+
+    max_places = 10
+
+    def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
+        """Length of the shortest path through the nearest frontiers, by the first one."""
+        lengths = np.array([f.path_length_m for f in frontiers])
+        near = np.argsort(lengths, kind='stable')[: self.max_places]
+        places = np.array([frontiers[i].viewpoint for i in near])
+        between = np.array([self.finder.path_lengths_from(place, places) for place in places])
+        straight = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+        between = np.where(np.isfinite(between), between, straight)
+        costs = np.full(len(frontiers), np.inf)
+        costs[near] = lengths[near] + shortest_rest(np.ascontiguousarray(between))
+        return costs
 
 
 class VisitAllEndNodes(NearestFrontier):
@@ -283,7 +305,7 @@ class VisitAllEndNodes(NearestFrontier):
 
     def __init__(self, config: TargetConfig | None = None) -> None:
         super().__init__(config)
-        self.map = FrontierMap(
+        self.finder = FrontierFinder(
             allow_backtracking=True
         )  # the graph may lead through narrow passages
         self._progress_timeout = _ProgressTimeout(self.config)
@@ -299,7 +321,7 @@ class VisitAllEndNodes(NearestFrontier):
             self._end_node = None
             return super().step(topology, patch, scan, T_map_base)
         goal, length_m = found
-        self.map.update(patch, scan, T_map_base)
+        self.finder.update(patch, scan, T_map_base)
         if not self._is_end_node_at(goal):
             self._number += 1
             self._end_node = goal
@@ -356,6 +378,10 @@ class VisitAllEndNodes(NearestFrontier):
         return any(math.dist((x, y), place) < self.config.visit_radius_m for place in self._visited)
 
 
+def _place(xy: Array) -> tuple[float, float]:
+    return float(xy[0]), float(xy[1])
+
+
 def _turn(T_map_base: Array, heading_rad: float) -> float:
     return abs(se2.wrap(float(heading_rad - T_map_base[2])))
 
@@ -380,13 +406,39 @@ def _decision(
     if finished:
         code = FinishCode.UNREACHABLE if failures else FinishCode.ALL_RESOLVED
         reason = 'remaining targets are unreachable' if failures else 'no target is left'
-    return Decision(chosen, finished, reason, code, nodes, [], 0.0, 0.0)
+    return Decision(chosen, finished, reason, code, nodes, [], 0.0)
 
 
 def _end_node(node_id: int, goal: Array, is_target: bool) -> EndNode:
     x = float(goal[0])
     y = float(goal[1])
-    return EndNode(node_id, x, y, 0.5, 0.0, 0.0, math.inf, 0.0, 0.0, is_target, goal)
+    return EndNode(node_id, x, y, 0.5, 0.0, 0.0, math.inf, 0.0, 0.0, 0.0, is_target, goal)
+
+
+@kernel
+def shortest_rest(between: Array) -> Array:
+    """Length of the shortest path through all other places from each place, (N,), exact.
+
+    between (N, N): path lengths; time and memory grow with 2^N.
+    """
+    count = between.shape[0]
+    sets = 1 << count
+    # rest[visited, last]: shortest path from the last place through all that are not visited.
+    rest = np.full((sets, count), np.inf)
+    rest[sets - 1, :] = 0.0
+    for visited in range(sets - 2, 0, -1):
+        for last in range(count):
+            if not visited >> last & 1:
+                continue
+            for following in range(count):
+                if visited >> following & 1:
+                    continue
+                length = between[last, following] + rest[visited | 1 << following, following]
+                rest[visited, last] = min(rest[visited, last], length)
+    lengths = np.empty(count)
+    for first in range(count):
+        lengths[first] = rest[1 << first, first]
+    return lengths
 
 
 @kernel

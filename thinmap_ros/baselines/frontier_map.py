@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
-from thinmap_ros.core.exploration.field_of_view import box_of_scan, directions_of_view
-from thinmap_ros.core.exploration.frontiers import OpenBorders
+from thinmap_ros.core.exploration.frontiers import FrontierMap
+from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.grid_search import downsample_mask, path_lengths_from
 from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.traversability import (
@@ -25,6 +26,8 @@ from thinmap_ros.core.se2 import Array
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 _COARSE = 2
+_SLACK_CELLS = 5
+_PART_M = 1.0
 # The same robot and the same frontiers as for the exploration of the paper.
 _EXPLORER = ExplorerConfig()
 _PLANNER = WavefrontConfig()
@@ -49,60 +52,76 @@ class Frontier:
         return se2.pose(self.viewpoint[0], self.viewpoint[1], math.atan2(dy, dx))
 
 
-class FrontierMap:
+class FrontierFinder:
     """The frontiers of a growing map, without those that persist after close observation."""
 
     def __init__(self, allow_backtracking: bool = False) -> None:
         """allow_backtracking: the recent path counts as traversable, however narrow it appears."""
-        self.borders = OpenBorders(_EXPLORER.min_frontier_size)
+        self.map = FrontierMap()
         self._recent_path = RecentPath() if allow_backtracking else None
         self.patch: GridPatch | None = None
+        self._given_up: set[tuple[int, int]] = set()
         self._reachable: Mask = np.zeros((0, 0), dtype=np.bool_)
 
     def update(self, patch: GridPatch, scan: Scan, T_map_base: Array) -> None:
         """Update the frontiers after a scan made at a pose (3,)."""
         self.patch = patch
-        xy = (float(T_map_base[0]), float(T_map_base[1]))
         if self._recent_path is not None:
             self._recent_path.add_pose(T_map_base)
-        self.borders.update(patch, box_of_scan(scan, T_map_base))
-        self.borders.examine(xy, _EXPLORER.exhaustion_range_m, directions_of_view(scan, T_map_base))
+        self.map.update(patch, box_of_scan(scan, T_map_base))
 
     def is_open(self, frontier: Frontier) -> bool:
         """Whether enough of a frontier remains; its cells must be of the present frame."""
-        left = np.count_nonzero(self.borders.mask[frontier.cells[:, 0], frontier.cells[:, 1]])
-        return bool(left * self.borders.frame.resolution >= _EXPLORER.min_frontier_size - 1e-6)
+        return self.map.is_long(self.map.remaining(frontier.cells), _EXPLORER.min_frontier_size)
 
     def find(self, T_map_base: Array) -> list[Frontier]:
         """All frontiers with a viewpoint that is reachable from a pose (3,)."""
-        frame = self.borders.frame
-        cells, numbers, _ = self.borders.stretches()
+        frame = self.map.frame
+        clusters = self._clusters()
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        standing = traversable_cells(self.borders.free, _EXPLORER.robot_radius_m, frame.resolution)
+        standing = traversable_cells(self.map.free, _EXPLORER.robot_radius_m, frame.resolution)
         reach = self._reach_from(standing, xy)
-        if len(cells) == 0:
+        if not clusters:
             return []
-        reached = reach & standing
         self._reachable = downsample_mask(reach, _COARSE)
-        stretches = [cells[numbers == number] for number in np.unique(numbers)]
-        places = [
-            self.borders.place_to_look(stretch, reached, _EXPLORER.frontier_assignment_radius_m, xy)
-            for stretch in stretches
-        ]
-        found = [(s, p) for s, p in zip(stretches, places, strict=True) if p is not None]
+        places = [self._place_at(cells, reach & standing, xy) for cells in clusters]
+        found = [(c, p) for c, p in zip(clusters, places, strict=True) if p is not None]
         ways = self.path_lengths_from(
             np.array(T_map_base[:2]), np.array([p for _, p in found]).reshape(-1, 2)
         )
         return [
-            Frontier(s, self._centroid(s), p, float(way))
-            for (s, p), way in zip(found, ways, strict=True)
+            Frontier(c, np.array(self.map.middle_of(c)), p, float(way))
+            for (c, p), way in zip(found, ways, strict=True)
             if math.isfinite(way)
         ]
 
+    def give_up(self, frontier: Frontier, xy: Array) -> None:
+        """Ignore the part of a frontier nearest to a point (2,), from which it was observed."""
+        away_m = np.hypot(*(self.map.frame.centres_of(frontier.cells) - xy).T)
+        near = away_m <= away_m.min() + _PART_M
+        self._given_up.update(self._lattice_cells(frontier.cells[near]))
+
+    def _clusters(self) -> list[Cells]:
+        """Frontier cells of each cluster, without those that were given up."""
+        min_length_m = _EXPLORER.min_frontier_size
+        clusters = []
+        for cells in self.map.clusters(min_length_m):
+            keys = self._lattice_cells(cells)
+            left = cells[[key not in self._given_up for key in keys]]
+            if self.map.is_long(len(left), min_length_m):
+                clusters.append(left)
+        return clusters
+
+    def _lattice_cells(self, cells: Cells) -> list[tuple[int, int]]:
+        """Indices of cells (N, 2) that stay when the map grows."""
+        frame = self.map.frame
+        first = np.round(np.array([frame.origin_y, frame.origin_x]) / frame.resolution)
+        return [(int(row), int(col)) for row, col in cells + first]
+
     def _reach_from(self, standing: Mask, xy: tuple[float, float]) -> Mask:
         """Cells (H, W) that are reachable from a point (m)."""
-        free = self.borders.free
-        frame = self.borders.frame
+        free = self.map.free
+        frame = self.map.frame
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
             return np.zeros_like(standing)
@@ -117,11 +136,61 @@ class FrontierMap:
 
     def path_lengths_from(self, xy: Array, places: Array) -> Array:
         """Path lengths, m, from a point (2,) to viewpoints (N, 2) of `find`, (N,)."""
-        frame = self.borders.frame
+        frame = self.map.frame
         cells = frame.cells_of(np.vstack([xy[None], places])) // _COARSE
         start = (int(cells[0, 0]), int(cells[0, 1]))
         return path_lengths_from(self._reachable, start, cells[1:]) * frame.resolution * _COARSE
 
-    def _centroid(self, cells: Cells) -> Array:
-        cell = cells[np.square(cells - cells.mean(axis=0)).sum(axis=1).argmin()]
-        return np.asarray(self.borders.frame.centres_of(cell[None])[0])
+    def _place_at(self, cells: Cells, allowed: Mask, xy: tuple[float, float]) -> Array | None:
+        """Centre (2,), m, of the allowed cell at a frontier (N, 2) nearest to a point, m."""
+        frame = self.map.frame
+        row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
+        max_steps = int(_EXPLORER.frontier_assignment_radius_m / frame.resolution)
+        cell = _nearest_allowed(self.map.free, cells, allowed, max_steps, row, col)
+        return None if cell[0] < 0 else np.asarray(frame.centres_of(np.array([cell]))[0])
+
+
+@kernel
+def _nearest_allowed(
+    free: Mask, cells: Cells, allowed: Mask, most_steps: int, to_row: int, to_col: int
+) -> tuple[int, int]:
+    """Breadth first over free cells, from all border cells at once.
+
+    It goes _SLACK_CELLS steps on after the first find.
+    """
+    rows, cols = free.shape
+    seen = np.zeros((rows, cols), dtype=np.bool_)
+    queue = np.empty((rows * cols, 3), dtype=np.int64)
+    tail = 0
+    for i in range(cells.shape[0]):
+        queue[tail, 0] = cells[i, 0]
+        queue[tail, 1] = cells[i, 1]
+        queue[tail, 2] = 0
+        seen[cells[i, 0], cells[i, 1]] = True
+        tail += 1
+    head = 0
+    best = np.inf
+    best_row = -1
+    best_col = -1
+    while head < tail and queue[head, 2] <= most_steps:
+        row = queue[head, 0]
+        col = queue[head, 1]
+        steps = queue[head, 2]
+        head += 1
+        away = math.hypot(row - to_row, col - to_col)
+        if allowed[row, col] and away < best:
+            if best_row < 0:
+                most_steps = min(most_steps, steps + _SLACK_CELLS)
+            best = away
+            best_row = row
+            best_col = col
+        for side in range(4):
+            r = row + (side == 0) - (side == 1)
+            c = col + (side == 2) - (side == 3)
+            if 0 <= r < rows and 0 <= c < cols and free[r, c] and not seen[r, c]:
+                seen[r, c] = True
+                queue[tail, 0] = r
+                queue[tail, 1] = c
+                queue[tail, 2] = steps + 1
+                tail += 1
+    return best_row, best_col

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.closed_loop import ExplorationOutcome
+from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2, MissingArea
 from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.se2 import Array
@@ -153,3 +154,31 @@ def _first_time(coverage: Array, share: float) -> float | None:
 def _turns(poses: Array) -> Array:
     turns = np.diff(poses[:, 2])
     return np.asarray((turns + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def missing_area_report(
+    missing: MissingArea | None, hidden: Iterable[tuple[float, float, float]]
+) -> dict[str, Any] | None:
+    """What an exploration has probably not seen, m2, and where; None where nothing is estimated.
+
+    hidden: position, m, and expected hidden area of each end node and frontier.
+    """
+    if missing is None:
+        return None
+    places = sorted(hidden, key=lambda place: -place[2])
+    return {
+        'expected_m2': round(missing.expected_m2, 1),
+        'bound_95_m2': round(missing.bound_m2, 1),
+        'places': [
+            {'x': round(x, 2), 'y': round(y, 2), 'expected_m2': round(area, 1)}
+            for x, y, area in places
+            if area >= WORTH_SEEING_M2
+        ],
+    }
+
+
+def hidden_places(report: dict[str, Any]) -> Array:
+    """Places of a report's `missing_area`, (N, 3): x, y, m, and expected area, m2."""
+    missing = report['missing_area'] or {'places': []}
+    rows = [(place['x'], place['y'], place['expected_m2']) for place in missing['places']]
+    return np.array(rows).reshape(-1, 3)

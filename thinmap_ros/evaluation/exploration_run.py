@@ -10,7 +10,12 @@ import numpy as np
 from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
 from thinmap_ros.core.exploration.strategy import Decision
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus, TargetLog, exploration_report
+from thinmap_ros.evaluation.exploration_metrics import (
+    EndNodeCensus,
+    TargetLog,
+    exploration_report,
+    missing_area_report,
+)
 from thinmap_ros.evaluation.kidnapping import Kidnapping
 from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.robot import PRESETS
@@ -59,6 +64,7 @@ def explore(
         'median': round(float(np.median(milliseconds)), 2),
         'max': round(milliseconds.max(), 2),
     }
+    report['missing_area'] = _missing_area(loop.decision)
     report |= {} if kidnapping is None else kidnapping.report()
     report['world'] = world.name
     report['strategy'] = options.strategy
@@ -66,3 +72,10 @@ def explore(
     report['wall_s'] = round(wall_s, 3)
     report['cpu_s'] = round(cpu_s, 3)
     return loop, report
+
+
+def _missing_area(decision: Decision | None) -> dict[str, Any] | None:
+    if decision is None:
+        return None
+    hidden = [(node.x, node.y, node.expected_area_m2) for node in decision.end_nodes]
+    return missing_area_report(decision.missing, hidden)

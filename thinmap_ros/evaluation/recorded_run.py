@@ -11,12 +11,18 @@ import numpy as np
 from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.belief.model import MissingArea
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus, exploration_report
+from thinmap_ros.evaluation.exploration_metrics import (
+    EndNodeCensus,
+    exploration_report,
+    hidden_places,
+    missing_area_report,
+)
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
@@ -37,18 +43,32 @@ FILES = (
     'summary.png',
     'recording.rrd',
 )
-_TOPICS = {'/ground_truth', '/pose', '/map', '/topology', '/end_nodes', '/collisions', '/scan'}
+_TOPICS = {
+    '/ground_truth',
+    '/pose',
+    '/map',
+    '/topology',
+    '/end_nodes',
+    '/exploration_status',
+    '/collisions',
+    '/scan',
+}
 
 
 @dataclass(eq=False)
 class Recording:
-    """The outputs of a run: paths by stamp, maps by stamp, the last graph, end nodes, contacts."""
+    """The outputs of a run: paths by stamp, maps by stamp, the last graph, end nodes, contacts.
+
+    hidden: position, m, and expected hidden area, m2, of each end node at the end; missing: area.
+    """
 
     true: dict[int, Array] = field(default_factory=dict)
     estimated: dict[int, Array] = field(default_factory=dict)
     maps: list[tuple[int, GridPatch]] = field(default_factory=list)
     topology: TopologicalMap = field(default_factory=TopologicalMap)
     end_nodes: list[tuple[int, list[tuple[int, float, float]]]] = field(default_factory=list)
+    hidden: list[tuple[float, float, float]] = field(default_factory=list)
+    missing: MissingArea | None = None
     collisions: int = 0
     range_max_m: float = 8.0
 
@@ -74,6 +94,11 @@ def read(path: Path) -> Recording:
         elif raw.topic == '/end_nodes':
             nodes = [(int(n.node_id), n.position.x, n.position.y) for n in message.end_nodes]
             recording.end_nodes.append((ns, nodes))
+            recording.hidden = [
+                (n.position.x, n.position.y, float(n.expected_area_m2)) for n in message.end_nodes
+            ]
+        elif raw.topic == '/exploration_status':
+            recording.missing = _missing_area(message)
         else:
             recording.range_max_m = float(message.range_max)
     if not (recording.true and recording.estimated and recording.maps):
@@ -82,6 +107,11 @@ def read(path: Path) -> Recording:
             f'it has {", ".join(sorted(bag.topics))}'
         )
     return recording
+
+
+def _missing_area(message: Any) -> MissingArea | None:
+    areas = (float(message.missing_area_m2), float(message.missing_area_bound_m2))
+    return MissingArea(*areas) if min(areas) >= 0.0 else None
 
 
 def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> dict[str, Any]:
@@ -106,7 +136,10 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
         f'{world.name}: {100.0 * report["coverage"]:.1f} % seen, '
         f'{report["distance"]:.1f} m, {report["time"]:.0f} s'
     )
-    figures.summary_figure(out / 'summary.png', patch, topology, estimated, true, title, regions)
+    hidden = hidden_places(report)
+    figures.summary_figure(
+        out / 'summary.png', patch, topology, estimated, true, title, regions, hidden
+    )
     if rerun_sinks.is_installed():
         recording_from_bag(out / 'bag', out / 'recording.rrd')
     else:
@@ -132,6 +165,7 @@ def _report(recording: Recording, seen: ObservableCells, result: dict[str, Any])
         bool(result['finished']), str(result['reason']), recording.collisions
     )
     report = exploration_report(ending, times, true, estimated, coverage, _census(recording))
+    report['missing_area'] = missing_area_report(recording.missing, recording.hidden)
     # Also the heading: a live run is evaluated by its poses.
     turned = se2.wrap(np.asarray(estimated[:, 2] - true[:, 2]))
     report['heading_rmse_deg'] = round(float(np.degrees(np.sqrt(np.mean(turned**2)))), 4)

@@ -129,9 +129,8 @@ class _Watched:
 
 def _exploration(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     world = world_of(recipe.world)
-    loop = make_loop(
-        world, world.start, Options(seed=seed, robot=recipe.robot, speed_m_s=SETUP.speed_m_s)
-    )
+    options = Options('paper', seed=seed, robot=recipe.robot, speed_m_s=SETUP.speed_m_s)
+    loop = make_loop(world, world.start, options)
     watched = _Watched(loop.strategy, loop.simulation)
     loop.strategy = watched
     goal = observable_cells(

@@ -15,6 +15,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.evaluation.exploration_metrics import hidden_places
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.files import graphs, occupancy_maps, package_data, trajectories
 from thinmap_ros.files.atomic import write_text
@@ -44,10 +45,11 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
         f'{report["world"]}: {report["coverage"]:.1%} in {report["time"]:.0f} s, '
         f'{report["distance"]:.0f} m'
     )
+    hidden = hidden_places(report)
     poses = np.array(log.poses)
     true_poses = np.array(log.true_poses)
     figures.summary_figure(
-        folder / 'summary.png', patch, topology, poses, true_poses, title, regions
+        folder / 'summary.png', patch, topology, poses, true_poses, title, regions, hidden
     )
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
 

@@ -1,5 +1,6 @@
 """Figures of maps, and size reduction of PNG files."""
 
+import math
 from collections import defaultdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,10 +32,12 @@ def summary_figure(
     true: Array | None = None,
     title: str = '',
     regions: RegionMap | None = None,
+    hidden: Array | None = None,
 ) -> None:
     """Write a PNG: map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven.
 
-    regions: of the grid, in pale colours.
+    regions: of the grid, in pale colours; hidden (N, 3): positions, m, and hidden area, m2, that is
+    expected there.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -48,6 +51,8 @@ def summary_figure(
     axes = figure.add_subplot()
     draw_map(axes, patch, regions)
     draw_graph(axes, topology)
+    if hidden is not None and len(hidden):
+        draw_hidden_areas(axes, hidden)
     if true is not None and len(true):
         axes.plot(
             true[:, 0],
@@ -77,7 +82,7 @@ def summary_figure(
             zorder=6,
         )
     axes.set(xlabel='x (m)', ylabel='y (m)', title=title, aspect='equal')
-    axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.07), ncols=4, fontsize=8, frameon=False)
+    figure.legend(loc='outside lower center', ncols=4, fontsize=8, frameon=False)
     with atomic_write(path) as aside:
         figure.savefig(aside, format='png', bbox_inches='tight')
 
@@ -100,6 +105,27 @@ def draw_map(axes: 'Axes', patch: GridPatch, regions: RegionMap | None = None) -
     y = patch.frame.origin_y + patch.frame.resolution * np.arange(rows + 1)
     # Not by imshow: it takes some 90 bytes per pixel.
     axes.pcolormesh(x, y, shade, antialiased=False, rasterized=True)
+
+
+def draw_hidden_areas(axes: 'Axes', hidden: Array) -> None:
+    """Draw a circle of each expected hidden area (N, 3; x, y in m, m2) at its position."""
+    from matplotlib.patches import Circle
+
+    for i, (x, y, area_m2) in enumerate(hidden.tolist()):
+        label = 'expected hidden area' if i == 0 else None
+        radius_m = math.sqrt(area_m2 / math.pi)
+        axes.add_patch(
+            Circle(
+                (x, y),
+                radius_m,
+                facecolor='none',
+                edgecolor=palette.HIDDEN,
+                linestyle='--',
+                linewidth=1.5,
+                label=label,
+                zorder=5,
+            )
+        )
 
 
 def draw_graph(axes: 'Axes', topology: TopologicalMap, size: float = 5.0) -> None:

@@ -7,6 +7,7 @@ NODES = {NodeKind.END: '#D55E00', NodeKind.BRANCH: '#0072B2', NodeKind.CORNER: '
 EDGE = '#009E73'
 ESTIMATE = '#CC79A7'
 TRUTH = '#56B4E9'
+HIDDEN = '#E69F00'
 # Pale, in turn by id.
 REGIONS = {
     RegionKind.ROOM: ('#C9DFF2', '#D6D3EC', '#C5E3EA', '#DCE6F5'),

@@ -1,4 +1,4 @@
-"""Frontier candidates: assignment of frontiers to end nodes, and their viewpoints."""
+"""Candidates: assignment of frontiers to end nodes, viewpoints, and what is kept."""
 
 import math
 
@@ -6,23 +6,41 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.candidates import SurveyConfig, Surveyor
+from thinmap_ros.core.exploration.belief.fitted import FITTED
+from thinmap_ros.core.exploration.candidates import CandidateConfig, CandidateFinder
+from thinmap_ros.core.exploration.frontiers import FrontierMap
+from thinmap_ros.core.exploration.reachable import ReachableSpace
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
 FRAME = GridFrame(0.0, 0.0, 0.1)
 AT = se2.pose(1.0, 2.0, 0.0)
 
 
-def surveyor_of(cells, ends=None):
-    surveyor = Surveyor(SurveyConfig())
-    surveyor.borders.update(
-        GridPatch(FRAME, cells.astype(np.int8)), np.array([[0.0, 0.0], [1.0, 1.0]])
-    )
-    surveyor.follow(ends or {})
-    return surveyor
+class Room:
+    """A map with its frontiers, and the candidates found in it."""
+
+    def __init__(self, cells, ends=()):
+        self.frontiers = FrontierMap()
+        self.space = ReachableSpace(CandidateConfig().robot_radius_m)
+        self.finder = CandidateFinder(CandidateConfig(), FITTED)
+        self.nodes = [Node(5 + i, NodeKind.END, x, y, 1.0) for i, (x, y) in enumerate(ends)]
+        self.set_cells(cells)
+
+    def set_cells(self, cells):
+        patch = GridPatch(FRAME, cells.astype(np.int8))
+        self.frontiers.update(patch, np.array([[0.0, 0.0], [50.0, 50.0]]))
+
+    def find(self, at=AT, seconds=0.0):
+        self.space.update(self.frontiers, at)
+        topology = TopologicalMap(self.nodes)
+        stamp_ns = int(seconds * SECOND_NS)
+        self.finder.update(topology, self.frontiers, self.space.now, 8.0, stamp_ns)
+        return self.finder.candidates
 
 
 def corridor():
@@ -48,46 +66,6 @@ def corner():
     return cells
 
 
-def test_a_border_at_the_end_of_the_range_is_looked_at_from_a_little_nearer():
-    (candidate,) = surveyor_of(corridor()).survey(AT, 8.0)
-    assert candidate.track.node_id == FIRST_FRONTIER_ID
-    assert len(candidate.cells) == 38
-    # Cells 2 m behind the frontier at 9 m are in range from 3.5 m on.
-    assert candidate.goal[0] == pytest.approx(11.0 - 7.5, abs=0.5)
-    assert abs(candidate.goal[2]) < 0.3
-
-
-def test_where_a_far_look_showed_nothing_the_robot_goes_to_the_node_and_then_to_the_border():
-    surveyor = surveyor_of(corridor(), {5: (8.0, 2.0)})
-    (far,) = surveyor.survey(AT, 8.0)
-    assert far.track.node_id == 5
-    assert far.goal[0] < 5.0
-    surveyor.examined(far, far.goal)
-    (near,) = surveyor.survey(AT, 8.0)
-    assert near.track.node_id == 5
-    assert near.goal[:2].tolist() == [8.0, 2.0]
-    surveyor.examined(near, near.goal)
-    (last,) = surveyor.survey(AT, 8.0)
-    assert last.track.node_id >= FIRST_FRONTIER_ID
-    assert last.goal[0] > 8.2
-    surveyor.examined(last, last.goal)
-    assert sum(len(c.cells) for c in surveyor.survey(AT, 8.0)) < len(last.cells)
-
-
-def test_from_where_the_robot_is_to_look_most_of_what_is_hidden_is_in_sight():
-    surveyor = surveyor_of(corner())
-    candidates = surveyor.survey(AT, 8.0)
-    assert candidates
-    borders = surveyor.borders
-    for candidate in candidates:
-        row, col = (int(v) for v in borders.frame.cells_of(candidate.goal[None, :2])[0])
-        assert surveyor.reached[row, col]
-        seen = [
-            line_is_clear(borders.passable, row, col, int(r), int(c)) for r, c in candidate.cells
-        ]
-        assert np.mean(seen) > 0.5
-
-
 def open_hall(seen_to_m):
     """36 x 20 m, observed up to x: the frontier is as long as the hall is wide."""
     cells = np.full((200, 360), -1)
@@ -97,44 +75,122 @@ def open_hall(seen_to_m):
     return cells
 
 
-def test_of_a_border_longer_than_the_laser_reaches_a_part_is_looked_at_from_the_nearest_place():
-    """No viewpoint shows most of it; the goal is as far from it as the range allows."""
-    surveyor = surveyor_of(open_hall(12.0))
-    near = se2.pose(2.0, 4.0, 0.0)
-    far = se2.pose(2.0, 16.0, 0.0)
-    for at in (near, far):
-        (candidate,) = surveyor.survey(at, 8.0)
+def test_a_frontier_at_the_end_of_the_range_is_observed_from_a_little_nearer():
+    (candidate,) = Room(corridor()).find()
+    assert candidate.node_id == candidate.evidence.id == FIRST_FRONTIER_ID
+    assert len(candidate.cells) == 38
+    assert candidate.length_m == pytest.approx(3.8)
+    # Cells 2 m behind the frontier at 9 m are in range from 3.5 m on.
+    assert candidate.goal[0] == pytest.approx(11.0 - 7.5, abs=0.5)
+    assert abs(candidate.goal[2]) < 0.3
+
+
+def test_after_a_visit_without_success_a_frontier_is_observed_from_nearby():
+    room = Room(corridor(), [(8.0, 2.0)])
+    (far,) = room.find()
+    assert far.node_id == 5
+    assert far.goal[0] < 5.0
+    far.evidence.visits += 1
+    far.examined_ns = -1
+    (near,) = room.find()
+    assert near.evidence is far.evidence
+    assert near.goal[0] > 7.0
+    assert near.probability > far.probability
+
+
+def test_a_frontier_belongs_to_the_nearest_end_node_that_sees_it():
+    room = Room(corridor(), [(6.5, 2.0), (8.0, 2.0), (8.5, 20.0)])
+    by_id = {candidate.node_id: candidate for candidate in room.find()}
+    assert len(by_id[6].cells) == 38
+    assert all(len(by_id[node_id].cells) == 0 for node_id in (5, 7))
+    assert by_id[5].probability > 0.99 > 0.5 > by_id[6].probability
+    cells = corridor()
+    cells[1:38, 85] = 100
+    room.set_cells(cells)
+    own = [candidate for candidate in room.find(seconds=1.0) if not candidate.is_end_node]
+    assert sum(len(candidate.cells) for candidate in own) == 38
+
+
+def test_most_of_what_is_hidden_is_in_line_of_sight_of_the_viewpoint():
+    room = Room(corner())
+    candidates = room.find()
+    assert candidates
+    frontiers = room.frontiers
+    for candidate in candidates:
+        row, col = (int(v) for v in frontiers.frame.cells_of(candidate.goal[None, :2])[0])
+        assert room.space.now.cells[row, col]
+        seen = [
+            line_is_clear(frontiers.passable, row, col, int(r), int(c)) for r, c in candidate.cells
+        ]
+        assert np.mean(seen) > 0.5
+
+
+def test_a_frontier_longer_than_the_range_is_observed_in_part_from_the_nearest_place():
+    room = Room(open_hall(12.0))
+    for seconds, y in ((0.0, 4.0), (10.0, 16.0)):
+        (candidate,) = room.find(se2.pose(2.0, y, 0.0), seconds)
         assert len(candidate.cells) == 198
         assert candidate.goal[0] < 9.0
-        assert abs(candidate.goal[1] - at[1]) < 2.5
+        assert abs(candidate.goal[1] - y) < 2.5
 
 
-def test_a_goal_stays_good_as_long_as_enough_can_be_seen_from_it():
-    surveyor = surveyor_of(open_hall(12.0))
-    (candidate,) = surveyor.survey(se2.pose(2.0, 4.0, 0.0), 8.0)
-    assert surveyor.still_shows(candidate, candidate.goal, 8.0)
-    assert surveyor.still_shows(candidate, se2.pose(10.0, 14.0, 0.0), 8.0)
-    for x, y in ((2.0, 10.0), (-3.0, 5.0), (20.0, 10.0), (0.1, 0.1)):
-        assert not surveyor.still_shows(candidate, se2.pose(x, y, 0.0), 8.0)
-    surveyor.examined(candidate, candidate.goal)
-    assert not surveyor.still_shows(candidate, candidate.goal, 8.0)
+def test_an_unchanged_frontier_keeps_its_viewpoint_for_some_seconds():
+    room = Room(open_hall(12.0))
+    (first,) = room.find(se2.pose(2.0, 4.0, 0.0))
+    (kept,) = room.find(se2.pose(2.0, 16.0, 0.0), 4.0)
+    assert kept.goal is first.goal and kept.examined_ns == 0
+    (renewed,) = room.find(se2.pose(2.0, 16.0, 0.0), 6.0)
+    assert renewed.goal is not first.goal
 
 
-def test_the_way_to_a_goal_is_that_over_the_grid():
-    surveyor = surveyor_of(corridor())
-    (candidate,) = surveyor.survey(AT, 8.0)
-    assert surveyor.way_m(candidate.goal) == pytest.approx(
-        math.dist(candidate.goal[:2], AT[:2]), rel=0.1, abs=0.2
-    )
-    assert surveyor.way_m(np.array([11.0, 2.0, 0.0])) == math.inf
-    assert surveyor.way_m(np.array([-50.0, 2.0, 0.0])) == math.inf
+def test_path_lengths_are_those_on_the_grid_or_a_detour():
+    room = Room(corridor())
+    room.find()
+    goals = np.array([[8.0, 2.0], [11.0, 2.0], [-50.0, 2.0]])
+    reached, *others = room.space.path_lengths(AT, goals)
+    assert reached == pytest.approx(7.0, rel=0.1, abs=0.2)
+    assert others == pytest.approx([30.0, 153.0])
 
 
-def test_no_owner_holds_less_of_a_stretch_than_counts_as_a_border():
-    surveyor = Surveyor(SurveyConfig())
-    surveyor.borders.frame = GridFrame(0.0, 0.0, 0.1)
-    owners = np.array([7] * 9 + [8] * 2 + [-1] * 6 + [8] * 3 + [9] * 2)
-    numbers = np.array([1] * 17 + [2] * 5, dtype=np.int32)
-    found = surveyor._without_scraps(owners, numbers)
-    assert found.tolist() == [7] * 11 + [-1] * 6 + [8] * 5
-    assert owners[9] == 8
+def test_paths_between_goals_may_lead_through_the_unknown():
+    room = Room(corridor())
+    room.find()
+    ((_, through),) = room.space.path_lengths_between(np.array([[2.0, 2.0], [11.0, 2.0]]), 0)[:1]
+    assert 9.0 < through < 15.0
+    assert math.isfinite(through)
+
+
+def narrow_passage():
+    """A room of 4 x 4 m with a gap of 0.3 m to the east; beyond it 1 m is known."""
+    cells = np.full((40, 80), -1)
+    cells[:, :40] = 0
+    cells[[0, -1]] = 100
+    cells[:, 0] = 100
+    cells[:, 40] = 100
+    cells[18:21, 40] = 0
+    cells[15:24, 41:51] = 0
+    return cells
+
+
+def test_a_frontier_that_cannot_be_seen_from_anywhere_is_approached():
+    """From nearby the map may turn out to be wrong about the passage."""
+    cells = narrow_passage()
+    cells[14, 41:60] = cells[24, 41:60] = 100
+    cells[15:18, 46] = cells[19:24, 46] = 100
+    room = Room(cells)
+    (candidate,) = [c for c in room.find() if c.length_m > 0.0]
+    row, col = (int(v) for v in room.frontiers.frame.cells_of(candidate.goal[None, :2])[0])
+    assert room.space.now.cells[row, col]
+    assert math.dist(candidate.goal[:2], candidate.middle) < 3.0
+    far = Room(np.pad(cells[:, 40:], ((0, 0), (0, 0)), constant_values=-1))
+    assert all(c.goal is None for c in far.find(se2.pose(-9.0, 2.0, 0.0)))
+
+
+def test_a_wall_of_one_cell_separates_what_can_be_reached():
+    cells = corridor()
+    cells[:, 61] = 100
+    room = Room(cells)
+    room.find()
+    rows, cols = np.nonzero(room.space.now.cells)
+    assert cols.max() < 61
+    assert len(rows)

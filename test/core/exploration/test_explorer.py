@@ -10,6 +10,7 @@ import pytest
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision, FinishCode
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
@@ -46,13 +47,13 @@ def two_rooms():
 class Run:
     """An exploration with known poses; fails(decision): whether navigation to a target fails."""
 
-    def __init__(self, world, config=None, seed=1, fails=None, start=START):
+    def __init__(self, world, strategy=None, seed=1, fails=None, start=START):
         self.world = world
         self.fails = fails or (lambda decision: False)
         self.simulation = Simulation(world, start, PRESETS['2dx'], LaserScannerConfig(), seed)
         self.grid = OccupancyGrid()
         self.topology = TopologyBuilder()
-        self.explorer = Explorer(config)
+        self.explorer = strategy or Explorer()
         self.navigator = Navigator(
             NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=0.5))
         )
@@ -116,14 +117,13 @@ def test_it_sees_all_and_stops_by_itself_without_a_touch():
     assert run.simulation.robot.collisions == 0
 
 
-def test_at_the_end_every_end_node_is_reliable_and_none_has_a_border():
+def test_at_the_end_every_end_node_is_reliable():
     nodes = finished_run().last.end_nodes
     assert nodes
     assert (
         min(node.probability for node in nodes if node.node_id < FIRST_FRONTIER_ID)
         >= ExplorerConfig().probability_threshold
     )
-    assert all(node.frontier_length_m == 0.0 for node in nodes)
 
 
 def test_what_is_told_is_told_consistently():
@@ -134,7 +134,10 @@ def test_what_is_told_is_told_consistently():
         assert len({node.node_id for node in decision.end_nodes}) == len(decision.end_nodes)
     areas = [decision.known_area_m2 for decision in finished_run().decisions]
     assert areas[-1] == pytest.approx(33.0, abs=2.0)
-    assert finished_run().last.coverage_estimate == 1.0
+    assert finished_run().last.coverage_estimate > 0.98
+    assert finished_run().last.remaining == 0
+    expected_m2 = [decision.missing.expected_m2 for decision in finished_run().decisions]
+    assert max(expected_m2) > 10.0 > 0.5 > expected_m2[-1]
 
 
 def test_some_end_nodes_are_never_visited():
@@ -164,29 +167,17 @@ def comb(doors=45):
 
 def test_of_many_places_the_target_is_a_near_one_and_stays():
     explorer = Explorer()
-    scan = Scan.create(0, np.full(181, np.inf), -math.pi / 2, math.pi / 180, 0.02, 8.0)
-    goals = []
+    scan = Scan.create(0, np.full(181, np.inf), -math.pi / 2, math.pi / 180, 0.02, 3.0)
+    targets = []
     for k in range(12):
         pose = np.array([50.0 + 0.1 * k, 2.0, math.pi / 2])
         decision = explorer.step(
             TopologicalMap(), comb(), replace(scan, stamp_ns=k * 400_000_000), pose
         )
-        goals.append(decision.target.goal[:2])
+        targets.append(decision.target)
     assert sum(node.frontier_length_m > 0.0 for node in decision.end_nodes) == 45
-    assert math.dist(goals[0], (50.0, 2.0)) < 4.0
-    assert max(math.dist(goal, goals[0]) for goal in goals) < 0.5
-
-
-@pytest.mark.parametrize('theta', [0.0, 1.5])
-def test_the_first_target_is_the_one_that_the_robot_faces(theta):
-    run = Run(two_rooms(), start=se2.pose(1.0, 1.0, theta)).go(2.0)
-    first = next(decision for decision in run.decisions if decision.target is not None)
-    turns = {
-        node.node_id: abs(se2.wrap(math.atan2(node.goal[1] - 1.0, node.goal[0] - 1.0) - theta))
-        for node in first.end_nodes
-        if node.frontier_length_m > 0.0
-    }
-    assert turns[first.target.node_id] == min(turns.values())
+    assert math.dist(targets[0].goal[:2], (50.0, 2.0)) < 4.0
+    assert len({target.node_id for target in targets}) == 1
 
 
 def test_a_target_that_cannot_be_reached_is_put_aside_tried_again_and_named_at_the_end():
@@ -208,77 +199,43 @@ def test_an_exploration_goes_on_from_its_state_as_if_it_had_not_been_interrupted
     run = Run(two_rooms()).go(8.0)
     state = {key: array.copy() for key, array in run.explorer.state().items()}
     again = Explorer.from_state(state)
-    before = run.explorer.surveyor
-    after = again.surveyor
-    assert {
-        i: (t.probability, t.distances_m, t.angle_span_deg)
-        for i, t in before.tracker.tracks.items()
-    } == {
-        i: (t.probability, t.distances_m, t.angle_span_deg) for i, t in after.tracker.tracks.items()
+    assert {name: array.tolist() for name, array in again.state().items()} == {
+        name: array.tolist() for name, array in state.items()
     }
     run.explorer = again
     run.go(300.0)
     assert run.last.finished
     assert run.last.code == FinishCode.ALL_RESOLVED
     assert run.coverage() >= 0.99
-    finished = run.explorer.state()
-    late = Explorer.from_state(finished)
-    for _ in range(3):
-        decision = late.step(run.topology.map, run.grid.known_area(), run.scan, run.poses[-1])
-    assert decision.finished, 'a target that was examined without success stays examined'
+    late = Explorer.from_state(run.explorer.state())
+    for k in range(3):
+        scan = replace(run.scan, stamp_ns=run.scan.stamp_ns + k * 1_000_000_000)
+        decision = late.step(run.topology.map, run.grid.known_area(), scan, run.poses[-1])
+    assert decision.finished, 'a target that was visited without success stays visited'
 
 
-@pytest.mark.parametrize('broken', ['nodes_ids', 'borders_looks', 'visited'])
+@pytest.mark.parametrize('broken', ['ids', 'views', 'visits'])
 def test_a_state_that_is_none_is_refused(broken):
     state = Run(two_rooms()).go(1.0).explorer.state()
     with pytest.raises(InputError, match='saved exploration'):
         Explorer.from_state({key: array for key, array in state.items() if key != broken})
 
 
-def test_the_literal_scheme_stops_by_itself_too():
-    run = Run(two_rooms(), ExplorerConfig(mode='paper')).go(600.0)
+def test_the_scheme_of_the_paper_stops_by_itself_too():
+    run = Run(two_rooms(), PaperExplorer()).go(600.0)
     assert run.last.finished
     assert run.simulation.robot.collisions == 0
 
 
-def hall_with_pockets(size=(160, 300)):
-    """A free hall with 30 unknown patches near the robot and two at the far end (slices)."""
-    cells = np.zeros(size, dtype=np.int8)
-    cells[[0, -1]] = 100
-    cells[:, [0, -1]] = 100
-    near = [
-        (slice(row, row + 6), slice(col, col + 6))
-        for row in range(20, 150, 25)
-        for col in range(20, 110, 18)
-    ]
-    far = [(slice(row, row + 6), slice(270, 276)) for row in (74, 84)]
-    for pocket in near + far:
-        cells[pocket] = -1
-    return cells, far
-
-
-def test_the_successor_of_a_target_may_lie_farther_off_than_all_that_is_toured():
-    cells, far = hall_with_pockets()
-    explorer = Explorer()
-    pose = se2.pose(10.0, 8.2, 0.0)
-
-    def step(seconds):
-        nothing = Scan.create(
-            seconds * 1_000_000_000, np.full(181, np.nan), -1.57, math.radians(1.0), 0.05, 2.0
-        )
-        return explorer.step(
-            TopologicalMap(), GridPatch(GridFrame(0.0, 0.0, 0.1), cells), nothing, pose
-        ).target
-
-    target = step(0)
-    assert target.x > 26.5
-    cells[min(far, key=lambda pocket: abs(pocket[0].start + 3 - 10.0 * target.y))] = 0
-    explorer.surveyor.borders.update(
-        GridPatch(GridFrame(0.0, 0.0, 0.1), cells), np.array([[0.0, 0.0], [30.0, 16.0]])
-    )
-    after = step(2)
-    assert after.node_id != target.node_id
-    assert after.x < 12.0, 'by now it is weighed against all that is nearer'
+def test_the_first_target_of_the_paper_is_the_one_that_the_robot_faces():
+    run = Run(two_rooms(), PaperExplorer(), start=se2.pose(1.0, 1.0, 1.5)).go(3.0)
+    first = next(decision for decision in run.decisions if decision.target is not None)
+    turns = {
+        node.node_id: abs(se2.wrap(math.atan2(node.y - 1.0, node.x - 1.0) - 1.5))
+        for node in first.end_nodes
+        if node.probability < ExplorerConfig().probability_threshold
+    }
+    assert turns[first.target.node_id] == min(turns.values())
 
 
 def test_a_graph_that_is_there_before_the_map_does_not_end_the_exploration():

@@ -108,9 +108,9 @@ class Scripted:
         self.patch = patch
         target = None
         if self.goal is not None:
-            target = EndNode(1, 0.0, 0.0, 0.5, 0.0, 0.0, 1.0, 0.0, 1.0, True, self.goal)
+            target = EndNode(1, 0.0, 0.0, 0.5, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, True, self.goal)
         finished = self.code != FinishCode.NONE
-        return Decision(target, finished, 'words', self.code, [], [], 0.5, self.area_m2)
+        return Decision(target, finished, 'words', self.code, [], [], self.area_m2)
 
     def target_failed(self, reason):
         self.failures.append(reason)

@@ -7,17 +7,15 @@ import pytest
 from scipy import ndimage
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.end_node_tracker import _in_sight
-from thinmap_ros.core.exploration.frontiers import _parts
-from thinmap_ros.core.exploration.stretches import without_scraps
+from thinmap_ros.core.exploration.frontiers import _clusters
+from thinmap_ros.core.exploration.visibility import _visible
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.planning.grid_search import downsample_mask, upsample_mask
+from thinmap_ros.core.planning.grid_search import downsample_mask
 from thinmap_ros.core.planning.obstacle_points import _arc, _clear_steps, _points_around
 from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.traversability import (
-    near_true_cell,
     path_collides,
     reachable_cells,
     traversable_cells,
@@ -156,7 +154,7 @@ def test_places_in_sight(seed):
     bearings = np.arctan2(*(places - laser[:2]).T[::-1]) - laser[2]
     asked = (np.hypot(*(places - laser[:2]).T) < 2.5) & (np.abs(se2.wrap(bearings - 0.3)) <= 1.1)
     clear = [line_is_clear(free, 30, 30, int(row), int(col)) for row, col in frame.cells_of(places)]
-    found = _in_sight(free, frame.as_array(), laser, places, 2.5, 0.3, 1.1)
+    found = _visible(free, (-1.0, 2.0, 0.1), laser, places, (2.5, 0.3, 1.1))
     assert (found == (asked & clear)).all()
 
 
@@ -184,7 +182,7 @@ def test_the_cost_of_cells_falls_with_the_distance_to_what_is_not_free(seed):
 def test_what_is_joined(seed):
     mask = np.random.default_rng(seed).random((30, 40)) < 0.35
     cells = np.argwhere(mask)
-    numbers, sizes = _parts(mask.shape, cells)
+    numbers, sizes = _clusters(mask.shape, cells)
     expected, count = ndimage.label(mask, np.ones((3, 3)))
     assert len(sizes) == count
     assert (numbers + 1 == expected[mask]).all()
@@ -197,7 +195,7 @@ def test_what_is_joined(seed):
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_squares_of_cells_and_back(seed):
+def test_squares_of_cells(seed):
     rng = np.random.default_rng(seed)
     cells = rng.random((31, 44)) < 0.1
     factor = int(rng.integers(1, 5))
@@ -205,34 +203,6 @@ def test_squares_of_cells_and_back(seed):
     shape = (padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
     expected = padded.reshape(shape).any(axis=(1, 3))
     assert (downsample_mask(cells, factor) == expected).all()
-    chosen = rng.random(expected.shape) < 0.5
-    rows, cols = cells.shape
-    spread = np.repeat(np.repeat(chosen, factor, axis=0), factor, axis=1)[:rows, :cols]
-    assert (upsample_mask(chosen, factor, cells) == (cells & spread)).all()
-
-
-@pytest.mark.parametrize('seed', SEEDS)
-def test_which_cells_are_near_a_true_one(seed):
-    rng = np.random.default_rng(seed)
-    mask = rng.random((30, 40)) < 0.01
-    cells = rng.integers(-3, 44, (20, 2))
-    reach = rng.uniform(0.0, 6.0)
-    places = np.argwhere(mask)
-    expected = [(np.square(places - cell).sum(axis=1) <= reach * reach).any() for cell in cells]
-    assert (near_true_cell(mask, cells, reach) == expected).all()
-
-
-@pytest.mark.parametrize('seed', SEEDS)
-def test_owners_without_scraps(seed):
-    rng = np.random.default_rng(seed)
-    owners = rng.integers(-1, 4, 60)
-    numbers = np.sort(rng.integers(0, 5, 60))
-    expected = owners.copy()
-    for number in np.unique(numbers):
-        part = owners[numbers == number]
-        ids, inverse, counts = np.unique(part, return_inverse=True, return_counts=True)
-        expected[numbers == number] = np.where(counts[inverse] < 4, ids[counts.argmax()], part)
-    assert (without_scraps(owners, numbers, 4) == expected).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)

@@ -53,11 +53,11 @@ class TwoAttempts:
 
     def step(self, topology, patch, scan, T_map_base):
         goal = T_map_base + np.array([0.5, 0.0, 0.0])
-        target = EndNode(7, goal[0], goal[1], 0.5, 0.0, 0.0, 1.0, 0.0, 1.0, True, goal)
+        target = EndNode(7, goal[0], goal[1], 0.5, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, True, goal)
         if self.attempts < 2:
-            return Decision(target, False, 'one left', FinishCode.NONE, [target], [], 0.5, 1.0)
+            return Decision(target, False, 'one left', FinishCode.NONE, [target], [], 1.0)
         code = FinishCode.UNREACHABLE
-        return Decision(None, True, 'two attempts failed', code, [target], [7], 0.5, 1.0)
+        return Decision(None, True, 'two attempts failed', code, [target], [7], 1.0)
 
     def target_failed(self, reason):
         self.attempts += 1

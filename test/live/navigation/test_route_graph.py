@@ -68,9 +68,10 @@ def is_of(route_graph, topology):
 def test_a_route_server_receives_the_graph_as_it_grows_and_when_it_is_saved(graph, tmp_path):
     server = RouteServer(graph)
     mapping = Mapping(graph, route_graph_period_s=1.0)
-    mapping.drives_until(lambda: len(server.graphs) > 3, 'several graphs')
-    sizes = [len(received.nodes) for received in server.graphs]
-    assert max(sizes) > min(sizes), 'the graph grows'
+    mapping.drives_until(
+        lambda: len({len(received.nodes) for received in server.graphs}) > 1,
+        'a graph that has grown',
+    )
     mapping.stands()
     topology = mapping.graphs[-1]
     graph.until(lambda: is_of(server.graphs[-1], topology), 'the newest graph')

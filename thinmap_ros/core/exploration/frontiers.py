@@ -1,111 +1,69 @@
-"""Where known free space ends although nothing stands there.
+"""Frontiers of the whole map: where known free space ends although nothing stands there.
 
-It is what is left to see, kept up to date scan by scan.
-
-A border cell is a free cell beside (over an edge) one that is unknown. A single missing beam makes
-one too, so only borders of some length count. A border is *exhausted* when it has been looked at
-closely and stayed: no laser sees more of it. Border cells belong to the nearest end node in sight
-of them; those that no end node sees are left over.
+A frontier cell is a free cell with an unknown cell above, below, left or right. Cells are found
+again only where a scan can have changed the map. A single missing beam makes a frontier, too, so
+only clusters of some length count.
+Source: Yamauchi, "A frontier-based approach for autonomous exploration", 1997.
 """
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.exploration.viewpoints import place_at, place_for, shows_enough
-from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridFrame
+from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, GridPatch
-from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.grid.raytrace import axis_setup
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.traversability import Part
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.snapshot import MAX_COORDINATE_M, Field
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import known_free, true_cells
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
-_TOPOLOGY = TopologyConfig()
-_LOOKS = 3
-_SPARE = 64
-_WHOLE_EVERY = 100
-_PART_M = 1.0
-_MARGIN = 3
-NOTHING = (0, 0, 0, 0)
-_MOST_CELLS = 1 << 28  # of a map with the room to grow
-FIELDS = {
-    'frame': Field(
-        np.float64,
-        (3,),
-        (-MAX_COORDINATE_M, -MAX_COORDINATE_M, MIN_RESOLUTION_M),
-        (MAX_COORDINATE_M, MAX_COORDINATE_M, MAX_RESOLUTION_M),
-    ),
-    'looks': Field(np.uint8, ('rows', 'cols'), 0, _LOOKS),
-}
+Place = tuple[float, float]
+NOTHING: Part = (0, 0, 0, 0)
+_GAPS = TopologyConfig()
+_SPARE_CELLS = 64  # of room when the map grows: users of these arrays start again when they do
+_MARGIN_CELLS = 3  # read beyond those that are written, so that the cut is no frontier
+_UPDATES_PER_WHOLE_MAP = 100  # corrections of the map reach cells that no scan can change
+_MAX_CELLS = 1 << 28
+_RAYS = 120
 
 
-class OpenBorders:
-    """The border cells of the whole map; only what a scan can have changed is looked at again.
+class FrontierMap:
+    """Frontier cells of the whole map, updated where a scan can have changed it.
 
-    free (H, W): known free cells, small gaps closed; passable (H, W): all but occupied ones;
-    mask (H, W): open border cells; all on the cells of `frame`, which holds the map and some room
-    for it to grow. revision: rises whenever they change; known_cells: how many are free; changed:
-    the part in which free and passable may have changed since somebody set it to NOTHING, None
-    where that is everywhere.
+    free (H, W): known free cells, small gaps closed; passable (H, W): all but occupied cells; mask
+    (H, W): frontier cells; all on the cells of `frame`, which holds the map and some room for it to
+    grow. free_cells: how many are free.
     """
 
-    def __init__(self, shortest_m: float) -> None:
-        self._shortest_m = shortest_m
-        self.frame = GridFrame(0.0, 0.0, 1.0)
-        self.revision = self.known_cells = self._updates = 0
-        self.free: Mask = np.zeros((0, 0), dtype=np.bool_)
-        self.mask: Mask = np.zeros((0, 0), dtype=np.bool_)
-        self.passable: Mask = np.ones((0, 0), dtype=np.bool_)
-        self.changed: Part | None = None
-        self._looks: NDArray[np.uint8] = np.zeros((0, 0), dtype=np.uint8)
+    def __init__(self) -> None:
+        self._updates = 0
+        self._changed: Part | None = None
+        self._clear(GridFrame(0.0, 0.0, 1.0))
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """What a map does not tell, as arrays by name.
-
-        It is how often each border cell was looked at closely.
-        """
-        return {'frame': self.frame.as_array(), 'looks': self._looks}
-
-    @staticmethod
-    def from_state(state: Mapping[str, NDArray[Any]], shortest_m: float) -> 'OpenBorders':
-        """Borders that go on from the `state` of others, on a map of their lattice.
-
-        state: checked by FIELDS.
-        """
-        borders = OpenBorders(shortest_m)
-        origin_x, origin_y, resolution = state['frame'].tolist()
-        looks = state['looks']
-        rows, cols = looks.shape
-        borders.frame = GridFrame(origin_x, origin_y, resolution)
-        borders._looks = looks
-        borders.free, borders.mask = (np.zeros((rows, cols), dtype=np.bool_) for _ in range(2))
-        borders.passable = np.ones((rows, cols), dtype=np.bool_)
-        return borders
+    @property
+    def known_area_m2(self) -> float:
+        """Known free area."""
+        return self.free_cells * self.frame.resolution**2
 
     def update(self, patch: GridPatch, box: Array) -> None:
-        """Find the borders of a map anew in a box, the first time and now and then everywhere.
+        """Find the frontier cells of the whole map in a box; now and then everywhere.
 
-        box (2, 2): its lower left and upper right corner, m (see field_of_view.box_of_scan).
-        Other cells change only where the map was corrected, or is replaced by another one.
+        box (2, 2): its lower left and upper right corner, m (see visibility.box_of_scan).
         """
-        whole = patch.is_replaced or self._updates % _WHOLE_EVERY == 0
+        whole = patch.is_replaced or self._updates % _UPDATES_PER_WHOLE_MAP == 0
         self._updates += 1
         row, col = self._fit(patch)
         if patch.is_replaced:
             self._clear_outside(row, col, patch.shape)
         rows, cols = (slice(0, size) for size in patch.shape) if whole else _part(patch, box)
-        # A few cells more are read than written, so that the cut is no border.
         wide = (
-            slice(max(rows.start - _MARGIN, 0), rows.stop + _MARGIN),
-            slice(max(cols.start - _MARGIN, 0), cols.stop + _MARGIN),
+            slice(max(rows.start - _MARGIN_CELLS, 0), rows.stop + _MARGIN_CELLS),
+            slice(max(cols.start - _MARGIN_CELLS, 0), cols.stop + _MARGIN_CELLS),
         )
         part = GridPatch(patch.frame, np.ascontiguousarray(patch.cells[wide]))
         inner = (
@@ -114,117 +72,75 @@ class OpenBorders:
             cols.start - wide[1].start,
             cols.stop - wide[1].start,
         )
-        offset = (wide[0].start + row, wide[1].start + col)
-        if self.changed is not None:
-            written = (rows.start + row, cols.start + col, rows.stop + row, cols.stop + col)
-            self.changed = written if self.changed == NOTHING else _both(self.changed, written)
-        free = known_free(part, _TOPOLOGY)
-        changed, more = _renew(
-            part.cells, free, inner, offset, self.free, self.passable, self.mask, self._looks
+        self._mark_changed((rows.start + row, cols.start + col, rows.stop + row, cols.stop + col))
+        self.free_cells += _update(
+            part.cells,
+            known_free(part, _GAPS),
+            inner,
+            (wide[0].start + row, wide[1].start + col),
+            self.free,
+            self.passable,
+            self.mask,
         )
-        self.revision = self.revision + changed
-        self.known_cells = self.known_cells + more
 
-    def examine(self, xy: tuple[float, float], reach_m: float, faces: NDArray[np.float64]) -> None:
-        """Count a close look from a point, m.
+    def take_changes(self) -> Part | None:
+        """Part in which cells may have changed since the last call; None: everywhere."""
+        changed = self._changed
+        self._changed = NOTHING
+        return changed
 
-        It counts for border cells whose unknown neighbour lies in plain sight, yet unknown.
-        faces (2,): first and last direction of view in the map frame, rad. After some such looks a
-        cell is exhausted.
-        """
-        row, col = self._cell_of(xy)
-        reach = reach_m / self.frame.resolution
-        self.revision += _examine(self.mask, self.free, self._looks, row, col, reach, faces)
+    def clusters(self, min_length_m: float) -> list[Cells]:
+        """Frontier cells (N, 2) of each cluster that is long enough, in the order of first cells.
 
-    def exhaust(self, cells: Cells, xy: tuple[float, float]) -> None:
-        """Give up border cells (N, 2) for good.
-
-        Only those about as near to a point, m, as the nearest of them are given up.
-        A long border is seen from one place in part only.
-        """
-        away_m = np.hypot(*(self.frame.centres_of(cells) - xy).T)
-        gone = cells[away_m <= away_m.min(initial=np.inf) + _PART_M]
-        self._looks[gone[:, 0], gone[:, 1]] = _LOOKS
-        self.mask[gone[:, 0], gone[:, 1]] = False
-        self.revision += 1
-
-    def stretches(self) -> tuple[Cells, Cells, int]:
-        """Border cells (N, 2) in stretches long enough, their numbers (N,), and how many there are.
-
-        Stretches are joined over edges and corners, and numbered in the order of their first cells.
+        Cells of a cluster are joined over edges and corners.
         """
         cells = true_cells(self.mask)
-        numbers, sizes = _parts(self.mask.shape, cells)
-        long_enough = sizes * self.frame.resolution >= self._shortest_m - 1e-6
-        keep = long_enough[numbers]
-        return cells[keep], numbers[keep], int(long_enough.sum())
+        numbers, sizes = _clusters(self.mask.shape, cells)
+        order = np.argsort(numbers, kind='stable')
+        clusters = np.split(cells[order], np.cumsum(sizes)[:-1])
+        return [cluster for cluster in clusters if self.is_long(len(cluster), min_length_m)]
 
-    def owners(self, cells: Cells, nodes: Cells, reach_m: float) -> Cells:
-        """Index of the node (M, 2) in sight within reach_m nearest to each cell (N, 2), or -1."""
-        return np.asarray(_owners(self.free, cells, nodes, reach_m / self.frame.resolution))
+    def is_long(self, cell_count: int, min_length_m: float) -> bool:
+        """Whether a number of cells is at least so long; a cell counts as its edge."""
+        return cell_count > 0 and cell_count * self.frame.resolution >= min_length_m - 1e-6
 
-    def place_to_look(
-        self, cells: Cells, allowed: Mask, reach_m: float, xy: tuple[float, float]
-    ) -> Array | None:
-        """Centre (2,), m, of the allowed cell (H, W) right at a border (N, 2).
+    def remaining(self, cells: Cells) -> int:
+        """How many of some cells (N, 2) are still frontier cells."""
+        return int(np.count_nonzero(self.mask[cells[:, 0], cells[:, 1]]))
 
-        See viewpoints.place_at.
-        """
-        return self._centre_of(
-            place_at(
-                self.free, cells, allowed, int(reach_m / self.frame.resolution), self._cell_of(xy)
+    def middle_of(self, cells: Cells) -> Place:
+        """Centre, m, of the cell of a cluster (N, 2) nearest to its centroid."""
+        cell = cells[np.square(cells - cells.mean(axis=0)).sum(axis=1).argmin()]
+        x, y = self.frame.centres_of(cell[None])[0]
+        return float(x), float(y)
+
+    def hidden_area_m2(self, place: Place, reach_m: float) -> float:
+        """Unknown area in line of sight of a place, m: through the unknown, up to an obstacle."""
+        row, col = self.frame.cells_of(np.array([place]))[0]
+        resolution = self.frame.resolution
+        cells = _hidden_cells(self.free, self.passable, row, col, reach_m / resolution)
+        return float(cells) * resolution**2
+
+    def _mark_changed(self, part: Part) -> None:
+        if self._changed == NOTHING:
+            self._changed = part
+        elif self._changed is not None:
+            a = self._changed
+            self._changed = (
+                min(a[0], part[0]),
+                min(a[1], part[1]),
+                max(a[2], part[2]),
+                max(a[3], part[3]),
             )
-        )
-
-    def place_to_view(
-        self, cells: Cells, allowed: Mask, ways: Array, reach_m: float, depth_m: float
-    ) -> Array | None:
-        """Centre (2,), m, of the allowed cell (H, W) from which to see behind a border (N, 2).
-
-        See viewpoints.place_for.
-        ways (h, w): length of the way to each square of allowed cells; depth_m: how far behind the
-        border is looked.
-        """
-        resolution = self.frame.resolution
-        depth = round(depth_m / resolution)
-        reach = reach_m / resolution
-        return self._centre_of(
-            place_for(self.free, self.passable, cells, allowed, ways, depth, reach)
-        )
-
-    def shows_enough(self, cells: Cells, place: Array, reach_m: float, depth_m: float) -> bool:
-        """Whether a place (2,), m, is one from which to see behind a border (N, 2).
-
-        See viewpoints.shows_enough.
-        """
-        resolution = self.frame.resolution
-        depth = round(depth_m / resolution)
-        reach = reach_m / resolution
-        cell = self._cell_of((float(place[0]), float(place[1])))
-        return shows_enough(self.free, self.passable, cells, cell, depth, reach)
-
-    def _has_room_for(self, patch: GridPatch) -> bool:
-        """Whether a map has cells of this size, and near these: saved ones may be of elsewhere."""
-        frame = self.frame
-        x = (patch.frame.origin_x - frame.origin_x) / frame.resolution
-        y = (patch.frame.origin_y - frame.origin_y) / frame.resolution
-        if patch.frame.resolution != frame.resolution:
-            return False
-        rows, cols = (
-            max(first + size, have) - min(first, 0.0) + 2 * _SPARE
-            for first, size, have in zip((y, x), patch.shape, self.mask.shape, strict=True)
-        )
-        return bool(rows * cols <= _MOST_CELLS)
 
     def _clear(self, frame: GridFrame) -> None:
-        """Begin with nothing, on the cells of a frame."""
+        """Forget all cells; the next ones lie on a frame."""
         self.frame = frame
-        self.changed = None
-        self.known_cells = 0
-        self.free = np.zeros((0, 0), dtype=np.bool_)
-        self.mask = np.zeros((0, 0), dtype=np.bool_)
-        self.passable = np.ones((0, 0), dtype=np.bool_)
-        self._looks = np.zeros((0, 0), dtype=np.uint8)
+        self.free_cells = 0
+        self.free: Mask = np.zeros((0, 0), dtype=np.bool_)
+        self.mask: Mask = np.zeros((0, 0), dtype=np.bool_)
+        self.passable: Mask = np.ones((0, 0), dtype=np.bool_)
+        self._changed = None
 
     def _clear_outside(self, row: int, col: int, shape: tuple[int, int]) -> None:
         """Make all cells unknown that lie outside a map: it may have become smaller."""
@@ -236,32 +152,11 @@ class OpenBorders:
         self.free[outside] = False
         self.mask[outside] = False
         self.passable[outside] = True
-        self.known_cells -= gone
-        self.revision += 1
-        self.changed = None
-
-    def _cell_of(self, xy: tuple[float, float]) -> tuple[int, int]:
-        """Cell (row, col) that holds a point, m."""
-        frame = self.frame
-        row = (xy[1] - frame.origin_y) / frame.resolution
-        col = (xy[0] - frame.origin_x) / frame.resolution
-        return math.floor(row), math.floor(col)
-
-    def _centre_of(self, cell: tuple[int, int] | None) -> Array | None:
-        """Point (2,), m, in the middle of a cell (row, col)."""
-        if cell is None:
-            return None
-        x = self.frame.origin_x
-        y = self.frame.origin_y
-        resolution = self.frame.resolution
-        return np.array([(cell[1] + 0.5) * resolution + x, (cell[0] + 0.5) * resolution + y])
+        self.free_cells -= gone
+        self._changed = None
 
     def _fit(self, patch: GridPatch) -> tuple[int, int]:
-        """Make room for a patch where there is none; returns where its first cell lies, (row, col).
-
-        Once there is a map, more room is made than is needed: what looks at these arrays does so
-        anew when they grow.
-        """
+        """Make room for a patch; returns its first cell (row, col) in these arrays."""
         if self.mask.size == 0 or not self._has_room_for(patch):
             self._clear(patch.frame)
         resolution = self.frame.resolution
@@ -271,31 +166,38 @@ class OpenBorders:
             (max(-first, 0), max(first + size - have, 0))
             for first, size, have in zip((row, col), patch.shape, self.mask.shape, strict=True)
         )
-        if top or bottom or left or right:
-            spare = _SPARE if self.mask.size else 0
-            more = tuple(
-                (low and low + spare, high and high + spare)
-                for low, high in ((top, bottom), (left, right))
-            )
-            self.free = np.pad(self.free, more)
-            self.passable = np.pad(self.passable, more, constant_values=True)
-            self.mask = np.pad(self.mask, more)
-            self._looks = np.pad(self._looks, more)
-            self.frame = self.frame.with_origin_at(-more[0][0], -more[1][0])
-            self.changed = None
-            row = row + more[0][0]
-            col = col + more[1][0]
-        return row, col
+        if not (top or bottom or left or right):
+            return row, col
+        spare = _SPARE_CELLS if self.mask.size else 0
+        more = tuple(
+            (low and low + spare, high and high + spare)
+            for low, high in ((top, bottom), (left, right))
+        )
+        self.free = np.pad(self.free, more)
+        self.passable = np.pad(self.passable, more, constant_values=True)
+        self.mask = np.pad(self.mask, more)
+        self.frame = self.frame.with_origin_at(-more[0][0], -more[1][0])
+        self._changed = None
+        return row + more[0][0], col + more[1][0]
 
-
-def _both(a: Part, b: Part) -> Part:
-    return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
+    def _has_room_for(self, patch: GridPatch) -> bool:
+        """Whether a map has cells of this size, and near these."""
+        frame = self.frame
+        if patch.frame.resolution != frame.resolution:
+            return False
+        x = (patch.frame.origin_x - frame.origin_x) / frame.resolution
+        y = (patch.frame.origin_y - frame.origin_y) / frame.resolution
+        rows, cols = (
+            max(first + size, have) - min(first, 0.0) + 2 * _SPARE_CELLS
+            for first, size, have in zip((y, x), patch.shape, self.mask.shape, strict=True)
+        )
+        return bool(rows * cols <= _MAX_CELLS)
 
 
 def _part(patch: GridPatch, box: Array) -> tuple[slice, slice]:
-    """Rows and columns of a map that lie in a box."""
+    """Rows and columns of a map that lie in a box (2, 2), m."""
     frame = patch.frame
-    (rows, cols) = patch.shape
+    rows, cols = patch.shape
     (left, top), (right, bottom) = (
         (
             math.floor((x - frame.origin_x) / frame.resolution),
@@ -309,7 +211,7 @@ def _part(patch: GridPatch, box: Array) -> tuple[slice, slice]:
 
 
 @kernel
-def _renew(
+def _update(
     cells: NDArray[np.int8],
     known: Mask,
     inner: tuple[int, int, int, int],
@@ -317,48 +219,42 @@ def _renew(
     free: Mask,
     passable: Mask,
     mask: Mask,
-    looks: NDArray[np.uint8],
-) -> tuple[bool, int]:
-    """Take over a part of a map (H, W) and find its borders.
+) -> int:
+    """Write a part of a map (H, W) and its frontier cells; returns how many more cells are free.
 
-    Returns whether what is free or border has changed, and how many more cells are free.
-    known (H, W): which cells are free; inner: first row, row after the last, and the same of
-    columns, of what is written to free, passable, mask and looks, in which the part begins at row
-    and column `offset`. A border is a free cell with an unknown one above, below, left or right;
-    what lies outside of the part is unknown.
+    known (H, W): its free cells; inner: first row, row after the last, and the same of columns, of
+    what is written; offset: row and column at which the part begins in free, passable and mask.
+    Cells outside of the part count as unknown.
     """
     rows, cols = cells.shape
-    changed = False
     more = 0
     for row in range(inner[0], inner[1]):
         for col in range(inner[2], inner[3]):
             r = row + offset[0]
             c = col + offset[1]
-            border = False
-            if known[row, col] and looks[r, c] < _LOOKS:
+            is_frontier = False
+            if known[row, col]:
                 for side in range(4):
                     y = row + (side == 0) - (side == 1)
                     x = col + (side == 2) - (side == 3)
                     if not (0 <= y < rows and 0 <= x < cols):
-                        border = True
+                        is_frontier = True
                     elif not known[y, x]:
-                        border |= cells[y, x] < 0 or FREE_AT_MOST < cells[y, x] < OCCUPIED_AT_LEAST
-            changed |= known[row, col] != free[r, c] or border != mask[r, c]
+                        is_frontier |= (
+                            cells[y, x] < 0 or FREE_AT_MOST < cells[y, x] < OCCUPIED_AT_LEAST
+                        )
             more += int(known[row, col]) - int(free[r, c])
             free[r, c] = known[row, col]
-            mask[r, c] = border
+            mask[r, c] = is_frontier
             passable[r, c] = cells[row, col] < OCCUPIED_AT_LEAST
-    return changed, more
+    return more
 
 
 @kernel
-def _parts(shape: tuple[int, int], cells: Cells) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number of the part (joined over edges and corners) of each cell (N, 2) of an array, (N,).
-
-    Also how many cells are in each part.
-    """
+def _clusters(shape: tuple[int, int], cells: Cells) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of the cluster of each cell (N, 2) of an array, (N,), and the size of each cluster."""
     cols = shape[1] + 2
-    # Index + 1 of the cell that lies there; the empty border saves all questions about the rim.
+    # Index + 1 of the cell that lies there; the empty margin makes bounds checks unnecessary.
     at = np.zeros((shape[0] + 2) * cols, dtype=np.int32)
     places = (cells[:, 0] + 1) * cols + cells[:, 1] + 1
     for i in range(places.size):
@@ -366,91 +262,52 @@ def _parts(shape: tuple[int, int], cells: Cells) -> tuple[NDArray[np.int64], NDA
     numbers = np.full(places.size, -1, dtype=np.int64)
     sizes = np.zeros(places.size, dtype=np.int64)
     stack = np.empty(places.size, dtype=np.int64)
-    parts = 0
+    clusters = 0
     for first in range(places.size):
         if numbers[first] >= 0:
             continue
-        numbers[first] = parts
+        numbers[first] = clusters
         stack[0] = first
         count = 1
         while count > 0:
             count -= 1
             here = places[stack[count]]
-            sizes[parts] += 1
+            sizes[clusters] += 1
             for to in (-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1):
                 i = at[here + to] - 1
                 if i >= 0 and numbers[i] < 0:
-                    numbers[i] = parts
+                    numbers[i] = clusters
                     stack[count] = i
                     count += 1
-        parts += 1
-    return numbers, sizes[:parts].copy()
+        clusters += 1
+    return numbers, sizes[:clusters].copy()
 
 
 @kernel
-def _examine(
-    mask: Mask,
-    free: Mask,
-    looks: NDArray[np.uint8],
-    row: int,
-    col: int,
-    reach: float,
-    faces: NDArray[np.float64],
-) -> bool:
-    """Count a look at each border cell in plain sight.
-
-    Returns whether one of them is exhausted now.
-    """
-    rows, cols = mask.shape
-    exhausted = False
-    whole = int(math.ceil(reach))
-    for r in range(max(row - whole, 0), min(row + whole + 1, rows)):
-        for c in range(max(col - whole, 0), min(col + whole + 1, cols)):
-            away = math.hypot(r - row, c - col)
-            if not mask[r, c] or away > reach:
-                continue
-            turn = (math.atan2(r - row, c - col) - faces[0]) % (2.0 * math.pi)
-            if turn > faces[1] - faces[0]:
-                continue
-            for side in range(4):
-                ur = r + (side == 0) - (side == 1)
-                uc = c + (side == 2) - (side == 3)
-                inside = 0 <= ur < rows and 0 <= uc < cols
-                if not inside or free[ur, uc] or math.hypot(ur - row, uc - col) < away:
-                    continue
-                # In plain sight: all cells up to it are free, and it would be seen if it counted as
-                # free itself.
-                if _sees_up_to(free, row, col, ur, uc):
-                    looks[r, c] = min(looks[r, c] + 1, _LOOKS)
-                    if looks[r, c] == _LOOKS:
-                        mask[r, c] = False
-                        exhausted = True
-                    break
-    return exhausted
-
-
-@kernel
-def _sees_up_to(free: Mask, row: int, col: int, to_row: int, to_col: int) -> bool:
-    """Whether the straight line between two cells runs over free cells, the last not counted."""
-    steps = 2 * max(abs(to_row - row), abs(to_col - col))
-    for i in range(steps):
-        r = int(math.floor(row + 0.5 + (to_row - row) * i / steps))
-        c = int(math.floor(col + 0.5 + (to_col - col) * i / steps))
-        if not (r == to_row and c == to_col) and not free[r, c]:
-            return False
-    return True
-
-
-@kernel
-def _owners(free: Mask, cells: Cells, nodes: Cells, reach: float) -> Cells:
-    owners = np.full(cells.shape[0], -1, dtype=np.int64)
-    for i in range(cells.shape[0]):
-        best = reach
-        for j in range(nodes.shape[0]):
-            away = math.hypot(cells[i, 0] - nodes[j, 0], cells[i, 1] - nodes[j, 1])
-            if away < best and line_is_clear(
-                free, nodes[j, 0], nodes[j, 1], cells[i, 0], cells[i, 1]
-            ):
-                best = away
-                owners[i] = j
-    return owners
+def _hidden_cells(free: Mask, passable: Mask, row: int, col: int, reach: float) -> int:
+    """Cells neither free nor occupied on rays from a cell, each counted once."""
+    rows, cols = free.shape
+    whole = int(reach) + 2
+    seen = np.zeros((2 * whole + 1, 2 * whole + 1), dtype=np.bool_)
+    count = 0
+    for k in range(_RAYS):
+        angle = 2.0 * math.pi * k / _RAYS
+        c, step_x, next_x, delta_x = axis_setup(col + 0.5, math.cos(angle))
+        r, step_y, next_y, delta_y = axis_setup(row + 0.5, math.sin(angle))
+        travelled = 0.0
+        while travelled <= reach:
+            inside = 0 <= r < rows and 0 <= c < cols
+            if inside and not passable[r, c] and not free[r, c]:
+                break
+            if not (inside and free[r, c]) and not seen[r - row + whole, c - col + whole]:
+                seen[r - row + whole, c - col + whole] = True
+                count += 1
+            if next_x < next_y:
+                travelled = next_x
+                next_x += delta_x
+                c += step_x
+            else:
+                travelled = next_y
+                next_y += delta_y
+                r += step_y
+    return count

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Protocol, runtime_checkable
 
+from thinmap_ros.core.exploration.belief.model import MissingArea
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -33,7 +34,7 @@ class EndNode(NamedTuple):
 
     node_id: id in the topological map, or from FIRST_FRONTIER_ID on, below 2^32; goal: pose (3,)
     from which to observe it; frontier_length_m: length of the frontier that is
-    assigned to it.
+    assigned to it; expected_area_m2: hidden area expected behind that.
     """
 
     node_id: int
@@ -45,6 +46,7 @@ class EndNode(NamedTuple):
     min_distance_m: float
     angle_span_deg: float
     frontier_length_m: float
+    expected_area_m2: float
     is_target: bool
     goal: Array
 
@@ -54,8 +56,8 @@ class Decision:
     """What to do next: drive to target.goal, stay, or finish.
 
     reason: words for the end, or for the progress; unreachable: ids of end nodes that are ignored
-    for now because they could not be reached; coverage_estimate: known free area over that and the
-    area expected behind frontiers, 0 to 1.
+    for now because they could not be reached; remaining: how many are worth a visit; missing: area
+    that is not seen, None where the strategy does not estimate it.
     """
 
     target: EndNode | None
@@ -64,8 +66,16 @@ class Decision:
     code: FinishCode
     end_nodes: list[EndNode]
     unreachable: list[int]
-    coverage_estimate: float
     known_area_m2: float
+    remaining: int = 0
+    missing: MissingArea | None = None
+
+    @property
+    def coverage_estimate(self) -> float:
+        """Known free area over that and the missing one, 0 to 1; 0 where nothing is estimated."""
+        if self.missing is None or self.known_area_m2 <= 0.0:
+            return 0.0
+        return self.known_area_m2 / (self.known_area_m2 + self.missing.expected_m2)
 
 
 @runtime_checkable

@@ -1,11 +1,9 @@
-"""From where to look at a border of the known.
+"""Viewpoints: from where a robot sees most of what a frontier hides.
 
-From as far away as the laser allows, or from right beside it.
-
-The unknown behind a border is stood for by some points, straight on from the border's cells. A
-place is good if most of them could be seen from there as long as nothing is known to stand between.
-A robot that stands on the known side of a corner sees along the border, but none of what the corner
-hides; one at the end of its laser's range has to come only a little nearer.
+Some points straight behind the frontier's cells stand for the unknown. A viewpoint has the shortest
+path of all places from which most of these points could be seen if nothing stands in the unknown. A
+robot on the known side of a corner sees along the frontier, but nothing that the corner hides; one
+at the end of its laser's range has to come only a little nearer.
 """
 
 import math
@@ -28,7 +26,6 @@ SQUARE = 3
 _POINTS = 8
 _SHARE = 0.7
 _SPACING = 10
-_SLACK = 5
 _STRIDE = 4
 
 
@@ -47,30 +44,10 @@ def place_for(
     return None if row < 0 else (int(row), int(col))
 
 
-def shows_enough(
-    free: Mask, passable: Mask, cells: Cells, place: Cell, depth: int, reach: float
-) -> bool:
-    """Whether enough of what a border (N, 2) hides could be seen from a cell; see place_for."""
-    points, need = _wanted(free, passable, cells, depth)
-    return bool(_sees_enough(passable, place[0], place[1], points, reach, need))
-
-
 def _wanted(free: Mask, passable: Mask, cells: Cells, depth: int) -> tuple[Cells, int]:
-    """Points (M, 2) behind a border (N, 2), and how many of them have to be in sight."""
+    """Points (M, 2) behind a frontier (N, 2), and how many of them have to be in sight."""
     points = _hidden_points(free, passable, cells, depth, max(_POINTS, len(cells) // _SPACING))
     return points, math.ceil(_SHARE * min(len(points), _POINTS))
-
-
-def place_at(
-    free: Mask, cells: Cells, allowed: Mask, most_steps: int, towards: Cell
-) -> Cell | None:
-    """The allowed cell right at a border (N, 2), near to it and to another cell.
-
-    Of all allowed cells whose way to the border over free cells is at most most_steps, and nearly
-    the shortest, the one nearest to `towards`: round a pillar all sides are equally near.
-    """
-    row, col = _place_at(free, cells, allowed, most_steps, *towards)
-    return None if row < 0 else (int(row), int(col))
 
 
 @kernel
@@ -155,49 +132,3 @@ def _sees_enough(
         if away < reach and line_is_clear(passable, row, col, points[i, 0], points[i, 1]):
             seen += 1
     return seen >= need
-
-
-@kernel
-def _place_at(
-    free: Mask, cells: Cells, allowed: Mask, most_steps: int, to_row: int, to_col: int
-) -> tuple[int, int]:
-    """Breadth first over free cells, from all border cells at once.
-
-    It goes _SLACK steps on after the first find.
-    """
-    rows, cols = free.shape
-    seen = np.zeros((rows, cols), dtype=np.bool_)
-    queue = np.empty((rows * cols, 3), dtype=np.int64)
-    tail = 0
-    for i in range(cells.shape[0]):
-        queue[tail, 0] = cells[i, 0]
-        queue[tail, 1] = cells[i, 1]
-        queue[tail, 2] = 0
-        seen[cells[i, 0], cells[i, 1]] = True
-        tail += 1
-    head = 0
-    best = np.inf
-    best_row = -1
-    best_col = -1
-    while head < tail and queue[head, 2] <= most_steps:
-        row = queue[head, 0]
-        col = queue[head, 1]
-        steps = queue[head, 2]
-        head += 1
-        away = math.hypot(row - to_row, col - to_col)
-        if allowed[row, col] and away < best:
-            if best_row < 0:
-                most_steps = min(most_steps, steps + _SLACK)
-            best = away
-            best_row = row
-            best_col = col
-        for side in range(4):
-            r = row + (side == 0) - (side == 1)
-            c = col + (side == 2) - (side == 3)
-            if 0 <= r < rows and 0 <= c < cols and free[r, c] and not seen[r, c]:
-                seen[r, c] = True
-                queue[tail, 0] = r
-                queue[tail, 1] = c
-                queue[tail, 2] = steps + 1
-                tail += 1
-    return best_row, best_col

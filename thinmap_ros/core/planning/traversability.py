@@ -98,20 +98,6 @@ def path_collides(patch: GridPatch, path: Array, radius_m: float) -> bool:
     return bool(_collides(patch.cells, at, path, radius_m / frame.resolution - 1e-6))
 
 
-@kernel
-def near_true_cell(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mask:
-    """Whether a true cell of a mask (H, W) lies within `reach` cells of each cell (N, 2), (N,)."""
-    whole = int(math.floor(reach))
-    near = np.zeros(cells.shape[0], dtype=np.bool_)
-    for i in range(cells.shape[0]):
-        row = cells[i, 0]
-        col = cells[i, 1]
-        for r in range(max(row - whole, 0), min(row + whole + 1, allowed.shape[0])):
-            for c in range(max(col - whole, 0), min(col + whole + 1, allowed.shape[1])):
-                near[i] |= allowed[r, c] and (r - row) ** 2 + (c - col) ** 2 <= reach * reach
-    return near
-
-
 def disc(
     of: NDArray[Any], centre: tuple[int, int], reach: float
 ) -> tuple[tuple[slice, slice], Mask]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
@@ -127,7 +127,6 @@ _COLUMNS = [
     'probability',
     'distance_index',
     'angle_index',
-    'open_border_m',
     'is_target',
 ]
 
@@ -139,7 +138,7 @@ def _replay_exploration(samples: list[DriveSample]) -> tuple[list[_Moment], EndN
         return Estimate(truth, np.zeros((3, 3)), np.zeros(3))
 
     pipeline = Pipeline(PipelineConfig(scans_per_graph=SCANS_PER_GRAPH), here)
-    explorer = Explorer()
+    explorer = PaperExplorer()
     census = EndNodeCensus()
     moments = []
     for k, sample in enumerate(samples):
@@ -166,7 +165,6 @@ def _rows(moments: list[_Moment]) -> Rows:
             n.probability,
             n.distance_index,
             n.angle_index,
-            n.frontier_length_m,
             n.is_target,
         ]
         for m in moments

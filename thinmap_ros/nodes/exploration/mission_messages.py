@@ -12,6 +12,8 @@ from thinmap_ros.core.exploration.mission import Budget, Mission, MissionGoal
 from thinmap_ros.core.exploration.strategy import EndNode
 from thinmap_ros.ros import messages
 
+_NOT_ESTIMATED = -1.0
+
 
 def mission_goal_from(message: Explore.Goal) -> MissionGoal:
     """Goal of a mission. Raises InputError where a limit or a corner is no number, or too large."""
@@ -38,6 +40,8 @@ def status_msg(mission: Mission, frame_id: str, now_ns: int) -> ExplorationStatu
         reason=mission.end.reason,
         distance_m=mission.odometer.distance_m,
         elapsed=messages.duration_msg(mission.elapsed_s(now_ns / 1e9)),
+        missing_area_m2=_NOT_ESTIMATED,
+        missing_area_bound_m2=_NOT_ESTIMATED,
     )
     decision = mission.decision
     if decision is None:
@@ -45,7 +49,10 @@ def status_msg(mission: Mission, frame_id: str, now_ns: int) -> ExplorationStatu
     status.coverage_estimate = decision.coverage_estimate
     status.known_area_m2 = decision.known_area_m2
     status.reason = status.reason or decision.reason
-    status.end_nodes_remaining = sum(node.frontier_length_m > 0.0 for node in decision.end_nodes)
+    status.end_nodes_remaining = decision.remaining
+    if decision.missing is not None:
+        status.missing_area_m2 = decision.missing.expected_m2
+        status.missing_area_bound_m2 = decision.missing.bound_m2
     if decision.target is not None:
         status.has_target = True
         status.target_id = decision.target.node_id
@@ -63,5 +70,6 @@ def _end_node_msg(node: EndNode) -> EndNodeMsg:
         angle_index=node.angle_index,
         min_distance_m=node.min_distance_m if is_observed else 0.0,
         angle_span_deg=node.angle_span_deg,
+        expected_area_m2=node.expected_area_m2,
         is_target=node.is_target,
     )

@@ -1,0 +1,161 @@
+"""What an exploration believes of its candidates, and what is hidden behind them indeed."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.exploration.cases import load_case
+from thinmap_ros.closed_loop import Options, make_loop, no_progress
+from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.exploration.strategy import Decision
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.sim.coverage import ObservableCells, observable_cells
+from thinmap_ros.sim.robot import PRESETS
+
+Mask = NDArray[np.bool_]
+Cells = NDArray[np.int64]
+COLUMNS = (
+    'evidence_id',
+    'is_end_node',
+    'length_m',
+    'hidden_m2',
+    'distance_index',
+    'angle_index',
+    'visits',
+    'probability',
+    'expected_m2',
+    'area_m2',
+)
+_DECISIONS_PER_ROW = 10
+_SPEED_M_S = 0.5
+_LIMIT_S = 4000.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """An exploration whose candidates are recorded."""
+
+    world: str
+    start: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the result."""
+        return f'{self.world}/{self.start}'
+
+
+def observe(case: Case) -> dict[str, Any]:
+    """Explore a world; returns a row of COLUMNS for each candidate, now and then."""
+    world, start = load_case(case.world, case.start)
+    options = Options(speed_m_s=_SPEED_M_S)
+    radius_m = PRESETS[options.robot].radius_m
+    observable = observable_cells(world, start, radius_m, options.laser.range_max_m)
+    rows: list[list[float]] = []
+    decisions = 0
+
+    def watch(decision: Decision, T_map_base: Array) -> None:
+        nonlocal decisions
+        decisions += 1
+        if decisions % _DECISIONS_PER_ROW == 0:
+            assert isinstance(loop.strategy, Explorer)
+            rows.extend(_rows(loop.strategy, loop.pipeline.grid.known_area(), observable))
+
+    loop = make_loop(world, start, options, None, watch)
+    outcome = loop.run(observable, _LIMIT_S, no_progress, scans_per_show=50)
+    return {
+        'rows': rows,
+        'finished': outcome.finished,
+        'coverage': loop.log.coverage[-1][1],
+        'options': case.name,
+    }
+
+
+def _rows(explorer: Explorer, patch: GridPatch, observable: ObservableCells) -> list[list[float]]:
+    candidates = explorer.candidates
+    if not candidates:
+        return []
+    frame = explorer.frontier_map.frame
+    areas = hidden_areas(
+        [c.cells[explorer.frontier_map.mask[tuple(c.cells.T)]] for c in candidates],
+        frame,
+        patch,
+        observable,
+    )
+    return [
+        [
+            c.evidence.id,
+            float(c.is_end_node),
+            c.length_m,
+            c.hidden_m2,
+            c.evidence.distance_index,
+            c.evidence.angle_index,
+            c.evidence.visits,
+            c.probability,
+            c.expected_area_m2,
+            area,
+        ]
+        for c, area in zip(candidates, areas.tolist(), strict=True)
+    ]
+
+
+def hidden_areas(
+    frontiers: list[Cells], frame: GridFrame, patch: GridPatch, observable: ObservableCells
+) -> Array:
+    """Observable area, m2, that is not known as free and nearest to each frontier (N, 2), (M,).
+
+    Distances lead through that area only. frame: of the frontier cells.
+    """
+    own = observable.frame
+    scale = own.resolution
+    missing = observable.cells & ~_known(patch, observable)
+    seeds = [own.cells_of(frame.centres_of(cells)) for cells in frontiers]
+    owners = [np.full(len(cells), i) for i, cells in enumerate(seeds)]
+    labels = _partition(missing, np.vstack(seeds), np.concatenate(owners))
+    counts = np.bincount(labels[labels >= 0], minlength=len(frontiers))
+    return np.asarray(counts * scale**2)
+
+
+def _known(patch: GridPatch, observable: ObservableCells) -> Mask:
+    """Observable cells that are known as free, (H, W)."""
+    known = np.zeros(observable.cells.shape, dtype=np.bool_)
+    cells = np.argwhere(observable.cells)
+    at = patch.frame.cells_of(observable.frame.centres_of(cells))
+    inside = ((at >= 0) & (at < patch.shape)).all(axis=1)
+    cells = cells[inside]
+    known[cells[:, 0], cells[:, 1]] = patch.free[at[inside, 0], at[inside, 1]]
+    return known
+
+
+@kernel
+def _partition(missing: Mask, seeds: Cells, owners: Cells) -> NDArray[np.int32]:
+    """Owner of the nearest seed (N, 2) of each missing cell (H, W), or -1; breadth first."""
+    rows, cols = missing.shape
+    labels = np.full((rows, cols), -1, dtype=np.int32)
+    queue = np.empty((rows * cols, 2), dtype=np.int64)
+    tail = 0
+    for i in range(seeds.shape[0]):
+        for r in range(max(seeds[i, 0] - 2, 0), min(seeds[i, 0] + 3, rows)):
+            for c in range(max(seeds[i, 1] - 2, 0), min(seeds[i, 1] + 3, cols)):
+                if missing[r, c] and labels[r, c] < 0:
+                    labels[r, c] = owners[i]
+                    queue[tail, 0] = r
+                    queue[tail, 1] = c
+                    tail += 1
+    head = 0
+    while head < tail:
+        row = queue[head, 0]
+        col = queue[head, 1]
+        head += 1
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            for c in range(max(col - 1, 0), min(col + 2, cols)):
+                if missing[r, c] and labels[r, c] < 0:
+                    labels[r, c] = labels[row, col]
+                    queue[tail, 0] = r
+                    queue[tail, 1] = c
+                    tail += 1
+    return labels

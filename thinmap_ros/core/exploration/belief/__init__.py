@@ -1,0 +1,1 @@
+"""What an exploration believes of its candidates: evidence, fitted model, missing area."""

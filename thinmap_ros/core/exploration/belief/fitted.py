@@ -1,0 +1,17 @@
+"""Constants of the belief about candidates.
+
+Written by `python -m benchmarks.exploration.fit_belief --write`, 2026-11-26.
+Fit again instead of editing.
+"""
+
+from thinmap_ros.core.exploration.belief.model import BeliefModel
+
+FITTED = BeliefModel(
+    log_odds=1.928,
+    length=-1.837,
+    hidden=-0.916,
+    reliability=0.038,
+    visit=0.283,
+    area_limits_m2=(1.6, 5.1, 10.8, 16.8, 22.8),
+    mean_area_m2=(2.9, 2.9, 8.8, 20.4, 53.1, 140.5),
+)

@@ -1,0 +1,181 @@
+"""Exploration by the position probability of end nodes, as the paper prints it.
+
+- Each view of an end node updates its position probability by equations (1) to (10), from 0.5 on.
+- Only end nodes below the threshold are visited: first the one that the robot faces, afterwards the
+  nearest one on the graph. A target is kept until its probability passes the threshold or it
+  disappears.
+- Finished when no end node below the threshold is left.
+
+What the paper leaves open: which views count, and which end node continues which (`evidence`); an
+end node that the robot has reached without success is not visited again, nor one that the
+navigator could not reach.
+
+Source: exploration paper sections 3.2 and 4.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.belief.evidence import Evidence, EvidenceStore
+from thinmap_ros.core.exploration.explorer import ExplorerConfig
+from thinmap_ros.core.exploration.frontiers import FrontierMap
+from thinmap_ros.core.exploration.position_probability import bayes_update
+from thinmap_ros.core.exploration.strategy import Decision, EndNode, finish_reason
+from thinmap_ros.core.exploration.visibility import box_of_scan, visible_places
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+
+PRIOR = 0.5
+_NEAR_M = 0.3
+_SCANS = 3
+_START_S = 5.0  # the first scans are no graph yet
+
+
+@dataclass(eq=False)
+class _EndNode:
+    """An end node: its id in the graph, its evidence, and its position probability."""
+
+    node_id: int
+    evidence: Evidence
+    probability: float = PRIOR
+
+    def as_end_node(self, goal: Array, is_target: bool) -> EndNode:
+        evidence = self.evidence
+        return EndNode(
+            node_id=self.node_id,
+            x=evidence.place[0],
+            y=evidence.place[1],
+            probability=self.probability,
+            distance_index=evidence.distance_index,
+            angle_index=evidence.angle_index,
+            min_distance_m=evidence.min_distance_m,
+            angle_span_deg=evidence.angle_span_deg,
+            frontier_length_m=0.0,
+            expected_area_m2=0.0,
+            is_target=is_target,
+            goal=goal,
+        )
+
+
+class PaperExplorer:
+    """Visits end nodes until the position probability of each one passes the threshold."""
+
+    def __init__(self, config: ExplorerConfig | None = None) -> None:
+        self.config = config or ExplorerConfig()
+        self._frontier_map = FrontierMap()
+        self._store = EvidenceStore(1)
+        self._end_nodes: list[_EndNode] = []
+        self._target: _EndNode | None = None
+        self._goal = np.zeros(3)
+        self._is_first = True
+        self._began_ns = -1
+        self._scans_at_goal = self._scans_without_target = 0
+
+    def step(
+        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
+    ) -> Decision:
+        """Choose where to drive; see strategy.Strategy."""
+        self._began_ns = scan.stamp_ns if self._began_ns < 0 else self._began_ns
+        self._frontier_map.update(patch, box_of_scan(scan, T_map_base))
+        self._follow(topology)
+        self._add_views(scan, T_map_base)
+        self._add_visit(T_map_base)
+        waits = not topology.nodes and scan.stamp_ns - self._began_ns < _START_S * SECOND_NS
+        left = [node for node in self._end_nodes if self._is_worth_a_visit(node)]
+        self._scans_without_target = 0 if left or waits else self._scans_without_target + 1
+        self._choose(left, topology, T_map_base)
+        return self._decision(len(left))
+
+    def target_failed(self, reason: str) -> None:
+        """Process that the present target could not be reached."""
+        if self._target is not None:
+            self._target.evidence.failures += 1
+            self._target = None
+
+    def _follow(self, topology: TopologicalMap) -> None:
+        """Follow the end nodes of the graph; one that has moved away begins again."""
+        before = {node.evidence.id: node for node in self._end_nodes}
+        nodes = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
+        places = [(node.x, node.y) for node in nodes]
+        found = self._store.follow(places, self.config.node_reset_distance_m)
+        self._end_nodes = []
+        for node, evidence in zip(nodes, found, strict=True):
+            known = before.get(evidence.id, _EndNode(node.id, evidence))
+            known.node_id = node.id
+            if not evidence.views:
+                known.probability = PRIOR
+            self._end_nodes.append(known)
+
+    def _add_views(self, scan: Scan, T_map_base: Array) -> None:
+        """Equations (1) to (10) for each end node of which this scan is a view."""
+        if not self._end_nodes:
+            return
+        T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
+        places = np.array([node.evidence.place for node in self._end_nodes])
+        frontiers = self._frontier_map
+        seen = visible_places(places, scan, T_map_laser, frontiers.free, frontiers.frame)
+        for i in np.flatnonzero(seen):
+            node = self._end_nodes[i]
+            if node.evidence.add_view(T_map_laser, self.config):
+                node.probability = bayes_update(node.probability, node.evidence.reliability)
+
+    def _add_visit(self, T_map_base: Array) -> None:
+        """An end node that the robot has reached needs no further visit."""
+        target = self._target
+        if target is None:
+            return
+        is_there = math.dist(T_map_base[:2], target.evidence.place) <= _NEAR_M
+        self._scans_at_goal = self._scans_at_goal + 1 if is_there else 0
+        if self._scans_at_goal >= _SCANS:
+            target.evidence.visits += 1
+            self._scans_at_goal = 0
+
+    def _is_worth_a_visit(self, node: _EndNode) -> bool:
+        attempts = node.evidence.visits + node.evidence.failures
+        return node.probability < self.config.probability_threshold and attempts == 0
+
+    def _choose(self, left: list[_EndNode], topology: TopologicalMap, T_map_base: Array) -> None:
+        if self._target not in left:
+            self._target = self._next(left, topology, T_map_base) if left else None
+            self._goal = np.full(3, np.inf)
+        if self._target is None:
+            return
+        place = self._target.evidence.place
+        if math.dist(place, self._goal[:2]) > _NEAR_M:  # it moves as the map grows
+            heading = math.atan2(place[1] - T_map_base[1], place[0] - T_map_base[0])
+            self._goal = se2.pose(*place, heading)
+
+    def _next(self, left: list[_EndNode], topology: TopologicalMap, T_map_base: Array) -> _EndNode:
+        if self._is_first:
+            self._is_first = False
+            return min(left, key=lambda node: _turn(T_map_base, node.evidence.place))
+        lengths = path_lengths_to_nodes(topology, float(T_map_base[0]), float(T_map_base[1]))
+        return min(left, key=lambda node: lengths.get(node.node_id, math.inf))
+
+    def _decision(self, left: int) -> Decision:
+        chosen = None
+        end_nodes = []
+        for node in self._end_nodes:
+            is_target = node is self._target
+            goal = self._goal if is_target else np.array([*node.evidence.place, 0.0])
+            end_node = node.as_end_node(goal, is_target)
+            chosen = end_node if is_target else chosen
+            end_nodes.append(end_node)
+        unreachable = sorted(n.node_id for n in self._end_nodes if n.evidence.failures)
+        finished = self._scans_without_target >= _SCANS
+        code, reason = finish_reason(finished, unreachable, left)
+        area_m2 = self._frontier_map.known_area_m2
+        return Decision(chosen, finished, reason, code, end_nodes, unreachable, area_m2, left)
+
+
+def _turn(T_map_base: Array, place: tuple[float, float]) -> float:
+    """Size of the turn towards a place, rad."""
+    bearing = math.atan2(place[1] - T_map_base[1], place[0] - T_map_base[0])
+    return abs(se2.wrap(bearing - float(T_map_base[2])))

@@ -1,0 +1,110 @@
+"""Where the robot can stand, where it can get from here, and how long the paths are."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.exploration.frontiers import NOTHING, FrontierMap
+from thinmap_ros.core.exploration.viewpoints import SQUARE
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.planning.grid_search import (
+    PathLengthTable,
+    distance_field_from,
+    downsample_mask,
+)
+from thinmap_ros.core.planning.recent_path import RecentPath
+from thinmap_ros.core.planning.traversability import (
+    escape_cells,
+    reachable_cells,
+    traversable_cells,
+    update_traversable_cells,
+)
+from thinmap_ros.core.se2 import Array
+
+Mask = NDArray[np.bool_]
+_ESCAPE_M = 0.6
+_DETOUR = 3.0  # of the straight line, where no path is known
+_COARSE_M = 0.3
+_FORGET_S = 20.0
+_UNKNOWN_COST = 2  # of a metre through the unknown: it may turn out to be blocked
+
+
+class Reachable(NamedTuple):
+    """Reachable cells (H, W), and the path length, in squares, to each of their squares."""
+
+    cells: Mask
+    path_lengths: Array
+    frame: GridFrame
+
+
+class ReachableSpace:
+    """Reachable space of a robot of a radius, updated where the map has changed."""
+
+    def __init__(self, robot_radius_m: float) -> None:
+        self._radius_m = robot_radius_m
+        self._recent_path = RecentPath()
+        self._standing: Mask = np.zeros((0, 0), dtype=np.bool_)
+        self._maybe = self._standing  # if nothing stands in the unknown
+        self._between = PathLengthTable(_COARSE_M, _FORGET_S, _UNKNOWN_COST)
+        nowhere = np.zeros((0, 0))
+        self.now = Reachable(self._standing, nowhere, GridFrame(0.0, 0.0, 1.0))
+
+    def add_pose(self, T_map_base: Array) -> None:
+        """Add a pose (3,): the robot can return over its recent path."""
+        self._recent_path.add_pose(T_map_base)
+
+    def update(self, frontiers: FrontierMap, T_map_base: Array) -> None:
+        """Find what can be reached from a pose (3,) in the map of the frontiers."""
+        self._update_standing(frontiers)
+        frame = frontiers.frame
+        xy = (float(T_map_base[0]), float(T_map_base[1]))
+        recent = self._recent_path.cells(frame, frontiers.free.shape)
+        allowed = escape_cells(self._standing, frontiers.free, frame, xy, _ESCAPE_M, recent)
+        row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
+        # Squares join what a wall of one cell separates, and say how far; cells say whether at all.
+        reached = reachable_cells(allowed, (row, col))
+        squares = downsample_mask(reached, SQUARE)
+        lengths = distance_field_from(squares, (row // SQUARE, col // SQUARE))
+        cells = reached & self._standing
+        self.now = Reachable(cells, lengths, frame)
+
+    def path_lengths(self, T_map_base: Array, goals: Array) -> Array:
+        """Path lengths (N,), m, to goals (N, 2); estimated where there is no path."""
+        frame = self.now.frame
+        rows, cols = (frame.cells_of(goals) // SQUARE).T
+        height, width = self.now.path_lengths.shape
+        inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
+        found = np.full(len(goals), np.inf)
+        squares = self.now.path_lengths[rows[inside], cols[inside]]
+        found[inside] = squares * SQUARE * frame.resolution
+        return _with_estimates(found, np.hypot(*(goals - T_map_base[:2]).T))
+
+    def path_lengths_between(self, goals: Array, stamp_ns: int) -> Array:
+        """Path lengths (N, N), m, between goals (N, 2), also through the unknown, at higher cost.
+
+        A robot that enters the unknown in one place may come out in another one.
+        """
+        straight = np.hypot(*(goals[:, None] - goals[None]).transpose(2, 0, 1))
+        found = self._between.update(self.now.cells, self._maybe, self.now.frame, goals, stamp_ns)
+        return _with_estimates(found, straight)
+
+    def _update_standing(self, frontiers: FrontierMap) -> None:
+        radius_m = self._radius_m
+        resolution = frontiers.frame.resolution
+        part = frontiers.take_changes()
+        if part is None:
+            self._standing = traversable_cells(frontiers.free, radius_m, resolution)
+            self._maybe = traversable_cells(frontiers.passable, radius_m, resolution)
+        elif part != NOTHING:
+            for standing, free in (
+                (self._standing, frontiers.free),
+                (self._maybe, frontiers.passable),
+            ):
+                update_traversable_cells(standing, free, part, radius_m, resolution)
+
+
+def _with_estimates(lengths_m: Array, straight_m: Array) -> Array:
+    """Path lengths, at least the straight line; a detour where there is no path."""
+    known = np.where(np.isfinite(lengths_m), lengths_m, _DETOUR * straight_m)
+    return np.asarray(np.maximum(known, straight_m))
