@@ -158,39 +158,3 @@ def test_paths_between_goals_may_lead_through_the_unknown():
     ((_, through),) = room.space.path_lengths_between(np.array([[2.0, 2.0], [11.0, 2.0]]), 0)[:1]
     assert 9.0 < through < 15.0
     assert math.isfinite(through)
-
-
-def narrow_passage():
-    """A room of 4 x 4 m with a gap of 0.3 m to the east; beyond it 1 m is known."""
-    cells = np.full((40, 80), -1)
-    cells[:, :40] = 0
-    cells[[0, -1]] = 100
-    cells[:, 0] = 100
-    cells[:, 40] = 100
-    cells[18:21, 40] = 0
-    cells[15:24, 41:51] = 0
-    return cells
-
-
-def test_a_frontier_that_cannot_be_seen_from_anywhere_is_approached():
-    """From nearby the map may turn out to be wrong about the passage."""
-    cells = narrow_passage()
-    cells[14, 41:60] = cells[24, 41:60] = 100
-    cells[15:18, 46] = cells[19:24, 46] = 100
-    room = Room(cells)
-    (candidate,) = [c for c in room.find() if c.length_m > 0.0]
-    row, col = (int(v) for v in room.frontiers.frame.cells_of(candidate.goal[None, :2])[0])
-    assert room.space.now.cells[row, col]
-    assert math.dist(candidate.goal[:2], candidate.middle) < 3.0
-    far = Room(np.pad(cells[:, 40:], ((0, 0), (0, 0)), constant_values=-1))
-    assert all(c.goal is None for c in far.find(se2.pose(-9.0, 2.0, 0.0)))
-
-
-def test_a_wall_of_one_cell_separates_what_can_be_reached():
-    cells = corridor()
-    cells[:, 61] = 100
-    room = Room(cells)
-    room.find()
-    rows, cols = np.nonzero(room.space.now.cells)
-    assert cols.max() < 61
-    assert len(rows)

@@ -12,7 +12,7 @@ from thinmap_ros.core.exploration.visibility import _visible
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.planning.grid_search import downsample_mask
+from thinmap_ros.core.planning.grid_search import downsample_mask, upsample_mask
 from thinmap_ros.core.planning.obstacle_points import _arc, _clear_steps, _points_around
 from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.traversability import (
@@ -195,7 +195,7 @@ def test_what_is_joined(seed):
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_squares_of_cells(seed):
+def test_squares_of_cells_and_back(seed):
     rng = np.random.default_rng(seed)
     cells = rng.random((31, 44)) < 0.1
     factor = int(rng.integers(1, 5))
@@ -203,6 +203,10 @@ def test_squares_of_cells(seed):
     shape = (padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
     expected = padded.reshape(shape).any(axis=(1, 3))
     assert (downsample_mask(cells, factor) == expected).all()
+    chosen = rng.random(expected.shape) < 0.5
+    rows, cols = cells.shape
+    spread = np.repeat(np.repeat(chosen, factor, axis=0), factor, axis=1)[:rows, :cols]
+    assert (upsample_mask(chosen, factor, cells) == (cells & spread)).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)

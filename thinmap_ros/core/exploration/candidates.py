@@ -24,7 +24,6 @@ from thinmap_ros.core.exploration.reachable import Reachable
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode
 from thinmap_ros.core.exploration.viewpoints import place_for
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.planning.traversability import nearest_true
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
@@ -190,9 +189,7 @@ class CandidateFinder:
     ) -> None:
         """Determine the hidden area and the viewpoint.
 
-        The viewpoint is as far away as the laser allows, unless a visit there showed nothing. Where
-        none can be reached, it is the nearest place that can: from there the map may turn out to be
-        wrong about the passage.
+        The viewpoint is as far away as the laser allows, unless a visit there showed nothing.
         """
         candidate.hidden_m2 = frontiers.hidden_area_m2(candidate.middle, HIDDEN_REACH_M)
         candidate.goal = None
@@ -209,14 +206,9 @@ class CandidateFinder:
                 reach_m / resolution,
             )
             if cell is not None:
-                break
-        else:
-            middle = frontiers.frame.cells_of(np.array([candidate.middle]))[0]
-            reach = self._config.frontier_assignment_radius_m / frontiers.frame.resolution
-            cell = nearest_true(reachable.cells, (int(middle[0]), int(middle[1])), reach)
-        if cell is not None:
-            x, y = frontiers.frame.centres_of(np.array([cell]))[0]
-            candidate.goal = _facing((float(x), float(y)), candidate.middle)
+                x, y = frontiers.frame.centres_of(np.array([cell]))[0]
+                candidate.goal = _facing((float(x), float(y)), candidate.middle)
+                return
 
 
 def _may_keep(candidate: Candidate, known: Candidate, stamp_ns: int) -> bool:

@@ -12,11 +12,11 @@ from thinmap_ros.core.planning.grid_search import (
     PathLengthTable,
     distance_field_from,
     downsample_mask,
+    upsample_mask,
 )
 from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.traversability import (
     escape_cells,
-    reachable_cells,
     traversable_cells,
     update_traversable_cells,
 )
@@ -61,12 +61,9 @@ class ReachableSpace:
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         recent = self._recent_path.cells(frame, frontiers.free.shape)
         allowed = escape_cells(self._standing, frontiers.free, frame, xy, _ESCAPE_M, recent)
-        row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
-        # Squares join what a wall of one cell separates, and say how far; cells say whether at all.
-        reached = reachable_cells(allowed, (row, col))
-        squares = downsample_mask(reached, SQUARE)
-        lengths = distance_field_from(squares, (row // SQUARE, col // SQUARE))
-        cells = reached & self._standing
+        row, col = (int(v) // SQUARE for v in frame.cells_of(np.array([xy]))[0])
+        lengths = distance_field_from(downsample_mask(allowed, SQUARE), (row, col))
+        cells = upsample_mask(np.isfinite(lengths), SQUARE, self._standing)
         self.now = Reachable(cells, lengths, frame)
 
     def path_lengths(self, T_map_base: Array, goals: Array) -> Array:
