@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from thinmap_ros.closed_loop import ExplorationOutcome
+from thinmap_ros.core.exploration.belief.model import MissingArea
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.evaluation.exploration_metrics import (
     MIN_OBSERVATIONS,
     EndNodeCensus,
     TargetLog,
     exploration_report,
+    hidden_places,
+    missing_area_report,
 )
 
 AFAR = np.array([100.0, 100.0, 0.0])
@@ -94,3 +97,13 @@ def test_a_target_that_goes_back_to_the_one_before_is_a_reversal(places, changes
     for place in places:
         log.add(None if place is None else np.array([place, 1.0, 0.0]))
     assert (log.changes, log.reversals) == (changes, reversals)
+
+
+def test_what_is_probably_missing_is_told_where_it_is_worth_seeing():
+    hidden = [(1.0, 2.0, 0.2), (3.0, 4.0, 2.0), (5.0, 6.0, 7.26)]
+    report = {'missing_area': missing_area_report(MissingArea(9.46, 20.0), hidden)}
+    assert report['missing_area']['expected_m2'] == 9.5
+    assert report['missing_area']['bound_95_m2'] == 20.0
+    assert hidden_places(report).tolist() == [[5.0, 6.0, 7.3], [3.0, 4.0, 2.0]]
+    assert missing_area_report(None, hidden) is None
+    assert hidden_places({'missing_area': None}).shape == (0, 3)

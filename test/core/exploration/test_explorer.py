@@ -9,6 +9,8 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.belief.evidence import Evidence
+from thinmap_ros.core.exploration.candidates import Candidate
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision, FinishCode
@@ -252,3 +254,40 @@ def test_a_graph_that_is_there_before_the_map_does_not_end_the_exploration():
         decision = late.step(run.topology.map, unknown, run.scan, START)
         assert not decision.finished and decision.target is None
     assert late.step(run.topology.map, run.grid.known_area(), run.scan, START).known_area_m2 > 0.0
+
+
+def test_of_two_viewpoints_that_take_turns_with_the_robot_one_is_reached():
+    explorer = Explorer()
+    evidence = Evidence(FIRST_FRONTIER_ID, (2.0, 2.0), (2.0, 2.0))
+    cells = np.zeros((15, 2), dtype=np.int64)
+    viewpoints = [se2.pose(0.0, 0.0, 0.5), se2.pose(0.0, 0.6, 0.5)]
+
+    def goal_after(viewpoint, robot, middle=(2.0, 2.0)):
+        candidate = Candidate(FIRST_FRONTIER_ID, (2.0, 2.0), cells, middle, evidence)
+        candidate.goal = viewpoint
+        explorer._drive_to(candidate, robot)
+        return explorer._target.goal
+
+    assert goal_after(viewpoints[0], START) is viewpoints[0]
+    assert goal_after(viewpoints[1], se2.pose(0.0, 0.2, 0.0)) is viewpoints[0]
+    # A frontier that has moved is observed from where it can be seen now.
+    assert goal_after(viewpoints[1], se2.pose(0.0, 0.2, 0.0), (2.1, 2.0)) is viewpoints[1]
+
+
+def test_after_a_visit_or_a_failure_the_next_viewpoint_counts():
+    explorer = Explorer()
+    evidence = Evidence(FIRST_FRONTIER_ID, (2.0, 2.0), (2.0, 2.0))
+    candidate = Candidate(
+        FIRST_FRONTIER_ID, (2.0, 2.0), np.zeros((15, 2), dtype=np.int64), (2.0, 2.0), evidence
+    )
+    candidate.goal = se2.pose(0.0, 0.0, 0.5)
+    explorer._drive_to(candidate, START)
+    for _ in range(3):
+        explorer._add_visit(se2.pose(0.0, 0.0, 0.5))
+    assert evidence.visits == 1
+    candidate.goal = se2.pose(0.5, 0.0, 0.5)
+    explorer._drive_to(candidate, se2.pose(0.0, 0.0, 0.5))
+    assert explorer._target.goal is candidate.goal
+    explorer.target_failed('no path')
+    assert evidence.failures == 1
+    assert explorer._target.goal is None

@@ -98,22 +98,32 @@ class Candidate:
 
     def as_end_node(self, target_goal: Array | None) -> EndNode:
         """End node of a decision; target_goal (3,): where the robot drives if it is the target."""
+        end_node = end_node_of(self.node_id, self.evidence, self.probability)
         goal = self.goal if target_goal is None else target_goal
-        evidence = self.evidence
-        return EndNode(
-            node_id=self.node_id,
-            x=self.place[0],
-            y=self.place[1],
-            probability=self.probability,
-            distance_index=evidence.distance_index,
-            angle_index=evidence.angle_index,
-            min_distance_m=evidence.min_distance_m,
-            angle_span_deg=evidence.angle_span_deg,
+        return end_node._replace(
             frontier_length_m=self.length_m,
             expected_area_m2=self.expected_area_m2,
             is_target=target_goal is not None,
-            goal=np.array([*self.place, 0.0]) if goal is None else goal,
+            goal=end_node.goal if goal is None else goal,
         )
+
+
+def end_node_of(node_id: int, evidence: Evidence, probability: float) -> EndNode:
+    """End node of a decision from its evidence: without a frontier, and not the target."""
+    return EndNode(
+        node_id=node_id,
+        x=evidence.place[0],
+        y=evidence.place[1],
+        probability=probability,
+        distance_index=evidence.distance_index,
+        angle_index=evidence.angle_index,
+        min_distance_m=evidence.min_distance_m,
+        angle_span_deg=evidence.angle_span_deg,
+        frontier_length_m=0.0,
+        expected_area_m2=0.0,
+        is_target=False,
+        goal=np.array([*evidence.place, 0.0]),
+    )
 
 
 class CandidateFinder:

@@ -191,6 +191,7 @@ class Explorer:
             candidate.evidence.failures += 1
             candidate.evidence.failed_ns = self._clock.now_ns
             self._drop_target()
+            self._target.goal = None
 
     def frontiers(self) -> list[Array]:
         """Cells of each frontier that a candidate has, (N, 2), m, map frame."""
@@ -225,6 +226,7 @@ class Explorer:
             target.candidate.evidence.visits += 1
             target.candidate.examined_ns = -1
             self._drop_target()
+            target.goal = None
 
     # The target.
 
@@ -290,18 +292,29 @@ class Explorer:
         return near if math.dist(near.middle, target.middle) <= _SAME_PLACE_M else None
 
     def _drive_to(self, candidate: Candidate, T_map_base: Array) -> None:
-        """Make a candidate the target; on the way the goal stays while its frontier does."""
+        """Make a candidate the target; the goal stays while its frontier does."""
         target = self._target
         goal = candidate.goal
         if goal is None:
             return
-        is_same = target.goal is not None and (
-            math.dist(candidate.middle, target.middle) <= _SAME_PLACE_M
-        )
-        if not (is_same and target.goal is not None and _may_stay(target.goal, goal, T_map_base)):
+        if not self._goal_stays(candidate, goal, T_map_base):
             target.goal = goal
         target.candidate = candidate
         target.middle = candidate.middle
+
+    def _goal_stays(self, candidate: Candidate, goal: Array, T_map_base: Array) -> bool:
+        """Whether the goal stays although another viewpoint of the same frontier is nearer now.
+
+        It does on the way, and as long as the frontier is unchanged: of two viewpoints that take
+        turns with the place of the robot, none would ever be reached.
+        """
+        target = self._target
+        if target.goal is None:
+            return False
+        moved_m = math.dist(candidate.middle, target.middle)
+        gap_m = math.dist(goal[:2], target.goal[:2])
+        is_on_the_way = math.dist(T_map_base[:2], target.goal[:2]) > _NEAR_M
+        return max(moved_m, gap_m) <= _SAME_PLACE_M and (is_on_the_way or moved_m == 0.0)
 
     def _drop_target(self) -> None:
         self._target.candidate = None
@@ -364,12 +377,3 @@ def _turns(T_map_base: Array, goals: Array) -> Array:
 def _is_at(T_map_base: Array, goal: Array) -> bool:
     near = math.dist(T_map_base[:2], goal[:2]) <= _NEAR_M
     return near and abs(se2.wrap(float(goal[2] - T_map_base[2]))) <= _NEAR_RAD
-
-
-def _may_stay(goal: Array, other: Array, T_map_base: Array) -> bool:
-    """Whether a goal stays although another one would be chosen now: the robot is on its way."""
-    gap_m = math.dist(other[:2], goal[:2])
-    if gap_m <= _SAME_PLACE_M and math.dist(T_map_base[:2], goal[:2]) > _NEAR_M:
-        return True
-    turned = abs(se2.wrap(float(other[2] - goal[2])))
-    return gap_m <= _NEAR_M and turned <= 2.0 * _NEAR_RAD

@@ -20,10 +20,11 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.belief.evidence import Evidence, EvidenceStore
+from thinmap_ros.core.exploration.candidates import end_node_of
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.position_probability import bayes_update
-from thinmap_ros.core.exploration.strategy import Decision, EndNode, finish_reason
+from thinmap_ros.core.exploration.strategy import Decision, finish_reason
 from thinmap_ros.core.exploration.visibility import box_of_scan, visible_places
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
@@ -45,23 +46,6 @@ class _EndNode:
     node_id: int
     evidence: Evidence
     probability: float = PRIOR
-
-    def as_end_node(self, goal: Array, is_target: bool) -> EndNode:
-        evidence = self.evidence
-        return EndNode(
-            node_id=self.node_id,
-            x=evidence.place[0],
-            y=evidence.place[1],
-            probability=self.probability,
-            distance_index=evidence.distance_index,
-            angle_index=evidence.angle_index,
-            min_distance_m=evidence.min_distance_m,
-            angle_span_deg=evidence.angle_span_deg,
-            frontier_length_m=0.0,
-            expected_area_m2=0.0,
-            is_target=is_target,
-            goal=goal,
-        )
 
 
 class PaperExplorer:
@@ -163,10 +147,9 @@ class PaperExplorer:
         chosen = None
         end_nodes = []
         for node in self._end_nodes:
-            is_target = node is self._target
-            goal = self._goal if is_target else np.array([*node.evidence.place, 0.0])
-            end_node = node.as_end_node(goal, is_target)
-            chosen = end_node if is_target else chosen
+            end_node = end_node_of(node.node_id, node.evidence, node.probability)
+            if node is self._target:
+                end_node = chosen = end_node._replace(is_target=True, goal=self._goal)
             end_nodes.append(end_node)
         unreachable = sorted(n.node_id for n in self._end_nodes if n.evidence.failures)
         finished = self._scans_without_target >= _SCANS
