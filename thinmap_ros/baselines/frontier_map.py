@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.frontiers import FrontierMap
+from thinmap_ros.core.exploration.viewpoints import place_beside
 from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.grid_search import downsample_mask, path_lengths_from
 from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.traversability import (
@@ -26,7 +26,6 @@ from thinmap_ros.core.se2 import Array
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 _COARSE = 2
-_SLACK_CELLS = 5
 _PART_M = 1.0
 # The same robot and the same frontiers as for the exploration of the paper.
 _EXPLORER = ExplorerConfig()
@@ -146,51 +145,5 @@ class FrontierFinder:
         frame = self.map.frame
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
         max_steps = int(_EXPLORER.frontier_assignment_radius_m / frame.resolution)
-        cell = _nearest_allowed(self.map.free, cells, allowed, max_steps, row, col)
-        return None if cell[0] < 0 else np.asarray(frame.centres_of(np.array([cell]))[0])
-
-
-@kernel
-def _nearest_allowed(
-    free: Mask, cells: Cells, allowed: Mask, most_steps: int, to_row: int, to_col: int
-) -> tuple[int, int]:
-    """Breadth first over free cells, from all border cells at once.
-
-    It goes _SLACK_CELLS steps on after the first find.
-    """
-    rows, cols = free.shape
-    seen = np.zeros((rows, cols), dtype=np.bool_)
-    queue = np.empty((rows * cols, 3), dtype=np.int64)
-    tail = 0
-    for i in range(cells.shape[0]):
-        queue[tail, 0] = cells[i, 0]
-        queue[tail, 1] = cells[i, 1]
-        queue[tail, 2] = 0
-        seen[cells[i, 0], cells[i, 1]] = True
-        tail += 1
-    head = 0
-    best = np.inf
-    best_row = -1
-    best_col = -1
-    while head < tail and queue[head, 2] <= most_steps:
-        row = queue[head, 0]
-        col = queue[head, 1]
-        steps = queue[head, 2]
-        head += 1
-        away = math.hypot(row - to_row, col - to_col)
-        if allowed[row, col] and away < best:
-            if best_row < 0:
-                most_steps = min(most_steps, steps + _SLACK_CELLS)
-            best = away
-            best_row = row
-            best_col = col
-        for side in range(4):
-            r = row + (side == 0) - (side == 1)
-            c = col + (side == 2) - (side == 3)
-            if 0 <= r < rows and 0 <= c < cols and free[r, c] and not seen[r, c]:
-                seen[r, c] = True
-                queue[tail, 0] = r
-                queue[tail, 1] = c
-                queue[tail, 2] = steps + 1
-                tail += 1
-    return best_row, best_col
+        cell = place_beside(self.map.free, cells, allowed, max_steps, (row, col))
+        return None if cell is None else np.asarray(frame.centres_of(np.array([cell]))[0])

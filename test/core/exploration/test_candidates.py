@@ -11,6 +11,7 @@ from thinmap_ros.core.exploration.candidates import CandidateConfig, CandidateFi
 from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.reachable import ReachableSpace
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
+from thinmap_ros.core.exploration.viewpoints import place_beside
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
@@ -158,3 +159,36 @@ def test_paths_between_goals_may_lead_through_the_unknown():
     ((_, through),) = room.space.path_lengths_between(np.array([[2.0, 2.0], [11.0, 2.0]]), 0)[:1]
     assert 9.0 < through < 15.0
     assert math.isfinite(through)
+
+
+def test_a_frontier_behind_a_passage_that_looks_too_narrow_is_observed_from_before_it():
+    cells = np.full((40, 80), -1)
+    cells[:, :40] = 0
+    cells[[0, -1]] = 100
+    cells[:, 0] = 100
+    cells[:, 40] = 100
+    cells[18:21, 40] = 0  # 0.3 m
+    cells[15:25, 41:50] = 0
+    cells[14, 41:60] = cells[25, 41:60] = 100
+    room = Room(cells)
+    for _ in range(2):
+        candidates = [c for c in room.find() if c.length_m > 0.0]
+        assert candidates
+        for candidate in candidates:
+            assert candidate.goal is not None
+            assert candidate.goal[0] < 4.0
+            assert math.dist(candidate.goal[:2], candidate.middle) < 3.0
+            candidate.evidence.visits += 1
+            candidate.examined_ns = -1
+
+
+def test_no_place_is_beside_a_frontier_across_a_wall():
+    free = np.zeros((40, 60), dtype=np.bool_)
+    free[1:39, 1:59] = True
+    free[:, 30] = False
+    frontier = np.array([[20, 33], [21, 33]])
+    allowed = free.copy()
+    allowed[:, 31:] = False
+    assert place_beside(free, frontier, allowed, 30, (20, 33)) is None
+    free[5, 30] = True
+    assert place_beside(free, frontier, allowed, 30, (20, 33))[1] < 30

@@ -22,7 +22,7 @@ from thinmap_ros.core.exploration.belief.model import HIDDEN_REACH_M, BeliefMode
 from thinmap_ros.core.exploration.frontiers import Cells, FrontierMap
 from thinmap_ros.core.exploration.reachable import Reachable
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode
-from thinmap_ros.core.exploration.viewpoints import place_for
+from thinmap_ros.core.exploration.viewpoints import place_beside, place_for
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
@@ -199,13 +199,24 @@ class CandidateFinder:
     ) -> None:
         """Determine the hidden area and the viewpoint.
 
-        The viewpoint is as far away as the laser allows, unless a visit there showed nothing.
+        The viewpoint is as far away as the laser allows, unless a visit there showed nothing. Where
+        no reachable place sees the frontier, it is the nearest one on the way: from there a passage
+        that looks too narrow may turn out to be wide enough.
         """
         candidate.hidden_m2 = frontiers.hidden_area_m2(candidate.middle, HIDDEN_REACH_M)
+        cell = self._viewpoint(candidate, frontiers, reachable, range_max_m)
         candidate.goal = None
+        if cell is not None:
+            x, y = frontiers.frame.centres_of(np.array([cell]))[0]
+            candidate.goal = _facing((float(x), float(y)), candidate.middle)
+
+    def _viewpoint(
+        self, candidate: Candidate, frontiers: FrontierMap, reachable: Reachable, range_max_m: float
+    ) -> tuple[int, int] | None:
+        """Cell (row, col) from which to observe a candidate; None: there is none."""
+        resolution = frontiers.frame.resolution
         views = [(range_max_m - _RIM_M, self._config.view_depth_m), (_NEAR_M, 0.0)]
         for reach_m, depth_m in views[min(candidate.evidence.visits, 1) :]:
-            resolution = frontiers.frame.resolution
             cell = place_for(
                 frontiers.free,
                 frontiers.passable,
@@ -216,9 +227,11 @@ class CandidateFinder:
                 reach_m / resolution,
             )
             if cell is not None:
-                x, y = frontiers.frame.centres_of(np.array([cell]))[0]
-                candidate.goal = _facing((float(x), float(y)), candidate.middle)
-                return
+                return cell
+        steps = int(self._config.frontier_assignment_radius_m / resolution)
+        row, col = frontiers.frame.cells_of(np.array([candidate.middle]))[0]
+        towards = (int(row), int(col))
+        return place_beside(frontiers.free, candidate.cells, reachable.cells, steps, towards)
 
 
 def _may_keep(candidate: Candidate, known: Candidate, stamp_ns: int) -> bool:

@@ -27,6 +27,7 @@ _POINTS = 8
 _SHARE = 0.7
 _SPACING = 10
 _STRIDE = 4
+_SLACK_CELLS = 5
 
 
 def place_for(
@@ -41,6 +42,18 @@ def place_for(
     """
     points, need = _wanted(free, passable, cells, depth)
     row, col = _view_place(ways, SQUARE, allowed, passable, points, reach, need)
+    return None if row < 0 else (int(row), int(col))
+
+
+def place_beside(
+    free: Mask, cells: Cells, allowed: Mask, max_steps: int, towards: Cell
+) -> Cell | None:
+    """The allowed cell beside a frontier (N, 2) that is nearest to another cell.
+
+    Of the allowed cells whose path to the frontier over free cells has at most max_steps cells, and
+    is nearly the shortest: around a pillar all sides are equally near.
+    """
+    row, col = _place_beside(free, cells, allowed, max_steps, towards[0], towards[1])
     return None if row < 0 else (int(row), int(col))
 
 
@@ -132,3 +145,49 @@ def _sees_enough(
         if away < reach and line_is_clear(passable, row, col, points[i, 0], points[i, 1]):
             seen += 1
     return seen >= need
+
+
+@kernel
+def _place_beside(
+    free: Mask, cells: Cells, allowed: Mask, most_steps: int, to_row: int, to_col: int
+) -> tuple[int, int]:
+    """Breadth first over free cells, from all border cells at once.
+
+    It goes _SLACK_CELLS steps on after the first find.
+    """
+    rows, cols = free.shape
+    seen = np.zeros((rows, cols), dtype=np.bool_)
+    queue = np.empty((rows * cols, 3), dtype=np.int64)
+    tail = 0
+    for i in range(cells.shape[0]):
+        queue[tail, 0] = cells[i, 0]
+        queue[tail, 1] = cells[i, 1]
+        queue[tail, 2] = 0
+        seen[cells[i, 0], cells[i, 1]] = True
+        tail += 1
+    head = 0
+    best = np.inf
+    best_row = -1
+    best_col = -1
+    while head < tail and queue[head, 2] <= most_steps:
+        row = queue[head, 0]
+        col = queue[head, 1]
+        steps = queue[head, 2]
+        head += 1
+        away = math.hypot(row - to_row, col - to_col)
+        if allowed[row, col] and away < best:
+            if best_row < 0:
+                most_steps = min(most_steps, steps + _SLACK_CELLS)
+            best = away
+            best_row = row
+            best_col = col
+        for side in range(4):
+            r = row + (side == 0) - (side == 1)
+            c = col + (side == 2) - (side == 3)
+            if 0 <= r < rows and 0 <= c < cols and free[r, c] and not seen[r, c]:
+                seen[r, c] = True
+                queue[tail, 0] = r
+                queue[tail, 1] = c
+                queue[tail, 2] = steps + 1
+                tail += 1
+    return best_row, best_col
