@@ -168,7 +168,7 @@ def test_a_frontier_behind_a_passage_that_looks_too_narrow_is_observed_from_befo
     cells[:, 0] = 100
     cells[:, 40] = 100
     cells[18:21, 40] = 0  # 0.3 m
-    cells[15:25, 41:50] = 0
+    cells[15:25, 41:60] = 0
     cells[14, 41:60] = cells[25, 41:60] = 100
     room = Room(cells)
     for _ in range(2):
