@@ -1,6 +1,6 @@
 """Draws which package of thinmap_ros imports which, read from the source, as an SVG file.
 
-    python scripts/import_picture.py [-o docs/imports.svg]
+    python scripts/import_picture.py [-o docs/images/imports.svg]
 
 A package stands above all that it imports. Imports that a path of other arrows implies have no
 arrow. The width of an arrow grows with the number of imports.
@@ -112,5 +112,5 @@ def draw(path: Path) -> None:
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('-o', '--out', type=Path, default=ROOT / 'docs' / 'imports.svg')
+    parser.add_argument('-o', '--out', type=Path, default=ROOT / 'docs' / 'images' / 'imports.svg')
     draw(parser.parse_args().out)

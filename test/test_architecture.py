@@ -1,4 +1,4 @@
-"""Allowed imports between packages, as in docs/architecture.md, and limits of the code style."""
+"""Allowed imports between packages (docs/development/architecture.md), and limits of the style."""
 
 import ast
 import subprocess

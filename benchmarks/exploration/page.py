@@ -1,4 +1,4 @@
-"""Make docs/exploration.md of what compare_exploration left.
+"""Make docs/results/exploration.md of what compare_exploration left.
 
 Usage: python -m benchmarks.exploration.page DIR [DIR ...]. A file reliability.md of a folder is the
 table of fit_belief.
@@ -13,7 +13,7 @@ from typing import Any
 from thinmap_ros.evaluation.strategy_comparison import OURS, markdown, relative_saving
 
 Report = dict[str, Any]
-_PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'exploration.md'
+_PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'results' / 'exploration.md'
 _FULL_COVERAGE = 0.99
 _NEARLY_ALL = 0.995
 _HEAD = """\

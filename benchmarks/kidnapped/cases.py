@@ -1,4 +1,4 @@
-"""Which robots are switched on where: the rows of docs/localization.md, case by case."""
+"""Which robots are switched on where: the rows of docs/results/localization.md, case by case."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

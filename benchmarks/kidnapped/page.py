@@ -1,4 +1,4 @@
-"""Make docs/localization.md of what the lost robots left.
+"""Make docs/results/localization.md of what the lost robots left.
 
 Usage: python -m benchmarks.kidnapped.page DIR [DOCS_DIR].
 """
@@ -19,7 +19,7 @@ is right that is sure within 0.3 m (0.5 m in the log, and when kidnapped) and 10
 it is; unless told otherwise it has a laser of 181 beams over 180 degrees that reaches 8 m, drives
 at 0.5 m/s to random places, and has 40 m of way. Times are of the processor, on a machine that did
 other things as well. Times of a step's parts and what a map takes in memory are in
-[benchmarks](benchmarks.md).
+[benchmarks](speed.md).
 """
 # In this order, what each is about.
 _ABOUT = {
@@ -79,4 +79,4 @@ def _groups(records: list[Written]) -> list[str]:
 
 if __name__ == '__main__':
     docs = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parents[2] / 'docs'
-    (docs / 'localization.md').write_text(page(Path(sys.argv[1])), encoding='utf-8')
+    (docs / 'results' / 'localization.md').write_text(page(Path(sys.argv[1])), encoding='utf-8')

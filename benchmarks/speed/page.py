@@ -1,4 +1,4 @@
-"""Make docs/benchmarks.md of the results of benchmarks.
+"""Make docs/results/speed.md of the results of benchmarks.
 
 Usage: python -m benchmarks.speed.page CSV_DIR [DOCS_DIR].
 """
@@ -17,7 +17,7 @@ and that all times are much too long.
 
 Another program measures the localizer on real logs, on degraded ones and in generated buildings:
 `python -m benchmarks.scoreboard -o DIR` (`--short`: two minutes of its worst
-cases) leaves its page in `DIR/scoreboard.md`. A complete run: [scoreboard.md](scoreboard.md).
+cases) leaves its page in `DIR/scoreboard.md`. A complete run: [slam.md](slam.md).
 Where small causes have large effects, as where a loop is found a scan later, one run tells little:
 `--runs 8` runs each case eight times, all but the first with odometry disturbed by less than wheels
 err by, and tells mean and worst.
@@ -98,4 +98,4 @@ def _indented(row: list[str]) -> list[str]:
 
 if __name__ == '__main__':
     docs = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parents[2] / 'docs'
-    (docs / 'benchmarks.md').write_text(page(Path(sys.argv[1])), encoding='utf-8')
+    (docs / 'results' / 'speed.md').write_text(page(Path(sys.argv[1])), encoding='utf-8')

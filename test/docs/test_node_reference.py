@@ -1,4 +1,4 @@
-"""docs/nodes.md lists each node's subscriptions, publishers, services and parameters as declared.
+"""docs/reference/nodes.md lists each node's subscriptions, publishers, services and parameters as declared.
 
 THINMAP_WRITE_CONFIG=1 rewrites the page.
 """
@@ -15,7 +15,7 @@ from support.node_list import NEEDED, NODES, OF_EVERY_NODE, OWN_WORDS, ROOT, def
 
 from thinmap_ros.logs.bag_writer import BagWriter
 
-PAGE = ROOT / 'docs' / 'nodes.md'
+PAGE = ROOT / 'docs' / 'reference' / 'nodes.md'
 # Topics of rclpy and of its lifecycle, which every node has.
 COMMON = ('/parameter_events', '/rosout', '/clock', '/diagnostics', 'transition_event')
 HEAD = """# Nodes

@@ -25,7 +25,7 @@ def reference(heading):
     """Topics of all nodes by name, with type and quality, that they publish or subscribe to."""
     found = {}
     table = ''
-    for line in (ROOT / 'docs' / 'nodes.md').read_text().splitlines():
+    for line in (ROOT / 'docs' / 'reference' / 'nodes.md').read_text().splitlines():
         row = re.fullmatch(r'\| `([\w/~]+)` \| `([\w/]+)` \| ([\w ,]+) \|', line)
         if line.startswith('| '):
             table = line if row is None and not line.startswith('|---') else table

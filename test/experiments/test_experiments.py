@@ -69,7 +69,7 @@ def test_an_experiment_writes_what_it_promises(name: str, tmp_path: Path) -> Non
     assert all(f'{name}/{plot.name}.png' in page for plot in outcome.plots)
     text = write_markdown(tmp_path, [name], tmp_path / 'docs').read_text(encoding='utf-8')
     assert all(
-        (tmp_path / 'docs' / 'experiments' / f'{name}_{plot.name}.png').exists()
+        (tmp_path / 'docs' / 'images' / 'papers' / f'{name}_{plot.name}.png').exists()
         for plot in outcome.plots
     )
     assert all(comparison.what in text for comparison in outcome.comparisons)

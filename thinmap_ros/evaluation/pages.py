@@ -92,7 +92,7 @@ topological information.
 
 
 def write_markdown(out: Path, names: list[str], docs: Path) -> Path:
-    """Write experiments.md over the experiments in a folder, their figures to docs/experiments.
+    """Write results/papers.md over the experiments in a folder, and their figures.
 
     Returns its path.
     """
@@ -103,11 +103,12 @@ def write_markdown(out: Path, names: list[str], docs: Path) -> Path:
         if about['comparisons']:
             parts.append(_markdown_rows(about['comparisons']))
         for plot in about['plots']:
-            picture = f'experiments/{name}_{plot["name"]}.png'
+            picture = f'images/papers/{name}_{plot["name"]}.png'
             write_small_png(out / name / f'{plot["name"]}.png', docs / picture)
-            parts.append(f'![{plot["caption"]}]({picture})\n\n*{plot["caption"]}*\n')
-    write_text(docs / 'experiments.md', '\n'.join(parts))
-    return docs / 'experiments.md'
+            parts.append(f'![{plot["caption"]}](../{picture})\n\n*{plot["caption"]}*\n')
+    page = docs / 'results' / 'papers.md'
+    write_text(page, '\n'.join(parts))
+    return page
 
 
 def _markdown_rows(comparisons: list[dict[str, Any]]) -> str:
