@@ -1,0 +1,314 @@
+"""Draws the pictures at the head of README.md: an exploration as a GIF, a finished map as a PNG.
+
+    python scripts/moving_picture.py exploration [WORLD] [-o docs/images/exploration.gif]
+    python scripts/moving_picture.py map MAP.yaml [-o docs/images/intel.png]
+
+`exploration` explores a simulated world with SLAM, as explore_world does, and draws a frame every
+few seconds of simulated time: occupancy map, topological graph, path, robot and laser.
+`map` draws a map_server map, as `replay --resolution-m 0.05` writes it.
+"""
+
+import argparse
+import math
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from matplotlib import font_manager
+from PIL import Image, ImageDraw, ImageFont
+
+from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, Options, make_loop, no_progress
+from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.strategy import Decision, Strategy
+from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.files.package_data import world_path
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.world import World
+from thinmap_ros.view import palette
+
+IMAGES = Path(__file__).resolve().parents[1] / 'docs' / 'images'
+CELL_M = 0.05
+WIDTH_PX = 800
+MARGIN_M = 0.3
+CAPTION_PX = 24
+SMOOTHING = 2  # frames are drawn this many times as large
+SCANS_PER_FRAME = 12
+FRAME_MS = 100
+LAST_FRAME_MS = 3000
+MAP_MARGIN_M = 1.0
+WALL_QUANTILE = 0.01
+MAP_SHADES = 16
+LIMIT_S = 3600.0
+GREY = '#CCCCCC'
+PLAN = '#D55E00'
+ROBOT = '#0072B2'
+LASER = '#56B4E938'
+OBSERVED = '#DAEEF9'  # the laser's colour on white
+PATH = palette.ESTIMATE
+WHITE = '#FFFFFF'
+BLACK = '#000000'
+
+
+class Canvas:
+    """A picture of a rectangle of the map frame, with a caption below it."""
+
+    def __init__(self, low: Array, high: Array) -> None:
+        self.low = low
+        self.high = high
+        self.scale = SMOOTHING * WIDTH_PX / (high[0] - low[0])
+        height_px = round((high[1] - low[1]) * self.scale) + SMOOTHING * CAPTION_PX
+        self.image = Image.new('RGB', (SMOOTHING * WIDTH_PX, height_px), WHITE)
+        self.draw = ImageDraw.Draw(self.image, 'RGBA')
+
+    def pixels(self, points: Array) -> list[tuple[float, float]]:
+        """Pixels of points (N, 2) in m."""
+        x = (points[:, 0] - self.low[0]) * self.scale
+        y = (self.high[1] - points[:, 1]) * self.scale
+        return list(zip(x.tolist(), y.tolist(), strict=True))
+
+    def line(self, points: Array, colour: str, width: float) -> None:
+        """Draw a polyline (N, 2) of a width in pixels."""
+        if len(points) > 1:
+            width_px = round(SMOOTHING * width)
+            self.draw.line(self.pixels(points), fill=colour, width=width_px, joint='curve')
+
+    def disc(self, point: Array, radius_px: float, colour: str) -> None:
+        """Draw a disc with a dark edge."""
+        ((x, y),) = self.pixels(point[None, :2])
+        radius = SMOOTHING * radius_px
+        box = (x - radius, y - radius, x + radius, y + radius)
+        self.draw.ellipse(box, fill=colour, outline=BLACK, width=SMOOTHING // 2)
+
+    def caption(self, text: str) -> None:
+        """Write a line below the map."""
+        place = (6 * SMOOTHING, self.image.height - CAPTION_PX * SMOOTHING)
+        self.draw.text(place, text, fill=BLACK, font=font(16 * SMOOTHING))
+
+    def smoothed(self) -> Image.Image:
+        """The picture in its final size."""
+        size = (WIDTH_PX, round(self.image.height / SMOOTHING))
+        return self.image.resize(size, Image.Resampling.LANCZOS)
+
+
+@cache
+def font(size: int) -> ImageFont.FreeTypeFont:
+    """The font of matplotlib, which is everywhere the same."""
+    return ImageFont.truetype(font_manager.findfont('DejaVu Sans'), size)
+
+
+def map_image(patch: GridPatch) -> Image.Image:
+    """One pixel for each cell: free white, occupied black, unknown grey; north is up."""
+    shades = np.full(patch.shape, palette.rgb(GREY)[0], dtype=np.uint8)
+    shades[patch.free] = 255
+    shades[patch.occupied] = 0
+    return Image.fromarray(shades[::-1])
+
+
+def paste_map(canvas: Canvas, patch: GridPatch) -> None:
+    """Draw the cells of a grid; the rest of the picture is unknown."""
+    rows, cols = patch.shape
+    frame = patch.frame
+    top = np.array([[frame.origin_x, frame.origin_y + rows * frame.resolution]])
+    ((left_px, top_px),) = canvas.pixels(top)
+    size = [round(count * frame.resolution * canvas.scale) for count in (cols, rows)]
+    cells = map_image(patch).resize((size[0], size[1]), Image.Resampling.NEAREST)
+    bottom_px = canvas.image.height - SMOOTHING * CAPTION_PX
+    canvas.draw.rectangle((0, 0, canvas.image.width, bottom_px), fill=GREY)
+    canvas.image.paste(cells, (round(left_px), round(top_px)))
+    canvas.draw.rectangle((0, bottom_px, canvas.image.width, canvas.image.height), fill=WHITE)
+
+
+def draw_graph(canvas: Canvas, topology: TopologicalMap) -> None:
+    """Draw the paths of the edges, and the nodes by kind."""
+    for edge in topology.edges.values():
+        canvas.line(edge.path, palette.EDGE, 2.0)
+    for node in topology.nodes.values():
+        canvas.disc(node.position, 4.0, palette.NODES[node.kind])
+
+
+def draw_laser(canvas: Canvas, scan: Scan, T_map_base: Array) -> None:
+    """Draw the area that a scan has observed."""
+    x, y, heading = se2.compose(T_map_base, scan.T_base_laser)
+    ranges = np.where(scan.valid, np.minimum(scan.ranges_m, scan.range_max_m), 0.0)
+    bearings = heading + scan.angles_rad
+    ends = np.column_stack([x + ranges * np.cos(bearings), y + ranges * np.sin(bearings)])
+    canvas.draw.polygon(canvas.pixels(np.vstack([[[x, y]], ends])), fill=LASER)
+
+
+def draw_robot(canvas: Canvas, T_map_base: Array, radius_m: float) -> None:
+    """Draw the robot and its heading."""
+    canvas.disc(T_map_base, radius_m * canvas.scale / SMOOTHING, ROBOT)
+    x, y, heading = T_map_base
+    front = (x + radius_m * math.cos(heading), y + radius_m * math.sin(heading))
+    canvas.line(np.array([[x, y], front]), WHITE, 2.0)
+
+
+class Film(Strategy):
+    """A strategy that draws a frame of every few scans and leaves the decisions to another one."""
+
+    def __init__(self, world: World, loop: ClosedLoop, radius_m: float) -> None:
+        rows, cols = np.nonzero(world.occupied)
+        walls = world.frame.centres_of(np.column_stack([rows, cols]))
+        self.low = walls.min(axis=0) - MARGIN_M
+        self.high = walls.max(axis=0) + MARGIN_M
+        self.loop = loop
+        self.strategy = loop.strategy
+        self.radius_m = radius_m
+        self.images: list[Image.Image] = []
+        self._scans = 0
+
+    def step(
+        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
+    ) -> Decision:
+        """Decide, and draw the frame that is due; the last one always."""
+        decision = self.strategy.step(topology, patch, scan, T_map_base)
+        if self._scans % SCANS_PER_FRAME == 0 or decision.finished:
+            self.images.append(self._image(topology, patch, scan, T_map_base, decision))
+        self._scans += 1
+        return decision
+
+    def target_failed(self, reason: str) -> None:
+        """Report a failed drive to the strategy that decides."""
+        self.strategy.target_failed(reason)
+
+    def _image(
+        self,
+        topology: TopologicalMap,
+        patch: GridPatch,
+        scan: Scan,
+        T_map_base: Array,
+        decision: Decision,
+    ) -> Image.Image:
+        canvas = Canvas(self.low, self.high)
+        paste_map(canvas, patch)
+        if not decision.finished:
+            draw_laser(canvas, scan, T_map_base)
+        path = np.array(self.loop.log.poses)[:, :2]
+        draw_graph(canvas, topology)
+        canvas.line(path, PATH, 2.5)
+        plan = self.loop.navigator.path
+        if plan is not None and decision.target is not None:
+            canvas.line(plan[:, :2], PLAN, 1.5)
+            canvas.disc(decision.target.goal, 3.5, WHITE)
+        draw_robot(canvas, T_map_base, self.radius_m)
+        driven_m = np.hypot(*np.diff(path, axis=0).T).sum()
+        text = f'{scan.stamp_ns / 1e9:.0f} s   {driven_m:.0f} m driven   '
+        text += f'{decision.known_area_m2:.0f} m² known'
+        canvas.caption(f'{text}   exploration finished' if decision.finished else text)
+        return canvas.smoothed()
+
+
+def explore_on_film(world: World, options: Options) -> list[Image.Image]:
+    """Explore a world with SLAM; returns a picture of every few seconds of simulated time."""
+    loop = make_loop(world, world.start, options)
+    loop.pipeline = fine_pipeline(world.start, options)
+    radius_m = PRESETS[options.robot].radius_m
+    film = Film(world, loop, radius_m)
+    loop.strategy = film
+    goal = observable_cells(world, world.start, radius_m, options.laser.range_max_m)
+    outcome = loop.run(goal, options.time_limit_s, no_progress)
+    print(f'{world.name}: {outcome.reason}, {len(film.images)} frames')
+    return film.images
+
+
+def fine_pipeline(start: Array, options: Options) -> Pipeline:
+    """The pipeline of an exploration in the simulator, with cells of CELL_M."""
+    x, y, yaw = (float(number) for number in start)
+    localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
+    grid = OccupancyConfig(resolution_m=CELL_M, no_return_clear_range_m=options.laser.range_max_m)
+    return Pipeline(PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH))
+
+
+def gif_palette() -> Image.Image:
+    """The colours of a frame, pure and blended with what is below them, as smoothing needs it."""
+    grounds = [np.array(palette.rgb(colour)) for colour in (WHITE, BLACK, GREY, OBSERVED)]
+    drawn = (PLAN, ROBOT, PATH, palette.EDGE, *palette.NODES.values())
+    inks = [*grounds, *(np.array(palette.rgb(colour)) for colour in dict.fromkeys(drawn))]
+    blends = {
+        tuple(np.rint(ground + share * (ink - ground)).astype(int).tolist())
+        for ink in inks
+        for ground in grounds
+        for share in (0.25, 0.5, 0.75, 1.0)
+    }
+    picture = Image.new('P', (1, 1))
+    picture.putpalette([channel for colour in sorted(blends) for channel in colour])
+    return picture
+
+
+def write_gif(path: Path, images: list[Image.Image]) -> None:
+    """Write an endless loop, with one palette for all frames."""
+    colours = gif_palette()
+    frames = [image.quantize(palette=colours, dither=Image.Dither.NONE) for image in images]
+    durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
+    with atomic_write(path) as aside:
+        frames[0].save(
+            aside,
+            format='GIF',
+            save_all=True,
+            append_images=frames[1:],
+            duration=durations,
+            loop=0,
+            optimize=True,
+        )
+
+
+def write_exploration(arguments: argparse.Namespace) -> None:
+    """Explore a world and write the GIF."""
+    world = World.from_patch(*read_world(world_path(arguments.world)))
+    options = Options(localization='slam', seed=arguments.seed, time_limit_s=LIMIT_S)
+    write_gif(arguments.out, explore_on_film(world, options))
+
+
+def building(patch: GridPatch) -> tuple[int, int, int, int]:
+    """Rows and columns (first, end, first, end) of the walls, without rays through windows."""
+    cells = np.argwhere(patch.occupied)
+    margin = round(MAP_MARGIN_M / patch.frame.resolution)
+    first = np.maximum(np.quantile(cells, WALL_QUANTILE, axis=0) - margin, 0).astype(int)
+    end = np.quantile(cells, 1.0 - WALL_QUANTILE, axis=0) + margin
+    row, col = first.tolist()
+    end_row, end_col = np.minimum(end, patch.shape).astype(int).tolist()
+    return row, end_row, col, end_col
+
+
+def write_map_picture(arguments: argparse.Namespace) -> None:
+    """Write the building of a map as a PNG of the height of the GIF."""
+    patch = read_map(arguments.map)
+    row, end_row, col, end_col = building(patch)
+    rows = patch.shape[0]
+    image = map_image(patch).crop((col, rows - end_row, end_col, rows - row))
+    size = (round(image.width * arguments.height / image.height), arguments.height)
+    small = image.resize(size, Image.Resampling.LANCZOS).quantize(MAP_SHADES)
+    with atomic_write(arguments.out) as aside:
+        small.save(aside, format='PNG', optimize=True)
+
+
+def main() -> None:
+    """Run the script."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(required=True)
+    exploration = commands.add_parser('exploration', help='a GIF of an exploration with SLAM')
+    exploration.add_argument('world', nargs='?', default='lab', help='a world (default: lab)')
+    exploration.add_argument('-o', '--out', type=Path, default=IMAGES / 'exploration.gif')
+    exploration.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
+    exploration.set_defaults(work=write_exploration)
+    finished = commands.add_parser('map', help='a PNG of a map_server map')
+    finished.add_argument('map', type=Path, help='YAML file of the map')
+    finished.add_argument('-o', '--out', type=Path, default=IMAGES / 'intel.png')
+    finished.add_argument('--height', type=int, default=437, help='px (default 437, as the GIF)')
+    finished.set_defaults(work=write_map_picture)
+    arguments = parser.parse_args()
+    arguments.work(arguments)
+
+
+if __name__ == '__main__':
+    main()
