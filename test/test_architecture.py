@@ -1,6 +1,7 @@
 """Allowed imports between packages (docs/development/architecture.md), and limits of the style."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,42 +10,23 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'thinmap_ros'
-# Allowed imports of each package; the base layers of core are 'core' and 'core.grid'.
-CORE = {'core', 'core.grid'}
-TOPOLOGY = CORE | {'core.topology'}
-ROOMS = {
-    'core': {'core'},
-    'core.grid': CORE,
-    'core.topology': TOPOLOGY,
-    'core.regions': TOPOLOGY | {'core.regions'},
-    'core.planning': TOPOLOGY | {'core.planning'},
-    'core.exploration': TOPOLOGY | {'core.planning', 'core.exploration'},
-    'core.ekf_slam': TOPOLOGY | {'core.ekf_slam'},
-    'core.slam': TOPOLOGY | {'core.ekf_slam', 'core.slam'},
-    'core.places': TOPOLOGY | {'core.planning', 'core.places'},
-}
-ROOMS['core.exploration'] |= {'core.places'}
-ALL_CORE = set(ROOMS)
-BELOW = ALL_CORE | {'sim', 'baselines', 'pipeline', 'kernels', 'files', 'logs', 'view'}
-BELOW |= {'strategies', 'closed_loop', 'replaying'}
-ROOMS |= {
-    'sim': ALL_CORE | {'sim'},
-    'baselines': ALL_CORE | {'baselines'},
-    'pipeline': ALL_CORE | {'pipeline'},
-    'kernels': ALL_CORE | {'kernels'},
-    'files': ALL_CORE | {'files'},
-    'logs': ALL_CORE | {'files', 'logs'},
-    'view': ALL_CORE | {'files', 'logs', 'view'},
-    'strategies': ALL_CORE | {'baselines', 'strategies'},
-    'closed_loop': ALL_CORE | {'sim', 'strategies', 'pipeline', 'closed_loop'},
-    'replaying': ALL_CORE | {'pipeline', 'kernels', 'files', 'logs', 'view', 'replaying'},
-    'ros': ALL_CORE | {'files', 'logs', 'kernels', 'ros'},
-    'evaluation': BELOW | {'evaluation'},
-    'experiments': BELOW | {'evaluation', 'experiments'},
-    'nodes': BELOW | {'ros', 'nodes'},
-    'tools': BELOW | {'evaluation', 'experiments', 'ros', 'tools'},
-    '__main__': ALL_CORE | {'tools', '__main__'},
-}
+PAGE = ROOT / 'docs' / 'development' / 'architecture.md'
+
+
+def read_rooms():
+    """Allowed imports of each package: itself, those in its row of the page, and all of theirs."""
+    rows = re.findall(r'^\| `([\w.]+)` \| .+ \|(.*)\|$', PAGE.read_text(), re.MULTILINE)
+    direct = {name: set(re.findall('`([^`]+)`', cell)) for name, cell in rows}
+    core = {name for name in direct if name.startswith('core')}
+
+    def allowed(name):
+        below = direct[name] | (core if 'core' in direct[name] and name not in core else set())
+        return {name}.union(*(allowed(other) for other in below))
+
+    return {name: allowed(name) for name in direct}
+
+
+ROOMS = read_rooms()
 WITH_LIBRARIES = {'files', 'logs', 'view', 'kernels', 'ros', 'nodes'}
 
 OUTSIDE = {
