@@ -1,4 +1,4 @@
-"""docs/reference/nodes.md lists each node's subscriptions, publishers, services and parameters as declared.
+"""docs/reference/nodes.md lists subscriptions, publishers, services and parameters of each node.
 
 THINMAP_WRITE_CONFIG=1 rewrites the page.
 """
@@ -23,6 +23,7 @@ HEAD = """# Nodes
 Made from the nodes themselves; do not edit (see `test/docs/test_node_reference.py`). Names without a leading slash are
 relative: a namespace goes before them. Every node but the monitor publishes `/diagnostics`; all follow `/clock` with
 `use_sim_time`. Nodes with the parameter `autostart` are lifecycle nodes (`~/change_state`, `~/get_state`, ...).
+[Messages](messages.md) lists the fields of the types of `thinmap_msgs`.
 """  # noqa: E501
 
 
@@ -122,21 +123,6 @@ def section(name, node):
     return lines
 
 
-def message_texts():
-    lines = ['# Messages, services and actions', '']
-    for part in ('msg', 'srv', 'action'):
-        for path in sorted((ROOT / 'thinmap_msgs' / part).iterdir()):
-            lines += [
-                f'## thinmap_msgs/{part}/{path.stem}',
-                '',
-                '```',
-                path.read_text().strip(),
-                '```',
-                '',
-            ]
-    return lines
-
-
 def test_the_page_lists_what_the_nodes_declare(declared):
     lines = [HEAD]
     for name in NODES:
@@ -144,7 +130,7 @@ def test_the_page_lists_what_the_nodes_declare(declared):
         lines += section(name, node)
         getattr(node, 'close', lambda: None)()
         node.destroy_node()
-    text = '\n'.join([*lines, *message_texts()])
+    text = '\n'.join(lines)
     if 'THINMAP_WRITE_CONFIG' in os.environ:
         PAGE.write_text(text)
     assert PAGE.read_text() == text, (
