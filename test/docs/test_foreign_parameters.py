@@ -1,6 +1,6 @@
-"""Parameter files of other packages start thinmap's nodes; docs/coming_from.md lists their names.
+"""Parameter files of other packages start thinmap's nodes; a page lists their names.
 
-THINMAP_WRITE_CONFIG=1 rewrites the tables of the page.
+THINMAP_WRITE_CONFIG=1 rewrites the tables of docs/reference/parameters_of_other_packages.md.
 """
 
 import os
@@ -18,7 +18,8 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.files.occupancy_maps import write_map
 from thinmap_ros.ros.foreign.tables import PACKAGES
 
-PAGE = ROOT / 'docs' / 'coming_from.md'
+PAGE = ROOT / 'docs' / 'reference' / 'parameters_of_other_packages.md'
+MIGRATION = ROOT / 'docs' / 'migration'
 ROWS = [(package, row) for package in PACKAGES for row in package.parameters]
 TARGETS = sorted({target for _, row in ROWS for target in row.targets})
 KNOWN = {row.name for _, row in ROWS if row.targets}
@@ -181,4 +182,30 @@ def test_the_page_lists_what_is_translated():
         text = before + start + table(package) + '\n' + end + after
     if 'THINMAP_WRITE_CONFIG' in os.environ:
         PAGE.write_text(text)
-    assert PAGE.read_text() == text, f'coming_from.md: see the top of {__file__}'
+    assert PAGE.read_text() == text, f'{PAGE.name}: see the top of {__file__}'
+
+
+@pytest.mark.parametrize(
+    ('page', 'packages'),
+    [
+        ('from_slam_toolbox', ('slam_toolbox',)),
+        ('from_explore_lite', ('explore_lite',)),
+        ('from_amcl', ('nav2_amcl', 'map_server and map_saver')),
+        ('from_nav2', ('Nav2 controller and bt_navigator',)),
+    ],
+)
+def test_migration_pages_name_the_targets_of_the_tables(page, packages):
+    """A row names all targets of its parameters, and none where there is none."""
+    rows = {row.name: row for package, row in ROWS if package.name in packages}
+    owners = {node for package in PACKAGES for node in package.nodes}
+    count = 0
+    for line in (MIGRATION / f'{page}.md').read_text().splitlines():
+        theirs, _, ours = line.strip('| ').partition(' | ')
+        named = [rows[name] for name in re.findall(r'`([^`]+)`', theirs) if name in rows]
+        pairs = re.findall(r'`(\w+)` `([\w.]+)`', ours)
+        targets = {(owner, name) for owner, name in pairs if owner in owners}
+        if not line.startswith('|') or not named or not (targets or ours.startswith('no')):
+            continue
+        assert targets == {target for row in named for target in row.targets}, line
+        count += 1
+    assert count >= 8

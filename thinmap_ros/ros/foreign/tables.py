@@ -41,7 +41,7 @@ _NO_RESPONSE = 'no: a match is judged by its inlier ratio'
 _NO_SOLVER = 'no: the pose graph has a solver of its own'
 _NO_BEAM_MODEL = 'no: poses are refined by scan matching, without a beam model'
 _NO_FILTER = 'no: there is no particle filter; samples are drawn only while the robot is lost'
-_NO_UTILITY = 'no: order by expected gain and path, see docs/results/exploration.md'
+_NO_UTILITY = 'no: targets are ordered by a tour'
 _REMAP = 'by remapping'
 
 SLAM_TOOLBOX = Package(
@@ -253,7 +253,7 @@ MAP_SERVER = Package(
         ),
         _row('topic_name', 'map', note=f'{_REMAP}: `-r map:=/other_map`'),
         _row('frame_id', 'map', note='no: `map_frame`; drivers have a `frame_id`, too'),
-        _row('save_map_timeout', '2.0', note='no: the map is there, nothing is waited for'),
+        _row('save_map_timeout', '2.0', note='no: the map is saved at once'),
         _row('free_thresh_default', '0.25', 'grid_mapper/free_thresh', note='of `map`, too'),
         _row(
             'occupied_thresh_default', '0.65', 'grid_mapper/occupied_thresh', note='of `map`, too'
