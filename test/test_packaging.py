@@ -84,6 +84,7 @@ LOCKS = {
     'lock-3.11.txt': ('python', 'ros', 'test', 'viewer'),
     'lock-3.12.txt': ('python', 'ros', 'test', 'viewer'),
     'lock-system-3.12.txt': ('python', 'test'),
+    'lock-docs.txt': ('docs',),
 }
 # Optional, and named in setup.py as extras.
 EXTRAS = {'rerun', 'dask', 'distributed'}
@@ -220,4 +221,11 @@ def test_every_tool_has_help(name):
 
 
 def test_versions_agree():
+    citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
+    setup = (ROOT / 'setup.py').read_text()
+    changelog = (ROOT / 'CHANGELOG.md').read_text()
+    released = re.search(r'^## \[(\d+\.\d+\.\d+)\] - (\S+)$', changelog, re.MULTILINE)
     assert {ElementTree.parse(path).find('version').text for path in MANIFESTS} == {__version__}
+    assert '\n    version=version(),\n' in setup  # of thinmap_ros/__init__.py
+    assert (citation['version'], released[1]) == (__version__, __version__)
+    assert str(citation['date-released']) == released[2]

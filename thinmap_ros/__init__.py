@@ -67,7 +67,7 @@ __all__ = [
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # The only place of the version: setup.py reads it, and a test compares the two package.xml with it.
-__version__ = '0.1.0'
+__version__ = '0.2.0'
 
 _PLACES = {
     # SLAM

@@ -5,7 +5,6 @@ THINMAP_WRITE_CONFIG=1 rewrites the files from the declarations.
 
 import json
 import os
-import re
 import textwrap
 
 import pytest
@@ -160,20 +159,6 @@ def test_robot_file_is_accepted_by_every_node_and_has_its_defaults(declared):
         assert own == {key: values[key] for key in own}
         seen |= set(own)
     assert seen == set(values)
-
-
-def test_the_readme_names_parameters_that_there_are():
-    rows = re.findall(r'^\| `(\w+)` \|.*\|.*\| (.*) \|$', (ROOT / 'README.md').read_text(), re.M)
-    named = [
-        (node, parameter)
-        for node, cell in rows
-        if node in NODES
-        for parameter in re.findall(r'`([\w.]+)`', re.sub(r'\(.*?\)', '', cell))
-    ]
-    assert len(named) > 20
-    for node, parameter in named:
-        text = (ROOT / 'config' / f'{node}.yaml').read_text()
-        assert parameter in flat(yaml.safe_load(text)['/**']['ros__parameters']), (node, parameter)
 
 
 PRESETS = sorted((ROOT / 'config').glob('*s/*.yaml'))
