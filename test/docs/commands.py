@@ -1,8 +1,8 @@
 """Command lines in the documentation.
 
 Each line of a code block is a command, and so is each code span in the text that starts like one.
-A block fenced as Python is no command: `python_blocks` gives it.
-`<!-- not run -->` on the line before a block or paragraph, or in front of a span, marks it.
+A block fenced as anything but bash is none: output, YAML, or Python, which `python_blocks` gives.
+`<!-- not run -->` on a line before a block or paragraph, or in front of a span, marks it.
 """
 
 import re
@@ -11,6 +11,7 @@ from pathlib import Path
 
 MARK = '<!-- not run -->'
 PYTHON = '```python'
+_FENCES = ('```', '```bash')  # of commands
 _SPAN = re.compile(rf'({re.escape(MARK)}\s+)?`([^`]+)`')
 _WHOLE = re.compile(
     r'ros2 (run \S+ \S+|-h|(topic|service|action|param|lifecycle|node|pkg|interface) \S+)'
@@ -64,19 +65,19 @@ def _parts(lines: list[str]) -> list[_Part]:
     section = ''
     marked = False
     fenced = False
-    python = False
+    is_skipped = False
     open_part: _Part | None = None
     for line in lines:
         text = line.strip()
         if text.startswith('```'):
             fenced = not fenced
-            python = fenced and text == PYTHON
+            is_skipped = fenced and text not in _FENCES
             open_part = None
             continue
-        if python:
+        if is_skipped:
             continue
         if not fenced and (not text or text == MARK):
-            marked = text == MARK
+            marked = marked or text == MARK
             open_part = None
             continue
         if not fenced and line.startswith('#'):
