@@ -1,4 +1,4 @@
-"""Hooks of mkdocs.yml: formulas as MathML, and pages for linked files of the project."""
+"""Hooks of mkdocs.yml: formulas as MathML, pages for linked files, names in tables that break."""
 
 import html
 import posixpath
@@ -18,6 +18,8 @@ _INCLUDED = {
 }
 _LINK = re.compile(r'(?<=\]\()([^()\s#]+)(?=[)#])')
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+_CELL = re.compile(r'<td[^>]*>.*?</td>', re.DOTALL)
+_CODE = re.compile(r'(?<=<code>)[^<]*')
 _LANGUAGES = {'.py': 'python', '.yaml': 'yaml', '.sh': 'bash', '.toml': 'toml', '': 'text'}
 
 
@@ -68,11 +70,16 @@ def on_page_markdown(text: str, page: Any, **_: Any) -> str:
 
 def on_page_content(text: str, **_: Any) -> str:
     """Replace formulas in LaTeX by MathML, which browsers show without a script."""
+    return _CELL.sub(_with_breaks, _FORMULA.sub(_mathml, text))
 
-    def mathml(match: re.Match[str]) -> str:
-        formula = html.unescape(match[3])
-        if match[2] == '(':
-            return convert(formula)
-        return f'<div class="formula">{convert(formula, display="block")}</div>'
 
-    return _FORMULA.sub(mathml, text)
+def _mathml(match: re.Match[str]) -> str:
+    formula = html.unescape(match[3])
+    if match[2] == '(':
+        return str(convert(formula))
+    return f'<div class="formula">{convert(formula, display="block")}</div>'
+
+
+def _with_breaks(cell: re.Match[str]) -> str:
+    """Allow a line break after each part of a name in a cell of a table."""
+    return _CODE.sub(lambda code: re.sub(r'(?<=\w[_/.])(?=\w)', '<wbr>', code[0]), cell[0])
