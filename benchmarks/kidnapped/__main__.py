@@ -2,8 +2,8 @@
 
 Usage: python -m benchmarks.kidnapped [ROW ...] -o DIR [--count N] [--worlds DIR] [--log LOG].
 
-Each row of docs/results/localization.md leaves a CSV file with a line for each robot, as soon as it is
-there; what is in the file is not run again.
+Each row of docs/results/localization.md leaves a CSV file with a line for each robot, as soon as it
+is there; what is in the file is not run again.
 """
 
 import argparse

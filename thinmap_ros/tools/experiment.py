@@ -145,7 +145,9 @@ def main() -> None:
         '--logs', type=Path, help='logs: a folder that has a folder NAME/log.clf for each of them'
     )
     parser.add_argument(
-        '--docs', type=Path, help='folder in which results/papers.md is made of all results in --out'
+        '--docs',
+        type=Path,
+        help='folder in which results/papers.md is made of all results in --out',
     )
     parser.add_argument(
         '--quick', action='store_true', help='fewer runs and shorter drives, to see that all works'
