@@ -111,6 +111,7 @@ PAGES: dict[str, Nodes] = {
 FIVE = ['localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer']
 NODE_NAMES = re.compile(r"'(\w+)',")
 ENDS_BY_ITSELF = ('bag_player',)
+_START = 'ros2 run thinmap_ros '
 
 
 def nodes_of_package() -> set[str]:
@@ -246,6 +247,8 @@ def run_page(graph: Any, lines: list[str], place: Path, environment: dict[str, s
     running: list[Line] = []
     try:
         for number, text in enumerate(lines):
+            _end_namesakes(graph, running, text)
+            health.clear()
             line = Line(shortened(text), number, place, environment)
             running.append(line)
             _follow(graph, line, health)
@@ -258,6 +261,21 @@ def run_page(graph: Any, lines: list[str], place: Path, environment: dict[str, s
         for line in running:
             if not line.has_ended():
                 line.kill()
+
+
+def _end_namesakes(graph: Any, running: list[Line], text: str) -> None:
+    """End nodes that a command starts again, as a reader does."""
+    if kind_of(text) != 'node':
+        return
+    names = set(told_by(text))
+    for program in [name for name in graph.processes if names & set(told_by(_START + name))]:
+        assert graph.stop(program) == 0
+    for line in running:
+        is_namesake = kind_of(line.text) == 'node' and bool(names & set(told_by(line.text)))
+        if is_namesake and not line.has_ended():
+            line.interrupt()
+            line.end(0)
+    graph.hear_out()
 
 
 def _follow(graph: Any, line: Line, health: list[DiagnosticArray]) -> None:
