@@ -135,7 +135,8 @@ def _fault(report: Report) -> str:
 def _pose_error(report: Report) -> str:
     return (
         f'{report["world"]}, start {report["start_number"]}: '
-        f'pose error {report["pose_rmse"]:.3f} m (rms).'
+        f'pose error {report["pose_rmse"]:.3f} m (rms), '
+        f'{report["pose_rmse_aligned"]:.3f} m after alignment.'
     )
 
 

@@ -75,6 +75,8 @@ def test_distance_time_and_error_are_those_of_the_path():
     assert report['time'] == pytest.approx(10.0)
     assert report['pose_rmse'] == pytest.approx(0.03)
     assert report['turned_rad'] == pytest.approx(1.0)
+    # A shift of the whole path is an error of the start, not of its shape.
+    assert report['pose_rmse_aligned'] == pytest.approx(0.0, abs=1e-5)
 
 
 def test_milestones_are_when_a_coverage_was_first_measured_and_none_where_it_never_was():

@@ -28,6 +28,7 @@ REPORT = {
     'end_nodes_seen',
     'end_nodes_visited',
     'pose_rmse',
+    'pose_rmse_aligned',
 }
 TOPICS = {
     '/scan',

@@ -30,6 +30,7 @@ FIELDS = {
     'end_nodes_seen',
     'end_nodes_visited',
     'pose_rmse',
+    'pose_rmse_aligned',
 }
 
 

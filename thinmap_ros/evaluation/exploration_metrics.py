@@ -12,6 +12,7 @@ from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2, MissingAr
 from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.evaluation.trajectory_errors import aligned_rms
 
 MILESTONES = (0.90, 0.95, 0.98, 0.99)
 SAME_PLACE_M = 1.0
@@ -112,7 +113,9 @@ def exploration_report(
     times_s (N,): since the start; true_poses, estimated_poses (N, 3): at these times, in the same
     frame; coverage (M, 2): time in s and coverage, 0 to 1, of each measurement. `distance`, and the
     times and distances of the first measurement of a coverage, refer to the true path, in m and s;
-    None if it was not reached. `curve`: time, distance and coverage of each measurement.
+    None if it was not reached. `pose_rmse`, m, includes the heading error of the first scans, which
+    turns the whole map; `pose_rmse_aligned` is the error of the map's shape alone. `curve`: time,
+    distance and coverage of each measurement.
     """
     steps = np.hypot(*np.diff(true_poses[:, :2], axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(steps)])
@@ -134,6 +137,7 @@ def exploration_report(
         'end_nodes_seen': census.seen,
         'end_nodes_visited': census.visited,
         'pose_rmse': round(float(np.sqrt(np.mean(errors**2))), 5),
+        'pose_rmse_aligned': round(aligned_rms(estimated_poses, true_poses), 5),
         'turned_rad': round(float(np.abs(_turns(true_poses)).sum()), 2),
         'curve': [
             [
