@@ -155,10 +155,10 @@ def best_viewpoint(
     """Viewpoint for a robot at an odometry pose (3,).
 
     starts (H, 3): any of them may be T_map_odom, with weights (H,).
-    The way there is free in the map, whichever it is: it is the same motion for all of them; it may
-    be a turn only. range_m: how far views are compared; looked (M, 3): odometry poses at which it
-    has looked already, which are of no use again. Where no viewpoint in reach tells places apart,
-    the farthest that is new; None where none is.
+    The path to the viewpoint is free in the map from each of the starts, as the motion is the same
+    for all. It may be a turn only. range_m: distance up to which views are compared; looked (M, 3):
+    odometry poses of earlier viewpoints, which add no information. If no viewpoint in reach
+    distinguishes the places, it is the farthest new one. None: there is no new one.
     """
     looked = np.empty((0, 3)) if looked is None else looked
     starts, weights = _distinct(T_odom_base, starts, weights)
@@ -250,9 +250,9 @@ def _common_states(
 def _in_reach(
     patch: GridPatch, T_odom_base: Array, driving: WavefrontConfig
 ) -> tuple[Array, Array]:
-    """Points (N, 2) a spacing apart to which the robot can get, and the way there, (N,), m.
+    """Reachable points (N, 2) a spacing apart, and the path length to each, (N,), m.
 
-    Where it is comes first.
+    The position of the robot is the first point.
     """
     resolution = patch.frame.resolution
     xy = (float(T_odom_base[0]), float(T_odom_base[1]))
@@ -271,9 +271,9 @@ def _in_reach(
 def _gains(
     places: Places, starts: Array, weights: Array, at: Array, range_m: float
 ) -> tuple[Array, Array]:
-    """Share of the pairs of places that are told apart from points (N, 2), and bearing to that.
+    """Share of the pairs of places that points (N, 2) distinguish, and the bearing for it.
 
-    Points and bearings are of the odometry's frame.
+    Points and bearings are in the frame of the odometry.
     """
     resolution = places.frame.resolution
     origin = (places.frame.origin_x, places.frame.origin_y)

@@ -88,7 +88,7 @@ def _best_tour(from_start: Array, between: Array, first: int, weights: Array, mo
 
 @kernel
 def _nearest_next(order: Places, first: int, between: Array) -> None:
-    """Begin with one place and go on to the nearest that is left, always."""
+    """Order the places by the nearest-neighbour rule, from a first one."""
     count = order.size
     left = np.ones(count, dtype=np.bool_)
     order[0] = first

@@ -33,12 +33,12 @@ _SLACK_CELLS = 5
 def place_for(
     free: Mask, passable: Mask, cells: Cells, allowed: Mask, ways: Array, depth: int, reach: float
 ) -> Cell | None:
-    """The allowed cell with the shortest way that could see most of what a border (N, 2) hides.
+    """Allowed cell with the shortest path that observes most of the space behind a frontier (N, 2).
 
-    free, passable (all but what is known to be solid), allowed (H, W);
-    ways (ceil(H / SQUARE), ceil(W / SQUARE)): length of the way to each square of SQUARE x SQUARE
-    cells, in whose middle the robot would stand; depth: how far behind the border is looked, in
-    cells; reach: how far the laser sees, in cells.
+    free, passable (all cells that are not occupied), allowed (H, W);
+    ways (ceil(H / SQUARE), ceil(W / SQUARE)): path length to each square of SQUARE x SQUARE cells;
+    the robot would stand in its middle; depth: of the space behind the frontier, in cells;
+    reach: range of the laser, in cells.
     """
     points, need = _wanted(free, passable, cells, depth)
     row, col = _view_place(ways, SQUARE, allowed, passable, points, reach, need)
@@ -101,7 +101,7 @@ def _hidden_points(free: Mask, passable: Mask, cells: Cells, depth: int, most: i
 def _view_place(
     ways: Array, factor: int, allowed: Mask, passable: Mask, points: Cells, reach: float, need: int
 ) -> tuple[int, int]:
-    """Middle of the square with the shortest way that sees at least `need` of the points, or -1.
+    """Middle of the square with the shortest path that sees at least `need` points, or -1.
 
     A line of sight runs over passable cells, and is shorter than reach.
     """

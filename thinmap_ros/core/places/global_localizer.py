@@ -48,7 +48,7 @@ _MANY_LOOKS = 16.0
 _LASTING_SHARE = 0.4
 _LASTING_LOOKS = 20.0
 _VIEWS = 6
-_FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while the search is on
+_FRESH_SHARE = 0.2  # of the samples: drawn from the whole map during the search
 _FRESH_BEST = 100
 # Samples whose beams are followed, where the likeliest pose of a place leaves some unexplained.
 _LOOKED_ALONG = 300
@@ -116,13 +116,13 @@ class GlobalLocalization:
        compared with those of the current scan's topological map by distance and angle.
     6. Bayes' rule weighs them, and odometry moves them.
 
-    Where one or a few candidates are left, sampling goes on round these only.
+    With one or a few candidates left, sampling continues around these only.
 
-    Beyond the paper: every spot of the map is compared with the ranges of the scan, so that long
-    corridors, halls and scans without nodes tell something too; candidates must explain each beam,
-    on its whole way; each keeps samples of its own, so that none dies out by chance; what they
-    explain alike leaves them equally likely; and the robot is sure only of a place that explains
-    what it has seen, has no rival left, and is known closely.
+    Beyond the paper: the ranges of the scan are compared with each traversable cell of the map, so
+    that corridors, halls and scans without nodes contribute. Candidates must explain the whole
+    length of each beam. Each has its own samples, so that none disappears by chance. Equal evidence
+    leaves candidates equally likely. A pose is accepted only if it explains the scans, has no other
+    candidate beside it, and has a small covariance.
     Source: topological map paper section 3.1.
     """
 
@@ -166,13 +166,13 @@ class GlobalLocalization:
         return self._known.samples if len(self._known) else self._drawn
 
     def step(self, scan: Scan, T_odom_base: Array) -> Result:
-        """Take in a scan with the odometry pose (3,) at its stamp."""
+        """Process a scan with the odometry pose (3,) at its stamp."""
         if not se2.is_finite(T_odom_base):
             return self._waiting(f'odometry {T_odom_base.tolist()}: expected finite numbers')
         if self._jumped(T_odom_base):
             self.restart()
             self._T_step = T_odom_base
-            return self._waiting('odometry has jumped: all begins anew')
+            return self._waiting('odometry has jumped: the search is reset')
         self._T_step = T_odom_base
         if scan.is_blind or not (scan.hit | scan.no_return).any():
             return self._waiting(f'scan at {scan.stamp_ns} ns: laser blind (too few valid beams)')

@@ -129,9 +129,9 @@ class Hypotheses:
         self.covariances = self.covariances + np.diag(spread**2)
 
     def take_evidence(self, judged: tuple[Array, Array], beams: int, novelty: float) -> None:
-        """Take in a look: what each makes of so many beams (see missed_beams).
+        """Add the evidence of an observation: inliers of each among some beams (see missed_beams).
 
-        novelty: how much of a new look it is.
+        novelty: its weight, 1 for an independent one.
         """
         self.missed = self.missed + novelty * missed_beams(judged, beams)
         self.compared = self.compared + novelty * beams
@@ -144,11 +144,11 @@ class Hypotheses:
     def add(
         self, poses: Array, prior: float, missed: Array, judged: tuple[Array, Array], beams: float
     ) -> None:
-        """Take up new ones (N, 3).
+        """Add new hypotheses (N, 3).
 
-        prior: log odds against those that are known; judged: what they make of so many beams of
-        earlier looks, and missed: how many of these they missed more than the best of the known
-        ones, (N,) each.
+        prior: log odds against the existing ones; judged: as in `take_evidence`, for some beams of
+        earlier observations; missed (N,): number of these that each misses more than the best
+        existing hypothesis.
         """
         count = len(poses)
         covariance = np.diag([_NEW_SIGMA_M**2, _NEW_SIGMA_M**2, _NEW_SIGMA_RAD**2])

@@ -17,7 +17,7 @@ from thinmap_ros.core.places.place_database import (
 )
 from thinmap_ros.core.se2 import Array
 
-_ASIDE_M = 0.12  # a beam is stopped only where those beside it, this far off, are stopped too
+_ASIDE_M = 0.12  # a beam is blocked only if parallel ones at this distance are blocked too
 _NO = 0
 _YES = 1
 _SAYS_NOTHING = 2
@@ -315,13 +315,13 @@ def _explains(
 def spot_scores(
     around: Bytes, low: Bytes, high: Bytes, least: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Spots and headings from which at least so many directions show what was measured.
+    """Positions and headings at which at least `least` directions agree with the scan.
 
-    Returns spot, heading and how many.
+    Returns indices of positions and headings, and the number of directions that agree.
 
-    around (P, D): see Places; low, high (D,): what is measured towards each direction of the robot
-    lies between; 0 and 255 where nothing is known. Of neighbouring headings of a spot, the best
-    ones are kept.
+    around (P, D): see Places; low, high (D,): limits of the measured range in each direction of the
+    robot; 0 and 255 without a measurement. Of neighbouring headings at a position, the best ones
+    are kept.
     """
     spots, directions = around.shape
     counts = np.empty(directions, dtype=np.int32)

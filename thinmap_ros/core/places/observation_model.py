@@ -63,7 +63,7 @@ def calibrate(
         if near.size:
             found[kind] = max(0.0, (near.size / all_of_it.size - chance) / (1.0 - chance))
             spread[kind] = max(spread[kind], float(np.median(near)) / _RAYLEIGH_MEDIAN)
-    # Few trials prove nothing beyond doubt.
+    # A few trials do not prove a rate near 1.
     return NodeModel(np.minimum(found, 0.9), spread, window / (2.0 * np.pi * spread**2))
 
 
@@ -109,7 +109,7 @@ def _chance(places: Places) -> float:
 
 @kernel
 def _ways(states: Bytes, x: float, y: float, angles: Array, most: float) -> Array:
-    """Way in cells to what is not free, for each angle (N,); inf where nothing is within `most`."""
+    """Cells to the first one that is not free, for each angle (N,); inf beyond `most`."""
     ways = np.full(angles.size, np.inf)
     for k in range(angles.size):
         way, state = free_way(states, x, y, angles[k], most)

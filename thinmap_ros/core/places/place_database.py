@@ -169,10 +169,10 @@ def near_walls(states: Bytes, resolution: float) -> Bytes:
 
 @kernel
 def free_way(states: Bytes, x: float, y: float, angle: float, most: float) -> tuple[float, int]:
-    """Way from a point (x, y) to the border of the first cell that is not free, and its state.
+    """Distance from a point (x, y) to the edge of the first cell that is not free, and its state.
 
-    Way, x and y in cells.
-    FREE where there is none within `most`; UNKNOWN where the ray leaves the map.
+    Distance, x and y in cells.
+    FREE if there is none within `most`; UNKNOWN if the ray leaves the map.
     """
     rows, cols = states.shape
     col, step_x, next_x, delta_x = axis_setup(x, math.cos(angle))

@@ -32,8 +32,8 @@ def candidates(
 ) -> tuple[Array, bool]:
     """Refined poses (N, 3) that explain a scan about as well as any, and whether these are all.
 
-    Every spot of the map is compared under every heading, range by range; to the best of them come
-    the samples drawn (M, 3). None where the scan shows next to nothing.
+    The ranges are compared at each position of the map and each heading; the samples drawn (M, 3)
+    are added to the best poses. No candidates if the scan has too few hits.
     """
     if int(seen.met.sum()) < _FEWEST_WALLS:
         return np.empty((0, 3)), False
@@ -49,9 +49,9 @@ def candidates(
 
 
 def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> tuple[Array, bool]:
-    """Spots with headings (N, 3) whose ranges all round agree best with a scan.
+    """Poses (N, 3) whose ranges in all directions agree best with a scan.
 
-    Also whether all that may be are there.
+    Also whether no candidate is missing.
     """
     ranges, known, met = profile(seen)
     # Off by half a spacing, by half a direction, and more where walls are seen at a slant.

@@ -45,7 +45,7 @@ def deletion_times(free: NDArray[np.bool_]) -> Times:
 
 
 def _pack(free: NDArray[np.bool_]) -> tuple[Words, int]:
-    """Rows as words inside a border of empty ones, one after the other; and the words of a row.
+    """Rows as words inside a margin of empty ones, one after the other; and the words of a row.
 
     Bit i of word w is column 64 w + i. Some more empty words follow, so that whole lanes may be
     read at the end.
