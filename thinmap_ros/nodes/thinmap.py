@@ -16,7 +16,7 @@ _USAGE = f"""usage: {{program}} [NODE ...] [--ros-args ...]
 
 Runs nodes in one process. Without names: {', '.join(_NODES)}.
 There are also: {', '.join(_OTHERS)}.
-A parameter goes to every node that has it; -p localizer:slam:=off goes to one."""
+A parameter goes to every node that has it; -p localizer:slam:=ekf_ti sets that of one."""
 
 
 def node_factories(names: list[str]) -> list[Callable[[], Node]]:
