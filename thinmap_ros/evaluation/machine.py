@@ -1,4 +1,4 @@
-"""Machine of the benchmarks, and their time and memory.
+"""Machine and commit of a measurement, and its time and memory.
 
 Times are comparable: the best of several alternating runs, or the CPU time of one run.
 """
@@ -7,6 +7,7 @@ import os
 import platform
 import resource
 import statistics
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,19 +15,67 @@ from importlib.metadata import version
 from pathlib import Path
 
 from thinmap_ros.evaluation.outcome import Row
+from thinmap_ros.files.atomic import read_text, write_text
 from thinmap_ros.pipeline import Pipeline
+
+_ROOT = Path(__file__).resolve().parents[2]
+_PROVENANCE = 'provenance.txt'
+_GIT_S = 10.0
 
 
 def machine() -> Iterator[Row]:
-    """Processor, cores, and versions."""
-    lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
-    names = [line.partition(':')[2].strip() for line in lines if line.startswith('model name')]
-    yield Row('processor', names[0] if names else platform.processor())
-    yield Row('cores', str(os.cpu_count()))
-    yield Row('processes that wanted one of them (load)', f'{os.getloadavg()[2]:.0f}')
-    yield Row('Python', platform.python_version())
+    """Load and versions of packages; processor and commit are in `provenance`."""
+    yield Row('load average', f'{os.getloadavg()[2]:.0f}')
     for package in ('numpy', 'scipy', 'numba'):
         yield Row(package, version(package))
+
+
+def provenance(folder: Path | None = None) -> str:
+    """One line of commit, processor, cores and Python: of a folder of results, else of this run."""
+    if folder is not None and (folder / _PROVENANCE).exists():
+        return read_text(folder / _PROVENANCE).strip()
+    known = commit(_ROOT)
+    words = [
+        *([f'Commit {known}'] if known else []),
+        _processor(),
+        f'{os.cpu_count()} cores',
+        f'Python {platform.python_version()}',
+    ]
+    return ', '.join(words)
+
+
+def write_provenance(folder: Path) -> None:
+    """Write the line of this run to a folder of results, for pages that are made of it later."""
+    write_text(folder / _PROVENANCE, f'{provenance()}\n')
+
+
+def commit(root: Path) -> str:
+    """Short hash of the commit of a source tree; empty outside of git.
+
+    Changes that are not committed are marked, but for those of docs, to which pages are written.
+    """
+    try:
+        # The tree may be installed inside the repository of another project.
+        if not _git(root, 'ls-files', 'thinmap_ros/evaluation'):
+            return ''
+        changes = _git(root, 'status', '--porcelain', '-uno', '--', '.', ':(exclude)docs')
+        return _git(root, 'rev-parse', '--short', 'HEAD') + (
+            ' with local changes' if changes else ''
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ''
+
+
+def _git(root: Path, *words: str) -> str:
+    command = ['git', '-C', str(root), *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=_GIT_S, check=True)
+    return done.stdout.strip()
+
+
+def _processor() -> str:
+    lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
+    names = [line.partition(':')[2].strip() for line in lines if line.startswith('model name')]
+    return names[0] if names else platform.processor()
 
 
 class CpuTimedPipeline(Pipeline):
