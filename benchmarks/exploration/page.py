@@ -1,4 +1,4 @@
-"""Make docs/results/exploration.md of what compare_exploration left.
+"""Make docs/results/exploration.md from the results of compare_exploration.
 
 Usage: python -m benchmarks.exploration.page DIR [DIR ...]. A file reliability.md of a folder is the
 table of fit_belief.
@@ -10,61 +10,75 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from thinmap_ros.evaluation.machine import provenance
 from thinmap_ros.evaluation.strategy_comparison import OURS, markdown, relative_saving
 
 Report = dict[str, Any]
 _PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'results' / 'exploration.md'
 _FULL_COVERAGE = 0.99
+_KINDS = {'dungeon': 'Dungeons', 'kth': 'KTH floors'}
 _NEARLY_ALL = 0.995
 _HEAD = """\
-# Exploration, measured
+# Exploration
 
-Made by `python -m benchmarks.exploration.page DIR ...` of the folders that
-`compare_exploration WORLD... -o DIR` left, with the options that each section names. Distance, time
-and turns are means ± the mean spread over the starts of a world; coverage is the share of what
-could be seen from where the robot can get to; a contact is a collision. Times are of the processor,
-on a machine that did other things as well.
+{provenance}
+
+`python -m benchmarks.exploration.page DIR ...` generates this page from folders of
+`compare_exploration WORLD... -o DIR`. Each section states the laser, the speed and the source of
+the poses.
+
+- *Distance*, *time* and *turns*: means, ± the mean standard deviation over the starts of a world.
+- *Coverage*: share of the area that is observable from where the robot can be.
+- *Reversals*: returns to the target before the last.
+- *Decision*: median CPU time. *Times real time*: on one core, next to other load.
+
+The strategies are described in [Exploration: theory](../theory/exploration.md).
 """
 _BELIEF = """\
-## Does the belief come true?
+## Calibration of the belief
 
-Fitted on 100 generated buildings, four dungeons and a floor; compared on 20 other buildings, four
-other dungeons and another floor (`python -m benchmarks.exploration.fit_belief -o DIR`). A
-candidate hides nothing if less than 0.5 m2 of what can be observed is behind its frontier. Each
-candidate counts once.
+The belief is the probability that nothing is hidden behind a frontier candidate. It is fitted on
+100 generated buildings, four dungeons and a floor, and evaluated on 20 other buildings, four other
+dungeons and another floor (`python -m benchmarks.exploration.fit_belief -o DIR`). Nothing is
+hidden if less than 0.5 m2 of observable area lies behind the frontier. Each candidate counts once.
 
 """
 _NOTES = """\
-## The paper and the belief
+## Position probability of the paper and calibrated belief
 
-The paper visits an end node only while its position probability is below 0.9, starts at 0.5, and
-counts how near and from which angles it was seen. That works in its room of 10 x 10 m, and some
-end nodes are never visited there. In larger buildings it does not hold: the end of a skeleton at
-the rim of the known is seen often and from near, so that its probability rises although a room is
-behind it, and the exploration stops early. How long the open frontier is, and how much unknown
-space is in line of sight behind it, tell more than views do; once they are known, distance and
-angle add almost nothing (weight 0.04 of their log odds). The belief keeps the paper's form, with
-the frontier as the prior.
+The strategy `paper` uses the position probability as the paper prints it. The probability starts
+at 0.5, and rises with the observations of an end node: by their distance and by the angles between
+them. The robot visits an end node only while its probability is below 0.9.
 
-A share of the area that may be left, promised by the user, saves no path: nothing that can be
-seen tells the last room from the last niche. So there is no such parameter; what is probably
-missing is reported instead.
+- **Where the claims hold**: in the room of the paper (10 x 10 m) the robot observes the entire
+  environment, and never visits some of the end nodes ([Experiments of the papers](papers.md)).
+- **Where they do not hold**: in larger buildings. The end of a skeleton at the edge of the known
+  area is observed often and from a short distance. Its probability rises although a room is hidden
+  behind it. The exploration stops early, as the coverage of `paper` in the tables shows.
+- **What the calibrated belief changes**: the strategy `position_probability` keeps the form of the
+  paper. Its prior depends on the length of the frontier and on the unknown space in line of sight
+  behind it. These predict hidden area better than observations do: with them, distance and angle
+  add almost nothing (weight 0.04 of their log odds).
+
+There is no parameter for a share of the area that may remain unexplored. It would not shorten the
+path, as no observation distinguishes the last room from the last niche. The report states the area
+that is probably missing instead.
 """
 
 
-def page(reports: list[Report], reliability: str = '') -> str:
+def page(reports: list[Report], reliability: str = '', made: str = '') -> str:
     """Text of the page: a section for each kind of world and options of the exploration.
 
-    reliability: table of `fit_belief`.
+    reliability: table of `fit_belief`; made: line of commit and machine.
     """
     sections: dict[tuple[str, str], list[Report]] = defaultdict(list)
     for report in reports:
         sections[report['world'].split('-')[0], _conditions(report['options'])].append(report)
-    parts = [_HEAD]
+    parts = [_HEAD.format(provenance=made)]
     for (kind, conditions), chosen in sections.items():
         worlds = {report['world'] for report in chosen}
         parts += [
-            f'## {kind} ({len(worlds)}): {conditions}\n',
+            f'## {_KINDS.get(kind, kind)} ({len(worlds)}): {conditions}\n',
             markdown(chosen),
             *_verdicts(chosen),
         ]
@@ -83,7 +97,7 @@ def _conditions(options: dict[str, Any]) -> str:
 
 
 def _verdicts(reports: list[Report]) -> list[str]:
-    """What went wrong in ours, and where another one is shorter."""
+    """Faults of position_probability, and pairs in which another strategy is shorter."""
     by_strategy: dict[str, dict[tuple[str, int], Report]] = defaultdict(dict)
     for report in reports:
         by_strategy[report['strategy']][report['world'], report['start_number']] = report
@@ -92,7 +106,10 @@ def _verdicts(reports: list[Report]) -> list[str]:
     if ours and not lines:
         count = f'{len(ours)} of {len(ours)}'
         share = f'{_FULL_COVERAGE:.0%} or more'
-        lines = [f'{OURS}: {count} stopped by itself, with {share}, without contact.']
+        lines = [
+            f'{OURS}: {count} runs stopped by themselves, with a coverage of {share} and '
+            'without collisions.'
+        ]
     lines += [
         _pose_error(report)
         for report in ours.values()
@@ -101,20 +118,20 @@ def _verdicts(reports: list[Report]) -> list[str]:
     if ours:
         rest = sum(_after(report, _NEARLY_ALL) for report in ours.values()) / len(ours)
         lines.append(
-            f'After {_NEARLY_ALL:.1%} were seen, {OURS} drove {rest:.1%} of its way (mean).'
+            f'After a coverage of {_NEARLY_ALL:.1%}, {OURS} drove {rest:.1%} of its path (mean).'
         )
     for name, theirs in sorted(by_strategy.items()):
         longer = relative_saving(ours, theirs, 'distance')
         if (longer > 0.0).any():
             lines.append(
-                f'{name} drove less in {int((longer > 0.0).sum())} of {len(longer)} pairs; '
-                f'{OURS} drove up to {longer.max():.0%} more.'
+                f'{name} has a shorter path in {int((longer > 0.0).sum())} of {len(longer)} pairs; '
+                f'that of {OURS} is up to {longer.max():.0%} longer.'
             )
     return [f'{line}\n' for line in lines]
 
 
 def _after(report: Report, share: float) -> float:
-    """Share of the whole way driven after a coverage was first measured; 0 where it never was."""
+    """Share of the path driven after a coverage was first measured; 0 where it never was."""
     along = [distance for _, distance, coverage in report['curve'] if coverage >= share]
     return 1.0 - along[0] / report['distance'] if along else 0.0
 
@@ -128,7 +145,7 @@ def _is_good(report: Report) -> bool:
 def _fault(report: Report) -> str:
     return (
         f'**{report["world"]}, start {report["start_number"]}**: {report["reason"]}; '
-        f'coverage {report["coverage"]:.2%}, {report["collisions"]} contacts.'
+        f'coverage {report["coverage"]:.2%}, {report["collisions"]} collisions.'
     )
 
 
@@ -151,7 +168,8 @@ def main() -> None:
         if (folder / 'reports.json').exists()
         for report in json.loads((folder / 'reports.json').read_text('utf-8'))
     ]
-    _PAGE.write_text(page(reports, reliability), encoding='utf-8')
+    text = page(reports, reliability, provenance(folders[0] if folders else None))
+    _PAGE.write_text(text, encoding='utf-8')
 
 
 if __name__ == '__main__':

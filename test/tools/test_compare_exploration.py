@@ -33,8 +33,7 @@ def report(strategy: str, world: str, start: int, distance: float) -> dict[str, 
         'coverage': 0.995,
         'finished': True,
         'collisions': 0,
-        'end_nodes_seen': 4,
-        'end_nodes_visited': 1,
+        'reversals': 2,
         'cpu_s': 1.0,
         'decision_ms': {'median': 0.5, 'max': 7.0},
         'curve': [[1.0, 0.9 * distance, 0.995], [2.0, distance, 0.995]],
@@ -52,7 +51,8 @@ def test_the_table_has_a_row_for_each_strategy_and_says_what_ours_saves() -> Non
     reports = [report('position_probability', 'a', i, 80.0) for i in range(3)]
     reports += [report('nearest_frontier', 'a', i, 100.0) for i in range(3)]
     table = markdown(reports)
-    assert '| nearest_frontier | 3 | 3 | 99.50% | 99.50% | 0 | 100.0 ± 0.0 |' in table
+    assert '| nearest_frontier | 3 | 3 | 99.50% / 99.50% | 0 | 100.0 ± 0.0 |' in table
+    assert '| 5.0 ± 0.0 | 2.0 | 0.50 | 200 |' in table
     assert '| nearest_frontier | 3 | -20.0% ± 0.0% | -20.0% ± 0.0% | +0.0% ± 0.0% | 3 |' in table
 
 
@@ -71,15 +71,15 @@ def test_the_page_has_a_section_for_each_way_of_exploring_and_names_every_fault(
     stuck = {'finished': False, 'reason': 'time limit of 20000 s', 'coverage': 0.5, 'options': far}
     reports.append(report('position_probability', 'kth-a', 1, 50.0) | stuck)
     text = page(reports)
-    assert '## dungeon (3): 181 beams over 180 degrees, 8 m, 0.5 m/s, poses known' in text
-    assert 'position_probability: 3 of 3 stopped by itself' in text
-    assert 'After 99.5% were seen, position_probability drove 10.0% of its way (mean).' in text
+    assert '## Dungeons (3): 181 beams over 180 degrees, 8 m, 0.5 m/s, poses known' in text
+    assert 'position_probability: 3 of 3 runs stopped by themselves' in text
+    assert 'After a coverage of 99.5%, position_probability drove 10.0% of its path (mean).' in text
     assert (
-        'nearest_frontier drove less in 1 of 3 pairs; position_probability drove up to 33% more.'
-        in text
+        'nearest_frontier has a shorter path in 1 of 3 pairs; '
+        'that of position_probability is up to 33% longer.' in text
     )
-    assert '## kth (1): 181 beams over 180 degrees, 20 m' in text
-    assert '**kth-a, start 1**: time limit of 20000 s; coverage 50.00%, 0 contacts.' in text
+    assert '## KTH floors (1): 181 beams over 180 degrees, 20 m' in text
+    assert '**kth-a, start 1**: time limit of 20000 s; coverage 50.00%, 0 collisions.' in text
 
 
 def compare(*words: str) -> 'subprocess.CompletedProcess[str]':

@@ -18,20 +18,20 @@ def markdown(reports: list[Report]) -> str:
     for report in reports:
         by_strategy[report['strategy']][report['world'], report['start_number']] = report
     lines = [
-        '| strategy | runs | stopped | coverage least | coverage mean | collisions '
-        '| distance m | time s | turned rad | end nodes visited / seen '
-        '| decision ms, median (highest) | longest | x real time (one core) |',
-        '|---|---|---|---|---|---|---|---|---|---|---|---|---|',
+        '| strategy | runs | stopped by itself | coverage, least / mean | collisions '
+        '| distance (m) | time (s) | turns (rad) | reversals per 100 m | decision (ms) '
+        '| times real time |',
+        '|---|---|---|---|---|---|---|---|---|---|---|',
     ]
     lines += [_row(name, list(runs.values())) for name, runs in sorted(by_strategy.items())]
     others = sorted(set(by_strategy) - {OURS})
     if OURS in by_strategy and others:
         lines += [
             '',
-            f'{OURS} against each, paired by world and start '
-            '(mean, 95 % interval; in how many it is shorter):',
+            f'Difference of {OURS} to each other strategy, paired by world and start '
+            '(mean and 95 % confidence interval; negative: it is shorter):',
             '',
-            '| against | pairs | distance | time | turns | shorter in |',
+            '| against | pairs | distance | time | turns | shorter distance in |',
             '|---|---|---|---|---|---|',
         ]
         lines += [_paired(name, by_strategy[OURS], by_strategy[name]) for name in others]
@@ -54,17 +54,22 @@ def half_interval_95(values: Array) -> float:
 def _row(name: str, runs: list[Report]) -> str:
     coverage = [run['coverage'] for run in runs]
     speed = sum(run['time'] for run in runs) / max(sum(run['cpu_s'] for run in runs), 1e-9)
-    decision, longest = (max(run['decision_ms'][key] for run in runs) for key in ('median', 'max'))
-    visited, seen = (
-        sum(run[key] for run in runs) for key in ('end_nodes_visited', 'end_nodes_seen')
-    )
+    decision_ms = float(np.median([run['decision_ms']['median'] for run in runs]))
     return (
-        f'| {name} | {len(runs)} | {sum(run["finished"] for run in runs)} | {min(coverage):.2%} '
-        f'| {np.mean(coverage):.2%} | {sum(run["collisions"] for run in runs)} '
+        f'| {name} | {len(runs)} | {sum(run["finished"] for run in runs)} '
+        f'| {min(coverage):.2%} / {np.mean(coverage):.2%} '
+        f'| {sum(run["collisions"] for run in runs)} '
         f'| {_spread(runs, "distance")} | {_spread(runs, "time")} | {_spread(runs, "turned_rad")} '
-        f'| {visited} / {seen} '
-        f'| {decision:.2f} | {longest:.0f} | {speed:.0f} |'
+        f'| {_reversals(runs)} | {decision_ms:.2f} | {speed:.0f} |'
     )
+
+
+def _reversals(runs: list[Report]) -> str:
+    """Returns to the target before the last per 100 m; empty for reports without them."""
+    if any('reversals' not in run for run in runs):
+        return ''
+    driven_m = sum(run['distance'] for run in runs)
+    return f'{100.0 * sum(run["reversals"] for run in runs) / max(driven_m, 1e-9):.1f}'
 
 
 def _spread(runs: list[Report], key: str) -> str:

@@ -15,6 +15,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_run import explore
+from thinmap_ros.evaluation.machine import write_provenance
 from thinmap_ros.evaluation.parallel_jobs import (
     Report,
     add_run_options,
@@ -99,6 +100,7 @@ def _work(arguments: argparse.Namespace) -> None:
         raise failure_summary(failures)
     reports = [read_report(_report_file(arguments.out, job), asdict(job.options)) for job in jobs]
     table = markdown(reports)
+    write_provenance(arguments.out)
     write_text(arguments.out / 'table.md', table)
     write_text(arguments.out / 'reports.json', json.dumps(reports) + '\n')
     figures.coverage_figure(arguments.out / 'coverage.png', reports)
