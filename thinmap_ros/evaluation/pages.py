@@ -5,6 +5,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from thinmap_ros.evaluation.machine import provenance
 from thinmap_ros.files.atomic import read_text, write_text
 from thinmap_ros.view.figures import write_small_png
 
@@ -33,8 +34,8 @@ def write_page(out: Path, names: list[str]) -> Path:
     )
     text = (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<title>thinmap: experiments</title><style>{_STYLE}</style></head><body>\n'
-        f"<h1>The papers' experiments</h1>\n<ul>{links}</ul>\n"
+        f'<title>thinmap: experiments of the papers</title><style>{_STYLE}</style></head><body>\n'
+        f'<h1>Experiments of the papers</h1>\n<ul>{links}</ul>\n'
         + '\n'.join(sections)
         + '\n</body></html>\n'
     )
@@ -59,7 +60,7 @@ def _section(name: str, about: About) -> str:
         )
     tables = [
         f'<a href="{name}/{table["name"]}.csv">{table["name"]}.csv</a> ({table["rows"]} rows'
-        + (', times: not the same from run to run)' if table['timed'] else ')')
+        + (', times: differ from run to run)' if table['timed'] else ')')
         for table in about['tables']
     ]
     return '\n'.join([*parts, f'<p>Tables: {", ".join(tables)}</p>' if tables else ''])
@@ -73,22 +74,78 @@ def _comparisons(comparisons: list[dict[str, Any]]) -> str:
         rows.append(
             f'<tr>{cells}<td class="{verdict}">{verdict}</td><td>{escape(c["remark"])}</td></tr>'
         )
-    head = '<tr><th>what</th><th>paper</th><th>here</th><th>met</th><th>remark</th></tr>'
+    head = (
+        '<tr><th>quantity</th><th>paper</th><th>thinmap</th><th>confirmed</th><th>remark</th></tr>'
+    )
     return f'<table>{head}{"".join(rows)}</table>'
 
 
 _HEAD = """\
-# The papers' experiments
+# Experiments of the papers
 
-Made by `scripts/experiments/all.sh --docs docs` from the files that the experiments leave in
-`out/experiments`; the same seed gives the same numbers, but for times. The robots are simulated,
-with noise as of real ones, but for the logs at the end. One experiment alone:
-`scripts/experiments/NAME.sh`; from the recorded drives, with the same figures (poses within 1 mm):
-`scripts/experiments/NAME.sh --from-bag bags`.
+{provenance}
+
+`scripts/experiments/all.sh --docs docs` runs all experiments and generates this page. The robots
+are simulated with realistic noise. The last section replays logs of real robots. The same seed
+gives the same numbers, except for times. `scripts/experiments/NAME.sh` runs one experiment. With
+`--from-bag bags` it reads the recorded drives instead of the simulator; poses agree within 1 mm.
 
 Papers: 1 thinning-based topological maps, 2 exploration by position probability, 3 EKF-SLAM with
-topological information.
+topological information. The column *confirmed* compares the result with that of the paper; it is
+empty if the paper gives no number.
 """
+# Experiment and comparison that decide about a claim, the claim, and a note.
+_CLAIMS = (
+    (
+        'thinning_voronoi',
+        'CPU time',
+        'Thinning needs less computation than the Voronoi diagram.',
+        'Whole floors: section `voronoi` of [Speed](speed.md).',
+    ),
+    (
+        'thinning_voronoi',
+        'additional nodes of thinning, laboratory',
+        'Thinning makes additional nodes.',
+        'With equal pruning, merging and corner nodes, both methods have about as many nodes.',
+    ),
+    (
+        'convergence',
+        'steps until one position is left',
+        'Global localization converges to one position.',
+        '',
+    ),
+    (
+        'exploration',
+        'coverage',
+        'Exploration by position probability, as the paper prints it, covers the environment.',
+        'This is the room of 10 x 10 m. In larger buildings the strategy `paper` stops early; the '
+        'calibrated belief of `position_probability` covers them: [Exploration](exploration.md).',
+    ),
+    (
+        'strategies',
+        'against visit all end nodes',
+        'Position probability is more efficient than to visit all end nodes.',
+        'With the calibrated belief.',
+    ),
+    (
+        'strategies',
+        'against nearest frontier',
+        'Position probability is more efficient than the nearest frontier.',
+        'With the calibrated belief, in three small worlds.',
+    ),
+    (
+        'feature_count',
+        'EKF-SLAM/TI',
+        'The time of a step of EKF-SLAM/TI is nearly constant.',
+        'With few features, the conventional filter takes as long.',
+    ),
+    (
+        'feature_count',
+        'difference of the estimates',
+        'Both filters have almost identical estimates.',
+        '',
+    ),
+)
 
 
 def write_markdown(out: Path, names: list[str], docs: Path) -> Path:
@@ -96,7 +153,7 @@ def write_markdown(out: Path, names: list[str], docs: Path) -> Path:
 
     Returns its path.
     """
-    parts = [_HEAD]
+    parts = [_HEAD.format(provenance=provenance(out)), *_claims(out, names)]
     for name in names:
         about = read_about(out, name)
         parts.append(f'## {about["title"]}\n\n*{about["source"]}.* {about["how"]} (`{name}`)\n')
@@ -112,8 +169,26 @@ def write_markdown(out: Path, names: list[str], docs: Path) -> Path:
 
 
 def _markdown_rows(comparisons: list[dict[str, Any]]) -> str:
-    rows = ['| what | paper | here | met | remark |', '|---|---|---|---|---|']
+    rows = ['| quantity | paper | thinmap | confirmed | remark |', '|---|---|---|---|---|']
     for c in comparisons:
         cells = [str(c[key]).replace('|', '/') for key in ('what', 'paper', 'ours')]
         rows.append(f'| {" | ".join(cells)} | {_VERDICTS[c["met"]]} | {c["remark"]} |')
     return '\n'.join(rows) + '\n'
+
+
+def _claims(out: Path, names: list[str]) -> list[str]:
+    """Section on the claims of the papers that the experiments decide; empty without any."""
+    met = {
+        (name, comparison['what']): comparison['met']
+        for name in names
+        for comparison in read_about(out, name)['comparisons']
+    }
+    rows = [
+        f'| {claim} | {_VERDICTS[met[name, what]]} | {note} |'
+        for name, what, claim, note in _CLAIMS
+        if (name, what) in met
+    ]
+    if not rows:
+        return []
+    head = ['## Claims of the papers\n', '| claim | confirmed | note |', '|---|---|---|']
+    return ['\n'.join([*head, *rows]) + '\n']

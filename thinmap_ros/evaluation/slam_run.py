@@ -45,7 +45,7 @@ class Run:
     def position_error(self) -> str:
         """Position errors as text."""
         off = 100.0 * np.hypot(*self.errors()[:, :2].T)
-        return f'{off.mean():.1f} cm (mean), {off.max():.1f} cm (most)'
+        return f'{off.mean():.1f} cm (mean), {off.max():.1f} cm (maximum)'
 
     @property
     def path_length_m(self) -> float:

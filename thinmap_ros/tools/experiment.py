@@ -11,6 +11,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.evaluation.machine import write_provenance
 from thinmap_ros.evaluation.outcome import Outcome
 from thinmap_ros.evaluation.pages import write_markdown, write_page
 from thinmap_ros.experiments.drives import Source
@@ -118,6 +119,7 @@ def _work_experiments(arguments: argparse.Namespace) -> None:
             'expected the bags that scripts/record_bags makes'
         )
     source = Source(arguments.seed, arguments.from_bag, arguments.quick)
+    write_provenance(arguments.out)
     for name, seconds in _run_all(names, source, arguments.out, arguments.processes):
         print(f'{name}: {seconds:.0f} s', flush=True)
 

@@ -75,15 +75,15 @@ def run(source: Source) -> Outcome:
         'distance of node A from its first position (m)',
         plan=False,
     )
-    caption = 'Paper 2, to Fig. 5 and 6: how far node A has moved.'
+    caption = 'Paper 2, to Fig. 5 and 6: displacement of node A.'
     plots.append(Plot('movement', caption, [panel], panel_inches=(6.5, 3.6), legend='inside'))
     (dead, dead_rest) = ends['dead_end']
     (joined, joined_rest) = ends['joined_hallways']
     return Outcome(
-        'End nodes move while there is something to see',
+        'Motion of end nodes during exploration',
         'Exploration paper, section 3.1, Fig. 5 and 6',
-        'The robot drives up a hallway and to the left, where it cannot see from its start: '
-        'a dead end, or the way to another hallway. Node A is the end node ahead of it.',
+        'The robot drives up a hallway and turns left into a part that is hidden from its start: '
+        'a dead end, or the connection to another hallway. Node A is the end node ahead of it.',
         [Table('node_a', ['world', 'time_s', 'x_m', 'y_m', 'way_m'], rows)],
         plots,
         [
@@ -91,11 +91,11 @@ def run(source: Source) -> Outcome:
                 'dead end: node A moves, then rests',
                 'yes',
                 f'moves {_moved(dead):.1f} m, '
-                f'rests after {dead_rest:.1f} m of {dead[-1, 3]:.1f} m of way',
+                f'rests after {dead_rest:.1f} m of {dead[-1, 3]:.1f} m driven',
                 bool(_moved(dead) > 1.0 and dead_rest < dead[-1, 3] - 0.5),
             ),
             Comparison(
-                'joined hallways: node A sprawls out into the other one',
+                'joined hallways: node A moves into the other one',
                 'yes',
                 f'moves {_moved(joined):.1f} m, to ({joined[-1, 1]:.1f} m, {joined[-1, 2]:.1f} m)',
                 _moved(joined) > _moved(dead) and joined_rest > dead_rest,

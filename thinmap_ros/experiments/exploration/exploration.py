@@ -81,7 +81,8 @@ def run(source: Source) -> Outcome:
         'Exploration by position probability',
         'Exploration paper, section 4, Fig. 10',
         'The room of 10 x 10 m, cells of 10 cm, 181 beams over 180 degrees, at most 0.2 m/s, '
-        'with exact poses. Beside each end node stand its number and its position probability.',
+        'with exact poses, by the strategy `paper`: position probability as the paper prints it. '
+        'The labels are the id and the position probability of each end node.',
         [
             Table('end_nodes', _COLUMNS, _rows(moments)),
             Table('coverage', ['time_s', 'coverage'], coverage),
@@ -90,7 +91,7 @@ def run(source: Source) -> Outcome:
             Plot(
                 'fig10',
                 'Paper 2, Fig. 10: the exploration at six moments; '
-                'number and position probability beside each end node, the path so far.',
+                'id and position probability of each end node, and the path.',
                 [_panel(m, poses[: moments.index(m) + 1]) for m in shown],
                 columns=3,
                 panel_inches=(4.6, 4.6),
@@ -98,19 +99,19 @@ def run(source: Source) -> Outcome:
         ],
         [
             Comparison(
-                'time for the room',
+                'exploration time',
                 f'under {_SETUP.paper_s:.0f} s',
                 f'{last.seconds:.0f} s, {way_m:.1f} m',
                 last.seconds < _SETUP.paper_s,
             ),
             Comparison(
-                'explored',
+                'coverage',
                 'the entire environment',
                 f'{coverage[-1][1]:.1%}',
                 coverage[-1][1] >= _SETUP.entire,
             ),
             Comparison(
-                'end nodes that were never visited',
+                'end nodes that are never visited',
                 'some',
                 f'{unvisited} of {census.seen}',
                 unvisited > 0,
@@ -179,9 +180,7 @@ def _panel(moment: _Moment, path: Array) -> Panel:
     at = np.array([[n.x, n.y] for n in nodes]).reshape(-1, 2)
     target = moment.decision.target
     goal = (
-        []
-        if target is None
-        else [Curve(target.goal[None, :2], 'looked at from', 3, '', 'X', size=9.0)]
+        [] if target is None else [Curve(target.goal[None, :2], 'viewpoint', 3, '', 'X', size=9.0)]
     )
     layers: list[Layer] = [
         MapLayer(moment.patch),

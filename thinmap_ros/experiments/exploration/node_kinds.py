@@ -38,7 +38,7 @@ def run(source: Source) -> Outcome:
             [*graph.nodes[edge.a].position, *graph.nodes[edge.b].position]
             for edge in graph.edges.values()
         ]
-        lines = Segments(np.array(ends), 'straight between nodes', 'black', 0.8)
+        lines = Segments(np.array(ends), 'straight lines between nodes', 'black', 0.8)
         panels.append(Panel([MapLayer(patch), GraphLayer(graph, 7.0), lines], name))
     room = patch_at_rest('room_10x10')
     graph = build(room, None, TopologyConfig())
@@ -47,14 +47,14 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'Three kinds of nodes',
         'Exploration paper, section 2.2, Fig. 3 and 4',
-        'A cell of the skeleton with one neighbour is an end node, one where three and more edges '
-        'meet a branch node. '
-        'A corner node stands where an obstacle blocks the straight line between two nodes.',
+        'A cell of the skeleton with one neighbour is an end node. A cell at which three or more '
+        'edges meet is a branch node. '
+        'A corner node is added if an obstacle blocks the straight line between two nodes.',
         [Table('nodes', ['shape', 'end', 'branch', 'corner'], rows)],
         [
             Plot(
                 'fig3',
-                'Paper 2, Fig. 3: which nodes a shape has.',
+                'Paper 2, Fig. 3: nodes of four shapes.',
                 panels,
                 columns=2,
                 panel_inches=(4.4, 3.6),
@@ -70,7 +70,7 @@ def run(source: Source) -> Outcome:
             Comparison(
                 'nodes of the four shapes',
                 'as drawn in Fig. 3',
-                'the same' if right else 'others',
+                'the same' if right else 'different',
                 right,
             )
         ],

@@ -38,8 +38,8 @@ def run(source: Source) -> Outcome:
         'Stages of thinning',
         'Exploration paper, section 2.1, Fig. 2 (and SLAM paper, Fig. 4)',
         'The room of 10 x 10 m, 0.1 m a cell. '
-        'Free is where the centre of a robot of 0.25 m radius can be. '
-        "A stage is both sub-iterations, by a plain copy of the paper's rules.",
+        'Free cells are those where the centre of a robot with a radius of 0.25 m can be. '
+        "A stage is both sub-iterations, by a literal implementation of the paper's rules.",
         [
             Table(
                 'stages',
@@ -60,7 +60,7 @@ def run(source: Source) -> Outcome:
         [
             Comparison('stages until nothing changes', 'more than 13', str(last)),
             Comparison(
-                'the fast thinning gives the very same cells', '', 'yes' if same else 'no', same
+                'the fast implementation gives the same cells', '', 'yes' if same else 'no', same
             ),
         ],
     )

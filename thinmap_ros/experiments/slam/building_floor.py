@@ -81,7 +81,7 @@ class _Glance:
 
 
 def run(source: Source) -> Outcome:
-    """Drive the floor once; both filters, and our localizer, see the same scans."""
+    """Drive the floor once; both filters and the scan matcher process the same scans."""
     world = world_of('floor_40x10')
     length = _SETUP.quick_scans if source.quick else None
     samples = list(islice(source.samples('floor_40x10'), length))
@@ -97,8 +97,8 @@ def run(source: Source) -> Outcome:
         'A building floor with 33 lines',
         'SLAM paper, sections 4 and 5.1, Fig. 7, 8, 11 and 12',
         'The floor of 40 x 10 m: a Pioneer 3-AT with an LMS200 drives its tour at 0.2 m/s '
-        f'({ti.path_length_m:.0f} m). The same scans go through the conventional filter '
-        '(all features) and through EKF-SLAM/TI (local areas), each on odometry and lines alone.',
+        f'({ti.path_length_m:.0f} m). Both filters process the same scans: the conventional one '
+        '(all features) and EKF-SLAM/TI (local areas), each with odometry and line features only.',
         [
             Table('map', map_errors.COLUMNS, [map_errors.row('floor_40x10', error)]),
             Table('path', _PATH, _path_rows(ti, full)),
@@ -138,27 +138,27 @@ def _comparisons(ti: Run, full: Run, apart: Array, used: float, known: int) -> l
         Comparison(
             'features used for an update',
             f'{_SETUP.paper_used} instead of more than {_SETUP.paper_all}',
-            f'{used:.0f} (median; most {max(ti.local)}) instead of {full.local[-1]}',
+            f'{used:.0f} (median; maximum {max(ti.local)}) instead of {full.local[-1]}',
             used <= 0.5 * full.local[-1],
         ),
         Comparison(
             'paths of both filters',
             'almost identical',
-            f'{100 * apart.mean():.2f} cm apart (mean), {100 * apart.max():.1f} cm (most)',
+            f'mean distance {100 * apart.mean():.2f} cm, maximum {100 * apart.max():.1f} cm',
             bool(apart.max() < 0.05),
         ),
         Comparison(
             'errors within 3 sigma (x, y, heading)',
             '',
             ', '.join(f'{share:.1%}' for share in inside),
-            remark='99.7 % would be a filter without any modelling error',
+            remark='99.7 % in a consistent filter; more: the covariance is conservative',
         ),
     ]
 
 
 def _errors_beside(ti: Run, ours: Run) -> Comparison:
     return Comparison(
-        'error of the position',
+        'position error',
         '',
         ti.position_error,
         remark=f'scan matching (`slam: scan_matching`): {ours.position_error}',
@@ -170,7 +170,7 @@ def _similar(error: map_errors.MapError) -> Comparison:
     return Comparison(
         'map against CAD data',
         'similar to the accurate map',
-        f'occupied cells {100 * off.mean():.1f} cm off (mean); '
+        f'mean error of occupied cells {100 * off.mean():.1f} cm; '
         f'{error.found:.0%} of all surfaces found',
         bool(off.mean() < 0.1),
     )
@@ -252,8 +252,8 @@ def _local_area(glance: _Glance) -> Plot:
         RobotMarkers(glance.pose[None], radius_m=PRESETS['3at'].radius_m),
     ]
     caption = (
-        'Paper 3, Fig. 7 and 8: the local area: nodes near the robot (large: those at which its '
-        'features are stored) and the features that an update takes.'
+        'Paper 3, Fig. 7 and 8: local area: nodes near the robot (large: those that store its '
+        'features) and the features of an update.'
     )
     return Plot('fig7_8', caption, [Panel(layers)], panel_inches=(9.5, 3.4))
 

@@ -83,13 +83,13 @@ def run(source: Source) -> Outcome:
     half = next((row for row in times if row[0] >= _SETUP.flat_until), last)
     apart = max(row[1] for row in same)
     return Outcome(
-        'Time of a step against the number of features',
+        'Time of a filter step against the number of features',
         'SLAM paper, section 5.2, Fig. 13',
-        f'Maps of {counts[0]} to {counts[-1]} lines. A step predicts and corrects by '
-        f'{_SETUP.seen} lines that are seen; a local area has {_SETUP.local} features, '
-        f'and after every {_SETUP.area_steps} steps, or a metre, the robot is in another one. '
-        'The conventional filter takes the same steps with all features. '
-        'CPU time of the filter alone: what a whole scan costs is on the benchmark page.',
+        f'Maps of {counts[0]} to {counts[-1]} lines. A step is a prediction and an update with '
+        f'{_SETUP.seen} observed lines. A local area has {_SETUP.local} features; '
+        f'it changes after every {_SETUP.area_steps} steps (1 m). '
+        'The conventional filter makes the same steps with all features in its state. '
+        'Times are CPU times of the filter alone; the page Speed has those of a whole scan.',
         [
             Table('times', _COLUMNS, times, timed=True),
             Table('difference', ['features', 'largest_difference_of_pose'], same),
@@ -107,7 +107,7 @@ def run(source: Source) -> Outcome:
                 f'as with {first[0]} features, '
                 f'{last[1] / first[1]:.2f} times with {last[0]}; '
                 f'mean {first[2]:.2f} and {last[2]:.2f} ms, '
-                f'a step into another area up to {last[3]:.0f} ms',
+                f'up to {last[3]:.0f} ms for a change of the local area',
             ),
             Comparison(
                 'conventional EKF-SLAM',
@@ -118,11 +118,11 @@ def run(source: Source) -> Outcome:
                 timed=True,
             ),
             Comparison(
-                'both estimate the same',
+                'difference of the estimates',
                 'almost identical',
-                f'pose at most {apart:.1e} (m, rad) apart',
+                f'pose: at most {apart:.1e} (m, rad)',
                 apart < _SETUP.same,
-                remark='the compressed form loses nothing; the paper drops the rest',
+                remark='the compressed update is exact; that of the paper is an approximation',
             ),
         ],
     )

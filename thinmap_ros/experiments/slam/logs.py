@@ -83,11 +83,11 @@ def run(folder: Path, out: Path) -> Outcome:
     rows = [result.row for result in results]
     return Outcome(
         'Logs of real robots',
-        'Recorded with SICK lasers; none of it was simulated',
-        'Each log in file order through localizer, grid and topology. '
-        'live: the pose as known at its scan; final: after all corrections. '
-        'Errors are those of the known relations between poses '
-        '(mean of translation, and of rotation).',
+        'Logs recorded with SICK lasers',
+        'Localizer, grid and topological map process each log in file order. '
+        'Live: the estimate at the time of a scan; final: after all corrections. '
+        'Errors are means over the reference relations between poses, of translation and rotation. '
+        'The column *paper* has the published results of other programs.',
         [
             Table('logs', _COLUMNS, rows),
             Table('others', ['system', 'live_m', 'final_m', 'cpu_ms_per_scan', 'peak_mb'], _OTHERS),
@@ -186,12 +186,12 @@ def _comparisons(row: list[Any]) -> list[Comparison]:
     if values['final_m'] is None:
         return []
     name = values['log']
-    ours = f'{values["final_m"]:.3f} m after all corrections, {values["live_m"]:.3f} m live'
+    ours = f'{values["final_m"]:.3f} m final, {values["live_m"]:.3f} m live'
     degrees = (
         f'{values["final_deg"]:.2f} deg, live {values["live_deg"]:.2f} deg; '
         f'odometry {values["odometry_m"]:.2f} m'
     )
-    rows = [Comparison(f'{name}: mean error of the relations', '', ours, remark=degrees)]
+    rows = [Comparison(f'{name}: mean error', '', ours, remark=degrees)]
     if name == _OTHERS_LOG:
         rows += [
             _against(system, live_m, final_m, values) for system, live_m, final_m, *_ in _OTHERS

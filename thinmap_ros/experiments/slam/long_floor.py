@@ -227,7 +227,7 @@ def _over_time(ti: Run, full: Run, off: Array, turned: Array) -> Plot:
     ]
     caption = (
         'Paper 3, to Fig. 14: errors of the pose over time, '
-        'and what a scan costs (with grid and topological map).'
+        'and CPU time of a scan (with grid and topological map).'
     )
     return Plot('over_time', caption, panels, panel_inches=(8.5, 2.1), legend='inside')
 
@@ -246,31 +246,31 @@ def _comparisons(ti: Run, full: Run, ours: Run, turned: Array) -> list[Compariso
             'are one feature',
         ),
         Comparison(
-            'error of the position',
+            'position error',
             'about 20 cm',
             ti.position_error,
             bool(np.hypot(*ti.errors()[:, :2].T).max() <= _SETUP.paper_error_m),
             remark=f'scan matching (`slam: scan_matching`): {ours.position_error}',
         ),
         Comparison(
-            'error of the heading',
+            'heading error',
             'about 5 deg',
-            f'{turned.mean():.2f} deg (mean), {turned.max():.2f} deg (most)',
+            f'{turned.mean():.2f} deg (mean), {turned.max():.2f} deg (maximum)',
             bool(turned.max() <= _SETUP.paper_error_deg),
         ),
         Comparison(
-            'a step',
-            '30-40 ms, on a machine of 2006',
-            f'{medians[0]:.1f} ms (median), {slowest:.1f} ms (99 of 100)',
+            'CPU time of a step',
+            '30-40 ms (computer of 2006)',
+            f'{medians[0]:.1f} ms (median), {slowest:.1f} ms (99th percentile)',
             slowest <= _SETUP.paper_step_ms,
             timed=True,
         ),
         Comparison(
-            'the conventional filter',
+            'CPU time of a step, conventional filter',
             'grows',
             f'{medians[1]:.1f} ms (median)',
             timed=True,
-            remark='with as few features as here both cost about the same: '
-            'see the time by the number of features',
+            remark='with so few features both cost about the same; '
+            'see the section on the number of features',
         ),
     ]

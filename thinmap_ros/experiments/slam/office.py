@@ -23,7 +23,7 @@ def run(source: Source) -> Outcome:
     wheels = np.hypot(*done.errors(done.odometry)[:, :2].T)
     row = map_errors.row('office', error)
     return Outcome(
-        'The map of an office',
+        'Map of an office',
         'SLAM paper, section 5.1, Fig. 10',
         'The office of 9.5 x 7.5 m with furniture; a Pioneer 3-AT with an LMS200 drives its tour '
         f'at 0.2 m/s ({done.path_length_m:.0f} m). Cells of 0.1 m.',
@@ -41,15 +41,15 @@ def run(source: Source) -> Outcome:
             Comparison(
                 'map against CAD data',
                 'similar to the accurate map',
-                f'occupied cells {100 * error.cells_off_m.mean():.1f} cm off (mean), '
+                f'mean error of occupied cells {100 * error.cells_off_m.mean():.1f} cm, '
                 f'{float(str(row[4])):.0%} within a cell; '
                 f'{error.found:.0%} of all surfaces found',
                 bool(error.cells_off_m.mean() < 0.1),
             ),
             Comparison(
-                'pose',
+                'position error',
                 '',
-                f'off by {done.position_error}; dead reckoning {wheels[-1]:.2f} m at the end',
+                f'{done.position_error}; dead reckoning {wheels[-1]:.2f} m at the end',
                 remark=f'scan matching (`slam: scan_matching`): {ours.position_error}',
             ),
         ],

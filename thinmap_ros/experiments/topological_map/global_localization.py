@@ -1,4 +1,4 @@
-"""Paper 1, Fig. 10 and 11: 5,000 samples of a lost robot come together at one place."""
+"""Paper 1, Fig. 10 and 11: 5,000 samples of a global localization converge to one place."""
 
 from dataclasses import dataclass
 from itertools import islice
@@ -75,8 +75,8 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'Global localization: 5,000 samples converge',
         'Topological map paper, sections 3.1 and 4.2, Fig. 10 and 11',
-        'The robot is switched on at (2 m, 2 m, 270 deg) of the laboratory, moves on continuously, '
-        'and knows only the map of the twelve stops. '
+        'The robot starts at (2 m, 2 m, 270 deg) of the laboratory, with the map of the twelve '
+        'stops and an unknown pose. '
         f'A step is {0.2 * SETUP.scans_per_lost_step:g} s, up to 0.3 m. '
         f'The same drive is localized with {len(seeds)} seeds of the samples.',
         [
@@ -86,16 +86,16 @@ def run(source: Source) -> Outcome:
         [_samples(panels), _curve(rows, len(drive_samples))],
         [
             Comparison(
-                'one position left',
-                f'after {_SETUP.paper_steps} steps',
-                f'after {np.median(taken):.0f} (median), {taken.max()} (most) steps '
+                'steps until one position is left',
+                f'{_SETUP.paper_steps}',
+                f'median {np.median(taken):.0f}, maximum {taken.max()}, '
                 f'in {len(taken)} of {len(seeds)} runs',
                 len(taken) == len(seeds) and int(taken.max()) <= _SETUP.paper_steps,
             ),
             Comparison(
-                'it is the right one',
+                'that position is correct',
                 'yes',
-                f'{right} of {len(seeds)} runs, at most {worst:.2f} m off',
+                f'{right} of {len(seeds)} runs, largest error {worst:.2f} m',
                 right == len(seeds),
             ),
         ],
@@ -107,7 +107,7 @@ def _candidates(result: Result) -> int:
 
 
 def _error(result: Result, sample: DriveSample) -> tuple[float | None, float | None]:
-    """How far the likeliest place is off, m and degrees."""
+    """Error of the most likely hypothesis, m and degrees."""
     if not result.hypotheses:
         return None, None
     off = result.hypotheses[0].T_map_base - sample.T_world_base

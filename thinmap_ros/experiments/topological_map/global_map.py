@@ -47,12 +47,11 @@ def run(source: Source) -> Outcome:
     back = _agreement(batch, states[-1])
     gone = _redundant(states[1], states[-1])
     return Outcome(
-        'Local topological maps become a global one',
+        'Merging of local topological maps',
         'Topological map paper, sections 2.2 and 4.1, Fig. 6 to 9',
-        'The robot stands at twelve places of the laboratory, one after the other, and sees a part '
-        'of it from each, looking two ways. The window of the map round the robot is thinned, '
-        'and merged into the global map. '
-        'The map made at one go from the grid of all scans tells how it should look.',
+        'The robot stands at twelve positions of the laboratory in turn, and scans in two '
+        'directions at each. The local window of the grid around the robot is thinned and merged '
+        'into the global map. The reference is the batch map, made from the grid of all scans.',
         [
             Table('growth', ['stop', 'x_m', 'y_m', 'nodes', 'edges'], growth),
             Table('nodes', ['id', 'kind', 'x_m', 'y_m', 'clearance_m'], _rows(states[-1])),
@@ -69,13 +68,12 @@ def run(source: Source) -> Outcome:
                 _is_one(states[-1]),
             ),
             Comparison(
-                'redundant nodes at the rim of the window are gone in the end',
+                'redundant nodes at the edge of the window, deleted by the end',
                 'deleted after update',
                 f'{gone} of the {len(states[1].nodes)} nodes of the first two stops',
             ),
             Comparison(
-                f'nodes within {_SAME_M} m of a node of the map made at one go, '
-                'and the other way round',
+                f'nodes within {_SAME_M} m of a node of the batch map, and vice versa',
                 '',
                 f'{share:.0%}, {back:.0%}',
             ),

@@ -23,13 +23,13 @@ _WORLDS = ('room_10x10', 'office', 'floor_40x10')
 class _Setup:
     """Pruning distances, the scans of Fig. 3, and what the paper reports.
 
-    prune_m: all that are compared; told_m: those of the summary; shown_m: that of Fig. 4, at which
-    all branches into corners are gone. scans: of the third stop, (3 m, 8.3 m, 0 deg), as in the
+    prune_m: all that are compared; reported_m: those of the summary; shown_m: that of Fig. 4, which
+    prunes all branches into corners. scans: of the third stop, (3 m, 8.3 m, 0 deg), as in the
     paper's Fig. 3 and 7(a). paper_more_nodes: nodes of thinning beyond those of Voronoi.
     """
 
     prune_m: tuple[float, ...]
-    told_m: tuple[float, ...]
+    reported_m: tuple[float, ...]
     shown_m: float
     scans: slice
     paper_more_nodes: int
@@ -37,7 +37,7 @@ class _Setup:
 
 _SETUP = _Setup(
     prune_m=(0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0),
-    told_m=(0.6, 1.5, 3.0),
+    reported_m=(0.6, 1.5, 3.0),
     shown_m=3.0,
     scans=slice(16, 20),
     paper_more_nodes=4,
@@ -70,10 +70,10 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'Thinning against the Voronoi diagram',
         'Topological map paper, section 2.1, Fig. 3 and 4',
-        'The map of the laboratory, merged from its twelve stops, and worlds as they are, '
-        '0.1 m a cell. The Voronoi diagram is that of all cells that bound the free space. Free '
-        'space, pruning (dead ends up to a distance), merging of branch nodes and corner nodes are '
-        'the same for both methods. Whole floors: the benchmark `voronoi`.',
+        'Maps: the laboratory, merged from scans at its twelve stops, and simulated worlds without '
+        'noise, cells of 0.1 m. The Voronoi diagram is that of all cells at the edge of the free '
+        'space. Both methods have the same free space, pruning length, merging of branch nodes and '
+        'corner nodes. Whole floors: section `voronoi` of the page Speed.',
         [
             Table('nodes', columns, counts),
             Table('times', ['map', 'prune_m', 'thinning_ms', 'voronoi_ms'], times, timed=True),
@@ -81,23 +81,23 @@ def run(source: Source) -> Outcome:
         [_local_map(samples[_SETUP.scans]), _both(maps['lab']), _curves(counts, times)],
         [
             Comparison(
-                'computing',
+                'CPU time',
                 'thinning needs less',
-                f'{faster:.1f} times less for the whole graph (median)',
+                f'{faster:.1f} times less for the graph (median)',
                 faster > 1.0,
                 True,
             ),
             Comparison(
-                'nodes of thinning beyond those of Voronoi, in the laboratory',
+                'additional nodes of thinning, laboratory',
                 f'{_SETUP.paper_more_nodes} in its example',
                 ', '.join(
-                    f'{more[prune_m]:+d} with dead ends up to {prune_m:g} m dropped'
-                    for prune_m in _SETUP.told_m
+                    f'{more[prune_m]:+d} with branches up to {prune_m:g} m pruned'
+                    for prune_m in _SETUP.reported_m
                 ),
                 max(more.values()) >= _SETUP.paper_more_nodes,
-                remark='A Voronoi diagram grows a branch into each corner. Without these branches '
-                'both have about as many nodes: additional nodes come from the rules for nodes, '
-                'not from thinning.',
+                remark='A Voronoi diagram has a branch into each corner. With these branches '
+                'pruned, both methods have about as many nodes. Additional nodes come from the '
+                'rules for nodes, not from thinning.',
             ),
         ],
     )
@@ -147,7 +147,7 @@ def _both(patch: GridPatch) -> Plot:
     return Plot(
         'fig4',
         'Paper 1, Fig. 4: the laboratory by Voronoi diagram (left) and by thinning (right), '
-        f'dead ends up to {_SETUP.shown_m} m dropped in both.',
+        f'branches up to {_SETUP.shown_m} m pruned in both.',
         [
             Panel([MapLayer(patch), GraphLayer(voronoi)], f'Voronoi: {len(voronoi.nodes)} nodes'),
             Panel([MapLayer(patch), GraphLayer(thinned)], f'thinning: {len(thinned.nodes)} nodes'),
@@ -168,10 +168,10 @@ def _curves(counts: Rows, times: Rows) -> Plot:
             Curve(xy(x, of_lab(rows, 2)), 'thinning', 0, marker='o'),
             Curve(xy(x, of_lab(rows, 3)), 'Voronoi', 1, '--', marker='s'),
         ]
-        panels.append(Panel(layers, '', 'pruning distance (m)', label, plan=False, log_y=log))
+        panels.append(Panel(layers, '', 'pruning length (m)', label, plan=False, log_y=log))
     return Plot(
         'fig4_by_pruning',
-        'Paper 1, to Fig. 4: nodes and computing time by the length of dead ends that are dropped; '
+        'Paper 1, to Fig. 4: number of nodes and CPU time against the pruning length; '
         'map of the laboratory.',
         panels,
         columns=2,

@@ -47,12 +47,12 @@ def run(source: Source) -> Outcome:
     wide, short = kinds.values()
     detour = float(wide[:, 0].sum() / short[:, 0].sum() - 1.0)
     return Outcome(
-        'The wavefront path',
+        'Wavefront path',
         'Topological map paper, section 3.2',
         'From (2 m, 2 m) of the laboratory to the last of its twelve stops, '
         'on the map merged from them. '
-        'The intrinsic cost keeps the path 0.6 m from walls where there is room; '
-        'without it only the way counts.',
+        'The intrinsic cost keeps the path 0.6 m from walls if there is room. '
+        'Without it, the path has the least length.',
         [
             Table(
                 'paths',
@@ -74,10 +74,10 @@ def run(source: Source) -> Outcome:
             ),
             Comparison('local minima of the navigation function', 'none', str(minima), minima == 0),
             Comparison(
-                'what the intrinsic cost does',
+                'effect of the intrinsic cost',
                 'go far from the object',
-                f'{wide[:, 2].mean():.2f} m from walls on the way '
-                f'(without {short[:, 2].mean():.2f} m), {detour:+.1%} of way',
+                f'mean clearance {wide[:, 2].mean():.2f} m '
+                f'(without {short[:, 2].mean():.2f} m), path length {detour:+.1%}',
                 bool(wide[:, 2].mean() > short[:, 2].mean()),
             ),
         ],
@@ -85,7 +85,7 @@ def run(source: Source) -> Outcome:
 
 
 def _field(patch: GridPatch, goal: tuple[float, float]) -> Array:
-    """Cost to the goal, m, of each cell (H, W); inf where there is no way."""
+    """Cost to the goal, m, of each cell (H, W); inf without a path."""
     row, col = patch.frame.cells_of(np.array([goal]))[0].tolist()
     return (
         navigation_function(cost_of_cells(patch, WavefrontConfig()), (row, col))
