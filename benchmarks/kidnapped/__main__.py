@@ -1,9 +1,9 @@
-"""Lost robots by the hundred.
+"""Global localization of many robots.
 
 Usage: python -m benchmarks.kidnapped [ROW ...] -o DIR [--count N] [--worlds DIR] [--log LOG].
 
-Each row of docs/results/localization.md leaves a CSV file with a line for each robot, as soon as it
-is there; what is in the file is not run again.
+Each section of docs/results/localization.md has a CSV file with a line for each robot, written as
+soon as its drive ends. Drives that are in the file are not run again.
 """
 
 import argparse
@@ -14,6 +14,7 @@ from pathlib import Path
 from benchmarks.kidnapped.cases import ROWS, Case, Setting
 from benchmarks.kidnapped.summary import Written, summary
 from benchmarks.worlds import WORLDS
+from thinmap_ros.evaluation.machine import write_provenance
 from thinmap_ros.evaluation.outcome import show
 
 _LOG = WORLDS.parent / 'logs' / 'intel' / 'log.clf'
@@ -45,7 +46,7 @@ def run_pending(cases: list[Case], path: Path) -> None:
 def main() -> None:
     """Run the rows that are named, or all."""
     parser = argparse.ArgumentParser(
-        prog='benchmarks.kidnapped', description='Robots that were switched on anywhere'
+        prog='benchmarks.kidnapped', description='Global localization from random starts'
     )
     parser.add_argument('rows', nargs='*', help=f'some of {", ".join(ROWS)} (default: all)')
     parser.add_argument('-o', '--output', type=Path, required=True, help='folder for ROW.csv')
@@ -64,6 +65,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if unknown := set(arguments.rows) - set(ROWS):
         parser.error(f'unknown row {sorted(unknown)[0]}: expected some of {", ".join(ROWS)}')
+    write_provenance(arguments.output)
     setting = Setting(arguments.worlds, arguments.log)
     for row in arguments.rows or ROWS:
         path = arguments.output / f'{row}.csv'

@@ -1,4 +1,4 @@
-"""What came of many lost robots, in a few lines each."""
+"""Summaries of many global localizations, in a few rows each."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -14,7 +14,7 @@ _NOTICED_S = 5.0
 
 
 def summary(row: str, records: list[Written]) -> Iterator[Row]:
-    """Rows of what the cases of a row came to."""
+    """Rows that summarize the cases of a row."""
     yield from _SUMMARIES[row](records)
 
 
@@ -38,9 +38,9 @@ def percent(some: int, of: int) -> float:
 def outcomes(
     records: list[Written], right: float, wrong: float, steps: float | None = None
 ) -> Iterator[Row]:
-    """Rows of drives that end where the robot is sure; right, wrong: percent wanted.
+    """Rows of drives that end with the localization; right, wrong: targets, percent.
 
-    Steps: their median wanted.
+    steps: target of their median.
     """
     count = len(records)
     counts = {
@@ -48,20 +48,22 @@ def outcomes(
         for word in ('right', 'wrong', 'open')
     }
     yield Row('drives', f'{count}')
-    yield at_least('right, of 100', percent(counts['right'], count), right)
-    yield at_most('wrong and sure, of 100', percent(counts['wrong'], count), wrong)
-    yield Row('right, wrong, not sure', f'{counts["right"]}, {counts["wrong"]}, {counts["open"]}')
+    yield at_least('correct localizations (%)', percent(counts['right'], count), right)
+    yield at_most('false localizations (%)', percent(counts['wrong'], count), wrong)
+    yield Row(
+        'correct, false, not localized', f'{counts["right"]}, {counts["wrong"]}, {counts["open"]}'
+    )
     taken = [float(record['steps']) for record in records]
     if steps is not None:
         yield at_most('steps, median', float(np.median(taken)), steps)
     for what, values in (
         ('steps', taken),
-        ('way, m', [float(record['way_m']) for record in records]),
+        ('distance (m)', [float(record['way_m']) for record in records]),
     ):
         shares = ' '.join(f'{value:.3g}' for value in np.percentile(values, [50, 90, 97, 100]))
-        yield Row(f'{what}: 50, 90, 97, 100 of 100', shares)
+        yield Row(f'{what}: percentiles 50, 90, 97, 100', shares)
     yield Row(
-        'processor time of a step, median',
+        'CPU time of a step, median',
         f'{np.median([float(r["step_ms"]) for r in records]):.3g} ms',
     )
 
@@ -72,23 +74,23 @@ def _twins(records: list[Written]) -> Iterator[Row]:
             sum(int(record[key]) for record in group) for key in ('steps', 'sure', 'equal')
         )
         yield Row(f'{name}: drives, steps', f'{len(group)}, {steps}')
-        yield at_most('sure, of 100 steps', percent(sure, steps), 0.0)
-        yield at_least('weights within 0.1, of 100 steps', percent(equal, steps), 95.0)
+        yield at_most('localized (% of steps)', percent(sure, steps), 0.0)
+        yield at_least('weights equal within 0.1 (% of steps)', percent(equal, steps), 95.0)
 
 
 def _foreign(records: list[Written]) -> Iterator[Row]:
     count = len(records)
     ways = [float(record['said_m']) for record in records if record['said_m']]
     sure = [record['case'] for record in records if record['sure_m']]
-    yield Row('maps with robots of other buildings', f'{count}')
-    yield at_least('told "not in this map", of 100', percent(len(ways), count), 95.0)
+    yield Row('maps with a robot from another building', f'{count}')
+    yield at_least('reported as not in this map (%)', percent(len(ways), count), 95.0)
     at_last = sum(record['last'] == 'NOT_IN_MAP' for record in records)
-    yield Row('told so at the end, of 100', f'{percent(at_last, count):.3g}')
-    yield at_most('sure at some time, of 100', percent(len(sure), count), 0.0)
+    yield Row('reported at the end (%)', f'{percent(at_last, count):.3g}')
+    yield at_most('false localizations (%)', percent(len(sure), count), 0.0)
     if sure:
-        yield Row('these', '; '.join(sure))
+        yield Row('cases with a false localization', '; '.join(sure))
     shares = ' '.join(f'{value:.3g}' for value in np.percentile(ways or [0.0], [50, 90]))
-    yield Row('way until told, m: 50, 90 of 100', shares)
+    yield Row('distance until the report (m): percentiles 50, 90', shares)
 
 
 def _kidnapped(records: list[Written]) -> Iterator[Row]:
@@ -100,32 +102,35 @@ def _kidnapped(records: list[Written]) -> Iterator[Row]:
     right = sum(record['found_right'] == 'True' for record in found)
     yield Row('kidnapped robots', f'{count}')
     yield at_least(
-        'noticed within 5 s, of 100', percent(sum(s <= _NOTICED_S for s in noticed), count), 95.0
+        'kidnapping detected within 5 s (%)',
+        percent(sum(s <= _NOTICED_S for s in noticed), count),
+        95.0,
     )
-    yield at_least('right again, of 100', percent(right, count), 97.0)
-    yield at_most('wrong and sure, of 100', percent(len(found) - right, count), 0.5)
+    yield at_least('correct relocalizations (%)', percent(right, count), 97.0)
+    yield at_most('false localizations (%)', percent(len(found) - right, count), 0.5)
     for what, values in (
-        ('noticed after, s', noticed),
-        ('found after that, s', [float(record['found_after_s']) for record in found]),
-        ('and m', [float(record['found_after_m']) for record in found]),
+        ('time until detection (s)', noticed),
+        (
+            'time from detection to relocalization (s)',
+            [float(record['found_after_s']) for record in found],
+        ),
+        ('distance in this time (m)', [float(record['found_after_m']) for record in found]),
     ):
         shares = ' '.join(f'{value:.3g}' for value in np.percentile(values or [0.0], [50, 90, 100]))
-        yield Row(f'{what}: 50, 90, 100 of 100', shares)
+        yield Row(f'{what}: percentiles 50, 90, 100', shares)
 
 
 def _halves(records: list[Written]) -> Iterator[Row]:
     inside = [record for record in records if is_in_map(record)]
-    yield Row('starts, of these in the map', f'{len(records)}, {len(inside)}')
+    yield Row('starts, starts in the map', f'{len(records)}, {len(inside)}')
     for what, chosen, wanted in (('all', records, None), ('in the map', inside, 90.0)):
         right = [record for record in chosen if record['outcome'] == 'right']
         soon = percent(sum(int(record['steps']) <= _SCANS for record in right), len(chosen))
-        name = f'{what}: right within {_SCANS} scans, of 100'
+        name = f'{what}: correct within {_SCANS} scans (%)'
         yield Row(name, f'{soon:.3g}') if wanted is None else at_least(name, soon, wanted)
-        yield Row(
-            f'{what}: right within 60 scans, of 100', f'{percent(len(right), len(chosen)):.3g}'
-        )
+        yield Row(f'{what}: correct within 60 scans (%)', f'{percent(len(right), len(chosen)):.3g}')
     wrong = sum(record['outcome'] == 'wrong' for record in records)
-    yield at_most('wrong and sure, of 100', percent(wrong, len(records)), 1.0)
+    yield at_most('false localizations (%)', percent(wrong, len(records)), 1.0)
 
 
 def _usual(records: list[Written]) -> Iterator[Row]:

@@ -38,9 +38,12 @@ def test_a_row_is_resumed_and_shown_on_the_page(tmp_path: Path) -> None:
     assert ran == list(outcomes)
     assert [record['outcome'] for record in read(path)] == list(outcomes.values())
     rows = {row.what: row for row in summary('kth', read(path))}
-    assert rows['right, wrong, not sure'].value == '1, 1, 1'
-    assert rows['wrong and sure, of 100'].good is False
+    assert rows['correct, false, not localized'].value == '1, 1, 1'
+    assert rows['false localizations (%)'].good is False
+    made = 'Commit 1234567, a processor, 2 cores, Python 3.12.3'
+    (tmp_path / 'provenance.txt').write_text(f'{made}\n')
     text = page(tmp_path)
+    assert text.startswith(f'# Global localization\n\n{made}\n')
     assert '| kth/a | 2 | 1 | 0 | 1 | 2.5 | 2.5 |' in text
     assert '| kth/b | 1 | 0 | 1 | 0 | 2.5 | 2.5 |' in text
     assert '## Dungeons' not in text
@@ -54,4 +57,4 @@ def test_robots_in_another_building_are_told_so_and_never_localized(
 ) -> None:
     records = [{'case': 'a <- b', 'said_m': said, 'sure_m': sure, 'last': 'NOT_IN_MAP'}]
     rows = {row.what: row.good for row in summary('foreign', records)}
-    assert (rows['told "not in this map", of 100'], rows['sure at some time, of 100']) == good
+    assert (rows['reported as not in this map (%)'], rows['false localizations (%)']) == good
