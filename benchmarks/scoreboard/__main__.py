@@ -21,6 +21,7 @@ from benchmarks.scoreboard.reports import report_file, report_of, reports_there
 from thinmap_ros.core.config import parameters_of
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.evaluation.machine import provenance, write_provenance
 from thinmap_ros.evaluation.parallel_jobs import (
     Failure,
     add_run_options,
@@ -53,8 +54,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--board',
         action='store_true',
-        help='what is asked of the localizer, a row each: some logs and buildings, recorded '
-        'drives, the closed loop, other lasers. Pages: DIR/board.md, DIR/cases.md',
+        help='targets of the localizer, a row each: some logs and buildings, recorded '
+        'drives, the closed loop, other lasers. Page: DIR/slam.md',
     )
     parser.add_argument(
         '--recordings',
@@ -106,7 +107,8 @@ def _run(arguments: argparse.Namespace) -> None:
             read_report(report_file(arguments.out, case.name), options)  # before hours of work
     failures = _run_cases(cases, options, arguments)
     reports = [report_of(arguments.out, case.name, options, failures) for case in cases]
-    text = page(cases, reports)
+    write_provenance(arguments.out)
+    text = page(cases, reports, provenance(arguments.out))
     if arguments.against:
         text += '\n' + against(cases, reports, reports_there(arguments.against, cases))
     write_text(arguments.out / 'scoreboard.md', text)

@@ -1,4 +1,4 @@
-"""The rows of the board: what is asked, what was measured, met or missed."""
+"""The rows of the board: target, measured value, met or missed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ Judge = Callable[[Found], tuple[str, bool]]
 
 @dataclass(frozen=True)
 class Row:
-    """What is asked of some cases; patterns: of their names; judge: what was measured, and if met.
+    """Target for some cases; patterns: of their names; judge: measured value, and if it is met.
 
     judge has the reports of those cases that were measured, at least one.
     """
@@ -78,7 +78,7 @@ def board_table(
 
     names: of all cases of the board; others: reports of the same cases elsewhere, if any.
     """
-    heads = ['row', 'asked', 'measured', '', *(['there'] if others is not None else [])]
+    heads = ['quantity', 'target', 'measured', '', *(['other run'] if others is not None else [])]
     lines = ['| ' + ' | '.join(heads) + ' |', '|---' * len(heads) + '|']
     measured = [report['name'] for report in reports]
     for row in board_rows():
@@ -95,7 +95,7 @@ def board_table(
 
 
 def _cells(row: Row, own: Found, count: int) -> list[str]:
-    """Title, what is asked, what was measured on the reports of some of so many cases, verdict."""
+    """Title, target, value measured in some of so many cases, and verdict."""
     found = [report for report in own if 'error' not in report]
     text, is_met = row.judge(found) if found else ('', False)
     notes = []
@@ -133,7 +133,7 @@ def _rows_of_time() -> list[Row]:
 def _rows_of_covariance() -> list[Row]:
     return [
         Row('simulated: share in the 95 % ellipse: least / median', _SIMULATED, *_inside(0.85)),
-        Row('simulated: wrong and sure scans: sum', _SIMULATED, *_sum('wrong_and_sure')),
+        Row('simulated: overconfident scans: sum', _SIMULATED, *_sum('wrong_and_sure')),
     ]
 
 
@@ -186,10 +186,10 @@ def _mean_and_worst(key: str, asked: float) -> tuple[str, Judge]:
 
 def _coverage(asked: float) -> tuple[str, Judge]:
     def judge(found: Found) -> tuple[str, bool]:
-        # An exploration that is cut short has none.
+        # An exploration that ends at its time limit has none.
         whole = [report for report in found if 'coverage' in report]
         if not whole:
-            return 'none that is not cut short', True
+            return 'no complete run', True
         least = min(whole, key=lambda report: float(report['coverage']))
         is_met = _is_within(asked, float(least['coverage']))
         return f'{least["coverage"]:.1%} ({least["name"]})', is_met

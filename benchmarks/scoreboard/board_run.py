@@ -1,4 +1,4 @@
-"""Run the board: recordings first, then its cases, then its pages."""
+"""Run the board: recordings first, then its cases, then its page."""
 
 import argparse
 import time
@@ -13,10 +13,11 @@ from benchmarks.scoreboard.cases import BuildingCase, Case, DriveCase, LogCase, 
 from benchmarks.scoreboard.closed_loop import measure_drive, measure_loop, record_drive
 from benchmarks.scoreboard.compare import against
 from benchmarks.scoreboard.measure import Task, measure_building, measure_log
-from benchmarks.scoreboard.page import case_tables
+from benchmarks.scoreboard.page import COLUMN_NOTES, case_tables
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.reports import report_file, report_of, reports_there
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.evaluation.machine import provenance, write_provenance
 from thinmap_ros.evaluation.parallel_jobs import Failure, failure_summary, read_report, run_pending
 from thinmap_ros.files.atomic import write_text
 
@@ -26,11 +27,16 @@ FOLDER = 'board'  # of the results; a case of the complete scoreboard may have t
 _SCANS_PER_GRAPH = 10
 _SPARSE_LOGS = ('aces', 'csail', 'fhw', 'intel_sparse')
 _HEAD = """\
-# Board
+# SLAM
 
-Made by `python -m benchmarks.scoreboard -o DIR --board`; each case is in [cases.md](cases.md). A
-recorded drive is the first 20 minutes of an exploration, 6,000 scans. Errors of logs: mean of the
-known relations; of drives and explorations: rms of the position, not aligned unless it says so.
+{provenance}
+
+`python -m benchmarks.scoreboard -o DIR --board` generates this page. Targets are those of the
+project. A *recorded drive* is the first 20 minutes of an exploration (6,000 scans), replayed with
+another odometry noise. *Closed loop*: exploration with the estimated pose. Errors of logs are means
+over the reference relations. Errors of drives and explorations are rms errors of the position, not
+aligned unless stated.
+
 """
 
 
@@ -67,7 +73,7 @@ class RecordTask:
 
 
 def run_board(arguments: argparse.Namespace, options: Numbers) -> None:
-    """Run what is missing of the board, and write its pages.
+    """Run the cases without a result, and write slam.md, the page of docs/results.
 
     Raises InputError where a case fails, after all others.
     """
@@ -84,12 +90,14 @@ def run_board(arguments: argparse.Namespace, options: Numbers) -> None:
     others = reports_there(arguments.against, cases, FOLDER) if arguments.against else None
     table = board_table(reports, _names(arguments), others)
     taken = sum(report.get('cpu_s', 0.0) for report in reports)
-    write_text(arguments.out / 'board.md', f'{_HEAD}\n{table}\nProcessor time: {taken:.0f} s.\n')
-    tables = case_tables(cases, reports)
+    write_provenance(arguments.out)
+    head = _HEAD.format(provenance=provenance(arguments.out))
+    board = f'{head}{table}\nCPU time of all cases: {taken:.0f} s.\n'
+    tables = f'{COLUMN_NOTES}\n{case_tables(cases, reports)}'
     if others is not None:
         tables += '\n' + against(cases, reports, others)
-    write_text(arguments.out / 'cases.md', '# Cases of the board\n\n' + tables)
-    print(f'{table}\n{arguments.out}/board.md')
+    write_text(arguments.out / 'slam.md', f'{board}\n{tables}')
+    print(f'{table}\n{arguments.out}/slam.md')
     if failures:
         raise failure_summary(failures)
 

@@ -1,4 +1,4 @@
-"""Two runs of the scoreboard beside each other."""
+"""Comparison of two runs of the scoreboard."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ _SAME_M = 0.005
 def against(
     cases: Sequence[Case], reports: Sequence[Numbers], others: Sequence[Numbers | None]
 ) -> str:
-    """Markdown: live errors here and there, of the cases that both runs have, worse ones first."""
+    """Markdown: live errors of both runs in their common cases, those that increase first."""
     both = [k for k, other in enumerate(others) if other is not None]
     common = [cases[k] for k in both]
     ours = [reports[k] for k in both]
@@ -24,13 +24,13 @@ def against(
     there = errors(common, theirs)
     ratio = (here + 1e-6) / (there + 1e-6)
     lines = [
-        f'## Against another run ({len(both)} of {len(cases)} cases)\n',
+        f'## Comparison with another run ({len(both)} of {len(cases)} cases)\n',
         f'Live error: median of the ratios {np.median(ratio):.3f}; worst tenth '
-        f'{worst_tenth(common, ours):.3f} m (there {worst_tenth(common, theirs):.3f} m); '
+        f'{worst_tenth(common, ours):.3f} m (other run {worst_tenth(common, theirs):.3f} m); '
         f'{MOST_M:g} m or failed: {np.count_nonzero(here >= MOST_M)} '
-        f'(there {np.count_nonzero(there >= MOST_M)}). Changes by more than {_SAME:.0%} and '
+        f'(other run {np.count_nonzero(there >= MOST_M)}). Changes by more than {_SAME:.0%} and '
         f'{1000 * _SAME_M:.0f} mm:\n',
-        '| case | here | there | ratio |',
+        '| case | this run (m) | other run (m) | ratio |',
         '|---|---|---|---|',
     ]
     changed = (np.abs(ratio - 1.0) > _SAME) & (np.abs(here - there) > _SAME_M)

@@ -1,4 +1,4 @@
-"""The scoreboard's page, and the one number for its worst tenth."""
+"""The page of all cases, and the mean error of their worst tenth."""
 
 import math
 from collections.abc import Sequence
@@ -10,31 +10,40 @@ from benchmarks.scoreboard.measure import DISTURBED
 from benchmarks.scoreboard.played import Numbers
 from thinmap_ros.core import se2
 
-MOST_M = 10.0  # an error beyond says no more
+MOST_M = 10.0  # larger errors count as this
 _SHORT_S = 240.0  # of the processor for the short form
 _START_S = 3.0  # of the processor for a process that runs a case, before it begins
 _PEERS = """\
-Peers on the same logs, final or live = final, m: IRIS LaMa intel 0.047, aces 0.046, csail 1.09,
-fhw 0.75; published, Cartographer: intel_raw 0.023, aces_raw 0.038, csail_raw 0.032.
+Results of other programs on the same logs, m: IRIS LaMa (final or live = final) intel 0.047, aces
+0.046, csail 1.09, fhw 0.75; Cartographer (published) intel_raw 0.023, aces_raw 0.038, csail_raw
+0.032.
+"""
+COLUMN_NOTES = """\
+- *live*, *final*: error of the estimate at the time of a scan, and after all corrections. Logs:
+  mean error of the reference relations; *degraded*: rms of the positions against the original log.
+  Others: rms error of the position.
+- *2 ms*: poses are interpolated with odometry to stamps of relations that differ by more than 2 ms.
+- *aligned*: after the rigid alignment of estimated and true trajectory. Without it, the heading
+  error of the first scans turns the whole map.
+- *revisits*: relations of revisited places only.
+- *across*: error of relations across the slip or the gap, live, from 30 m of mapped path on.
+- *unmapped*: share of the scans that belong to no map that is extended; scans at rest excluded.
+- *in 95 %*: share of the scans with the true position inside the 95 % ellipse.
+- *sigma / rms*: root of the mean trace of the covariance divided by the rms error; 1 in a
+  consistent filter.
+- *overconfident*: scans with an error above 0.5 m and above 3 sigma.
+- *CPU ms*: CPU time of the localizer for a scan. *longest step*: of localizer and grid, with loop
+  closure and map correction.
+- *peak*: highest resident memory of the process, with libraries and, for buildings, the simulator.
+  *added*: without the memory before the first scan.
 """
 _HEAD = """\
-# Scoreboard
+# SLAM: all cases
 
-Made by `python -m benchmarks.scoreboard -o DIR`. Logs: mean error of the known relations, m;
-`ours`: against the undegraded run of a log without relations (rms of positions). Buildings: rms
-error of the position, m; *aligned*: after the rigid motion that lays the path onto the true one
-best, as a first look without walls can turn the whole map.
+{provenance}
 
-*2 ms*: poses moved along the odometry to stamps of relations that are more than 2 ms off. *again*:
-relations of revisits alone. *over*: error of relations that span the slip or the gap, live, from
-30 m of known ground on. *unmapped*: share of scans whose pose belongs to no map that is being
-extended, standing scans aside. *in 95 %*: share of scans whose true position is in the 95 %
-ellipse. *sigma / rms*: root of the mean trace of the covariance over the rms error, both of scans
-that are not lost, 1 where it is right. *wrong and sure*: scans with an error above 0.5 m and
-3 sigma below it. *ms*: CPU time a scan of the localizer. *stall*: longest step of localizer and
-grid, with loop closing and all that is made anew after it, CPU time. *peak MB*: highest resident
-memory of the process, libraries and, for buildings, the simulated drive included. *MB more*: that
-without what the process held before the first scan.
+`python -m benchmarks.scoreboard -o DIR` generates this page.
+
 """
 _KINDS = (
     ('Logs', LogCase),
@@ -43,40 +52,40 @@ _KINDS = (
     ('Closed loop', LoopCase),
 )
 _COLUMNS = (
-    ('live', 'live_m', '.3f'),
-    ('final', 'final_m', '.3f'),
-    ('live 2 ms', 'exact_live_m', '.3f'),
-    ('final 2 ms', 'exact_final_m', '.3f'),
-    ('aligned live', 'live_aligned_m', '.3f'),
-    ('aligned final', 'final_aligned_m', '.3f'),
-    ('again live', 'again_live_m', '.3f'),
-    ('again final', 'again_final_m', '.3f'),
-    ('over', 'over_m', '.3f'),
+    ('live (m)', 'live_m', '.3f'),
+    ('final (m)', 'final_m', '.3f'),
+    ('live, 2 ms (m)', 'exact_live_m', '.3f'),
+    ('final, 2 ms (m)', 'exact_final_m', '.3f'),
+    ('live, aligned (m)', 'live_aligned_m', '.3f'),
+    ('final, aligned (m)', 'final_aligned_m', '.3f'),
+    ('live, revisits (m)', 'again_live_m', '.3f'),
+    ('final, revisits (m)', 'again_final_m', '.3f'),
+    ('across (m)', 'over_m', '.3f'),
     ('unmapped', 'unmapped', '.1%'),
     ('in 95 %', 'inside_95', '.0%'),
     ('sigma / rms', 'sigma_of_rms', '.1f'),
-    ('wrong and sure', 'wrong_and_sure', 'd'),
+    ('overconfident', 'wrong_and_sure', 'd'),
     ('coverage', 'coverage', '.1%'),
     ('collisions', 'collisions', 'd'),
-    ('ms median', 'ms_median', '.2f'),
+    ('CPU ms, median', 'ms_median', '.2f'),
     ('mean', 'ms_mean', '.2f'),
     ('99 %', 'ms_99', '.1f'),
-    ('stall ms', 'stall_ms', '.0f'),
-    ('peak MB', 'mb', '.0f'),
-    ('MB more', 'mb_more', '.0f'),
+    ('longest step (ms)', 'stall_ms', '.0f'),
+    ('peak (MB)', 'mb', '.0f'),
+    ('added (MB)', 'mb_more', '.0f'),
 )
 
 
-def page(cases: Sequence[Case], reports: Sequence[Numbers]) -> str:
-    """Markdown of all cases, the worst ones first named."""
+def page(cases: Sequence[Case], reports: Sequence[Numbers], made: str = '') -> str:
+    """Markdown of all cases; made: line of commit and machine."""
     live = errors(cases, reports)
     order = np.argsort(-live, kind='stable')
     worst = [f'{cases[k].name} {live[k]:.2f}' for k in order[: math.ceil(0.1 * len(live))]]
     failed = [report['name'] for report in reports if 'error' in report]
     parts = [
-        _HEAD,
+        _HEAD.format(provenance=made) + COLUMN_NOTES,
         f'**Worst tenth, live: {worst_tenth(cases, reports):.3f} m** (mean; an error '
-        f'counts as at most {MOST_M:g} m). It is: {", ".join(worst)}.\n',
+        f'counts as at most {MOST_M:g} m). Its cases: {", ".join(worst)}.\n',
         _PEERS,
         *([f'**Failed**: {", ".join(failed)}.\n'] if failed else []),
     ]
@@ -106,7 +115,8 @@ def worst_tenth(cases: Sequence[Case], reports: Sequence[Numbers]) -> float:
 def shortened(cases: Sequence[Case], reports: Sequence[Numbers]) -> str:
     """Names of the worst tenth for the short form, the worst first, one a line.
 
-    Those that would make it much longer than two minutes on two cores are left out, and said to be.
+    Those that would make it much longer than two minutes on two cores are left out; the file names
+    them.
     """
     live = errors(cases, reports)
     lines = [
@@ -168,7 +178,7 @@ def _table(
             continue
         cells = [_cell(report, key, form) for _, key, form in columns]
         if 'live_m' not in report:
-            cells[0] = f'{live[k]:.3f} (ours)'
+            cells[0] = f'{live[k]:.3f} (degraded)'
         lines.append(f'| {report["name"]} | {report["scans"]} | ' + ' | '.join(cells) + ' |')
     return '\n'.join(lines) + '\n'
 
@@ -180,10 +190,10 @@ def _repeated(cases: Sequence[Case], reports: Sequence[Numbers], live: np.ndarra
         runs.setdefault(case.first, []).append(k)
     lines = [
         '## Several runs\n',
-        f'All but the first with odometry disturbed by {1e3 * DISTURBED[0]:g} mm and '
-        f'{1e3 * DISTURBED[2]:g} mrad from scan to scan; mean: geometric. In the tables and in the '
-        'worst tenth each run counts as a case.\n',
-        '| case | runs | live, mean | worst | final, mean | worst |',
+        f'In all runs but the first, odometry has noise of {1e3 * DISTURBED[0]:g} mm and '
+        f'{1e3 * DISTURBED[2]:g} mrad from scan to scan. Means are geometric. In the tables and in '
+        'the worst tenth each run counts as a case.\n',
+        '| case | runs | live (m), mean | worst | final (m), mean | worst |',
         '|---|---|---|---|---|---|',
     ]
     for name, own in runs.items():
@@ -196,7 +206,7 @@ def _repeated(cases: Sequence[Case], reports: Sequence[Numbers], live: np.ndarra
 
 
 def _mean_and_worst(metres: np.ndarray) -> str:
-    """Geometric mean of errors (N,), as one far worse would hide the others, and the largest."""
+    """Geometric mean of errors (N,), which one large error does not dominate, and the largest."""
     if not len(metres):
         return '|'
     mean = np.exp(np.log(np.maximum(metres, 1e-3)).mean())

@@ -131,7 +131,7 @@ def test_a_row_is_met_or_missed():
     reports[2] |= {'live_m': 0.151, 'wrong_and_sure': 3, 'inside_95': 0.84, 'step_ms': 61.0}
     found = verdicts(reports)
     assert found[title][1:] == ['0.080 / 0.151 (drive_b)', '**missed**']
-    sure = found['simulated: wrong and sure scans: sum']
+    sure = found['simulated: overconfident scans: sum']
     assert sure == ['0', '3 (most: drive_b)', '**missed**']
     inside = found['simulated: share in the 95 % ellipse: least / median']
     assert inside == ['85%', '84.0% (drive_b) / 90.0%', '**missed**']
@@ -205,7 +205,7 @@ def small_board(monkeypatch, tmp_path):
 def test_a_small_board_is_resumed(small_board, capsys):
     words = ['-o', small_board, '--processes', 1, '--quiet']
     assert called(*words, '--only', 'drive_*_1') == 0
-    assert '[1 of 2 cases]' in (small_board / 'board.md').read_text()
+    assert '[1 of 2 cases]' in (small_board / 'slam.md').read_text()
     assert (small_board / 'drives' / 'office.npz').exists()
     results = small_board / 'board'
     kept = results / 'drive_office.odometry_1.json'
@@ -215,7 +215,7 @@ def test_a_small_board_is_resumed(small_board, capsys):
     kept.write_text(json.dumps(first | {'step_ms': 98765.0}))
     capsys.readouterr()
     assert called(*words) == 0
-    text = (small_board / 'board.md').read_text()
+    text = (small_board / 'slam.md').read_text()
     assert '| 98765 (drive_office.odometry_1) | **missed** |' in text
     assert capsys.readouterr().out.splitlines()[2] in text
     assert '| closed loop, other lasers' in text
@@ -225,7 +225,7 @@ def test_a_small_board_is_resumed(small_board, capsys):
     loop = json.loads((results / 'loop_office.turtlebot3_1.json').read_text())
     assert loop['coverage'] > 0.9
     assert loop['live_m'] < 0.2
-    cases = (small_board / 'cases.md').read_text()
+    cases = (small_board / 'slam.md').read_text()
     assert '| drive_office.odometry_1 |' in cases
     assert '| loop_office.turtlebot3_1 |' in cases
     # Other options need another folder with the same recordings; two folders are compared.
@@ -235,9 +235,12 @@ def test_a_small_board_is_resumed(small_board, capsys):
     other += ['--against', small_board, '--only', '*_1', '--set', 'slam=ekf_ti']
     assert called(*other, '--processes', 1, '--quiet') == 0
     assert not (small_board / 'other' / 'drives').exists()
-    text = (small_board / 'other' / 'board.md').read_text()
+    text = (small_board / 'other' / 'slam.md').read_text()
     assert '| 98765 (drive_office.odometry_1) |' in text
-    assert '## Against another run (2 of 2 cases)' in (small_board / 'other/cases.md').read_text()
+    assert (
+        '## Comparison with another run (2 of 2 cases)'
+        in (small_board / 'other/slam.md').read_text()
+    )
 
 
 @pytest.mark.programs
