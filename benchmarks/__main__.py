@@ -19,7 +19,7 @@ from benchmarks.speed import (
     topology_update,
 )
 from benchmarks.worlds import WORLDS
-from thinmap_ros.evaluation.machine import machine
+from thinmap_ros.evaluation.machine import machine, write_provenance
 from thinmap_ros.evaluation.outcome import Row, show
 
 _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
@@ -51,7 +51,9 @@ def main() -> None:
         '--worlds', type=Path, default=WORLDS, help=f'folder with worlds.json (default {WORLDS})'
     )
     parser.add_argument(
-        '--csv', type=Path, help='folder for the results: NAME.csv each, and machine.csv'
+        '--csv',
+        type=Path,
+        help='folder for the results: NAME.csv each, machine.csv and provenance.txt',
     )
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(_ALL):
@@ -62,6 +64,7 @@ def main() -> None:
         show(rows, arguments.csv and arguments.csv / f'{name}.csv')
     if arguments.csv:
         show(machine(), arguments.csv / 'machine.csv')
+        write_provenance(arguments.csv)
 
 
 if __name__ == '__main__':

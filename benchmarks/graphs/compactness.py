@@ -28,9 +28,9 @@ class _Sizes(NamedTuple):
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows for each kind of floors, and for a map by scans."""
     for kind, floors in groups(worlds, 'kth' if quick else ''):
-        yield Row(f'{kind}, perfect maps', f'{len(floors)} floors')
+        yield Row(f'{kind}, maps without noise', f'{len(floors)} floors')
         yield from _rows([read_map(floor.path) for floor in floors])
-    yield Row('lab, map by noisy scans from twelve places', '1 floor')
+    yield Row('lab, map from noisy scans at twelve positions', '1 floor')
     yield from _rows([grid_of(Source().samples('lab_stops')).known_area()])
 
 

@@ -30,12 +30,14 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         yield Row(floor.name, f'{len(graph.nodes)} nodes')
         if floor.name in _SECONDS:
             seconds = best_seconds({'work': work}, 5)['work']
-            yield at_most('  map to graph', seconds, _SECONDS[floor.name], 's')
+            yield at_most('  time from map to graph', seconds, _SECONDS[floor.name], 's')
             voronoi = best_seconds({'work': partial(build_voronoi, patch)}, 1)['work']
             yield at_least('  times faster than a Voronoi graph (SciPy)', voronoi / seconds, 1.0)
         if floor.name == 'kth/50052751':
             yield at_most('  nodes', len(graph.nodes), _MOST_NODES)
-        yield at_least('  drivable edges', drivable_share(patch, graph, config.robot_radius_m), 1.0)
+        yield at_least(
+            '  share of drivable edges', drivable_share(patch, graph, config.robot_radius_m), 1.0
+        )
         joined, ratio = completeness(patch, graph, config.robot_radius_m, 50 if quick else 1000, 0)
-        yield at_least('  reachable pairs joined', joined, 0.995)
-        yield at_most('  length of ways, sum against best on the grid', ratio, 1.15)
+        yield at_least('  share of reachable pairs that are connected', joined, 0.995)
+        yield at_most('  path length / shortest on the grid, sums', ratio, 1.15)

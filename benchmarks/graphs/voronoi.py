@@ -95,15 +95,19 @@ def _add_graph(
 def _rows(figures: dict[str, _Figures]) -> Iterator[Row]:
     shown: dict[str, Callable[[_Figures], str]] = {
         'nodes': lambda one: str(np.sum(one.kinds)),
-        'nodes: ends, branches, corners': lambda one: _joined(np.sum(one.kinds, axis=0).tolist()),
+        'end, branch and corner nodes': lambda one: _joined(np.sum(one.kinds, axis=0).tolist()),
         'edges': lambda one: str(sum(one.edges)),
-        'floors with loops and parts as the free space': _same,
-        'drivable edges, mean and least': lambda one: _mean_and(one.drivable, min),
-        'free places that see a node, mean and least': lambda one: _mean_and(one.sight, min),
-        'pairs joined, mean and least': lambda one: _mean_and(one.joined, min),
-        'lengths against best on the grid, mean and most': lambda one: _mean_and(one.lengths, max),
-        'skeleton': lambda one: f'{sum(one.skeleton_s):.3g} s',
-        'graph': lambda one: f'{sum(one.graph_s):.3g} s',
+        'floors with the topology of the free space': _same,
+        'share of drivable edges, mean and minimum': lambda one: _mean_and(one.drivable, min),
+        'share of free positions in sight of a node, mean and minimum': lambda one: _mean_and(
+            one.sight, min
+        ),
+        'share of connected pairs, mean and minimum': lambda one: _mean_and(one.joined, min),
+        'path length / shortest on the grid, mean and maximum': lambda one: _mean_and(
+            one.lengths, max
+        ),
+        'CPU time of the skeleton': lambda one: f'{sum(one.skeleton_s):.3g} s',
+        'CPU time of the graph': lambda one: f'{sum(one.graph_s):.3g} s',
     }
     for what, text in shown.items():
         for name, one in figures.items():

@@ -42,7 +42,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         yield at_most(f'ti, {number} features: longest step', longest, limit, 'ms')
     numbers = [number for number in numbers if number in local]
     yield at_most(
-        f'ti: {numbers[-1]} features against {numbers[0]}',
+        f'ti: {numbers[-1]} features / {numbers[0]} features',
         local[numbers[-1]][0] / local[numbers[0]][0],
         1.5,
     )
@@ -51,7 +51,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         yield Row(f'full, {number} features: step, median', f'{median:.3g} ms')
     most = max(whole)
     ratio = whole[most][0] / local[most][0]
-    yield at_least(f'full against ti with {most} features (target: with 1000)', ratio, 30.0, 'x')
+    yield at_least(f'full / ti with {most} features (target: with 1000)', ratio, 30.0, 'x')
 
 
 def _cost(slam: str, numbers: list[int]) -> Iterator[tuple[int, tuple[float, float]]]:

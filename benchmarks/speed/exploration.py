@@ -38,16 +38,18 @@ def _dungeons(chosen: list[Floor]) -> Iterator[Row]:
         reports.append(report)
     yield Row('dungeons explored', f'{len(reports)}')
     yield at_least(
-        '  stopped by itself', float(np.mean([report['finished'] for report in reports])), 1.0
+        '  runs that stop by themselves, share',
+        float(np.mean([report['finished'] for report in reports])),
+        1.0,
     )
     yield at_least('  least coverage', min(report['coverage'] for report in reports), 0.99)
     yield at_most('  collisions', sum(report['collisions'] for report in reports), 0)
     yield Row('  distance, mean', f'{np.mean([report["distance"] for report in reports]):.1f} m')
-    yield at_least('  times real time (of the processor), median', float(np.median(speeds)), 100.0)
+    yield at_least('  times real time (CPU time), median', float(np.median(speeds)), 100.0)
 
 
 def _decisions(floor: Floor, limit_s: float) -> Iterator[Row]:
     loop, report = explore(floor.world, floor.starts[0], replace(_FAST, time_limit_s=limit_s))
     yield Row(f'decisions on {floor.name}', f'{len(loop.log.decision_s)}')
-    yield at_most('  processor time for one, median', report['decision_ms']['median'], 20.0, 'ms')
-    yield at_most('  longest', report['decision_ms']['max'], 200.0, 'ms')
+    yield at_most('  CPU time of a decision, median', report['decision_ms']['median'], 20.0, 'ms')
+    yield at_most('  longest decision', report['decision_ms']['max'], 200.0, 'ms')

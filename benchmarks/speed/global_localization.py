@@ -1,4 +1,4 @@
-"""Global localization: step time, memory, some lost robots; `benchmarks.kidnapped` has them all."""
+"""Global localization: step time, memory, some drives; `benchmarks.kidnapped` has all."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -46,16 +46,16 @@ def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
         taken = 1e3 * median_seconds(
             partial(judge.log_likelihoods, samples, seen), 20 if quick else 200
         )
-        yield at_most(f'5,000 samples, 10 observed nodes, {count} in the map', taken, limit, 'ms')
-        yield Row('  what the map takes', f'{places.memory_bytes() / 1e6:.3g} MB', 'at most 50 MB')
+        yield at_most(f'step with 10 observed nodes, {count} in the map', taken, limit, 'ms')
+        yield Row('  memory of the map', f'{places.memory_bytes() / 1e6:.3g} MB', 'at most 50 MB')
 
 
 def run(folder: Path, quick: bool) -> Iterator[Row]:
-    """Step times, and the first of some rows of lost robots; quick: fewer."""
+    """Step times, and the first drives of some sections; quick: fewer."""
     yield from _step_times(folder, quick)
     for row, count in _QUICK.items():
         cases = islice(ROWS[row](Setting(folder, Path())), count if quick else 4 * count)
         records = [{'case': case.name, **case.run()} for case in cases]
         written = [{key: str(value) for key, value in record.items()} for record in records]
-        yield Row(f'lost robots: {row}', '')
+        yield Row(f'drives: {row}', '')
         yield from (replace(line, what=f'  {line.what}') for line in summary(row, written))

@@ -58,41 +58,43 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         if mark is first:
             continue
         lap = again.index(mark.travelled_m) + 2 if mark.travelled_m in again else None
-        where = (
-            f'lap {lap}, on the first {_SPAN_M:.0f} m' if lap else f'after {mark.travelled_m:.0f} m'
-        )
+        where = f'lap {lap}, first {_SPAN_M:.0f} m' if lap else f'after {mark.travelled_m:.0f} m'
         yield from _ratios(where, mark, first)
         if mark.travelled_m <= lap_m:
             new = mark
             grown_kb = 1e3 * (mark.resident_mb - first.resident_mb)
             yield Row(
-                '  memory a square metre of new free area',
+                '  memory per square metre of new free area',
                 f'{grown_kb / (mark.area_m2 - first.area_m2):.3g} kB',
             )
         elif new is not None:
             more_mb = (mark.resident_mb - new.resident_mb) / (
                 1e-3 * (mark.travelled_m - new.travelled_m)
             )
-            yield Row('  memory a kilometre on known ground', f'{more_mb:.3g} MB')
+            yield Row('  memory per kilometre in the known area', f'{more_mb:.3g} MB')
 
 
 def _rows(mark: _Mark) -> Iterator[Row]:
     yield Row(f'after {mark.travelled_m:.0f} m: free area in the map', f'{mark.area_m2:.0f} m2')
     every = mark.taken_ms['all']
-    yield Row('  CPU a scan, median and mean', f'{np.median(every):.3g} and {every.mean():.3g} ms')
+    yield Row(
+        '  CPU time of a scan, median and mean', f'{np.median(every):.3g} and {every.mean():.3g} ms'
+    )
     for of, name in ((np.median, 'median'), (np.mean, 'mean')):
         parts = ', '.join(f'{of(mark.taken_ms[part]):.2f}' for part in _PARTS)
         yield Row(f'  {", ".join(_PARTS)}: {name}', f'{parts} ms')
-    yield Row('  CPU a scan, 99 of 100', f'{np.percentile(every, 99):.3g} ms')
+    yield Row('  CPU time of a scan, 99th percentile', f'{np.percentile(every, 99):.3g} ms')
     yield Row('  memory', f'{mark.resident_mb:.0f} MB')
-    yield Row('  error of the pose', f'{mark.off_m:.2f} m')
+    yield Row('  position error', f'{mark.off_m:.2f} m')
 
 
 def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
     now = mark.taken_ms['all']
     then = first.taken_ms['all']
     yield at_most(
-        f'  {where}, against the first time: median', float(np.median(now) / np.median(then)), 1.2
+        f'  {where}: CPU time / that of the first time, median',
+        float(np.median(now) / np.median(then)),
+        1.2,
     )
     yield at_most('  the same, mean', float(now.mean() / then.mean()), 1.2)
 

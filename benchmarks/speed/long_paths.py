@@ -64,14 +64,16 @@ def _measure(name: str, patch: GridPatch, quick: bool) -> Iterator[Row]:
     ratios = np.array(tally.ratios[_WARM_UP:])
     planned = np.isfinite(ratios)
     yield Row(name, f'{len(ratios)} pairs')
-    yield at_least('  planned on the graph, share', float(planned.mean()), 0.8)
-    yield Row('  wavefront alone: time, median, longest', _times(alone_ms))
-    yield Row('  on the graph: time, median, longest', _times(along_ms))
+    yield at_least('  share of paths planned on the graph', float(planned.mean()), 0.8)
+    yield Row('  wavefront alone: time, median and maximum', _times(alone_ms))
+    yield Row('  on the graph: time, median and maximum', _times(along_ms))
     yield at_most(
-        '  time over that of the wavefront alone, median', float(np.median(along_ms / alone_ms)), 1
+        '  time / that of the wavefront alone, median', float(np.median(along_ms / alone_ms)), 1
     )
-    yield at_most('  length over that, mean', float(ratios[planned].mean()), 1.03)
-    yield Row('  the same, longest', f'{ratios[planned].max():.3g}')
+    yield at_most(
+        '  length / that of the wavefront alone, mean', float(ratios[planned].mean()), 1.03
+    )
+    yield Row('  the same, maximum', f'{ratios[planned].max():.3g}')
 
 
 def _try(

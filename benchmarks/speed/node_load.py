@@ -36,7 +36,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         together = [['thinmap']]
         apart = [[name] for name in _NODES]
         yield from _measured('one process', together, seconds, bag, (40.0, 400.0))
-        yield from _measured('a process for each', apart, seconds, None, (None, None))
+        yield from _measured('one process per node', apart, seconds, None, (None, None))
         yield from _traffic(bag)
 
 
@@ -86,7 +86,7 @@ def _measured(
         psutil.wait_procs([*nodes, *others], timeout=_STOP_S)
     yield Row(what, f'{len(delays.of("pose"))} scans')
     for name, value, limit, unit in (
-        ('processor', share, limits[0], '%'),
+        ('CPU load', share, limits[0], '%'),
         ('memory', memory, limits[1], 'MB'),
     ):
         if limit is None:
@@ -95,7 +95,10 @@ def _measured(
             yield at_most(f'  {name}', value, limit, unit)
     for topic, limit in (('pose', 20.0), ('local_topology', 50.0)):
         yield at_most(
-            f'  scan to {topic}, 99 %', float(np.percentile(delays.of(topic), 99.0)), limit, 'ms'
+            f'  latency from scan to {topic}, 99th percentile',
+            float(np.percentile(delays.of(topic), 99.0)),
+            limit,
+            'ms',
         )
 
 
@@ -184,4 +187,4 @@ def _traffic(bag: Path) -> Iterator[Row]:
     for topic, found in sorted(sizes.items(), key=lambda item: -sum(item[1])):
         rate = len(found) / seconds
         size = sum(found) / len(found) / 1e3
-        yield Row(f'  {topic}: {rate:.1f} a second of {size:.2f} kB', f'{rate * size:.1f} kB/s')
+        yield Row(f'  {topic}: {rate:.1f} Hz, {size:.2f} kB per message', f'{rate * size:.1f} kB/s')

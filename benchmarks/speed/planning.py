@@ -53,17 +53,21 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         for _ in range(-(-(_GOALS_QUICK if quick else _GOALS) // len(chosen))):
             _try(floor, read_map(floor.path), rng, tally)
     yield Row('goals', f'{tally.reachable + tally.unreachable}')
-    yield at_least('  reachable ones reached', tally.reached / max(tally.reachable, 1), 1.0)
-    yield at_most('  paths nearer to something than allowed', tally.too_near, 0)
+    yield at_least(
+        '  reachable goals with a path, share', tally.reached / max(tally.reachable, 1), 1.0
+    )
+    yield at_most('  paths with too little clearance', tally.too_near, 0)
     yield at_most(
-        '  length against the best with the same clearance, mean',
+        '  length / shortest with the same clearance, mean',
         float(np.mean(tally.ratios)),
         1.05,
     )
-    yield at_most('  the same, longest', float(np.max(tally.ratios)), 1.05)
-    yield at_least('  unreachable ones refused', tally.refused / max(tally.unreachable, 1), 1.0)
-    yield at_most('  longest time to refuse one', max(tally.refuse_s), 1.0, 's')
-    yield Row('  time for a plan, median', f'{1e3 * np.median(tally.plan_s):.3g} ms')
+    yield at_most('  the same, maximum', float(np.max(tally.ratios)), 1.05)
+    yield at_least(
+        '  unreachable goals rejected, share', tally.refused / max(tally.unreachable, 1), 1.0
+    )
+    yield at_most('  longest time of a rejection', max(tally.refuse_s), 1.0, 's')
+    yield Row('  time of a plan, median', f'{1e3 * np.median(tally.plan_s):.3g} ms')
 
 
 def _try(floor: Floor, patch: GridPatch, rng: np.random.Generator, tally: _Tally) -> None:

@@ -65,16 +65,16 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         yield Row('karto-scanmatcher', 'not installed')
     for prior, errors in _PRIORS.items():
         yield Row(
-            f'prior off by up to {errors[0]:g} m and {errors[1]:g} degrees in each direction', ''
+            f'prior error up to {errors[0]:g} m and {errors[1]:g} degrees in each direction', ''
         )
         found = {name: _measure(maker, cases, errors) for name, maker in makers.items()}
         for name, (match_ms, drawn_ms, off) in found.items():
             off_m = np.hypot(off[:, 0], off[:, 1])
             off_deg = np.degrees(np.abs(off[:, 2]))
             right = float(((off_m <= _RIGHT_M) & (off_deg <= _RIGHT_DEG)).mean())
-            yield Row(f'  {name}: CPU of a match, median', f'{np.median(match_ms):.3g} ms')
+            yield Row(f'  {name}: CPU time of a match, median', f'{np.median(match_ms):.3g} ms')
             yield Row(
-                f'  {name}: the same with {_BEFORE} scans added before',
+                f'  {name}: the same, with the insertion of {_BEFORE} scans',
                 f'{np.median(drawn_ms):.3g} ms',
             )
             yield Row(
@@ -82,7 +82,9 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
                 f'{1e3 * np.median(off_m):.3g} mm, {np.median(off_deg):.2g} degrees',
             )
             yield at_least(
-                f'  {name}: within {_RIGHT_M:g} m and {_RIGHT_DEG:g} degrees, {prior}', right, 0.95
+                f'  {name}: share within {_RIGHT_M:g} m and {_RIGHT_DEG:g} degrees, {prior}',
+                right,
+                0.95,
             )
 
 

@@ -55,9 +55,11 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
             },
             rounds=3 if side <= 1000 else 1,
         )
-        yield Row(f'thin {side} x {side}', f'{1e3 * fast["thin"]:.2f} ms')
+        yield Row(f'{side} x {side} cells', f'{1e3 * fast["thin"]:.2f} ms')
         for name, limit in zip(('skimage', 'opencv'), _FASTER[side], strict=True):
             yield at_least(f'  times faster than {name}', slow[name] / fast['thin'], limit)
         if side == 1000:
-            yield at_most('  in copies of the mask', fast['thin'] / fast['copy'], 60.0)
-            yield at_most('  in distance transforms (L2, 5)', fast['thin'] / fast['distance'], 0.5)
+            yield at_most('  time / copy of the mask', fast['thin'] / fast['copy'], 60.0)
+            yield at_most(
+                '  time / distance transform (L2, 5)', fast['thin'] / fast['distance'], 0.5
+            )

@@ -30,15 +30,15 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         there, back = agreement(graph, batch, 0.5)
         yield from [
             Row(name, f'{len(poses)} scans', '', None),
-            at_most('  cycle, median', float(np.median(milliseconds)), 2.0, 'ms'),
-            at_most('  cycle, longest', float(milliseconds.max()), 10.0, 'ms'),
+            at_most('  update, median', float(np.median(milliseconds)), 2.0, 'ms'),
+            at_most('  update, longest', float(milliseconds.max()), 10.0, 'ms'),
             at_most(
-                '  cycle, last tenth against first',
+                '  update, last tenth / first tenth',
                 float(np.median(milliseconds[-tenth:]) / np.median(milliseconds[:tenth])),
                 1.2,
             ),
-            at_least('  nodes with one of the batch map within 0.5 m', there, 0.95),
-            at_least('  nodes of the batch map with one within 0.5 m', back, 0.95),
+            at_least('  share of nodes within 0.5 m of a node of the batch map', there, 0.95),
+            at_least('  share of nodes of the batch map within 0.5 m of a node', back, 0.95),
             Row(
                 '  loops',
                 f'{loop_count(graph)}',
@@ -47,11 +47,15 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
             ),
             _components(len(graph.components()), len(batch.components())),
             at_least(
-                '  nodes in view that keep their ids',
+                '  share of nodes in the window that keep their ids',
                 drive.ledger.kept / max(drive.ledger.asked, 1),
                 0.99,
             ),
-            at_least('  drivable edges', drivable_share(drive.grid.known_area(), graph, 0.25), 1.0),
+            at_least(
+                '  share of drivable edges',
+                drivable_share(drive.grid.known_area(), graph, 0.25),
+                1.0,
+            ),
         ]
 
 
