@@ -55,6 +55,8 @@ them. The robot visits an end node only while its probability is below 0.9.
 - **Where they do not hold**: in larger buildings. The end of a skeleton at the edge of the known
   area is observed often and from a short distance. Its probability rises although a room is hidden
   behind it. The exploration stops early, as the coverage of `paper` in the tables shows.
+- **Efficiency**: the tables compare the distances in pairs. If an interval includes zero, neither
+  strategy is shown to be shorter.
 - **What the calibrated belief changes**: the strategy `position_probability` keeps the form of the
   paper. Its prior depends on the length of the frontier and on the unknown space in line of sight
   behind it. These predict hidden area better than observations do: with them, distance and angle
