@@ -25,7 +25,7 @@ from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.logs.log import Event, Log, OdometryEvent
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.view import figures
+from thinmap_ros.view.summary import summary_figure
 
 
 @dataclass(eq=False)
@@ -130,9 +130,7 @@ def write_outputs(
     regions = find_regions(patch, RegionConfig(robot_radius_m=robot_radius_m))
     graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
     release_compiler_pages()  # before matplotlib is loaded
-    figures.summary_figure(
-        folder / 'summary.png', patch, topology, poses, title=title, regions=regions
-    )
+    summary_figure(folder / 'summary.png', patch, topology, poses, title=title, regions=regions)
     report = _report(result, poses, seconds)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
     return report

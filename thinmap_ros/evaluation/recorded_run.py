@@ -31,8 +31,9 @@ from thinmap_ros.logs.bag import Bag
 from thinmap_ros.sim.coverage import ObservableCells, observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
-from thinmap_ros.view import figures, rerun_sinks
+from thinmap_ros.view import rerun_sinks
 from thinmap_ros.view.message_view import recording_from_bag
+from thinmap_ros.view.summary import summary_figure
 
 FILES = (
     'map.pgm',
@@ -137,9 +138,7 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
         f'{report["distance"]:.1f} m, {report["time"]:.0f} s'
     )
     hidden = hidden_places(report)
-    figures.summary_figure(
-        out / 'summary.png', patch, topology, estimated, true, title, regions, hidden
-    )
+    summary_figure(out / 'summary.png', patch, topology, estimated, true, title, regions, hidden)
     if rerun_sinks.is_installed():
         recording_from_bag(out / 'bag', out / 'recording.rrd')
     else:

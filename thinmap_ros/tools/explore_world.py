@@ -25,7 +25,7 @@ from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, NAMES
 from thinmap_ros.tools import cli
-from thinmap_ros.view import figures
+from thinmap_ros.view.summary import summary_figure
 
 WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's worlds"
 
@@ -42,13 +42,13 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
     regions = find_regions(patch)
     graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
     title = (
-        f'{report["world"]}: {report["coverage"]:.1%} in {report["time"]:.0f} s, '
-        f'{report["distance"]:.0f} m'
+        f'{report["world"]}: {100.0 * report["coverage"]:.1f} % seen, '
+        f'{report["distance"]:.1f} m, {report["time"]:.0f} s'
     )
     hidden = hidden_places(report)
     poses = np.array(log.poses)
     true_poses = np.array(log.true_poses)
-    figures.summary_figure(
+    summary_figure(
         folder / 'summary.png', patch, topology, poses, true_poses, title, regions, hidden
     )
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')

@@ -13,7 +13,7 @@ _WIDTHS = (5, 2)  # of the map, and of curves and legend
 LEGEND = """**orange** end node, with its position probability; **grey** it will stay ·
 **dark blue** branch · **amber** corner · **green** skeleton ·
 **blue** features of the local area, its nodes ringed;
-**pale blue** other features · **red dots** scan · **pink** pose and its 95 % · **sky** truth ·
+**pale blue** other features · **red dots** scan · **pink** pose and its 95 % · **indigo** truth ·
 **yellow** path and target · **purple** samples ·
 **pale outlines** rooms (blue), corridors (sand), halls (green)"""
 # Each curve: name in the legend and colour, by plot.
