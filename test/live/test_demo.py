@@ -77,6 +77,8 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     assert len(json.loads((out / 'topology.geojson').read_text())['features']) > 5
     assert np.loadtxt(out / 'trajectory.tum').shape[1] == 8
     assert (out / 'summary.png').stat().st_size > 10_000
+    page = (out / 'report.html').read_text()
+    assert 'room_10x10' in page and 'thinmap_ros.tools.demo' in page
     bag = Bag(out / 'bag')
     assert set(bag.topics) >= TOPICS
     assert not bag.is_truncated

@@ -50,6 +50,21 @@ def test_how_programs_end(
     assert capsys.readouterr().err == said
 
 
+@pytest.mark.parametrize(
+    ('words', 'command'),
+    [
+        (['thinmap replay', 'a b.log', '-o', 'out'], "thinmap replay 'a b.log' -o out"),
+        (['/x/thinmap_ros/tools/demo.py', '--view'], 'python -m thinmap_ros.tools.demo --view'),
+        (['/x/lib/thinmap_ros/replay', 'a.log'], 'ros2 run thinmap_ros replay a.log'),
+    ],
+)
+def test_the_command_can_be_run_again(
+    monkeypatch: pytest.MonkeyPatch, words: list[str], command: str
+) -> None:
+    monkeypatch.setattr('sys.argv', words)
+    assert cli.command_line() == command
+
+
 def parse(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     cli.add_log_options(parser)

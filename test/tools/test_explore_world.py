@@ -71,7 +71,14 @@ def test_a_room_is_explored_and_everything_written(world: Path, tmp_path: Path) 
         report['time_at'].keys() == report['distance_at'].keys() == {'0.90', '0.95', '0.98', '0.99'}
     )
     assert report['pose_rmse'] < 0.1
-    for name in ('map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'trajectory.tum'):
+    for name in (
+        'map.pgm',
+        'map.yaml',
+        'topology.geojson',
+        'summary.png',
+        'trajectory.tum',
+        'report.html',
+    ):
         assert (out / name).stat().st_size > 0
 
 

@@ -29,6 +29,7 @@ from thinmap_ros.view.null_view import NullView
 
 TRAJECTORIES = {'trajectory.tum', 'trajectory_final.tum'}
 FILES = TRAJECTORIES | {'map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'report.json'}
+FILES |= {'report.html'}
 needs_rerun = pytest.mark.skipif(
     not rerun_sinks.is_installed(),
     reason='needs rerun, which is not installed (the extra "viewer")',

@@ -102,9 +102,9 @@ def test_scale_bars_have_round_lengths(width, bar):
 def test_a_strip_is_shown_with_space_around_it():
     left, right, bottom, top = shown_area(room(10, 3000))
     assert (left, right) == pytest.approx((0.0, 300.0))
-    assert top - bottom == pytest.approx(48.0) and bottom + top == pytest.approx(1.0)
+    assert top - bottom == pytest.approx(300.0 * 1.2 / 7.0) and bottom + top == pytest.approx(1.0)
 
 
 def test_titles_are_one_line():
     assert shortened('two\nlines') == 'two lines'
-    assert len(shortened(200 * 'x')) == 80
+    assert len(shortened(200 * 'x')) == 70

@@ -1,6 +1,7 @@
 """Common parts of command line programs: arguments, errors in one line, exit codes."""
 
 import argparse
+import shlex
 import signal
 import sys
 from collections.abc import Callable
@@ -45,6 +46,19 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
         sys.exit(INTERRUPTED)
     finally:
         compilation.end()
+
+
+def command_line() -> str:
+    """The command that runs this program again, for a shell."""
+    program = Path(sys.argv[0])
+    words = [program.name]
+    if sys.argv[0].startswith('thinmap '):
+        words = sys.argv[0].split()
+    elif program.suffix == '.py':
+        words = ['python', '-m', f'thinmap_ros.tools.{program.stem}']
+    elif program.parent.name == 'thinmap_ros':  # where colcon installs programs
+        words = ['ros2', 'run', 'thinmap_ros', program.name]
+    return shlex.join([*words, *sys.argv[1:]])
 
 
 def _catch_interrupts() -> None:

@@ -15,7 +15,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.exploration_metrics import hidden_places
+from thinmap_ros.evaluation.exploration_metrics import exploration_title, hidden_places
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.files import graphs, occupancy_maps, package_data, trajectories
 from thinmap_ros.files.atomic import write_text
@@ -25,6 +25,7 @@ from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, NAMES
 from thinmap_ros.tools import cli
+from thinmap_ros.view import report_page
 from thinmap_ros.view.summary import summary_figure
 
 WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's worlds"
@@ -41,10 +42,7 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
     occupancy_maps.write_map(folder / 'map', patch)
     regions = find_regions(patch)
     graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
-    title = (
-        f'{report["world"]}: {100.0 * report["coverage"]:.1f} % seen, '
-        f'{report["distance"]:.1f} m, {report["time"]:.0f} s'
-    )
+    title = exploration_title(report)
     hidden = hidden_places(report)
     poses = np.array(log.poses)
     true_poses = np.array(log.true_poses)
@@ -52,6 +50,7 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
         folder / 'summary.png', patch, topology, poses, true_poses, title, regions, hidden
     )
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
+    report_page.write(folder, title, report, cli.command_line())
 
 
 def _start(world: World, given: str | None) -> Array:

@@ -38,7 +38,8 @@ class _Layout:
     long_in: longer side of the map, shortest_in: least width and height, inches; font_pt: of all
     text; title_chars: of a longer title only the beginning is shown; smallest_m: least side of the
     area that is shown; bar_share: longest scale bar, of the width; bar_above_in: its height above
-    the map; legend_in: width of an entry; many_nodes: above this number, nodes are drawn smaller.
+    the map; legend_in: width and height of an entry; margins_in: width and height
+    of labels and title; dense_nodes: nodes per square inch above which they are drawn smaller.
     """
 
     dpi: int
@@ -49,21 +50,23 @@ class _Layout:
     smallest_m: float
     bar_share: float
     bar_above_in: float
-    legend_in: float
-    many_nodes: int
+    legend_in: tuple[float, float]
+    margins_in: tuple[float, float]
+    dense_nodes: float
 
 
 _LAYOUT = _Layout(
-    dpi=150,
-    long_in=7.5,
+    dpi=160,
+    long_in=7.0,
     shortest_in=(4.0, 1.2),
-    font_pt=10.0,
-    title_chars=80,
+    font_pt=11.0,
+    title_chars=70,
     smallest_m=1.0,
     bar_share=0.3,
-    bar_above_in=0.06,
-    legend_in=1.9,
-    many_nodes=150,
+    bar_above_in=0.07,
+    legend_in=(2.0, 0.24),
+    margins_in=(0.8, 1.25),
+    dense_nodes=4.0,
 )
 
 
@@ -91,14 +94,15 @@ def summary_figure(
     area = shown_area(patch)
     width, height = _map_inches(area)
     with matplotlib.rc_context({'font.size': _LAYOUT.font_pt}):
-        figure = Figure(figsize=(width + 0.8, height + 1.8), dpi=_LAYOUT.dpi, layout='constrained')
+        figure = Figure(dpi=_LAYOUT.dpi, layout='constrained')
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
         axes.set_facecolor(_UNKNOWN)
         cells = wall_lines.drawn_cells(patch) if is_measured else raw_cells(patch)
         surfaces = _draw_cells(axes, patch, cells, regions)
         _draw_paths(axes, estimated, true)
-        draw_graph(axes, topology, 5.0 if len(topology.nodes) <= _LAYOUT.many_nodes else 3.5)
+        is_dense = len(topology.nodes) > _LAYOUT.dense_nodes * width * height
+        draw_graph(axes, topology, 3.5 if is_dense else 5.0)
         if hidden is not None and len(hidden):
             draw_hidden_areas(axes, hidden)
         left, right, bottom, top = area
@@ -106,8 +110,8 @@ def summary_figure(
             xlabel='x (m)', ylabel='y (m)', aspect='equal', xlim=(left, right), ylim=(bottom, top)
         )
         _draw_scale_bar(axes, right - left)
-        figure.suptitle(shortened(title), fontsize=_LAYOUT.font_pt + 1, parse_math=False)
-        _draw_legend(figure, axes, surfaces)
+        figure.suptitle(shortened(title), parse_math=False)
+        _draw_legend(figure, axes, surfaces, (width, height))
         with atomic_write(path) as aside:
             figure.savefig(aside, format='png', bbox_inches='tight', metadata={'Software': None})
 
@@ -265,7 +269,10 @@ def _draw_scale_bar(axes: 'Axes', width_m: float) -> None:
     )
 
 
-def _draw_legend(figure: 'Figure', axes: 'Axes', surfaces: dict[str, str]) -> None:
+def _draw_legend(
+    figure: 'Figure', axes: 'Axes', surfaces: dict[str, str], map_in: tuple[float, float]
+) -> None:
+    """Draw the legend below the map, and set the size of the figure to hold both."""
     from matplotlib.patches import Patch
 
     handles: list[Any] = [
@@ -273,7 +280,10 @@ def _draw_legend(figure: 'Figure', axes: 'Axes', surfaces: dict[str, str]) -> No
         for name, colour in surfaces.items()
     ]
     handles += axes.get_legend_handles_labels()[0]
-    columns = max(2, int(figure.get_figwidth() / _LAYOUT.legend_in))
+    width = map_in[0] + _LAYOUT.margins_in[0]
+    columns = max(2, int(width / _LAYOUT.legend_in[0]))
+    rows = -(-len(handles) // columns)
+    figure.set_size_inches(width, map_in[1] + _LAYOUT.margins_in[1] + rows * _LAYOUT.legend_in[1])
     figure.legend(
         handles=handles,
         loc='outside lower center',
