@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from thinmap_ros.closed_loop import ClosedLoop, Options
 from thinmap_ros.core import se2
@@ -26,6 +25,7 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, NAMES
 from thinmap_ros.tools import cli
 from thinmap_ros.view import report_page
+from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import summary_figure
 
 WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's worlds"
@@ -106,13 +106,11 @@ def _work(arguments: argparse.Namespace) -> None:
         raise InputError(
             '--kidnap-at: expected --localization=slam, because true poses are never lost'
         )
-    with tqdm(
-        total=100, unit='%', disable=arguments.quiet, bar_format='{l_bar}{bar}| {postfix}'
-    ) as bar:
+    with ProgressBar('explore_world', arguments.quiet) as bar:
 
         def show(seconds: float, coverage: float) -> None:
-            bar.set_postfix_str(f'{seconds:.0f} s simulated', refresh=False)
-            bar.update(100.0 * coverage - bar.n)
+            share = max(coverage, seconds / options.time_limit_s)
+            bar.show(share, f'{100.0 * coverage:.0f} % seen, {seconds:.0f} s simulated')
 
         loop, report = explore(world, _start(world, arguments.start), options, show)
     write_outputs(loop, report, arguments.out)

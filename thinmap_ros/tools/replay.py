@@ -121,6 +121,11 @@ class _InterruptibleLog:
         """Unusable records of the log."""
         return self._log.skipped
 
+    @property
+    def expected_scans(self) -> int | None:
+        """Expected number of scans of the log."""
+        return self._log.expected_scans
+
     def events(self) -> Iterator[Event]:
         """Events of the log; raises KeyboardInterrupt between two of them."""
         for event in self._log.events():
