@@ -98,6 +98,7 @@ def test_a_map_without_a_start_can_be_explored_from_a_given_one(tmp_path: Path) 
     ('words', 'said'),
     [
         (['nowhere.yaml'], 'nowhere.yaml'),
+        (['atlantis'], "world 'atlantis': expected a file, or one of dead_end, "),
         (['WORLD', '--start=1,2'], '--start=1,2: expected three numbers'),
         (['WORLD', '--start=1,nan,0'], '--start=1,nan,0: expected finite numbers'),
         (['WORLD', '--start=2.2,0.5,0'], 'expected a place where a robot'),

@@ -166,6 +166,25 @@ def _work(arguments: argparse.Namespace) -> None:
         f'{result["reason"]}: {100.0 * report["coverage"]:.1f} % seen, {report["distance"]:.1f} m, '
         f'{report["time"]:.1f} s, {report["collisions"]} collisions; results in {arguments.out}'
     )
+    print(_next_steps(arguments.out))
+
+
+def _next_steps(out: Path) -> str:
+    """Where the results are shown, and commands to try next."""
+    folder = out.parent
+    after = ' (after `source scripts/env`)' if cli.is_module() else ''
+    commands = (
+        cli.command_of('explore_world', 'office', '-o', str(folder / 'office')),
+        cli.command_of('replay', str(out / 'bag'), '-o', str(folder / 'replay')),
+        cli.command_of('demo', '--world', 'office', '-o', str(folder / 'demo_office')),
+    )
+    return '\n'.join(
+        [
+            f'pictures and figures: {out / report_page.NAME}',
+            f'try next{after}:',
+            *(f'  {command}' for command in commands),
+        ]
+    )
 
 
 def main() -> None:
