@@ -60,7 +60,7 @@ class DemoMonitorNode(Node):
         self._sent_at = 0.0
         self._accepted = False
         self.finished = False
-        self._bar = ProgressBar('demo')
+        self._bar = ProgressBar('area seen')
         self._bar.show(0.0, 'waiting for the nodes')
         self._explore = ActionClient(self, Explore, 'explore')
         self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
@@ -102,8 +102,7 @@ class DemoMonitorNode(Node):
         doing = target if status.state == ExplorationStatus.EXPLORING else status.reason
         self._bar.show(
             self._coverage,
-            f'{100.0 * self._coverage:.1f} % seen, {status.distance_m:.1f} m, '
-            f'{messages.seconds(status.elapsed):.0f} s: {doing}',
+            f'{status.distance_m:.1f} m, {messages.seconds(status.elapsed):.0f} s: {doing}',
         )
 
     def _on_result(self, ended: Any) -> None:
