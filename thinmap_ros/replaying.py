@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from tqdm import tqdm
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.estimate import Estimate
@@ -25,7 +24,8 @@ from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.logs.log import Event, Log, OdometryEvent
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.view import figures
+from thinmap_ros.view.progress_bar import ProgressBar
+from thinmap_ros.view.summary import summary_figure
 
 
 @dataclass(eq=False)
@@ -69,10 +69,15 @@ def replay(
     result = Replay(Pipeline(config))
     pairing = ScanOdometrySynchronizer()
     tidy_up = compiler_memory_releaser()
-    with _errors_kept(result, keep_partial):
-        for event in tqdm(log.events(), unit=' events', disable=not show_progress):
+    with _errors_kept(result, keep_partial), ProgressBar('replay', not show_progress) as bar:
+        expected = None
+        for number, event in enumerate(log.events()):
             _add_event(result, pairing, event, watcher)
             tidy_up()
+            if show_progress:
+                # Of a bag it is known once the bag has been opened.
+                expected = log.expected_scans if number == 0 else expected
+                _show(bar, len(result.poses), expected)
     with _errors_kept(result, keep_partial):
         result.pipeline.finish()
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
@@ -83,6 +88,14 @@ def replay(
         with _errors_kept(result, keep_partial):
             watcher.finish(result.stamps_ns[-1], result.pipeline)
     return result
+
+
+def _show(bar: ProgressBar, scans: int, expected: int | None) -> None:
+    """Show the number of scans, and the expected one; with more than that, it was a bad guess."""
+    if expected is None or scans > expected:
+        bar.show(None, f'{scans} scans')
+    else:
+        bar.show(scans / expected, f'{scans} of {expected} scans')
 
 
 @contextmanager
@@ -130,9 +143,7 @@ def write_outputs(
     regions = find_regions(patch, RegionConfig(robot_radius_m=robot_radius_m))
     graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
     release_compiler_pages()  # before matplotlib is loaded
-    figures.summary_figure(
-        folder / 'summary.png', patch, topology, poses, title=title, regions=regions
-    )
+    summary_figure(folder / 'summary.png', patch, topology, poses, title=title, regions=regions)
     report = _report(result, poses, seconds)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
     return report

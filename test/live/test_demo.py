@@ -1,10 +1,12 @@
 """The demo as documented: the whole live graph, faster than real time."""
 
 import json
+import shlex
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -78,6 +80,17 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     assert len(json.loads((out / 'topology.geojson').read_text())['features']) > 5
     assert np.loadtxt(out / 'trajectory.tum').shape[1] == 8
     assert (out / 'summary.png').stat().st_size > 10_000
+    page = (out / 'report.html').read_text()
+    assert 'room_10x10' in page and 'thinmap_ros.tools.demo' in page
+    assert f'pictures and figures: {out / "report.html"}' in stdout
+    steps = [shlex.split(line) for line in stdout.partition('try next')[2].splitlines()[1:]]
+    assert [step[2] for step in steps] == [
+        f'thinmap_ros.tools.{name}' for name in ('explore_world', 'replay', 'demo')
+    ]
+    # The first two are quick, and need no graph.
+    for step in steps[:2]:
+        subprocess.run([sys.executable, *step[1:]], check=True, timeout=PROGRAM_S)
+        assert (Path(step[-1]) / 'report.html').exists()
     bag = Bag(out / 'bag')
     assert set(bag.topics) >= TOPICS
     assert not bag.is_truncated

@@ -429,3 +429,11 @@ def test_files_of_a_bag_are_read_as_they_were_numbered(tmp_path: Path) -> None:
     bag = Bag(folder)
     assert [message.log_ns for message in bag.messages()] == list(range(12))
     assert 'metadata.yaml' in bag.repair_hint and 'bag_repair' in bag.repair_hint
+
+
+@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
+def test_the_number_of_scans_is_known_from_the_first_event_on(tmp_path: Path, name: str) -> None:
+    log = BagLog(write(tmp_path / name, lambda writer, make: drive(writer, make, count=7)))
+    assert log.expected_scans is None
+    next(iter(log.events()))
+    assert log.expected_scans == 7

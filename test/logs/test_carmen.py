@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.stamps import LATEST_S
+from thinmap_ros.logs import carmen
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
 
@@ -297,3 +298,26 @@ def test_the_latest_stamp_is_that_of_ros_messages(tmp_path: Path) -> None:
     log = CarmenLog(write(tmp_path, ''.join([*lines, FLASER])))
     assert len(list(log.events())) == 3
     assert log.skipped.count == 1
+
+
+@pytest.mark.parametrize('is_zipped', [False, True])
+def test_the_number_of_scans_is_known_of_a_short_log(tmp_path: Path, is_zipped: bool) -> None:
+    content = (FLASER + '# comment\n' + FLASER).encode()
+    path = tmp_path / 'log.clf'
+    path.write_bytes(gzip.compress(content) if is_zipped else content)
+    assert CarmenLog(path).expected_scans == 2
+
+
+def test_the_number_of_scans_of_a_long_log_is_estimated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(carmen, '_SAMPLE_BYTES', 10_000)
+    path = tmp_path / 'log.clf'
+    path.write_text(1000 * FLASER)
+    assert 990 <= CarmenLog(path).expected_scans <= 1010  # type: ignore[operator]
+
+
+def test_no_number_of_scans_is_expected_of_an_unreadable_log(tmp_path: Path) -> None:
+    assert CarmenLog(tmp_path / 'missing').expected_scans is None
+    (tmp_path / 'empty').write_text('')
+    assert CarmenLog(tmp_path / 'empty').expected_scans is None

@@ -50,6 +50,37 @@ def test_how_programs_end(
     assert capsys.readouterr().err == said
 
 
+@pytest.mark.parametrize(
+    ('words', 'command'),
+    [
+        (['thinmap replay', 'a b.log', '-o', 'out'], "thinmap replay 'a b.log' -o out"),
+        (['/x/thinmap_ros/tools/demo.py', '--view'], 'python -m thinmap_ros.tools.demo --view'),
+        (['/x/lib/thinmap_ros/replay', 'a.log'], 'ros2 run thinmap_ros replay a.log'),
+    ],
+)
+def test_the_command_can_be_run_again(
+    monkeypatch: pytest.MonkeyPatch, words: list[str], command: str
+) -> None:
+    monkeypatch.setattr('sys.argv', words)
+    assert cli.command_line() == command
+
+
+@pytest.mark.parametrize(
+    ('called', 'command'),
+    [
+        ('thinmap demo', 'thinmap replay bag'),
+        ('/x/thinmap_ros/tools/demo.py', 'python -m thinmap_ros.tools.replay bag'),
+        ('/x/lib/thinmap_ros/demo', 'ros2 run thinmap_ros replay bag'),
+        ('/x/bin/demo', 'replay bag'),
+    ],
+)
+def test_other_programs_are_run_in_the_same_way(
+    monkeypatch: pytest.MonkeyPatch, called: str, command: str
+) -> None:
+    monkeypatch.setattr('sys.argv', [called, '--view'])
+    assert cli.command_of('replay', 'bag') == command
+
+
 def parse(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     cli.add_log_options(parser)

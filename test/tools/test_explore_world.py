@@ -72,7 +72,14 @@ def test_a_room_is_explored_and_everything_written(world: Path, tmp_path: Path) 
         report['time_at'].keys() == report['distance_at'].keys() == {'0.90', '0.95', '0.98', '0.99'}
     )
     assert report['pose_rmse'] < 0.1
-    for name in ('map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'trajectory.tum'):
+    for name in (
+        'map.pgm',
+        'map.yaml',
+        'topology.geojson',
+        'summary.png',
+        'trajectory.tum',
+        'report.html',
+    ):
         assert (out / name).stat().st_size > 0
 
 
@@ -92,6 +99,7 @@ def test_a_map_without_a_start_can_be_explored_from_a_given_one(tmp_path: Path) 
     ('words', 'said'),
     [
         (['nowhere.yaml'], 'nowhere.yaml'),
+        (['atlantis'], "world 'atlantis': expected a file, or one of dead_end, "),
         (['WORLD', '--start=1,2'], '--start=1,2: expected three numbers'),
         (['WORLD', '--start=1,nan,0'], '--start=1,nan,0: expected finite numbers'),
         (['WORLD', '--start=2.2,0.5,0'], 'expected a place where a robot'),

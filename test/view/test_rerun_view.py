@@ -16,7 +16,7 @@ from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.view import palette, rerun_sinks
+from thinmap_ros.view import palette, rerun_blueprint, rerun_sinks
 from thinmap_ros.view.message_view import MessageView, recording_from_bag
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
@@ -138,7 +138,9 @@ def test_graph_target_lines_and_numbers(tmp_path):
     rows, _ = read_back(tmp_path / 'a.rrd')
     colours = rows['/map/nodes'][0][1]['Points3D:colors']
     assert colours == [0xD55E00FF, 0x0072B2FF]
-    assert rows['/map/end_nodes'][0][1]['Points3D:labels'] == ['0.44']
+    text = rows['/map/end_nodes/probability'][0][1]
+    assert text['Points3D:labels'] == ['0.44']
+    assert text['Points3D:colors'] == [0x000000FF], 'readable whatever the colour of the node'
     assert np.array(rows['/map/skeleton'][0][1]['LineStrips3D:strips']).shape == (1, 3, 3)
     np.testing.assert_allclose(
         np.array(rows['/map/lines'][0][1]['LineStrips3D:strips'])[0, :, :2], [[0, 0], [1, 2]]
@@ -366,3 +368,36 @@ def test_regions_are_closed_lines(tmp_path):
     ((_, row),) = read_back(tmp_path / 'a.rrd')[0]['/map/regions']
     points = np.array(row['LineStrips3D:strips']).reshape(-1, 3)
     assert len(points) == 4 and points[0].tolist() == points[-1].tolist()
+
+
+@needs_rerun
+def test_the_camera_looks_straight_down_on_the_middle_of_the_map():
+    import rerun as rr
+    import rerun.blueprint
+
+    patch = GridPatch(GridFrame(-2.0, 1.0, 0.1), np.zeros((40, 80), dtype=np.int8))
+    eye = rerun_blueprint._eye(rr.blueprint, patch)
+    position, target, up = (
+        np.array(batch.as_arrow_array().to_pylist()[0])
+        for batch in (eye.position, eye.look_target, eye.eye_up)
+    )
+    np.testing.assert_allclose(position[:2], [2.0, 3.0], atol=1e-6)
+    np.testing.assert_allclose(target, [2.0, 3.0, 0.0], atol=1e-6)
+    assert up.tolist() == [0.0, 1.0, 0.0]
+    # The map fits into the height and the width of the picture.
+    half_m = position[2] * np.tan(np.radians(27.5))
+    assert half_m > 2.0 and 1.3 * half_m > 4.0
+
+
+@needs_rerun
+def test_the_estimated_path_is_wider_and_below_the_true_one(tmp_path):
+    view = View(tmp_path / 'a.rrd')
+    for name in ('estimate', 'truth'):
+        view.trajectory(START, name, np.zeros(3))
+        view.trajectory(START + S, name, np.array([1.0, 0.0, 0.0]))
+    view.close()
+    rows, _ = read_back(tmp_path / 'a.rrd')
+    estimate, truth = (rows[f'/map/{name}'][0][1] for name in ('estimate', 'truth'))
+    assert estimate['LineStrips3D:radii'][0] < truth['LineStrips3D:radii'][0] < 0.0
+    heights = [row['LineStrips3D:strips'][0][0][2] for row in (estimate, truth)]
+    assert heights[0] < heights[1]

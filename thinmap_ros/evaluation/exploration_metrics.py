@@ -160,6 +160,14 @@ def _turns(poses: Array) -> Array:
     return np.asarray((turns + np.pi) % (2.0 * np.pi) - np.pi)
 
 
+def exploration_title(report: dict[str, Any]) -> str:
+    """Title of a report: world, area seen, distance and time."""
+    return (
+        f'{report["world"]}: {100.0 * report["coverage"]:.1f} % seen, '
+        f'{report["distance"]:.1f} m, {report["time"]:.0f} s'
+    )
+
+
 def missing_area_report(
     missing: MissingArea | None, hidden: Iterable[tuple[float, float, float]]
 ) -> dict[str, Any] | None:

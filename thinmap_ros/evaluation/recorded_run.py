@@ -20,6 +20,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.exploration_metrics import (
     EndNodeCensus,
     exploration_report,
+    exploration_title,
     hidden_places,
     missing_area_report,
 )
@@ -31,8 +32,9 @@ from thinmap_ros.logs.bag import Bag
 from thinmap_ros.sim.coverage import ObservableCells, observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
-from thinmap_ros.view import figures, rerun_sinks
+from thinmap_ros.view import rerun_sinks
 from thinmap_ros.view.message_view import recording_from_bag
+from thinmap_ros.view.summary import summary_figure
 
 FILES = (
     'map.pgm',
@@ -40,6 +42,7 @@ FILES = (
     'topology.geojson',
     'trajectory.tum',
     'report.json',
+    'report.html',
     'summary.png',
     'recording.rrd',
 )
@@ -132,14 +135,10 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     estimated = np.array(list(recording.estimated.values()))
     trajectories.write_tum(out / 'trajectory.tum', list(recording.estimated), list(estimated))
     true = np.array(list(recording.true.values()))
-    title = (
-        f'{world.name}: {100.0 * report["coverage"]:.1f} % seen, '
-        f'{report["distance"]:.1f} m, {report["time"]:.0f} s'
-    )
+    report['world'] = world.name
+    title = exploration_title(report)
     hidden = hidden_places(report)
-    figures.summary_figure(
-        out / 'summary.png', patch, topology, estimated, true, title, regions, hidden
-    )
+    summary_figure(out / 'summary.png', patch, topology, estimated, true, title, regions, hidden)
     if rerun_sinks.is_installed():
         recording_from_bag(out / 'bag', out / 'recording.rrd')
     else:

@@ -87,6 +87,13 @@ class Bag:
         read = 'only the intact part is read'
         return f'{self.path}: {self.damage}: {read}; `bag_repair {self.path}` writes a repaired bag'
 
+    def message_count(self, topic: str) -> int | None:
+        """Recorded number of messages of a topic; None if a file does not record it."""
+        holders = [storage for storage in self._storages if topic in storage.topics]
+        counts = [storage.message_counts.get(topic) for storage in holders]
+        known = [count for count in counts if count is not None]
+        return sum(known) if counts and len(known) == len(counts) else None
+
     def messages(self, topics: set[str] | None = None) -> Iterator[RawMessage]:
         """Intact messages of the given topics, or of all, in log order."""
         for storage in self._storages:
@@ -139,7 +146,8 @@ class Bag:
 class BagLog:
     """Scans and odometry of a bag. Empty topic name: the only topic of that type.
 
-    T_base_laser (3,): pose of the laser on the robot; None: from /tf_static.
+    T_base_laser (3,): pose of the laser on the robot; None: from /tf_static. expected_scans: as in
+    `Log`, from the first event on.
     """
 
     path: Path
@@ -148,6 +156,7 @@ class BagLog:
     T_base_laser: Array | None = None
     base_frame: str = 'base_link'
     skipped: SkippedRecords = field(default_factory=SkippedRecords)
+    expected_scans: int | None = field(default=None, init=False)
 
     def events(self) -> Iterator[Event]:
         """Odometry and scans in the order of the log. Unusable messages are skipped and counted.
@@ -169,6 +178,7 @@ class BagLog:
             self._topic(bag, _SCAN, self.scan_topic, 'laser scans'): 0,
             self._topic(bag, _ODOMETRY, self.odometry_topic, 'odometry'): 0,
         }
+        self.expected_scans = bag.message_count(next(iter(used)))
         transforms = self._static_transforms(bag)
         mounts: dict[str, Mount] = {}
         for message in bag.messages(set(used)):

@@ -33,7 +33,9 @@ from thinmap_ros.logs.log import (
     refuse_foreign,
 )
 
-_KEYWORDS = (b'ODOM', b'FLASER', b'ROBOTLASER1')  # other lines are not read
+_SCAN_KEYWORDS = (b'FLASER', b'ROBOTLASER1')
+_KEYWORDS = (b'ODOM', *_SCAN_KEYWORDS)  # other lines are not read
+_SAMPLE_BYTES = 1 << 22
 _TOO_LONG = (
     f'expected at most {LOGS.lines} lines, and {LOGS.file_ratio} times the bytes of a gzip file: '
     'only the lines before are read'
@@ -97,6 +99,23 @@ class CarmenLog:
         if scans == 0:
             reason = f'; first skipped line: {self.skipped.first}' if self.skipped.first else ''
             raise InputError(f'{self.path}: no scan: expected FLASER or ROBOTLASER1 lines{reason}')
+
+    @property
+    def expected_scans(self) -> int | None:
+        """Number of scan lines, estimated from the beginning of the file; None without any."""
+        scans = 0
+        left = _SAMPLE_BYTES
+        try:
+            size = self.path.stat().st_size
+            with open_regular_file(self.path) as file, _unpacked(file) as stream:
+                while left > 0 and (line := stream.readline(LOGS.line_bytes)):
+                    left -= len(line)
+                    scans += line.lstrip().startswith(_SCAN_KEYWORDS)
+                # Of a compressed file, the compressed bytes.
+                read = file.tell()
+        except (OSError, EOFError, zlib.error, InputError):
+            return None
+        return round(scans * size / max(read, 1)) or None
 
     def _lines(self) -> Iterator[tuple[int, str]]:
         refuse_foreign(self.path)
@@ -227,10 +246,15 @@ def _check_length(words: list[str], count: int, expected: str) -> None:
 
 @contextmanager
 def _open(path: Path) -> Iterator[IO[bytes] | gzip.GzipFile]:
-    with open_regular_file(path) as stream:
-        is_zipped = stream.read(2) == b'\x1f\x8b'
-        stream.seek(0)
-        yield gzip.GzipFile(fileobj=stream) if is_zipped else stream
+    with open_regular_file(path) as stream, _unpacked(stream) as unpacked:
+        yield unpacked
+
+
+@contextmanager
+def _unpacked(stream: IO[bytes]) -> Iterator[IO[bytes] | gzip.GzipFile]:
+    is_zipped = stream.read(2) == b'\x1f\x8b'
+    stream.seek(0)
+    yield gzip.GzipFile(fileobj=stream) if is_zipped else stream
 
 
 def _is_gzip(path: Path) -> bool:

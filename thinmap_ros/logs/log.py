@@ -63,6 +63,11 @@ class Log(Protocol):
         """Unusable records so far."""
         ...
 
+    @property
+    def expected_scans(self) -> int | None:
+        """Number of scans, roughly, for a progress bar; None if unknown."""
+        ...
+
     def events(self) -> Iterator[Event]:
         """Odometry and scans in the order of the file."""
         ...

@@ -19,7 +19,7 @@ import numpy as np
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Message, Schema
+from mcap.records import Channel, ChunkIndex, Message, Schema, Statistics
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
@@ -119,17 +119,21 @@ class ChunkSpan:
 
 @dataclass(frozen=True)
 class Summary:
-    """Summary section of a file that was closed properly."""
+    """Summary section of a file that was closed properly.
+
+    message_counts: by channel; empty if they are not recorded.
+    """
 
     definitions: list[Definition]
     blocks: list[ChunkSpan]
+    message_counts: dict[int, int] = field(default_factory=dict)
 
 
 class McapFile:
     """An MCAP file opened for reading in log order, by its summary, or by a first pass without one.
 
     damage: damaged parts; with a summary, some are found only while reading. has_messages: whether
-    there are any.
+    there are any. message_counts: by topic, as recorded in the summary.
     """
 
     def __init__(self, path: Path) -> None:
@@ -144,6 +148,11 @@ class McapFile:
         if not self._chunk_spans:
             self._chunk_spans = list(_first_pass(path, summary, self.definitions, self.damage))
         self.has_messages = bool(self._chunk_spans)
+        self.message_counts = {
+            channel.topic: summary.message_counts[number]
+            for number, channel in self.definitions.channels.items()
+            if number in summary.message_counts
+        }
 
     def messages(self, topics: set[str] | None = None) -> Iterator[tuple[Schema, Channel, Message]]:
         """Messages of the given topics, or of all, in the order of the log."""
@@ -396,8 +405,19 @@ def _parsed_summary(content: bytes, data_end: int) -> Summary:
             summary.definitions.append(definition(code, record))
         elif code == Opcode.CHUNK_INDEX:
             summary.blocks.append(_indexed(record, data_end))
+        elif code == Opcode.STATISTICS:
+            summary.message_counts.update(_message_counts(record))
         at += HEAD.size + length
     return summary
+
+
+def _message_counts(record: bytes) -> dict[int, int]:
+    """Message counts by channel; empty if the record is unreadable."""
+    try:
+        statistics = Statistics.read(ReadDataStream(BytesIO(record)))
+    except (McapError, struct.error):
+        return {}
+    return dict(statistics.channel_message_counts)
 
 
 def _indexed(record: bytes, data_end: int) -> ChunkSpan:

@@ -35,11 +35,15 @@ class RawMessage:
 
 
 class Storage(Protocol):
-    """One file of a bag: `topics` and their types, `offers` (QoS) of their publishers, `damage`."""
+    """One file of a bag: `topics` and their types, `offers` (QoS) of their publishers, `damage`.
+
+    message_counts: number of messages by topic, as recorded; a topic without a number is missing.
+    """
 
     topics: dict[str, str]
     offers: dict[str, list[Qos]]
     damage: Damage
+    message_counts: dict[str, int]
 
     @property
     def has_messages(self) -> bool:
@@ -62,6 +66,7 @@ class McapStorage:
         self._file = McapFile(path)
         self.damage = self._file.damage
         self.has_messages = self._file.has_messages
+        self.message_counts = self._file.message_counts
         self.topics: dict[str, str] = {}
         self.offers: dict[str, list[Qos]] = {}
         self._schemas: dict[str, Schema] = {}
@@ -96,10 +101,12 @@ class SqliteStorage:
         self.damage = Damage()
         self.topics: dict[str, str] = {}
         self.offers: dict[str, list[Qos]] = {}
+        self.message_counts: dict[str, int] = {}
         try:
             with self._reader() as reader:
                 for connection in reader.connections:
                     self.topics[connection.topic] = connection.msgtype
+                    self.message_counts[connection.topic] = connection.msgcount
                     if isinstance(connection.ext, ConnectionExtRosbag2):
                         self.offers.setdefault(connection.topic, []).extend(
                             connection.ext.offered_qos_profiles

@@ -12,7 +12,6 @@ from rclpy.action import ActionClient
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
-from tqdm import tqdm
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
@@ -25,6 +24,7 @@ from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
+from thinmap_ros.view.progress_bar import ProgressBar
 
 _PERIOD_S = 0.5
 # Without an answer for this time, the goal is sent again: an explorer that has just been discovered
@@ -60,10 +60,8 @@ class DemoMonitorNode(Node):
         self._sent_at = 0.0
         self._accepted = False
         self.finished = False
-        self._bar = tqdm(
-            total=100.0, bar_format='{desc:<48}|{bar}| {n:5.1f} % seen  {postfix}', leave=True
-        )
-        self._bar.set_description_str('waiting for the nodes')
+        self._bar = ProgressBar('area seen')
+        self._bar.show(0.0, 'waiting for the nodes')
         self._explore = ActionClient(self, Explore, 'explore')
         self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
         self.create_timer(_PERIOD_S, self._send_goal, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -101,14 +99,11 @@ class DemoMonitorNode(Node):
             if status.has_target
             else 'looking around'
         )
-        self._bar.set_description_str(
-            target if status.state == ExplorationStatus.EXPLORING else status.reason
+        doing = target if status.state == ExplorationStatus.EXPLORING else status.reason
+        self._bar.show(
+            self._coverage,
+            f'{status.distance_m:.1f} m, {messages.seconds(status.elapsed):.0f} s: {doing}',
         )
-        self._bar.set_postfix_str(
-            f'{status.distance_m:.1f} m, {messages.seconds(status.elapsed):.0f} s'
-        )
-        self._bar.n = 100.0 * self._coverage
-        self._bar.refresh()
 
     def _on_result(self, ended: Any) -> None:
         status: ExplorationStatus = ended.result.status

@@ -1,6 +1,7 @@
 """Common parts of command line programs: arguments, errors in one line, exit codes."""
 
 import argparse
+import shlex
 import signal
 import sys
 from collections.abc import Callable
@@ -45,6 +46,29 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
         sys.exit(INTERRUPTED)
     finally:
         compilation.end()
+
+
+def command_line() -> str:
+    """The command that runs this program again, for a shell."""
+    return command_of(Path(sys.argv[0].split()[-1]).stem, *sys.argv[1:])
+
+
+def command_of(program: str, *words: str) -> str:
+    """The command that runs a program of this package in the way this one was run, for a shell."""
+    called = Path(sys.argv[0])
+    how = [program]
+    if sys.argv[0].startswith('thinmap '):
+        how = ['thinmap', program]
+    elif is_module():
+        how = ['python', '-m', f'thinmap_ros.tools.{program}']
+    elif called.parent.name == 'thinmap_ros':  # where colcon installs programs
+        how = ['ros2', 'run', 'thinmap_ros', program]
+    return shlex.join([*how, *words])
+
+
+def is_module() -> bool:
+    """Whether this program was run as a module of the source tree."""
+    return sys.argv[0].endswith('.py')
 
 
 def _catch_interrupts() -> None:

@@ -16,12 +16,14 @@ from pathlib import Path
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation import recorded_run
+from thinmap_ros.evaluation.exploration_metrics import exploration_title
 from thinmap_ros.evaluation.processes import end_with_parent
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.ros_check import require_ros
+from thinmap_ros.view import report_page
 
 # On a busy machine nodes need time to exit; a killed recorder leaves a truncated bag.
 _PATIENCE_S = 20.0
@@ -159,9 +161,29 @@ def _work(arguments: argparse.Namespace) -> None:
     explore(arguments, world, start)
     result = json.loads((arguments.out / 'result.json').read_text())
     report = recorded_run.write(arguments.out, world, arguments.robot, result)
+    report_page.write(arguments.out, exploration_title(report), report, cli.command_line())
     print(
         f'{result["reason"]}: {100.0 * report["coverage"]:.1f} % seen, {report["distance"]:.1f} m, '
         f'{report["time"]:.1f} s, {report["collisions"]} collisions; results in {arguments.out}'
+    )
+    print(_next_steps(arguments.out))
+
+
+def _next_steps(out: Path) -> str:
+    """Where the results are shown, and commands to try next."""
+    folder = out.parent
+    after = ' (after `source scripts/env`)' if cli.is_module() else ''
+    commands = (
+        cli.command_of('explore_world', 'office', '-o', str(folder / 'office')),
+        cli.command_of('replay', str(out / 'bag'), '-o', str(folder / 'replay')),
+        cli.command_of('demo', '--world', 'office', '-o', str(folder / 'demo_office')),
+    )
+    return '\n'.join(
+        [
+            f'pictures and figures: {out / report_page.NAME}',
+            f'try next{after}:',
+            *(f'  {command}' for command in commands),
+        ]
     )
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from thinmap_ros.closed_loop import ClosedLoop, Options
 from thinmap_ros.core import se2
@@ -15,7 +14,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.exploration_metrics import hidden_places
+from thinmap_ros.evaluation.exploration_metrics import exploration_title, hidden_places
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.files import graphs, occupancy_maps, package_data, trajectories
 from thinmap_ros.files.atomic import write_text
@@ -25,7 +24,9 @@ from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, NAMES
 from thinmap_ros.tools import cli
-from thinmap_ros.view import figures
+from thinmap_ros.view import report_page
+from thinmap_ros.view.progress_bar import ProgressBar
+from thinmap_ros.view.summary import summary_figure
 
 WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's worlds"
 
@@ -41,17 +42,15 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
     occupancy_maps.write_map(folder / 'map', patch)
     regions = find_regions(patch)
     graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
-    title = (
-        f'{report["world"]}: {report["coverage"]:.1%} in {report["time"]:.0f} s, '
-        f'{report["distance"]:.0f} m'
-    )
+    title = exploration_title(report)
     hidden = hidden_places(report)
     poses = np.array(log.poses)
     true_poses = np.array(log.true_poses)
-    figures.summary_figure(
+    summary_figure(
         folder / 'summary.png', patch, topology, poses, true_poses, title, regions, hidden
     )
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
+    report_page.write(folder, title, report, cli.command_line())
 
 
 def _start(world: World, given: str | None) -> Array:
@@ -107,13 +106,11 @@ def _work(arguments: argparse.Namespace) -> None:
         raise InputError(
             '--kidnap-at: expected --localization=slam, because true poses are never lost'
         )
-    with tqdm(
-        total=100, unit='%', disable=arguments.quiet, bar_format='{l_bar}{bar}| {postfix}'
-    ) as bar:
+    with ProgressBar('explore_world', arguments.quiet) as bar:
 
         def show(seconds: float, coverage: float) -> None:
-            bar.set_postfix_str(f'{seconds:.0f} s simulated', refresh=False)
-            bar.update(100.0 * coverage - bar.n)
+            share = max(coverage, seconds / options.time_limit_s)
+            bar.show(share, f'{100.0 * coverage:.0f} % seen, {seconds:.0f} s simulated')
 
         loop, report = explore(world, _start(world, arguments.start), options, show)
     write_outputs(loop, report, arguments.out)

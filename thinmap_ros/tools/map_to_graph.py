@@ -14,7 +14,7 @@ from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.files import graphs, occupancy_maps
 from thinmap_ros.tools import cli
-from thinmap_ros.view import figures
+from thinmap_ros.view.summary import summary_figure
 
 _DEFAULTS = TopologyConfig()
 
@@ -53,13 +53,14 @@ def _work(arguments: argparse.Namespace) -> None:
     regions = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius))
     graphs.write_graph(arguments.out, topology, membership_of(topology, regions))
     if arguments.picture is not None:
-        figures.summary_figure(
+        summary_figure(
             arguments.picture,
             patch,
             topology,
             np.empty((0, 2)),
             title=arguments.map.stem,
             regions=regions,
+            is_measured=False,
         )
     if not topology.nodes:
         place = 'no free place' if start is None else f'no free place round {start}'

@@ -24,6 +24,7 @@ from thinmap_ros.logs.log import Event, Log, SkippedRecords
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.replaying import Replay, replay, write_outputs
 from thinmap_ros.tools import cli
+from thinmap_ros.view import report_page
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
@@ -120,6 +121,11 @@ class _InterruptibleLog:
         """Unusable records of the log."""
         return self._log.skipped
 
+    @property
+    def expected_scans(self) -> int | None:
+        """Expected number of scans of the log."""
+        return self._log.expected_scans
+
     def events(self) -> Iterator[Event]:
         """Events of the log; raises KeyboardInterrupt between two of them."""
         for event in self._log.events():
@@ -161,6 +167,7 @@ def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{arguments.log.name}: {len(result.poses)} scans'
     report = write_outputs(result, arguments.out, title, seconds)
+    report_page.write(arguments.out, title, report, cli.command_line())
     skipped = f', {result.skipped} skipped' if result.skipped else ''
     if result.first_skipped:
         skipped += f' (first: {result.first_skipped})'

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.files.atomic import atomic_write
@@ -24,81 +23,10 @@ _SMALL_COLOURS = 64
 _MARKERS = {NodeKind.END: 'o', NodeKind.BRANCH: 's', NodeKind.CORNER: '^'}
 
 
-def summary_figure(
-    path: Path,
-    patch: GridPatch,
-    topology: TopologicalMap,
-    estimated: Array,
-    true: Array | None = None,
-    title: str = '',
-    regions: RegionMap | None = None,
-    hidden: Array | None = None,
-) -> None:
-    """Write a PNG: map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven.
-
-    regions: of the grid, in pale colours; hidden (N, 3): positions, m, and hidden area, m2, that is
-    expected there.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    height, width = (count * patch.frame.resolution for count in patch.shape)
-    scale = 9.0 / max(height, width)
-    figure = Figure(
-        figsize=(width * scale + 1.2, height * scale + 1.6), dpi=DPI, layout='constrained'
-    )
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    draw_map(axes, patch, regions)
-    draw_graph(axes, topology)
-    if hidden is not None and len(hidden):
-        draw_hidden_areas(axes, hidden)
-    if true is not None and len(true):
-        axes.plot(
-            true[:, 0],
-            true[:, 1],
-            '-',
-            color=palette.TRUTH,
-            linewidth=2.5,
-            label='path driven',
-            zorder=2,
-        )
-    if len(estimated):
-        axes.plot(
-            *estimated[:, :2].T,
-            '-',
-            color=palette.ESTIMATE,
-            linewidth=1.0,
-            label='path estimated',
-            zorder=3,
-        )
-        axes.plot(
-            *estimated[0, :2],
-            marker='*',
-            color='black',
-            markersize=11,
-            linestyle='',
-            label='start',
-            zorder=6,
-        )
-    axes.set(xlabel='x (m)', ylabel='y (m)', title=title, aspect='equal')
-    figure.legend(loc='outside lower center', ncols=4, fontsize=8, frameon=False)
-    with atomic_write(path) as aside:
-        figure.savefig(aside, format='png', bbox_inches='tight')
-
-
-def draw_map(axes: 'Axes', patch: GridPatch, regions: RegionMap | None = None) -> None:
-    """Draw the cells of a grid: free white or by region, occupied black, unknown grey.
-
-    regions: of this grid.
-    """
+def draw_map(axes: 'Axes', patch: GridPatch) -> None:
+    """Draw the cells of a grid: free white, occupied black, unknown grey."""
     shade = np.full((*patch.shape, 3), _GREY, dtype=np.uint8)
     shade[patch.free] = 255
-    if regions is not None:
-        colours = np.full((1 + max(regions.regions, default=0), 3), 255, dtype=np.uint8)
-        for region in regions.regions.values():
-            colours[region.id] = palette.rgb(palette.region(region.kind, region.id))
-        shade[patch.free] = colours[regions.labels[patch.free]]
     shade[patch.occupied] = 0
     rows, cols = patch.shape
     x = patch.frame.origin_x + patch.frame.resolution * np.arange(cols + 1)

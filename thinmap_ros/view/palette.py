@@ -6,8 +6,8 @@ from thinmap_ros.core.topology.graph import NodeKind
 NODES = {NodeKind.END: '#D55E00', NodeKind.BRANCH: '#0072B2', NodeKind.CORNER: '#E69F00'}
 EDGE = '#009E73'
 ESTIMATE = '#CC79A7'
-TRUTH = '#56B4E9'
-HIDDEN = '#E69F00'
+TRUTH = '#332288'
+HIDDEN = '#882255'
 # Pale, in turn by id.
 REGIONS = {
     RegionKind.ROOM: ('#C9DFF2', '#D6D3EC', '#C5E3EA', '#DCE6F5'),

@@ -10,12 +10,14 @@ from thinmap_ros.view.rerun_sinks import TIMELINE
 
 UNKNOWN_GREY = 205
 _WIDTHS = (5, 2)  # of the map, and of curves and legend
-LEGEND = """**orange** end node, with its position probability; **grey** it will stay ·
-**dark blue** branch · **amber** corner · **green** skeleton ·
-**blue** features of the local area, its nodes ringed;
-**pale blue** other features · **red dots** scan · **pink** pose and its 95 % · **sky** truth ·
-**yellow** path and target · **purple** samples ·
-**pale outlines** rooms (blue), corridors (sand), halls (green)"""
+LEGEND = """
+- **orange** end node with its position probability, **grey** it will stay;
+  **dark blue** branch, **amber** corner, **green** skeleton
+- **pink** estimated path, pose and its 95 %; **indigo** true path; **grey** odometry;
+  **yellow** planned path and target; **purple** samples
+- **red** scan; **blue** features of the local area, its nodes ringed; **pale blue** other features
+- **pale outlines**: rooms (blue), corridors (sand), halls (green)
+"""
 # Each curve: name in the legend and colour, by plot.
 _PLOTS = {
     'error': ('pose: error, 2 sigma', ('position, cm', 'heading, deg', '2 sigma, cm')),
@@ -30,20 +32,18 @@ _PLOTS = {
 
 @dataclass(frozen=True)
 class _Camera:
-    """The camera above the map.
+    """The camera above the map, which looks straight down: all parts of the map have one scale.
 
     aspect: width over height of the map's part of the window, or less. half_view_rad: half of the
-    vertical field of view of rerun's camera. tilt: horizontal offset to the south, as a share of
-    the height. margin: size of the picture over that of the map.
+    vertical field of view of rerun's camera. margin: size of the picture over that of the map.
     """
 
     aspect: float
     half_view_rad: float
-    tilt: float
     margin: float
 
 
-_CAMERA = _Camera(aspect=1.3, half_view_rad=math.radians(27.5), tilt=0.25, margin=1.15)
+_CAMERA = _Camera(aspect=1.3, half_view_rad=math.radians(27.5), margin=1.1)
 
 
 def entity(plot: str, curve: str) -> str:
@@ -102,14 +102,12 @@ def size_m(patch: GridPatch) -> float:
 
 
 def _eye(rrb: Any, patch: GridPatch) -> Any:
-    """Camera position, slightly south of the zenith."""
+    """Camera at the zenith of the map's centre; y points up in the picture."""
     rows, cols = patch.shape
     frame = patch.frame
     x = frame.origin_x + frame.resolution * cols / 2.0
     y = frame.origin_y + frame.resolution * rows / 2.0
     height = _CAMERA.margin * size_m(patch) / (2.0 * math.tan(_CAMERA.half_view_rad))
     return rrb.EyeControls3D(
-        position=(x, y - _CAMERA.tilt * height, height),
-        look_target=(x, y, 0.0),
-        eye_up=(0.0, 0.0, 1.0),
+        position=(x, y, height), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
     )

@@ -26,7 +26,13 @@ _LOCAL_LINE = '#0072B2'
 _LINE = '#8FBEDB'
 _LOCAL_NODE = '#0072B2'
 _STAYS = '#7D7D7D'  # an end node with position probability 1
-_TRAILS = {'estimate': palette.ESTIMATE, 'truth': palette.TRUTH, 'odometry': _ODOMETRY}
+_LABEL = '#000000'
+# Colour and radius in pixels: the estimated path is visible below the true one.
+_TRAILS = {
+    'estimate': (palette.ESTIMATE, 2.4),
+    'truth': (palette.TRUTH, 0.9),
+    'odometry': (_ODOMETRY, 1.2),
+}
 # Heights above the map, m, in the order of importance.
 _Z = {
     'regions': 0.01,
@@ -34,8 +40,8 @@ _Z = {
     'lines': 0.03,
     'samples': 0.035,
     'odometry': 0.04,
-    'truth': 0.05,
-    'estimate': 0.06,
+    'estimate': 0.05,
+    'truth': 0.06,
     'plan': 0.07,
     'local_area': 0.075,
     'nodes': 0.08,
@@ -171,9 +177,10 @@ class View(NullView):
         self._trail_ends[name] = here
         self._at(ns)
         step = _lifted(np.array([before, here]), _Z[name])
+        colour, radius_px = _TRAILS[name]
         self._log(
             f'map/{name}',
-            self._rr.LineStrips3D([step], colors=[rgb(_TRAILS[name])], radii=[self._px(1.2)]),
+            self._rr.LineStrips3D([step], colors=[rgb(colour)], radii=[self._px(radius_px)]),
         )
 
     def topology(self, ns: int, topology: TopologicalMap) -> None:
@@ -209,14 +216,22 @@ class View(NullView):
         labels = [f'{p:.2f}' for p in probabilities]
 
         def draw() -> None:
+            lifted = _lifted(places, _Z['end_nodes'])
             points = self._rr.Points3D(
-                _lifted(places, _Z['end_nodes']),
+                lifted,
                 colors=[_faded(palette.NODES[NodeKind.END], float(p)) for p in probabilities],
                 radii=[self._px(6.0)],
+            )
+            self._log('map/end_nodes', points)
+            # Text has the colour of its point: grey cannot be read.
+            text = self._rr.Points3D(
+                lifted,
+                colors=[rgb(_LABEL)],
+                radii=[self._px(0.0)],
                 labels=labels,
                 show_labels=True,
             )
-            self._log('map/end_nodes', points)
+            self._log('map/end_nodes/probability', text)
 
         self._throttled('end_nodes', ns, draw)
 

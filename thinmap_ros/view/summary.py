@@ -1,0 +1,294 @@
+"""The summary picture of a run: map, regions, graph and paths, with legend and scale bar."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.regions.region_map import RegionKind, RegionMap
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.view import palette, wall_lines
+from thinmap_ros.view.figures import draw_graph, draw_hidden_areas
+from thinmap_ros.view.wall_lines import DrawnCells
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_UNKNOWN = '#CCCCCC'
+_FREE = '#FFFFFF'
+_WALL = '#000000'
+_BOUNDARY = '#777777'
+_KINDS = {RegionKind.ROOM: 'room', RegionKind.CORRIDOR: 'corridor', RegionKind.HALL: 'hall'}
+# Free cells this near to a region are drawn as part of it: regions end before the walls, m.
+_REGION_MARGIN_M = 0.5
+_ELLIPSIS = '…'
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Sizes of the picture.
+
+    long_in: longer side of the map, shortest_in: least width and height, inches; font_pt: of all
+    text; title_chars: of a longer title only the beginning is shown; smallest_m: least side of the
+    area that is shown; bar_share: longest scale bar, of the width; bar_above_in: its height above
+    the map; legend_in: width and height of an entry; margins_in: width and height
+    of labels and title; dense_nodes: nodes per square inch above which they are drawn smaller.
+    """
+
+    dpi: int
+    long_in: float
+    shortest_in: tuple[float, float]
+    font_pt: float
+    title_chars: int
+    smallest_m: float
+    bar_share: float
+    bar_above_in: float
+    legend_in: tuple[float, float]
+    margins_in: tuple[float, float]
+    dense_nodes: float
+
+
+_LAYOUT = _Layout(
+    dpi=160,
+    long_in=7.0,
+    shortest_in=(4.0, 1.2),
+    font_pt=11.0,
+    title_chars=70,
+    smallest_m=1.0,
+    bar_share=0.3,
+    bar_above_in=0.07,
+    legend_in=(2.0, 0.24),
+    margins_in=(0.8, 1.25),
+    dense_nodes=4.0,
+)
+
+
+def summary_figure(
+    path: Path,
+    patch: GridPatch,
+    topology: TopologicalMap,
+    estimated: Array,
+    true: Array | None = None,
+    title: str = '',
+    regions: RegionMap | None = None,
+    hidden: Array | None = None,
+    is_measured: bool = True,
+) -> None:
+    """Write a PNG: map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven.
+
+    regions: of the grid, in pale colours; hidden (N, 3): positions, m, and hidden area, m2, that is
+    expected there; is_measured: whether walls are drawn as lines (see `wall_lines`), or each cell
+    as it is.
+    """
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    area = shown_area(patch)
+    width, height = _map_inches(area)
+    with matplotlib.rc_context({'font.size': _LAYOUT.font_pt}):
+        figure = Figure(dpi=_LAYOUT.dpi, layout='constrained')
+        FigureCanvasAgg(figure)
+        axes = figure.add_subplot()
+        axes.set_facecolor(_UNKNOWN)
+        cells = wall_lines.drawn_cells(patch) if is_measured else raw_cells(patch)
+        surfaces = _draw_cells(axes, patch, cells, regions)
+        _draw_paths(axes, estimated, true)
+        is_dense = len(topology.nodes) > _LAYOUT.dense_nodes * width * height
+        draw_graph(axes, topology, 3.5 if is_dense else 5.0)
+        if hidden is not None and len(hidden):
+            draw_hidden_areas(axes, hidden)
+        left, right, bottom, top = area
+        axes.set(
+            xlabel='x (m)', ylabel='y (m)', aspect='equal', xlim=(left, right), ylim=(bottom, top)
+        )
+        _draw_scale_bar(axes, right - left)
+        figure.suptitle(shortened(title), parse_math=False)
+        _draw_legend(figure, axes, surfaces, (width, height))
+        with atomic_write(path) as aside:
+            figure.savefig(aside, format='png', bbox_inches='tight', metadata={'Software': None})
+
+
+def shown_area(patch: GridPatch) -> tuple[float, float, float, float]:
+    """Least and greatest x, and y, m, of the map in a picture that is neither tiny nor a strip."""
+    rows, cols = patch.shape
+    frame = patch.frame
+    sides = [max(count * frame.resolution, _LAYOUT.smallest_m) for count in (cols, rows)]
+    m_per_in = max(sides) / _LAYOUT.long_in
+    width, height = (
+        max(side, least * m_per_in) for side, least in zip(sides, _LAYOUT.shortest_in, strict=True)
+    )
+    x = frame.origin_x + 0.5 * cols * frame.resolution
+    y = frame.origin_y + 0.5 * rows * frame.resolution
+    return x - 0.5 * width, x + 0.5 * width, y - 0.5 * height, y + 0.5 * height
+
+
+def scale_bar_m(width_m: float) -> float:
+    """Length of the scale bar: 1, 2 or 5 times a power of ten."""
+    longest = _LAYOUT.bar_share * width_m
+    power = 10.0 ** np.floor(np.log10(longest))
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= longest * 1.0001))
+
+
+def shortened(title: str) -> str:
+    """A title in one line, cut off where it is too long."""
+    line = ' '.join(title.split())
+    most = _LAYOUT.title_chars
+    return line if len(line) <= most else line[: most - 1] + _ELLIPSIS
+
+
+def raw_cells(patch: GridPatch) -> DrawnCells:
+    """Free and occupied cells of a map as they are."""
+    return DrawnCells(patch.free, patch.occupied)
+
+
+def _map_inches(area: tuple[float, float, float, float]) -> tuple[float, float]:
+    left, right, bottom, top = area
+    scale = _LAYOUT.long_in / max(right - left, top - bottom)
+    return (right - left) * scale, (top - bottom) * scale
+
+
+def _draw_cells(
+    axes: 'Axes', patch: GridPatch, cells: DrawnCells, regions: RegionMap | None
+) -> dict[str, str]:
+    """Draw the cells; returns the colour of each kind of surface by its name in the legend."""
+    factor = wall_lines.reduction(patch.shape)
+    cell_m = factor * patch.frame.resolution
+    cells = wall_lines.reduced(cells, factor)
+    shade = np.empty((*cells.free.shape, 3), dtype=np.uint8)
+    shade[:] = palette.rgb(_UNKNOWN)
+    shade[cells.free] = palette.rgb(_FREE)
+    surfaces = {'wall': _WALL} if cells.occupied.any() else {}
+    surfaces['unknown'] = _UNKNOWN
+    labels = None
+    if regions is not None and regions.regions:
+        labels = wall_lines.block_maximum(regions.labels, factor)
+        labels = _spread_labels(labels, cells.free, round(_REGION_MARGIN_M / cell_m))
+        for kind, name in _KINDS.items():
+            ids = [region.id for region in regions.regions.values() if region.kind == kind]
+            colour = palette.REGIONS[kind][0]
+            if ids:
+                shade[np.isin(labels, ids)] = palette.rgb(colour)
+                surfaces[name] = colour
+    if (shade[cells.free] == 255).all(axis=1).any():
+        surfaces['free'] = _FREE
+    shade[cells.occupied] = palette.rgb(_WALL)
+    rows, cols = cells.free.shape
+    x = patch.frame.origin_x + cell_m * np.arange(cols + 1)
+    y = patch.frame.origin_y + cell_m * np.arange(rows + 1)
+    # Not by imshow: it takes some 90 bytes per pixel.
+    axes.pcolormesh(x, y, shade, antialiased=False, rasterized=True)
+    if labels is not None:
+        _draw_boundaries(axes, labels, patch.frame, cell_m)
+    return surfaces
+
+
+def _spread_labels(
+    labels: NDArray[np.int32], free: NDArray[np.bool_], margin: int
+) -> NDArray[np.int32]:
+    """Labels (H, W) of all free cells that are at most some cells from a region, 0 elsewhere."""
+    from scipy.ndimage import distance_transform_cdt
+
+    away, nearest = distance_transform_cdt(labels == 0, metric='chessboard', return_indices=True)
+    spread = labels[nearest[0], nearest[1]]
+    return np.where(free & (away <= margin), spread, 0)
+
+
+def _draw_boundaries(
+    axes: 'Axes', labels: NDArray[np.int32], frame: GridFrame, cell_m: float
+) -> None:
+    """Draw the borders between cells of different regions."""
+    from matplotlib.collections import LineCollection
+
+    segments = []
+    for here, there, along in (
+        (labels[:, :-1], labels[:, 1:], (0.0, 1.0)),
+        (labels[:-1], labels[1:], (1.0, 0.0)),
+    ):
+        cells = np.argwhere((here != there) & (here > 0) & (there > 0))[:, ::-1]
+        starts = cells + (along[1], along[0])
+        segments.append(np.stack([starts, starts + along], axis=1))
+    ends = np.concatenate(segments) * cell_m + (frame.origin_x, frame.origin_y)
+    if len(ends):
+        lines = LineCollection(
+            list(ends), colors=_BOUNDARY, linewidths=1.2, label='region boundary', zorder=1.5
+        )
+        axes.add_collection(lines)
+
+
+def _draw_paths(axes: 'Axes', estimated: Array, true: Array | None) -> None:
+    """Draw the estimated path, wide, and the driven one over it, thin."""
+    if len(estimated):
+        axes.plot(
+            *estimated[:, :2].T,
+            color=palette.ESTIMATE,
+            linewidth=4.5,
+            solid_capstyle='round',
+            label='path, estimated',
+            zorder=2,
+        )
+    if true is not None and len(true):
+        axes.plot(
+            *true[:, :2].T, color=palette.TRUTH, linewidth=1.5, label='path, driven', zorder=3
+        )
+    if len(estimated):
+        style: dict[str, Any] = {
+            'color': 'white',
+            'markeredgecolor': palette.TRUTH,
+            'markeredgewidth': 1.2,
+            'linestyle': '',
+            'zorder': 6,
+        }
+        axes.plot(*estimated[0, :2], marker='*', markersize=14, label='start', **style)
+        axes.plot(*estimated[-1, :2], marker='X', markersize=9, label='end', **style)
+
+
+def _draw_scale_bar(axes: 'Axes', width_m: float) -> None:
+    """Draw a bar of a round length above the map, at the right."""
+    length = scale_bar_m(width_m)
+    share = length / width_m
+    style: dict[str, Any] = {'transform': axes.transAxes, 'clip_on': False}
+    above = _LAYOUT.bar_above_in / _map_inches((*axes.get_xlim(), *axes.get_ylim()))[1]
+    axes.plot(
+        [1.0 - share, 1.0],
+        [1.0 + above, 1.0 + above],
+        color='black',
+        linewidth=3.0,
+        solid_capstyle='butt',
+        **style,
+    )
+    axes.text(
+        1.0 - 0.5 * share, 1.0 + 1.8 * above, f'{length:g} m', ha='center', va='bottom', **style
+    )
+
+
+def _draw_legend(
+    figure: 'Figure', axes: 'Axes', surfaces: dict[str, str], map_in: tuple[float, float]
+) -> None:
+    """Draw the legend below the map, and set the size of the figure to hold both."""
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = [
+        Patch(facecolor=colour, edgecolor='#555555', linewidth=0.5, label=name)
+        for name, colour in surfaces.items()
+    ]
+    handles += axes.get_legend_handles_labels()[0]
+    width = map_in[0] + _LAYOUT.margins_in[0]
+    columns = max(2, int(width / _LAYOUT.legend_in[0]))
+    rows = -(-len(handles) // columns)
+    figure.set_size_inches(width, map_in[1] + _LAYOUT.margins_in[1] + rows * _LAYOUT.legend_in[1])
+    figure.legend(
+        handles=handles,
+        loc='outside lower center',
+        ncols=columns,
+        fontsize=_LAYOUT.font_pt,
+        frameon=False,
+        handlelength=1.6,
+    )
