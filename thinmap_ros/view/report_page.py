@@ -44,6 +44,7 @@ _FIGURES = (
     _Figure(('time',), 'Simulated time', 's'),
     _Figure(('collisions',), 'Collisions'),
     _Figure(('pose_rmse',), 'Position error (RMS)', 'cm', 100.0, 1),
+    _Figure(('pose_rmse_aligned',), 'Position error after alignment (RMS)', 'cm', 100.0, 1),
     _Figure(('heading_rmse_deg',), 'Heading error (RMS)', 'deg', 1.0, 2),
     _Figure(('end_nodes_seen',), 'End nodes found'),
     _Figure(('end_nodes_visited',), 'End nodes visited'),
