@@ -71,7 +71,8 @@ class Candidate:
     or the middle of the frontier; cells (N, 2): of its frontier, none where all around an end node
     is known; middle (x, y), m: of these cells; goal (3,): viewpoint, None where none can be
     reached; hidden_m2: unknown area in line of sight; probability: that nothing worth seeing is
-    behind; mean_area_m2: if there is; examined_ns: when viewpoint and hidden area were determined.
+    behind; mean_area_m2: if there is; examined_ns: when viewpoint and hidden area were determined;
+    end_node: as it is published; judged_by: number of views and visits that the belief includes.
     """
 
     node_id: int
@@ -85,6 +86,8 @@ class Candidate:
     probability: float = 0.5
     mean_area_m2: float = 0.0
     examined_ns: int = -1
+    end_node: EndNode | None = None
+    judged_by: tuple[int, int] = (-1, -1)
 
     @property
     def is_end_node(self) -> bool:
@@ -98,14 +101,42 @@ class Candidate:
 
     def as_end_node(self, target_goal: Array | None) -> EndNode:
         """End node of a decision; target_goal (3,): where the robot drives if it is the target."""
-        end_node = end_node_of(self.node_id, self.evidence, self.probability)
-        goal = self.goal if target_goal is None else target_goal
-        return end_node._replace(
-            frontier_length_m=self.length_m,
-            expected_area_m2=self.expected_area_m2,
-            is_target=target_goal is not None,
-            goal=end_node.goal if goal is None else goal,
-        )
+        if self.end_node is None:
+            end_node = end_node_of(self.node_id, self.evidence, self.probability)
+            self.end_node = end_node._replace(
+                frontier_length_m=self.length_m,
+                expected_area_m2=self.expected_area_m2,
+                goal=end_node.goal if self.goal is None else self.goal,
+            )
+        if target_goal is None:
+            return self.end_node
+        return self.end_node._replace(is_target=True, goal=target_goal)
+
+    def adopt_belief(self, known: 'Candidate') -> bool:
+        """Adopt the belief of the last time, if it has the same evidence about the same place.
+
+        Call it where frontier and hidden area are the same.
+        """
+        if known.judged_by != self._evidence_count or known.node_id != self.node_id:
+            return False
+        if known.place != self.place:
+            return False
+        self.probability = known.probability
+        self.mean_area_m2 = known.mean_area_m2
+        self.end_node = known.end_node
+        self.judged_by = known.judged_by
+        return True
+
+    def judge(self, model: BeliefModel) -> None:
+        """Update the belief by the evidence."""
+        self.probability = model.probability(self.evidence, self.length_m, self.hidden_m2)
+        self.mean_area_m2 = model.mean_area(self.length_m, self.hidden_m2)
+        self.end_node = None
+        self.judged_by = self._evidence_count
+
+    @property
+    def _evidence_count(self) -> tuple[int, int]:
+        return len(self.evidence.views), self.evidence.visits
 
 
 def end_node_of(node_id: int, evidence: Evidence, probability: float) -> EndNode:
@@ -151,20 +182,17 @@ class CandidateFinder:
         self.candidates = self._found(topology, frontiers)
         for candidate in self.candidates:
             candidate.length_m = len(candidate.cells) * frontiers.frame.resolution
-            if len(candidate.cells):
-                known = before.get(id(candidate.evidence))
-                if known is None or not _may_keep(candidate, known, stamp_ns):
-                    self._examine(candidate, frontiers, reachable, range_max_m)
-                    candidate.examined_ns = stamp_ns
-            self.judge(candidate)
+            known = before.get(id(candidate.evidence))
+            is_same = known is not None and _may_keep(candidate, known, stamp_ns)
+            if len(candidate.cells) and not is_same:
+                self._examine(candidate, frontiers, reachable, range_max_m)
+                candidate.examined_ns = stamp_ns
+            if known is None or not (is_same and candidate.adopt_belief(known)):
+                self.judge(candidate)
 
     def judge(self, candidate: Candidate) -> None:
         """Update the belief about a candidate."""
-        length_m = candidate.length_m
-        hidden_m2 = candidate.hidden_m2
-        model = self._model
-        candidate.probability = model.probability(candidate.evidence, length_m, hidden_m2)
-        candidate.mean_area_m2 = model.mean_area(length_m, hidden_m2)
+        candidate.judge(self._model)
 
     def _found(self, topology: TopologicalMap, frontiers: FrontierMap) -> list[Candidate]:
         nodes = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
@@ -236,6 +264,8 @@ class CandidateFinder:
 
 def _may_keep(candidate: Candidate, known: Candidate, stamp_ns: int) -> bool:
     """Adopt viewpoint and hidden area of the last time, if the frontier is still the same."""
+    if not len(candidate.cells):
+        return not len(known.cells)
     same = len(known.cells) == len(candidate.cells) and known.middle == candidate.middle
     recent = 0 <= stamp_ns - known.examined_ns < _RENEW_S * SECOND_NS
     if not (same and recent and known.examined_ns >= 0):

@@ -110,9 +110,12 @@ class FrontierMap:
 
     def middle_of(self, cells: Cells) -> Place:
         """Centre, m, of the cell of a cluster (N, 2) nearest to its centroid."""
-        cell = cells[np.square(cells - cells.mean(axis=0)).sum(axis=1).argmin()]
-        x, y = self.frame.centres_of(cell[None])[0]
-        return float(x), float(y)
+        row, col = _middle(cells)
+        frame = self.frame
+        return (
+            frame.origin_x + (col + 0.5) * frame.resolution,
+            frame.origin_y + (row + 0.5) * frame.resolution,
+        )
 
     def hidden_area_m2(self, place: Place, reach_m: float) -> float:
         """Unknown area in line of sight of a place, m: through the unknown, up to an obstacle."""
@@ -248,6 +251,21 @@ def _update(
             mask[r, c] = is_frontier
             passable[r, c] = cells[row, col] < OCCUPIED_AT_LEAST
     return more
+
+
+@kernel
+def _middle(cells: Cells) -> tuple[int, int]:
+    """Cell of a cluster (N, 2) nearest to its centroid."""
+    row = cells[:, 0].sum() / cells.shape[0]
+    col = cells[:, 1].sum() / cells.shape[0]
+    best = 0
+    nearest = math.inf
+    for i in range(cells.shape[0]):
+        away = (cells[i, 0] - row) ** 2 + (cells[i, 1] - col) ** 2
+        if away < nearest:
+            nearest = away
+            best = i
+    return cells[best, 0], cells[best, 1]
 
 
 @kernel
