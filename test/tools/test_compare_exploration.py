@@ -47,6 +47,13 @@ def test_savings_are_paired_by_world_and_start() -> None:
     assert relative_saving(ours, others, 'distance').tolist() == pytest.approx([-0.5, -0.1])
 
 
+def test_a_run_that_stopped_early_is_no_pair() -> None:
+    ours = {('a', 0): report('x', 'a', 0, 50.0), ('a', 1): report('x', 'a', 1, 90.0)}
+    others = {('a', 0): report('y', 'a', 0, 100.0), ('a', 1): report('y', 'a', 1, 1.0)}
+    others['a', 1]['coverage'] = 0.3
+    assert relative_saving(ours, others, 'distance').tolist() == pytest.approx([-0.5])
+
+
 def test_the_table_has_a_row_for_each_strategy_and_says_what_ours_saves() -> None:
     reports = [report('position_probability', 'a', i, 80.0) for i in range(3)]
     reports += [report('nearest_frontier', 'a', i, 100.0) for i in range(3)]

@@ -10,6 +10,7 @@ from thinmap_ros.core.se2 import Array
 Report = dict[str, Any]
 OURS = 'position_probability'
 _NORMAL_95 = 1.96
+_COMPLETE = 0.95  # coverage below which a path is short because much is missing
 
 
 def markdown(reports: list[Report]) -> str:
@@ -28,8 +29,9 @@ def markdown(reports: list[Report]) -> str:
     if OURS in by_strategy and others:
         lines += [
             '',
-            f'Difference of {OURS} to each other strategy, paired by world and start '
-            '(mean and 95 % confidence interval; negative: it is shorter):',
+            f'Difference of {OURS} to each other strategy, paired by world and start, where both '
+            f'covered at least {_COMPLETE:.0%} (mean and 95 % confidence interval; negative: it is '
+            'shorter):',
             '',
             '| against | pairs | distance | time | turns | shorter distance in |',
             '|---|---|---|---|---|---|',
@@ -41,8 +43,12 @@ def markdown(reports: list[Report]) -> str:
 def relative_saving(
     ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report], key: str
 ) -> Array:
-    """Ours / other - 1 of a quantity, for each world and start of both, (N,)."""
-    common = sorted(ours.keys() & others.keys())
+    """Ours / other - 1 of a quantity, (N,), for each world and start that both have covered."""
+    common = sorted(
+        pair
+        for pair in ours.keys() & others.keys()
+        if min(ours[pair]['coverage'], others[pair]['coverage']) >= _COMPLETE
+    )
     return np.array([ours[pair][key] / others[pair][key] - 1.0 for pair in common])
 
 
