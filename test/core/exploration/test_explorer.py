@@ -197,6 +197,14 @@ def test_a_target_that_cannot_be_reached_is_put_aside_tried_again_and_named_at_t
     assert not np.hypot(*(np.array(run.poses)[:, :2] - START[:2]).T).any()
 
 
+def test_a_navigator_that_refuses_all_goals_at_first_does_not_end_the_exploration():
+    run = Run(two_rooms())
+    run.fails = lambda decision: run.scan.stamp_ns < 30e9
+    run.go()
+    assert run.last.code == FinishCode.ALL_RESOLVED
+    assert run.coverage() > 0.99
+
+
 def test_an_exploration_goes_on_from_its_state_as_if_it_had_not_been_interrupted():
     run = Run(two_rooms()).go(8.0)
     state = {key: array.copy() for key, array in run.explorer.state().items()}

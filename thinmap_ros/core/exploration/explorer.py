@@ -43,7 +43,7 @@ _MAX_ATTEMPTS = 3  # visits, or drives, until a candidate is given up
 _SCANS = 3  # at the goal, or with nothing left
 _GONE_S = 0.35
 _START_S = 5.0  # the first scans are no graph yet
-_FINAL_PAUSE_S = 5.0
+_FINAL_PAUSE_S = 20.0  # a navigator that starts, or is blocked by people, refuses goals meanwhile
 _MAX_TOUR = 20  # the cost of a tour grows with the fourth power of its places
 _IMPROBABLE_WAIT = 3.0  # waiting costs so much more where most probably nothing is hidden
 
