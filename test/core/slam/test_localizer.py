@@ -309,6 +309,23 @@ def test_without_any_wall_the_odometry_is_followed():
     assert np.linalg.eigvalsh(estimate.covariance)[-1] > 1e-3
 
 
+@pytest.mark.parametrize('seed', range(4))
+def test_after_dead_reckoning_a_few_points_that_fit_badly_do_not_move_the_pose(seed):
+    rng = np.random.default_rng(seed)
+    rows, localizer = driven(60)
+    odom = rows[-1][2]
+    for k in range(150):
+        odom = se2.compose(odom, se2.pose(0.05, 0.0, 0.03))
+        predicted = localizer.step(replace(BLIND, stamp_ns=(60 + k) * PERIOD_NS), odom)
+    assert localizer.config.matching.is_wide(localizer._uncertainty.since_match)
+    scan = scan_in(ELSEWHERE, se2.pose(1.0, 1.5, 0.5), rng, 210 * PERIOD_NS)
+    ranges = np.full(scan.ranges_m.size, np.inf)
+    ranges[60:100] = scan.ranges_m[60:100]
+    estimate = localizer.step(replace(scan, ranges_m=ranges), odom)
+    assert 0.0 < estimate.inlier_ratio < localizer.config.matching.min_inlier_ratio
+    np.testing.assert_allclose(estimate.T_map_base, predicted.T_map_base, atol=1e-3)
+
+
 def test_wheel_slip_is_corrected_by_matching():
     """Occasional odometry discontinuities of 0.3 m or 10 degrees."""
     rng = np.random.default_rng(4)

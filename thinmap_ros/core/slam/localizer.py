@@ -312,7 +312,7 @@ class Localizer:
         """Set the pose to that of an accepted match, or else to the predicted one."""
         prior = prediction.T_map_base
         is_unexpected = match is not None and self._uncertainty.is_unexpected(match, prior)
-        accepted = match is not None and not (is_unexpected and self._is_rejected(match))
+        accepted = match is not None and not self._is_rejected(match, is_unexpected)
         # After set_pose an innovation is due to the given pose, and not to the odometry.
         if match is not None and is_unexpected and not self._tracking.is_delocalized:
             self._prediction.contradict(prediction, match, accepted)
@@ -326,12 +326,20 @@ class Localizer:
             self._prediction.update(prediction, match)
         self._uncertainty.update(match, prior, prediction.covariance, fits, is_stationary)
 
-    def _is_rejected(self, match: Match) -> bool:
-        """Whether an unexpected match is rejected: many of its points contradict the map."""
-        return (
+    def _is_rejected(self, match: Match, is_unexpected: bool) -> bool:
+        """Whether the pose of a match is worse than the predicted one.
+
+        An unexpected match is, if many of its points contradict the map. After dead reckoning a
+        match that fits badly is: a few points fit somewhere within a wide prior.
+        """
+        if self._tracking.is_delocalized:
+            return False
+        if is_unexpected and (
             match.inlier_ratio < INLIERS_PER_CONTRADICTION * match.contradiction_ratio
-            and not self._tracking.is_delocalized
-        )
+        ):
+            return True
+        fits_badly = match.inlier_ratio < self.config.matching.min_inlier_ratio
+        return fits_badly and self.config.matching.is_wide(self._uncertainty.since_match)
 
     def _update_map(self, scan: Scan, points: Array) -> None:
         """Add the scan to the map if the robot has moved far enough since the last update."""

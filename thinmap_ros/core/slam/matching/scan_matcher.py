@@ -76,6 +76,11 @@ class MatchingConfig(Config):
     search_nodes: int = 1000
     basin: tuple[float, float] = (0.3, 0.15)
 
+    def is_wide(self, covariance: Array) -> bool:
+        """Whether a prior with this covariance (3, 3) reaches beyond the basin of convergence."""
+        reach = self.search_sigmas * np.sqrt(np.diag(covariance))
+        return bool(reach[:2].max() > self.basin[0] or reach[2] > self.basin[1])
+
 
 @dataclass(frozen=True, eq=False)
 class Match:
@@ -118,9 +123,7 @@ class Matcher:
         match = self._refined(scan, local_map, prior, prior, information)
         reach = self.config.search_sigmas * np.sqrt(np.diag(covariance))
         fits_badly = match.inlier_ratio < self.config.min_inlier_ratio
-        basin_m, basin_rad = self.config.basin
-        is_wide = max(reach[0], reach[1]) > basin_m or reach[2] > basin_rad
-        if not fits_badly and not is_wide:
+        if not fits_badly and not self.config.is_wide(covariance):
             return match
         if fits_badly:  # wheels may have slipped
             slip = np.array([*[self.config.wheel_slip_m] * 2, self.config.wheel_slip_rad])
