@@ -44,7 +44,10 @@ def test_intel_beside_others():
 
 @pytest.mark.parametrize(
     ('worlds', 'section'),
-    [('8 random worlds of 50 x 50 m', 'Dungeons (8)'), ('2 real floors of a university', 'KTH floors (2)')],
+    [
+        ('8 random worlds of 50 x 50 m', 'Dungeons (8)'),
+        ('2 real floors of a university', 'KTH floors (2)'),
+    ],
 )
 def test_distances_of_explorations(worlds, section):
     page = (RESULTS / 'exploration.md').read_text().split(f'## {section}')[1].split('\n## ')[0]

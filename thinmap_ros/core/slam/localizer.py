@@ -329,8 +329,8 @@ class Localizer:
     def _is_rejected(self, match: Match, is_unexpected: bool) -> bool:
         """Whether the pose of a match is worse than the predicted one.
 
-        An unexpected match is, if many of its points contradict the map. After dead reckoning a
-        match that fits badly is: a few points fit somewhere within a wide prior.
+        An unexpected match is, if many of its points contradict the map. After scans that could
+        not be matched, one that fits badly is: a few points fit somewhere within a wide prior.
         """
         if self._tracking.is_delocalized:
             return False
@@ -338,8 +338,8 @@ class Localizer:
             match.inlier_ratio < INLIERS_PER_CONTRADICTION * match.contradiction_ratio
         ):
             return True
-        fits_badly = match.inlier_ratio < self.config.matching.min_inlier_ratio
-        return fits_badly and self.config.matching.is_wide(self._uncertainty.since_match)
+        is_wide = self.config.matching.is_wide(self._uncertainty.since_match)
+        return self._tracking.is_unconfirmed and is_wide
 
     def _update_map(self, scan: Scan, points: Array) -> None:
         """Add the scan to the map if the robot has moved far enough since the last update."""

@@ -55,6 +55,7 @@ class Tracking:
         self._loaded_evidence = loaded_evidence
         self.evidence = 0.0
         self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
+        self.is_unconfirmed = False  # after a scan without a match, until one fits
         self.dead_reckoned = DeadReckoning(T_map_base, np.zeros((3, 3)))
         self.adjust(lost_threshold, least_fit)
         self._provisional_path_m = 0.0  # remaining path for which a new local map is provisional
@@ -82,7 +83,10 @@ class Tracking:
     def update(self, match: Match | None) -> None:
         """Update the evidence by a match; None (no match was possible) leaves it unchanged."""
         if match is None:
+            self.is_unconfirmed = True
             return
+        if match.inlier_ratio >= self._least_fit:
+            self.is_unconfirmed = False
         more = match.contradiction_ratio - match.inlier_ratio / INLIERS_PER_CONTRADICTION
         self.evidence = max(self.evidence + more, 0.0)
         if self.is_delocalized:
@@ -101,6 +105,7 @@ class Tracking:
         fits. Outside of the map no scan contradicts it.
         """
         self.is_delocalized = True
+        self.is_unconfirmed = False
         self._provisional_path_m = 0.0
         self.evidence = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
         self.dead_reckoned = DeadReckoning(T_map_base, covariance)
