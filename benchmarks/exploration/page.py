@@ -170,7 +170,9 @@ def main() -> None:
         if (folder / 'reports.json').exists()
         for report in json.loads((folder / 'reports.json').read_text('utf-8'))
     ]
-    text = page(reports, reliability, provenance(folders[0] if folders else None))
+    # Folders that were made later may be of another commit; the table of fit_belief has none.
+    made = dict.fromkeys(provenance(folder) for folder in folders if (folder / 'runs').exists())
+    text = page(reports, reliability, '\n'.join(made))
     _PAGE.write_text(text, encoding='utf-8')
 
 
