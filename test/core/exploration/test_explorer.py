@@ -205,6 +205,25 @@ def test_a_navigator_that_refuses_all_goals_at_first_does_not_end_the_exploratio
     assert run.coverage() > 0.99
 
 
+def test_a_belief_that_is_kept_is_that_of_its_evidence():
+    run = Run(two_rooms())
+    finder = run.explorer._finder
+
+    def check(decision):
+        for candidate, published in zip(finder.candidates, decision.end_nodes, strict=True):
+            evidence = candidate.evidence
+            expected = finder._model.probability(evidence, candidate.length_m, candidate.hidden_m2)
+            assert candidate.probability == published.probability == expected
+            assert published.node_id == candidate.node_id
+            assert published.min_distance_m == evidence.min_distance_m
+            assert published.angle_span_deg == evidence.angle_span_deg
+        return False
+
+    run.fails = check
+    run.go()
+    assert run.last.finished
+
+
 def test_an_exploration_goes_on_from_its_state_as_if_it_had_not_been_interrupted():
     run = Run(two_rooms()).go(8.0)
     state = {key: array.copy() for key, array in run.explorer.state().items()}
