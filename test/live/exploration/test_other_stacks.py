@@ -39,6 +39,7 @@ class Exploration:
         self.collisions = graph.heard('collisions', UInt32, qos.LATCHED)
         self.status = graph.heard('exploration_status', ExplorationStatus, qos.LATCHED)
         self.client = ActionClient(graph.node, Explore, 'explore')
+        self.others = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
         self.mode = graph.node.create_publisher(String, 'nav2_mode', qos.LATCHED)
 
     def start_nav2(self, **values):
@@ -84,11 +85,14 @@ class Exploration:
     def until_logged(self, text):
         self.graph.until(lambda: text in self.graph.log('explorer'), text)
 
-    def drive_to_somewhere_else(self):
-        """Send somebody else's goal to Nav2: it pauses the exploration until it is reached."""
+    def drive_home(self):
+        """Send a goal to the start to Nav2 as somebody else; returns its handle."""
         goal = NavigateToPose.Goal()
         goal.pose = messages.pose_stamped_msg(pose_of(self.start), 'map', 0)
-        client = ActionClient(self.graph.node, NavigateToPose, 'navigate_to_pose')
+        return self.graph.send_goal(self.others, goal)
+
+    def drive_to_somewhere_else(self):
+        """Send somebody else's goal to Nav2: it pauses the exploration until it is reached."""
         self.graph.until(lambda: self.targets and self.is_in_progress(), 'a target')
         began_m = self.status[-1].distance_m if self.status else 0.0
         self.graph.until(
@@ -96,7 +100,7 @@ class Exploration:
             'a place that is not the goal',
         )
         before = len(self.words)
-        handle = self.graph.send_goal(client, goal)
+        handle = self.drive_home()
         self.graph.until(lambda: 'exploration_paused' in self.word_list()[before:], 'it pauses')
         ended = self.graph.result(handle, 'the goal of somebody else')
         assert ended.status == GoalStatus.STATUS_SUCCEEDED
@@ -164,10 +168,14 @@ def test_a_foreign_slam_and_nav2_are_enough(graph, office):
 def test_nav2_drives_through_an_office_that_our_nodes_map(graph, office):
     office.tell('refuse')
     office.start_our_slam()
-    office.start_nav2(paced_by='local_topology')
+    # The simulation waits for the test as well: it must act before everything is explored.
+    graph.paced()
+    office.start_nav2(paced_by='heard_too')
     office.start_explorer()
     handle = graph.send_goal(office.client, Explore.Goal())
     office.until_logged('goal rejected')
+    # From now on the server answers this client.
+    assert not office.drive_home().accepted
     office.tell('abort')
     office.until_logged('target not reached: failed to create a plan')
     office.tell('drive')
