@@ -40,6 +40,7 @@ class EndNodeCensus:
 
     def __init__(self) -> None:
         self._places: list[_Place] = []
+        self._by_id: dict[int, _Place] = {}
 
     @property
     def seen(self) -> int:
@@ -59,15 +60,21 @@ class EndNodeCensus:
         A visit is a distance below 0.5 m (equation (2)).
         """
         nodes = {node_id: (x, y) for node_id, x, y in end_nodes if node_id < FIRST_FRONTIER_ID}
-        alive = {place.node_id: place for place in self._places if place.node_id in nodes}
-        idle = [place for place in self._places if place.node_id not in nodes]
+        idle: list[_Place] | None = None
+        at_x, at_y = float(T_map_base[0]), float(T_map_base[1])
         for node_id, (x, y) in nodes.items():
-            place = alive.get(node_id) or self._matching_place(idle, x, y)
-            place.node_id = node_id
+            place = self._by_id.get(node_id)
+            if place is None:
+                if idle is None:
+                    idle = [other for other in self._places if other.node_id not in nodes]
+                place = self._matching_place(idle, x, y)
+                self._by_id.pop(place.node_id, None)
+                self._by_id[node_id] = place
+                place.node_id = node_id
             place.x = x
             place.y = y
             place.observations += 1
-            place.visited |= math.dist((x, y), T_map_base[:2]) < NEAR_M
+            place.visited |= math.hypot(x - at_x, y - at_y) < NEAR_M
 
     def _matching_place(self, idle: list[_Place], x: float, y: float) -> _Place:
         near = min(idle, key=lambda place: math.dist((x, y), (place.x, place.y)), default=None)

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter, robot_radius
@@ -24,6 +25,7 @@ from thinmap_ros.core.exploration.reachable import Reachable
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode
 from thinmap_ros.core.exploration.viewpoints import place_beside, place_for
 from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
@@ -199,28 +201,31 @@ class CandidateFinder:
         places = np.array([(node.x, node.y) for node in nodes]).reshape(-1, 2)
         owned: list[list[Cells]] = [[] for _ in nodes]
         own: list[Cells] = []
-        for cells in frontiers.clusters(self._config.min_frontier_size):
-            owner = self._owner(frontiers, frontiers.middle_of(cells), places)
-            (own if owner is None else owned[owner]).append(cells)
-        clusters = [np.vstack(parts) if parts else _NO_CELLS for parts in owned] + own
+        clusters = frontiers.clusters(self._config.min_frontier_size)
+        for cells, owner in zip(clusters, self._owners(frontiers, clusters, places), strict=True):
+            (own if owner < 0 else owned[owner]).append(cells)
+        found = [np.vstack(parts) if parts else _NO_CELLS for parts in owned] + own
         at = [(node.x, node.y) for node in nodes] + [frontiers.middle_of(cells) for cells in own]
         evidence = self.store.follow(at, self._config.node_reset_distance_m)
         ids = [node.id for node in nodes] + [item.id for item in evidence[len(nodes) :]]
         return [
             Candidate(i, place, cells, frontiers.middle_of(cells) if len(cells) else place, item)
-            for i, place, cells, item in zip(ids, at, clusters, evidence, strict=True)
+            for i, place, cells, item in zip(ids, at, found, evidence, strict=True)
         ]
 
-    def _owner(self, frontiers: FrontierMap, middle: Place, nodes: Array) -> int | None:
-        """Index of the nearest end node (N, 2), m, that sees the middle of a frontier."""
-        away = np.hypot(*(nodes - middle).T)
-        cells = frontiers.frame.cells_of(np.vstack([np.array([middle]), nodes]))
-        for i in np.argsort(away, kind='stable'):
-            if away[i] > self._config.frontier_assignment_radius_m:
-                return None
-            if line_is_clear(frontiers.free, *cells[i + 1], *cells[0]):
-                return int(i)
-        return None
+    def _owners(self, frontiers: FrontierMap, clusters: list[Cells], nodes: Array) -> list[int]:
+        """Index of the nearest end node (N, 2), m, that sees each frontier's middle; -1: none."""
+        middles = np.array([frontiers.middle_of(cells) for cells in clusters]).reshape(-1, 2)
+        frame = frontiers.frame
+        owners = _nearest_in_sight(
+            frontiers.free,
+            middles,
+            nodes,
+            frame.cells_of(middles),
+            frame.cells_of(nodes),
+            self._config.frontier_assignment_radius_m,
+        )
+        return [int(owner) for owner in owners]
 
     def _examine(
         self, candidate: Candidate, frontiers: FrontierMap, reachable: Reachable, range_max_m: float
@@ -260,6 +265,33 @@ class CandidateFinder:
         row, col = frontiers.frame.cells_of(np.array([candidate.middle]))[0]
         towards = (int(row), int(col))
         return place_beside(frontiers.free, candidate.cells, reachable.cells, steps, towards)
+
+
+@kernel
+def _nearest_in_sight(
+    free: NDArray[np.bool_],
+    points: Array,
+    nodes: Array,
+    point_cells: Cells,
+    node_cells: Cells,
+    radius_m: float,
+) -> NDArray[np.int64]:
+    """Index of the nearest node (N, 2), m, within a radius of each point (M, 2), m; -1: none.
+
+    All cells between are free. point_cells (M, 2), node_cells (N, 2): the cells of both.
+    """
+    nearest = np.full(points.shape[0], -1, dtype=np.int64)
+    for i in range(points.shape[0]):
+        best_m = np.inf
+        for k in range(nodes.shape[0]):
+            away_m = math.hypot(nodes[k, 0] - points[i, 0], nodes[k, 1] - points[i, 1])
+            if away_m > radius_m or away_m >= best_m:
+                continue
+            row, col = node_cells[k]
+            if line_is_clear(free, row, col, point_cells[i, 0], point_cells[i, 1]):
+                best_m = away_m
+                nearest[i] = k
+    return nearest
 
 
 def _may_keep(candidate: Candidate, known: Candidate, stamp_ns: int) -> bool:

@@ -43,6 +43,7 @@ class FrontierMap:
     def __init__(self) -> None:
         self._updates = 0
         self._changed: Part | None = None
+        self._zeros = np.zeros(0, dtype=np.int32)
         self._clear(GridFrame(0.0, 0.0, 1.0))
 
     @property
@@ -95,10 +96,14 @@ class FrontierMap:
         Cells of a cluster are joined over edges and corners.
         """
         cells = true_cells(self.mask)
-        numbers, sizes = _clusters(self.mask.shape, cells)
-        order = np.argsort(numbers, kind='stable')
-        clusters = np.split(cells[order], np.cumsum(sizes)[:-1])
-        return [cluster for cluster in clusters if self.is_long(len(cluster), min_length_m)]
+        numbers, sizes = _clusters(self.mask.shape, cells, self._indices())
+        cells = cells[np.argsort(numbers, kind='stable')]
+        ends = np.cumsum(sizes).tolist()
+        return [
+            cells[end - size : end]
+            for end, size in zip(ends, sizes.tolist(), strict=True)
+            if self.is_long(size, min_length_m)
+        ]
 
     def is_long(self, cell_count: int, min_length_m: float) -> bool:
         """Whether a number of cells is at least so long; a cell counts as its edge."""
@@ -123,6 +128,13 @@ class FrontierMap:
         resolution = self.frame.resolution
         cells = _hidden_cells(self.free, self.passable, row, col, reach_m / resolution)
         return float(cells) * resolution**2
+
+    def _indices(self) -> NDArray[np.int32]:
+        """Zeros for each cell and a margin of one cell, kept: a map has few frontier cells."""
+        size = (self.mask.shape[0] + 2) * (self.mask.shape[1] + 2)
+        if self._zeros.size != size:
+            self._zeros = np.zeros(size, dtype=np.int32)
+        return self._zeros
 
     def _mark_changed(self, part: Part) -> None:
         if self._changed == NOTHING:
@@ -269,11 +281,15 @@ def _middle(cells: Cells) -> tuple[int, int]:
 
 
 @kernel
-def _clusters(shape: tuple[int, int], cells: Cells) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number of the cluster of each cell (N, 2) of an array, (N,), and the size of each cluster."""
+def _clusters(
+    shape: tuple[int, int], cells: Cells, at: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of the cluster of each cell (N, 2) of an array, (N,), and the size of each cluster.
+
+    at: zeros for the array with a margin of one cell; they are zeros again afterwards.
+    """
     cols = shape[1] + 2
     # Index + 1 of the cell that lies there; the empty margin makes bounds checks unnecessary.
-    at = np.zeros((shape[0] + 2) * cols, dtype=np.int32)
     places = (cells[:, 0] + 1) * cols + cells[:, 1] + 1
     for i in range(places.size):
         at[places[i]] = i + 1
@@ -298,6 +314,8 @@ def _clusters(shape: tuple[int, int], cells: Cells) -> tuple[NDArray[np.int64], 
                     stack[count] = i
                     count += 1
         clusters += 1
+    for place in places:
+        at[place] = 0
     return numbers, sizes[:clusters].copy()
 
 

@@ -11,7 +11,7 @@ piece elsewhere).
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
 
 Places = NDArray[np.int64]
@@ -39,48 +39,67 @@ def tours_by_first(
     )
 
 
-@kernel
-def _cost(order: Places, from_start: Array, between: Array, weights: Array, most: float) -> float:
+@inlined
+def _cost(
+    order: Places, from_start: Array, between: Array, weights: Array, horizon: float, most: float
+) -> float:
+    """Cost of a tour; inf as soon as it is at least `most`."""
     along = from_start[order[0]]
-    waits = weights[order[0]] * min(along, most)
+    waits = weights[order[0]] * min(along, horizon)
     for k in range(1, order.size):
         along += between[order[k - 1], order[k]]
-        waits += weights[order[k]] * min(along, most)
+        waits += weights[order[k]] * min(along, horizon)
+        if along + waits >= most:
+            return np.inf
     return float(along + waits)
 
 
+@inlined
+def _turn_piece(order: Places, i: int, j: int, tried: Places) -> None:
+    """Write the order with the piece from i to j, i < j, the other way round."""
+    tried[:] = order
+    for k in range(i, j + 1):
+        tried[k] = order[i + j - k]
+
+
+@inlined
+def _move(order: Places, i: int, j: int, tried: Places) -> None:
+    """Write the order with the place i moved to j."""
+    tried[:] = order
+    step = 1 if i < j else -1
+    for k in range(i, j, step):
+        tried[k] = order[k + step]
+    tried[j] = order[i]
+
+
 @kernel
-def _best_tour(from_start: Array, between: Array, first: int, weights: Array, most: float) -> float:
+def _best_tour(
+    from_start: Array, between: Array, first: int, weights: Array, horizon: float
+) -> float:
     """Begin with the nearest next, always.
 
     Then turn pieces and move places as long as that helps.
     """
     count = from_start.size
     order = np.empty(count, dtype=np.int64)
+    tried = np.empty(count, dtype=np.int64)
     _nearest_next(order, first, between)
-    best = _cost(order, from_start, between, weights, most)
+    best = _cost(order, from_start, between, weights, horizon, np.inf)
     for _ in range(_ROUNDS):
         before = best
         for i in range(1, count):
             for j in range(1, count):
-                tried = order.copy()
-                if i < j:
-                    tried[i : j + 1] = order[i : j + 1][::-1]
-                elif i > j:
-                    tried[j] = order[i]
-                    tried[j + 1 : i + 1] = order[j:i]
-                cost = _cost(tried, from_start, between, weights, most)
-                if cost < best - 1e-9:
-                    best = cost
-                    order = tried
-                if i < j:
-                    tried = order.copy()
-                    tried[j] = order[i]
-                    tried[i:j] = order[i + 1 : j + 1]
-                    cost = _cost(tried, from_start, between, weights, most)
+                for moves in (False, True):
+                    if i == j or (i > j and not moves):
+                        continue
+                    if moves:
+                        _move(order, i, j, tried)
+                    else:
+                        _turn_piece(order, i, j, tried)
+                    cost = _cost(tried, from_start, between, weights, horizon, best - 1e-9)
                     if cost < best - 1e-9:
                         best = cost
-                        order = tried
+                        order[:] = tried
         if best >= before:
             break
     return best

@@ -26,6 +26,7 @@ from thinmap_ros.core.exploration.position_probability import (
     distance_index,
     reliability,
 )
+from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
 
@@ -154,20 +155,20 @@ class EvidenceStore:
     def follow(self, places: Sequence[Place], reset_distance_m: float) -> list[Evidence]:
         """Evidence of each place now; each continues the nearest one within reset_distance_m."""
         earlier = self.items
-        at = np.array([item.place for item in earlier]).reshape(-1, 2)
-        continued = set()
+        indices = _continued(
+            np.array([item.place for item in earlier]).reshape(-1, 2),
+            np.array(places, dtype=np.float64).reshape(-1, 2),
+            reset_distance_m,
+        ).tolist()
         found = []
-        for place in places:
-            away = np.hypot(*(at - place).T)
-            nearest = int(away.argmin()) if len(earlier) else -1
-            if nearest < 0 or away[nearest] > reset_distance_m:
+        for place, index in zip(places, indices, strict=True):
+            if index < 0:
                 found.append(Evidence(self._next_id, place, place))
                 self._next_id += 1
-                continue
-            at[nearest] = math.inf
-            continued.add(nearest)
-            earlier[nearest].move_to(place, reset_distance_m)
-            found.append(earlier[nearest])
+            else:
+                earlier[index].move_to(place, reset_distance_m)
+                found.append(earlier[index])
+        continued = set(indices)
         left = (item for i, item in enumerate(earlier) if i not in continued)
         self.items = found + [item for item in left if item.is_lasting]
         return found
@@ -212,6 +213,26 @@ class EvidenceStore:
             items.append(item)
         self.items = items
         self._next_id = max([self._next_id, *(item.id + 1 for item in items)])
+
+
+@kernel
+def _continued(earlier: Array, places: Array, radius_m: float) -> NDArray[np.int64]:
+    """Index of the earlier place (N, 2), m, that each place (M, 2), m, continues; -1: none.
+
+    It is the nearest one within a radius; each is continued once, by the first place.
+    """
+    taken = np.zeros(earlier.shape[0], dtype=np.bool_)
+    indices = np.full(places.shape[0], -1, dtype=np.int64)
+    for i in range(places.shape[0]):
+        best_m = np.inf
+        for k in range(earlier.shape[0]):
+            away_m = math.hypot(earlier[k, 0] - places[i, 0], earlier[k, 1] - places[i, 1])
+            if not taken[k] and away_m <= radius_m and away_m < best_m:
+                best_m = away_m
+                indices[i] = k
+        if indices[i] >= 0:
+            taken[indices[i]] = True
+    return indices
 
 
 def _place(xy: NDArray[np.float64]) -> Place:
