@@ -40,7 +40,7 @@ class Room:
         self.space.update(self.frontiers, at)
         topology = TopologicalMap(self.nodes)
         stamp_ns = int(seconds * SECOND_NS)
-        self.finder.update(topology, self.frontiers, self.space.now, 8.0, stamp_ns)
+        self.finder.update(topology, self.frontiers, self.space.now, at, 8.0, stamp_ns)
         return self.finder.candidates
 
 
@@ -110,6 +110,29 @@ def test_a_frontier_belongs_to_the_nearest_end_node_that_sees_it():
     room.set_cells(cells)
     own = [candidate for candidate in room.find(seconds=1.0) if not candidate.is_end_node]
     assert sum(len(candidate.cells) for candidate in own) == 38
+
+
+def test_free_specks_behind_a_wall_are_no_candidates():
+    cells = corridor()
+    cells[1:39, 60] = 100
+    cells[1:39, 61:] = -1
+    assert Room(cells).find() == []
+    # Beams that noise moved across the wall have left a line of free cells behind it.
+    cells[5:25, 61] = 0
+    room = Room(cells)
+    for seconds in (0.0, 1.0):
+        assert room.find(seconds=seconds) == []
+    # A hole in the wall: it may be worth a look.
+    cells[10, 60] = 0
+    room.set_cells(cells)
+    (candidate,) = room.find(seconds=10.0)
+    assert len(candidate.cells) == 20
+    # So may a place that is cut off, but large enough for the robot.
+    cells[10, 60] = 100
+    cells[5:25, 61:71] = 0
+    room.set_cells(cells)
+    (candidate,) = room.find(seconds=20.0)
+    assert candidate.goal is None
 
 
 def test_most_of_what_is_hidden_is_in_line_of_sight_of_the_viewpoint():

@@ -318,3 +318,7 @@ def test_after_a_visit_or_a_failure_the_next_viewpoint_counts():
     explorer.target_failed('no path')
     assert evidence.failures == 1
     assert explorer._target.goal is None
+    explorer._drive_to(candidate, START)
+    for _ in range(3):
+        explorer._add_visit(candidate.goal)
+    assert (evidence.visits, evidence.failures) == (2, 0)

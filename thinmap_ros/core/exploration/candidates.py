@@ -2,7 +2,9 @@
 
 A frontier belongs to the nearest end node within `frontier_assignment_radius_m` that has its middle
 in line of sight. Unknown space that no end node sees, such as a niche that the skeleton does not
-reach into, is a candidate of its own. An end node without a frontier is one that is settled.
+reach into, is a candidate of its own. An end node without a frontier is one that is settled. Specks
+of free cells behind a wall, from beams that noise moved across it, have frontiers, too: they are no
+candidates.
 """
 
 import math
@@ -23,7 +25,7 @@ from thinmap_ros.core.exploration.belief.model import HIDDEN_REACH_M, BeliefMode
 from thinmap_ros.core.exploration.frontiers import Cells, FrontierMap
 from thinmap_ros.core.exploration.reachable import Reachable
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode
-from thinmap_ros.core.exploration.viewpoints import place_beside, place_for
+from thinmap_ros.core.exploration.viewpoints import is_enclosed, place_beside, place_for
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
@@ -33,6 +35,7 @@ from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 _RIM_M = 0.5  # at the end of its range the laser sees little
 _NEAR_M = 1.5
 _RENEW_S = 5.0
+_RENEW_S_M = 0.5  # of a candidate far away: so much per metre, as its surroundings do not change
 _NO_CELLS: Cells = np.zeros((0, 2), dtype=np.int64)
 
 
@@ -74,7 +77,8 @@ class Candidate:
     is known; middle (x, y), m: of these cells; goal (3,): viewpoint, None where none can be
     reached; hidden_m2: unknown area in line of sight; probability: that nothing worth seeing is
     behind; mean_area_m2: if there is; examined_ns: when viewpoint and hidden area were determined;
-    end_node: as it is published; judged_by: number of views and visits that the belief includes.
+    is_enclosed: whether its free cells connect to nowhere that the robot fits; end_node: as it is
+    published; judged_by: number of views and visits that the belief includes.
     """
 
     node_id: int
@@ -88,6 +92,7 @@ class Candidate:
     probability: float = 0.5
     mean_area_m2: float = 0.0
     examined_ns: int = -1
+    is_enclosed: bool = False
     end_node: EndNode | None = None
     judged_by: tuple[int, int] = (-1, -1)
 
@@ -167,36 +172,39 @@ class CandidateFinder:
         self._model = model
         self.store = EvidenceStore(FIRST_FRONTIER_ID)
         self.candidates: list[Candidate] = []
+        self._found: list[Candidate] = []
 
     def update(
         self,
         topology: TopologicalMap,
         frontiers: FrontierMap,
         reachable: Reachable,
+        T_map_base: Array,
         range_max_m: float,
         stamp_ns: int,
     ) -> None:
         """Find the candidates of a graph and a map, and update the belief about each.
 
-        range_max_m: of the laser.
+        T_map_base (3,): pose of the robot; range_max_m: of the laser.
         """
-        before = {id(c.evidence): c for c in self.candidates}
-        self.candidates = self._found(topology, frontiers)
-        for candidate in self.candidates:
+        before = {id(c.evidence): c for c in self._found}
+        self._found = self._find(topology, frontiers)
+        for candidate in self._found:
             candidate.length_m = len(candidate.cells) * frontiers.frame.resolution
             known = before.get(id(candidate.evidence))
-            is_same = known is not None and _may_keep(candidate, known, stamp_ns)
+            is_same = known is not None and _may_keep(candidate, known, stamp_ns, T_map_base)
             if len(candidate.cells) and not is_same:
                 self._examine(candidate, frontiers, reachable, range_max_m)
                 candidate.examined_ns = stamp_ns
             if known is None or not (is_same and candidate.adopt_belief(known)):
                 self.judge(candidate)
+        self.candidates = [c for c in self._found if not c.is_enclosed]
 
     def judge(self, candidate: Candidate) -> None:
         """Update the belief about a candidate."""
         candidate.judge(self._model)
 
-    def _found(self, topology: TopologicalMap, frontiers: FrontierMap) -> list[Candidate]:
+    def _find(self, topology: TopologicalMap, frontiers: FrontierMap) -> list[Candidate]:
         nodes = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
         places = np.array([(node.x, node.y) for node in nodes]).reshape(-1, 2)
         owned: list[list[Cells]] = [[] for _ in nodes]
@@ -239,7 +247,9 @@ class CandidateFinder:
         candidate.hidden_m2 = frontiers.hidden_area_m2(candidate.middle, HIDDEN_REACH_M)
         cell = self._viewpoint(candidate, frontiers, reachable, range_max_m)
         candidate.goal = None
-        if cell is not None:
+        if cell is None:
+            candidate.is_enclosed = is_enclosed(frontiers.free, reachable.standing, candidate.cells)
+        else:
             x, y = frontiers.frame.centres_of(np.array([cell]))[0]
             candidate.goal = _facing((float(x), float(y)), candidate.middle)
 
@@ -294,17 +304,20 @@ def _nearest_in_sight(
     return nearest
 
 
-def _may_keep(candidate: Candidate, known: Candidate, stamp_ns: int) -> bool:
+def _may_keep(candidate: Candidate, known: Candidate, stamp_ns: int, T_map_base: Array) -> bool:
     """Adopt viewpoint and hidden area of the last time, if the frontier is still the same."""
     if not len(candidate.cells):
         return not len(known.cells)
     same = len(known.cells) == len(candidate.cells) and known.middle == candidate.middle
-    recent = 0 <= stamp_ns - known.examined_ns < _RENEW_S * SECOND_NS
+    away_m = math.dist(candidate.middle, T_map_base[:2])
+    renew_s = max(_RENEW_S, _RENEW_S_M * away_m)
+    recent = 0 <= stamp_ns - known.examined_ns < renew_s * SECOND_NS
     if not (same and recent and known.examined_ns >= 0):
         return False
     candidate.goal = known.goal
     candidate.hidden_m2 = known.hidden_m2
     candidate.examined_ns = known.examined_ns
+    candidate.is_enclosed = known.is_enclosed
     return True
 
 

@@ -175,7 +175,12 @@ class Explorer:
             self._frame = self.frontier_map.frame
             self._space.update(self.frontier_map, T_map_base)
             self._finder.update(
-                topology, self.frontier_map, self._space.now, scan.range_max_m, scan.stamp_ns
+                topology,
+                self.frontier_map,
+                self._space.now,
+                T_map_base,
+                scan.range_max_m,
+                scan.stamp_ns,
             )
             self._missing = missing_area(
                 np.array([candidate.probability for candidate in self.candidates]),
@@ -215,7 +220,7 @@ class Explorer:
     def _add_visit(self, T_map_base: Array) -> None:
         """A target that stays although the robot is there and observes it hides nothing, probably.
 
-        It is observed from somewhere else the next time.
+        It is observed from somewhere else the next time, and is reachable, whatever failed before.
         """
         target = self._target
         if target.candidate is None or target.goal is None:
@@ -224,6 +229,7 @@ class Explorer:
         target.scans_at_goal = target.scans_at_goal + 1 if is_there else 0
         if target.scans_at_goal >= _SCANS:
             target.candidate.evidence.visits += 1
+            target.candidate.evidence.failures = 0
             target.candidate.examined_ns = -1
             self._drop_target()
             target.goal = None

@@ -31,9 +31,13 @@ _UNKNOWN_COST = 2  # of a metre through the unknown: it may turn out to be block
 
 
 class Reachable(NamedTuple):
-    """Reachable cells (H, W), and the path length, in squares, to each of their squares."""
+    """Reachable cells (H, W), and the path length, in squares, to each of their squares.
+
+    standing (H, W): cells where the robot fits, reachable or not.
+    """
 
     cells: Mask
+    standing: Mask
     path_lengths: Array
     frame: GridFrame
 
@@ -48,7 +52,7 @@ class ReachableSpace:
         self._maybe = self._standing  # if nothing stands in the unknown
         self._between = PathLengthTable(_COARSE_M, _FORGET_S, _UNKNOWN_COST)
         nowhere = np.zeros((0, 0))
-        self.now = Reachable(self._standing, nowhere, GridFrame(0.0, 0.0, 1.0))
+        self.now = Reachable(self._standing, self._standing, nowhere, GridFrame(0.0, 0.0, 1.0))
 
     def add_pose(self, T_map_base: Array) -> None:
         """Add a pose (3,): the robot can return over its recent path."""
@@ -64,7 +68,7 @@ class ReachableSpace:
         row, col = (int(v) // SQUARE for v in frame.cells_of(np.array([xy]))[0])
         lengths = distance_field_from(downsample_mask(allowed, SQUARE), (row, col))
         cells = upsample_mask(np.isfinite(lengths), SQUARE, self._standing)
-        self.now = Reachable(cells, lengths, frame)
+        self.now = Reachable(cells, allowed, lengths, frame)
 
     def path_lengths(self, T_map_base: Array, goals: Array) -> Array:
         """Path lengths (N,), m, to goals (N, 2); estimated where there is no path."""

@@ -57,6 +57,36 @@ def place_beside(
     return None if row < 0 else (int(row), int(col))
 
 
+@kernel
+def is_enclosed(free: Mask, standing: Mask, cells: Cells) -> bool:
+    """Whether the free cells around a frontier (N, 2) connect to none where the robot could stand.
+
+    free, standing (H, W).
+    """
+    rows, cols = free.shape
+    seen = np.zeros((rows, cols), dtype=np.bool_)
+    stack = np.empty((rows * cols, 2), dtype=np.int64)
+    count = 0
+    for i in range(cells.shape[0]):
+        if not seen[cells[i, 0], cells[i, 1]]:
+            seen[cells[i, 0], cells[i, 1]] = True
+            stack[count] = cells[i]
+            count += 1
+    while count > 0:
+        count -= 1
+        row, col = stack[count]
+        if standing[row, col]:
+            return False
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            for c in range(max(col - 1, 0), min(col + 2, cols)):
+                if free[r, c] and not seen[r, c]:
+                    seen[r, c] = True
+                    stack[count, 0] = r
+                    stack[count, 1] = c
+                    count += 1
+    return True
+
+
 def _wanted(free: Mask, passable: Mask, cells: Cells, depth: int) -> tuple[Cells, int]:
     """Points (M, 2) behind a frontier (N, 2), and how many of them have to be in sight."""
     points = _hidden_points(free, passable, cells, depth, max(_POINTS, len(cells) // _SPACING))

@@ -5,13 +5,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import SAFE_HIGHER, Config, parameter, part
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.long_path import LONG_PATH_M, Obstacles, route_band
+from thinmap_ros.core.planning.long_path import LONG_PATH_M, Band, Obstacles, route_band
 from thinmap_ros.core.planning.obstacle_points import ObstaclePoints
 from thinmap_ros.core.planning.path_follower import (
     PathFollower,
@@ -20,6 +17,7 @@ from thinmap_ros.core.planning.path_follower import (
     nearest_point,
 )
 from thinmap_ros.core.planning.recent_path import RecentPath
+from thinmap_ros.core.planning.short_path import plan_short_path
 from thinmap_ros.core.planning.traversability import path_collides
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
@@ -297,28 +295,25 @@ class Navigator:
         if self.topology is not None and not self._progress.is_near:
             config = self.config.planner
             band = route_band(self.topology, patch, start, self._target, config, obstacles)
-            path = None if band is None else self._spread(start, band.patch, obstacles, band.cells)
+            path = None if band is None else self._plan_in_band(start, band, obstacles)
             if path is not None:
                 return path
-        return self._spread(start, patch, obstacles)
+        trail = self._recent_path.cells(patch.frame, patch.shape)
+        return plan_short_path(patch, start, self._target, self.config.planner, obstacles, trail)
 
-    def _spread(
-        self,
-        start: tuple[float, float],
-        patch: GridPatch,
-        obstacles: Obstacles | None,
-        band: NDArray[np.bool_] | None = None,
+    def _plan_in_band(
+        self, start: tuple[float, float], band: Band, obstacles: Obstacles | None
     ) -> Array | None:
-        """Path to the target by wavefront; over the cells (H, W) of a band only, if given."""
+        """Path to the target by wavefront, over the cells of a band only."""
         return plan(
-            patch,
+            band.patch,
             start,
             self._target,
             self.config.planner,
             None if obstacles is None else obstacles.points,
             self.config.stop_radius_m,
-            self._recent_path.cells(patch.frame, patch.shape),
-            band,
+            self._recent_path.cells(band.patch.frame, band.patch.shape),
+            band.cells,
         )
 
     def _wait(self, reason: str, dt_s: float) -> Command:

@@ -75,6 +75,18 @@ class WavefrontConfig(Config):
     escape_cost: float = 10.0  # of these cells, and of those of the recent path
 
 
+@dataclass(frozen=True, eq=False)
+class PlannedPath:
+    """A path (K, 2), m, map frame.
+
+    cost_m: F at its start; is_exact: whether it ends at the goal, and not beside it.
+    """
+
+    points: Array
+    cost_m: float
+    is_exact: bool
+
+
 def plan(
     patch: GridPatch,
     start_xy: tuple[float, float],
@@ -85,7 +97,22 @@ def plan(
     trail: NDArray[np.int64] | None = None,
     band: Mask | None = None,
 ) -> Array | None:
-    """Path (K, 2) from start to goal, m, map frame, points half a cell apart; None: no path.
+    """Path (K, 2) from start to goal, m, map frame; None: no path. See `find_path`."""
+    found = find_path(patch, start_xy, goal_xy, config, points, stop_radius_m, trail, band)
+    return None if found is None else found.points
+
+
+def find_path(
+    patch: GridPatch,
+    start_xy: tuple[float, float],
+    goal_xy: tuple[float, float],
+    config: WavefrontConfig,
+    points: Array | None = None,
+    stop_radius_m: float = 0.0,
+    trail: NDArray[np.int64] | None = None,
+    band: Mask | None = None,
+) -> PlannedPath | None:
+    """Path from start to goal, m, map frame, points half a cell apart; None: no path.
 
     The path ends at the goal, or at the nearest allowed cell within goal_search_radius_m. It stays
     stop_radius_m away from obstacle points (N, 2), which the map need not contain. Points are not
@@ -132,7 +159,12 @@ def plan(
     path = trace_gradient_path(field, x, y, *goal) * patch.frame.resolution
     path += (patch.frame.origin_x, patch.frame.origin_y)
     path[0] = start_xy
-    return np.concatenate([path, [goal_xy]]) if goal == wished else path
+    is_exact = goal == wished
+    return PlannedPath(
+        np.concatenate([path, [goal_xy]]) if is_exact else path,
+        float(field[start]) * patch.frame.resolution,
+        is_exact,
+    )
 
 
 def cost_of_cells(patch: GridPatch, config: WavefrontConfig) -> Array:

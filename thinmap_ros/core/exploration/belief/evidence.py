@@ -226,8 +226,12 @@ def _continued(earlier: Array, places: Array, radius_m: float) -> NDArray[np.int
     for i in range(places.shape[0]):
         best_m = np.inf
         for k in range(earlier.shape[0]):
-            away_m = math.hypot(earlier[k, 0] - places[i, 0], earlier[k, 1] - places[i, 1])
-            if not taken[k] and away_m <= radius_m and away_m < best_m:
+            dx = earlier[k, 0] - places[i, 0]
+            # Most are far away, and a comparison is faster than a distance.
+            if taken[k] or abs(dx) > radius_m:
+                continue
+            away_m = math.hypot(dx, earlier[k, 1] - places[i, 1])
+            if away_m <= radius_m and away_m < best_m:
                 best_m = away_m
                 indices[i] = k
         if indices[i] >= 0:
