@@ -81,6 +81,7 @@ def page(reports: list[Report], reliability: str = '', made: str = '') -> str:
         worlds = {report['world'] for report in chosen}
         parts += [
             f'## {_KINDS.get(kind, kind)} ({len(worlds)}): {conditions}\n',
+            f'Worlds: {", ".join(sorted(worlds))}.\n',
             markdown(chosen),
             *_verdicts(chosen),
         ]

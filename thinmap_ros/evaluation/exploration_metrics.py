@@ -61,7 +61,7 @@ class EndNodeCensus:
         """
         nodes = {node_id: (x, y) for node_id, x, y in end_nodes if node_id < FIRST_FRONTIER_ID}
         idle: list[_Place] | None = None
-        at_x, at_y = float(T_map_base[0]), float(T_map_base[1])
+        at = (float(T_map_base[0]), float(T_map_base[1]))
         for node_id, (x, y) in nodes.items():
             place = self._by_id.get(node_id)
             if place is None:
@@ -74,7 +74,7 @@ class EndNodeCensus:
             place.x = x
             place.y = y
             place.observations += 1
-            place.visited |= math.hypot(x - at_x, y - at_y) < NEAR_M
+            place.visited |= math.dist((x, y), at) < NEAR_M
 
     def _matching_place(self, idle: list[_Place], x: float, y: float) -> _Place:
         near = min(idle, key=lambda place: math.dist((x, y), (place.x, place.y)), default=None)

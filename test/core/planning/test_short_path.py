@@ -86,7 +86,8 @@ def test_obstacle_points_and_the_recent_path_count_in_the_window(monkeypatch):
     patch = patch_of(hall())
     sizes = window_sizes(monkeypatch)
     column = np.column_stack([np.full(81, 12.0), np.linspace(16.0, 24.0, 81)])
-    start, goal = (10.0, 20.0), (14.0, 20.0)
+    start = (10.0, 20.0)
+    goal = (14.0, 20.0)
     path = plan_short_path(patch, start, goal, CONFIG, Obstacles(column, 0.24), NO_CELLS)
     assert length_of(path) > 8.5
     assert np.hypot(*(path[:, None] - column[None]).transpose(2, 0, 1)).min() > 0.2
