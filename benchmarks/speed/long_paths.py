@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.worlds import floors
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.long_path import LONG_PATH_M, route_band
-from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells, plan
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells, find_path, plan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -94,12 +94,12 @@ def _try(
     fresh = GridPatch(patch.frame, patch.cells)
     began = time.perf_counter()
     band = route_band(topology, fresh, start, goal, _CONFIG)
-    along = None if band is None else plan(band.patch, start, goal, _CONFIG, band=band.cells)
+    along = None if band is None else find_path(band.patch, start, goal, _CONFIG, band=band.cells)
     if along is None:
         plan(fresh, start, goal, _CONFIG)
     tally.along_s.append(time.perf_counter() - began)
     tally.alone_s.append(alone_s)
-    tally.ratios.append(math.inf if along is None else _length(along) / _length(alone))
+    tally.ratios.append(math.inf if along is None else _length(along.points) / _length(alone))
 
 
 def _times(values_ms: Array) -> str:

@@ -4,9 +4,9 @@ from support.ride import Ride
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.long_path import Obstacles, route_band
+from thinmap_ros.core.planning.long_path import route_band
 from thinmap_ros.core.planning.traversability import path_collides
-from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
+from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path, plan
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap
 
@@ -36,9 +36,8 @@ def length(path):
 
 
 def along(band, obstacles=None):
-    points = None if obstacles is None else obstacles.points
-    radius_m = 0.0 if obstacles is None else obstacles.radius_m
-    return plan(band.patch, START, GOAL, CONFIG, points, radius_m, band=band.cells)
+    found = find_path(band.patch, START, GOAL, CONFIG, obstacles, band=band.cells)
+    return None if found is None else found.points
 
 
 def passes(path, place):

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning import short_path
-from thinmap_ros.core.planning.long_path import Obstacles
 from thinmap_ros.core.planning.short_path import plan_short_path
-from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
+from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, plan
 
 CONFIG = WavefrontConfig()
 NO_CELLS = np.zeros((0, 2), dtype=np.int64)

@@ -18,7 +18,7 @@ from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.graph_search import path_points, shortest_route
 from thinmap_ros.core.planning.grid_search import distance_field_from
 from thinmap_ros.core.planning.traversability import nearest_true, path_collides
-from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
+from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, cost_of_cells
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
@@ -29,14 +29,6 @@ LONG_PATH_M = 20.0
 _BAND_M = 3.0  # half of its width: wide enough for the shortest path through most halls
 _ACCESS_M = 6.0  # the graph is looked for so far from the robot and from the goal
 _MAX_ROUTES = 6  # that are tried, each without the contradicted edges of those before
-
-
-@dataclass(frozen=True, eq=False)
-class Obstacles:
-    """Points (N, 2), m, map frame, that the map need not contain, and the distance to keep, m."""
-
-    points: Array
-    radius_m: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import SAFE_HIGHER, Config, parameter, part
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.long_path import LONG_PATH_M, Band, Obstacles, route_band
+from thinmap_ros.core.planning.long_path import LONG_PATH_M, Band, route_band
 from thinmap_ros.core.planning.obstacle_points import ObstaclePoints
 from thinmap_ros.core.planning.path_follower import (
     PathFollower,
@@ -19,7 +19,7 @@ from thinmap_ros.core.planning.path_follower import (
 from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.short_path import plan_short_path
 from thinmap_ros.core.planning.traversability import path_collides
-from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
+from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -305,16 +305,10 @@ class Navigator:
         self, start: tuple[float, float], band: Band, obstacles: Obstacles | None
     ) -> Array | None:
         """Path to the target by wavefront, over the cells of a band only."""
-        return plan(
-            band.patch,
-            start,
-            self._target,
-            self.config.planner,
-            None if obstacles is None else obstacles.points,
-            self.config.stop_radius_m,
-            self._recent_path.cells(band.patch.frame, band.patch.shape),
-            band.cells,
-        )
+        trail = self._recent_path.cells(band.patch.frame, band.patch.shape)
+        config = self.config.planner
+        found = find_path(band.patch, start, self._target, config, obstacles, trail, band.cells)
+        return None if found is None else found.points
 
     def _wait(self, reason: str, dt_s: float) -> Command:
         """Stop; abort the goal if there was never a path, or after blocked_timeout_s."""

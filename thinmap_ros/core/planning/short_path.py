@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.long_path import XY, Obstacles
-from thinmap_ros.core.planning.wavefront import PlannedPath, WavefrontConfig, find_path
+from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
 
 Cells = NDArray[np.int64]
+XY = tuple[float, float]
 Mask = NDArray[np.bool_]
 _GAP_M = TopologyConfig().max_unknown_gap_m
 _ROOM_M = 3.0  # around start and goal
@@ -55,24 +55,11 @@ def plan_short_path(
     window = _window(patch, start_xy, goal_xy, config, obstacles)
     if window is not None:
         inside = window.cells(trail)
-        found = _find_path(window.patch, start_xy, goal_xy, config, obstacles, inside)
+        found = find_path(window.patch, start_xy, goal_xy, config, obstacles, inside)
         if found is not None and found.is_exact and found.cost_m <= window.bound_m:
             return found.points
-    found = _find_path(patch, start_xy, goal_xy, config, obstacles, trail)
+    found = find_path(patch, start_xy, goal_xy, config, obstacles, trail)
     return None if found is None else found.points
-
-
-def _find_path(
-    patch: GridPatch,
-    start_xy: XY,
-    goal_xy: XY,
-    config: WavefrontConfig,
-    obstacles: Obstacles | None,
-    trail: Cells,
-) -> PlannedPath | None:
-    points = None if obstacles is None else obstacles.points
-    radius_m = 0.0 if obstacles is None else obstacles.radius_m
-    return find_path(patch, start_xy, goal_xy, config, points, radius_m, trail)
 
 
 def _window(

@@ -76,6 +76,14 @@ class WavefrontConfig(Config):
 
 
 @dataclass(frozen=True, eq=False)
+class Obstacles:
+    """Points (N, 2), m, map frame, that the map need not contain, and the distance to keep, m."""
+
+    points: Array
+    radius_m: float
+
+
+@dataclass(frozen=True, eq=False)
 class PlannedPath:
     """A path (K, 2), m, map frame.
 
@@ -92,13 +100,9 @@ def plan(
     start_xy: tuple[float, float],
     goal_xy: tuple[float, float],
     config: WavefrontConfig,
-    points: Array | None = None,
-    stop_radius_m: float = 0.0,
-    trail: NDArray[np.int64] | None = None,
-    band: Mask | None = None,
 ) -> Array | None:
     """Path (K, 2) from start to goal, m, map frame; None: no path. See `find_path`."""
-    found = find_path(patch, start_xy, goal_xy, config, points, stop_radius_m, trail, band)
+    found = find_path(patch, start_xy, goal_xy, config)
     return None if found is None else found.points
 
 
@@ -107,16 +111,15 @@ def find_path(
     start_xy: tuple[float, float],
     goal_xy: tuple[float, float],
     config: WavefrontConfig,
-    points: Array | None = None,
-    stop_radius_m: float = 0.0,
+    obstacles: Obstacles | None = None,
     trail: NDArray[np.int64] | None = None,
     band: Mask | None = None,
 ) -> PlannedPath | None:
     """Path from start to goal, m, map frame, points half a cell apart; None: no path.
 
-    The path ends at the goal, or at the nearest allowed cell within goal_search_radius_m. It stays
-    stop_radius_m away from obstacle points (N, 2), which the map need not contain. Points are not
-    rounded to cells: noise would make walls one cell thicker, and passages too narrow. trail: cells
+    The path ends at the goal, or at the nearest allowed cell within goal_search_radius_m. Obstacle
+    points are not rounded to cells: noise would make walls one cell thicker, and passages too
+    narrow. trail: cells
     (N, 2) of the recent path; the robot may return over them unless they are occupied now. band:
     cells (H, W) that the path may use; all, if None.
     """
@@ -125,8 +128,8 @@ def find_path(
         return None
     cost = cost_of_cells(patch, config)
     occupied = patch.occupied.copy()
-    if points is not None:
-        points = points[patch.contains(points)]
+    if obstacles is not None:
+        points = obstacles.points[patch.contains(obstacles.points)]
         at = patch.frame.cells_of(points)
         occupied[at[:, 0], at[:, 1]] = True
         cell_m = patch.frame.resolution
@@ -134,7 +137,7 @@ def find_path(
         _inflate_points(
             cost,
             _in_cells(patch, points),
-            stop_radius_m / cell_m,
+            obstacles.radius_m / cell_m,
             inflation_radius,
             config.inflation_cost,
         )
