@@ -9,6 +9,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.exploration.live.drive_progress import Arrivals
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, Strategy
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
@@ -88,6 +89,7 @@ class ClosedLoop:
         self.decision: Decision | None = None
         self._observation: Observation | None = None
         self._goal: Array | None = None
+        self._arrivals = Arrivals()
         self._T_map_odom = np.zeros(3)
         self._command = (0.0, 0.0)
 
@@ -167,8 +169,18 @@ class ClosedLoop:
             self.navigator.cancel()
             self._goal = None
         elif self._goal is None or not np.array_equal(target.goal, self._goal):
-            self._goal = target.goal
-            self.navigator.set_goal(*(float(number) for number in target.goal))
+            self._drive_to(target.goal)
+
+    def _drive_to(self, goal: Array) -> None:
+        """Set the goal, as a node would: one that was reached, and stays, has failed."""
+        if self._arrivals.are_useless(goal):
+            self._arrivals.clear()
+            self._goal = None
+            self.navigator.cancel()
+            self.strategy.target_failed('reached, but the target stays')
+            return
+        self._goal = goal
+        self.navigator.set_goal(*(float(number) for number in goal))
 
     def replace_strategy(
         self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator
@@ -194,6 +206,8 @@ class ClosedLoop:
         self._command = (command.v, command.w)
         if command.state == 'failed':
             self.strategy.target_failed(command.reason)
+        if command.state == 'reached' and self._goal is not None:
+            self._arrivals.add(self._goal)
         if command.state in ('failed', 'reached'):
             self._goal = None
 

@@ -301,6 +301,34 @@ def test_of_two_viewpoints_that_take_turns_with_the_robot_one_is_reached():
     assert goal_after(viewpoints[1], se2.pose(0.0, 0.2, 0.0), (2.1, 2.0)) is viewpoints[1]
 
 
+def test_a_target_that_was_left_is_taken_again_for_a_larger_saving_only():
+    """Two costs that take turns with the place of the robot end in one target."""
+    explorer = Explorer()
+    candidates = [
+        Candidate(
+            FIRST_FRONTIER_ID + i,
+            (x, 0.0),
+            np.zeros((15, 2), dtype=np.int64),
+            (x, 0.0),
+            Evidence(FIRST_FRONTIER_ID + i, (x, 0.0), (x, 0.0)),
+            goal=se2.pose(0.9 * x, 0.0, 0.0),
+        )
+        for i, x in enumerate((-50.0, 50.0))
+    ]
+    explorer._finder.candidates = candidates
+    changes = 0
+    chosen = None
+    for turn in range(40):
+        # Each time the other one is cheaper by 30 m.
+        costs = {candidates[turn % 2]: 70.0, candidates[1 - turn % 2]: 100.0}
+        explorer._costs = lambda ready, pose, costs=costs: costs
+        explorer._choose(TopologicalMap(), START)
+        changes += explorer._target.candidate is not chosen
+        chosen = explorer._target.candidate
+    # After the first choice for a saving of 2, 4, 4, 8, 8, 16 and 16 m; 32 m are too much.
+    assert changes == 8
+
+
 def test_after_a_visit_or_a_failure_the_next_viewpoint_counts():
     explorer = Explorer()
     evidence = Evidence(FIRST_FRONTIER_ID, (2.0, 2.0), (2.0, 2.0))

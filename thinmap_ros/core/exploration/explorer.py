@@ -269,9 +269,19 @@ class Explorer:
         costs = self._costs(ready, T_map_base)
         best = min(costs, key=lambda candidate: costs[candidate])
         kept = self._kept(list(costs))
-        if kept is not None and costs[best] >= costs[kept] - self.config.switch_margin_m:
-            best = kept
+        if kept is not None and kept is not best:
+            if costs[best] >= costs[kept] - self._switch_margin_m(best):
+                best = kept
+            else:
+                kept.evidence.times_left += 1
         self._drive_to(best, T_map_base)
+
+    def _switch_margin_m(self, candidate: Candidate) -> float:
+        """Saving for which the target is changed: twice as much for each time that it was left.
+
+        So the robot never swings between two targets without end, whatever the costs are.
+        """
+        return float(self.config.switch_margin_m * 2.0 ** min(candidate.evidence.times_left, 30))
 
     def _is_worth_a_visit(self, candidate: Candidate) -> bool:
         attempts = max(candidate.evidence.visits, candidate.evidence.failures)

@@ -1,0 +1,47 @@
+"""The closed loop treats a strategy as the node does."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from thinmap_ros.closed_loop import Options, make_loop
+from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
+from thinmap_ros.files import package_data
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.world import World
+
+NODE = EndNode(1, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True, np.zeros(3))
+
+
+class Repeats:
+    """A strategy that does not see that the robot is there; it ends after a failure."""
+
+    def __init__(self, goal):
+        self.goal = goal
+        self.failures = []
+
+    def step(self, topology, patch, scan, T_map_base):
+        is_over = bool(self.failures)
+        target = None if is_over else replace_goal(self.goal)
+        code = FinishCode.UNREACHABLE if is_over else FinishCode.NONE
+        return Decision(target, is_over, '', code, [], [], 0.0)
+
+    def target_failed(self, reason):
+        self.failures.append(reason)
+
+
+def replace_goal(goal):
+    return NODE._replace(goal=goal)
+
+
+def test_a_target_that_stays_although_it_was_reached_has_failed():
+    world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
+    start = np.asarray(world.start)
+    strategy = Repeats(start + (0.8, 0.0, 0.0))
+    loop = make_loop(world, start, replace(Options(), speed_m_s=0.5))
+    loop.strategy = strategy
+    goal = observable_cells(world, start, 0.25, 8.0)
+    outcome = loop.run(goal, 60.0, lambda seconds, coverage: None)
+    assert outcome.finished
+    assert strategy.failures == ['reached, but the target stays']
