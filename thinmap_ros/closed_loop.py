@@ -67,6 +67,18 @@ class Mishap(Protocol):
         """Receive the estimate of a scan."""
 
 
+@dataclass
+class _Drive:
+    """The goal (3,) that the navigator has, arrivals, and the last command (v, w).
+
+    Speeds in m/s and rad/s.
+    """
+
+    goal: Array | None = None
+    arrivals: Arrivals = field(default_factory=Arrivals)
+    command: tuple[float, float] = (0.0, 0.0)
+
+
 class ClosedLoop:
     """Simulator, pipeline, strategy and navigator, each called in turn as the live graph would."""
 
@@ -88,10 +100,8 @@ class ClosedLoop:
         self.log = RunLog()
         self.decision: Decision | None = None
         self._observation: Observation | None = None
-        self._goal: Array | None = None
-        self._arrivals = Arrivals()
+        self._drive = _Drive()
         self._T_map_odom = np.zeros(3)
-        self._command = (0.0, 0.0)
 
     def run(
         self,
@@ -115,7 +125,7 @@ class ClosedLoop:
                     break
             if steps % _CONTROL_STEPS == 0:
                 self._control(moment)
-            moment = self.simulation.step(*self._command)
+            moment = self.simulation.step(*self._drive.command)
             steps = steps + 1
         self.pipeline.finish()
         show(*self._measure(goal))
@@ -167,19 +177,19 @@ class ClosedLoop:
         target = self.decision.target
         if target is None:
             self.navigator.cancel()
-            self._goal = None
-        elif self._goal is None or not np.array_equal(target.goal, self._goal):
+            self._drive.goal = None
+        elif self._drive.goal is None or not np.array_equal(target.goal, self._drive.goal):
             self._drive_to(target.goal)
 
     def _drive_to(self, goal: Array) -> None:
         """Set the goal, as a node would: one that was reached, and stays, has failed."""
-        if self._arrivals.are_useless(goal):
-            self._arrivals.clear()
-            self._goal = None
+        if self._drive.arrivals.are_useless(goal):
+            self._drive.arrivals.clear()
+            self._drive.goal = None
             self.navigator.cancel()
             self.strategy.target_failed('reached, but the target stays')
             return
-        self._goal = goal
+        self._drive.goal = goal
         self.navigator.set_goal(*(float(number) for number in goal))
 
     def replace_strategy(
@@ -192,8 +202,7 @@ class ClosedLoop:
         self.navigator = navigator
         self.decision = None
         self._observation = None
-        self._goal = None
-        self._command = (0.0, 0.0)
+        self._drive = _Drive()
 
     def _control(self, moment: SensorReadings) -> None:
         observation = self._observation
@@ -203,13 +212,13 @@ class ClosedLoop:
         command = self.navigator.step(
             T_map_base, observation.patch, observation.scan, _CONTROL_STEPS * STEP_NS / 1e9
         )
-        self._command = (command.v, command.w)
+        self._drive.command = (command.v, command.w)
         if command.state == 'failed':
             self.strategy.target_failed(command.reason)
-        if command.state == 'reached' and self._goal is not None:
-            self._arrivals.add(self._goal)
+        if command.state == 'reached' and self._drive.goal is not None:
+            self._drive.arrivals.add(self._drive.goal)
         if command.state in ('failed', 'reached'):
-            self._goal = None
+            self._drive.goal = None
 
     def _measure(self, goal: ObservableCells) -> tuple[float, float]:
         seconds = self.simulation.stamp_ns / 1e9

@@ -316,6 +316,7 @@ def test_a_target_that_was_left_is_taken_again_for_a_larger_saving_only():
         for i, x in enumerate((-50.0, 50.0))
     ]
     explorer._finder.candidates = candidates
+    explorer.frontier_map.free_cells = 10  # of 1 m2
     changes = 0
     chosen = None
     for turn in range(40):
@@ -327,6 +328,11 @@ def test_a_target_that_was_left_is_taken_again_for_a_larger_saving_only():
         chosen = explorer._target.candidate
     # After the first choice for a saving of 2, 4, 4, 8, 8, 16 and 16 m; 32 m are too much.
     assert changes == 8
+    # Once something new was seen, the costs may be others.
+    explorer.frontier_map.free_cells += 1
+    explorer._costs = lambda ready, pose: {c: 100.0 if c is chosen else 70.0 for c in candidates}
+    explorer._choose(TopologicalMap(), START)
+    assert explorer._target.candidate is not chosen
 
 
 def test_after_a_visit_or_a_failure_the_next_viewpoint_counts():

@@ -12,8 +12,9 @@ Source: exploration paper sections 3.2 and 4.
 """
 
 import math
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,12 @@ from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.belief import evidence
 from thinmap_ros.core.exploration.belief.fitted import FITTED
-from thinmap_ros.core.exploration.belief.model import BeliefModel, MissingArea, missing_area
+from thinmap_ros.core.exploration.belief.model import (
+    WORTH_SEEING_M2,
+    BeliefModel,
+    MissingArea,
+    missing_area,
+)
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.frontiers import FrontierMap, Place
 from thinmap_ros.core.exploration.reachable import ReachableSpace
@@ -44,6 +50,7 @@ _SCANS = 3  # at the goal, or with nothing left
 _GONE_S = 0.35
 _START_S = 5.0  # the first scans are no graph yet
 _FINAL_PAUSE_S = 20.0  # a navigator that starts, or is blocked by people, refuses goals meanwhile
+_MAX_DOUBLINGS = 30
 _MAX_TOUR = 20  # the cost of a tour grows with the fourth power of its places
 _IMPROBABLE_WAIT = 3.0  # waiting costs so much more where most probably nothing is hidden
 
@@ -112,6 +119,31 @@ class _Target:
 
 
 @dataclass
+class _LeftTargets:
+    """How often targets were left for cheaper ones since the robot last saw something new.
+
+    known_area_m2: largest area that was known then; times: by id of the evidence.
+    """
+
+    known_area_m2: float = 0.0
+    times: Counter[int] = field(default_factory=Counter)
+
+    def update(self, known_area_m2: float) -> None:
+        """Forget all if something worth seeing was seen."""
+        if known_area_m2 >= self.known_area_m2 + WORTH_SEEING_M2:
+            self.known_area_m2 = known_area_m2
+            self.times.clear()
+
+    def add(self, evidence_id: int) -> None:
+        """Count that a target was left."""
+        self.times[evidence_id] += 1
+
+    def factor(self, evidence_id: int) -> float:
+        """Factor of the saving for which a target is taken: 2 for each time that it was left."""
+        return 2.0 ** min(self.times[evidence_id], _MAX_DOUBLINGS)
+
+
+@dataclass
 class _Clock:
     """Stamps, ns: of the first scan, of this one, and of the last search for candidates."""
 
@@ -129,6 +161,7 @@ class Explorer:
         self._finder = CandidateFinder(self.config, model)
         self._space = ReachableSpace(self.config.robot_radius_m)
         self._target = _Target()
+        self._left = _LeftTargets()
         self._clock = _Clock()
         self._frame = self.frontier_map.frame
         self._scans_without_target = 0
@@ -273,15 +306,16 @@ class Explorer:
             if costs[best] >= costs[kept] - self._switch_margin_m(best):
                 best = kept
             else:
-                kept.evidence.times_left += 1
+                self._left.add(kept.evidence.id)
         self._drive_to(best, T_map_base)
 
     def _switch_margin_m(self, candidate: Candidate) -> float:
-        """Saving for which the target is changed: twice as much for each time that it was left.
+        """Saving for which the target is changed, larger for one that was left.
 
         So the robot never swings between two targets without end, whatever the costs are.
         """
-        return float(self.config.switch_margin_m * 2.0 ** min(candidate.evidence.times_left, 30))
+        self._left.update(self.frontier_map.known_area_m2)
+        return self.config.switch_margin_m * self._left.factor(candidate.evidence.id)
 
     def _is_worth_a_visit(self, candidate: Candidate) -> bool:
         attempts = max(candidate.evidence.visits, candidate.evidence.failures)

@@ -78,8 +78,7 @@ class Evidence:
     id: from FIRST_FRONTIER_ID on; began_at: where it began; views: distance, m, and bearing, rad,
     of each view that counted; angle_span_deg: largest difference between two of these bearings;
     visits: how often the robot was there and the place stayed as it was; failures: how often the
-    robot could not get there, the last time at failed_ns; times_left: how often it was the target,
-    and another one was cheaper before the robot got there.
+    robot could not get there, the last time at failed_ns.
     """
 
     id: int
@@ -90,7 +89,6 @@ class Evidence:
     visits: int = 0
     failures: int = 0
     failed_ns: int = 0
-    times_left: int = 0
 
     @property
     def min_distance_m(self) -> float:
