@@ -1,7 +1,5 @@
 """The closed loop treats a strategy as the node does."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from thinmap_ros.closed_loop import Options, make_loop
@@ -23,7 +21,7 @@ class Repeats:
 
     def step(self, topology, patch, scan, T_map_base):
         is_over = bool(self.failures)
-        target = None if is_over else replace_goal(self.goal)
+        target = None if is_over else NODE._replace(goal=self.goal)
         code = FinishCode.UNREACHABLE if is_over else FinishCode.NONE
         return Decision(target, is_over, '', code, [], [], 0.0)
 
@@ -31,15 +29,11 @@ class Repeats:
         self.failures.append(reason)
 
 
-def replace_goal(goal):
-    return NODE._replace(goal=goal)
-
-
 def test_a_target_that_stays_although_it_was_reached_has_failed():
     world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
     start = np.asarray(world.start)
     strategy = Repeats(start + (0.8, 0.0, 0.0))
-    loop = make_loop(world, start, replace(Options(), speed_m_s=0.5))
+    loop = make_loop(world, start, Options(speed_m_s=0.5))
     loop.strategy = strategy
     goal = observable_cells(world, start, 0.25, 8.0)
     outcome = loop.run(goal, 60.0, lambda seconds, coverage: None)

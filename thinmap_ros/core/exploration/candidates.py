@@ -225,15 +225,15 @@ class CandidateFinder:
         """Index of the nearest end node (N, 2), m, that sees each frontier's middle; -1: none."""
         middles = np.array([frontiers.middle_of(cells) for cells in clusters]).reshape(-1, 2)
         frame = frontiers.frame
-        owners = _nearest_in_sight(
+        owners: list[int] = _nearest_in_sight(
             frontiers.free,
             middles,
             nodes,
             frame.cells_of(middles),
             frame.cells_of(nodes),
             self._config.frontier_assignment_radius_m,
-        )
-        return [int(owner) for owner in owners]
+        ).tolist()
+        return owners
 
     def _examine(
         self, candidate: Candidate, frontiers: FrontierMap, reachable: Reachable, range_max_m: float

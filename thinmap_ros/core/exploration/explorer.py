@@ -299,6 +299,7 @@ class Explorer:
         if not ready:
             self._drop_target()
             return
+        self._left.update(self.frontier_map.known_area_m2)
         costs = self._costs(ready, T_map_base)
         best = min(costs, key=lambda candidate: costs[candidate])
         kept = self._kept(list(costs))
@@ -312,9 +313,8 @@ class Explorer:
     def _switch_margin_m(self, candidate: Candidate) -> float:
         """Saving for which the target is changed, larger for one that was left.
 
-        So the robot never swings between two targets without end, whatever the costs are.
+        The robot never oscillates without end, whatever the costs are.
         """
-        self._left.update(self.frontier_map.known_area_m2)
         return self.config.switch_margin_m * self._left.factor(candidate.evidence.id)
 
     def _is_worth_a_visit(self, candidate: Candidate) -> bool:
