@@ -119,11 +119,71 @@ def test_scans_older_than_all_odometry_and_too_many_waiting_are_dropped_and_coun
 @pytest.mark.parametrize('gap_s', [0.2, 120.0, 1000.0, 1e6])
 def test_odometry_that_is_kilometres_away_after_a_gap_is_a_discontinuity(gap_s):
     increments = OdometryIncrements()
-    increments.add(0, np.zeros(3))
-    far = increments.add(int(gap_s * SECOND), se2.pose(2000.0, 0.0, 0.0))
+    increments.add(scan_at(0), np.zeros(3))
+    far = increments.add(scan_at(int(gap_s * SECOND)), se2.pose(2000.0, 0.0, 0.0))
     assert far.T_before_base.tolist() == [0.0, 0.0, 0.0]
     assert 0.0 < far.discontinuity_m < 400.0
     assert increments.rejected == 1
-    back = increments.add(int((gap_s + 0.2) * SECOND), se2.pose(2000.1, 0.0, 0.0))
+    back = increments.add(scan_at(int((gap_s + 0.2) * SECOND)), se2.pose(2000.1, 0.0, 0.0))
     assert back.T_before_base[0] == pytest.approx(0.1)
     assert increments.rejected == 1
+
+
+JUMPS = [
+    se2.pose(0.0, 0.0, 1.5),
+    se2.pose(0.0, 0.0, -2.5),
+    se2.pose(2.0, 0.0, 0.0),
+    se2.pose(-3.4, 1.0, 0.2),
+]
+
+
+@pytest.mark.parametrize('jump', JUMPS)
+def test_a_motion_that_no_robot_makes_in_the_time_is_a_discontinuity(jump):
+    increments = OdometryIncrements()
+    increments.add(scan_at(0), np.zeros(3))
+    step = increments.add(scan_at(SECOND // 5), jump)
+    assert not step.T_before_base.any()
+    assert step.discontinuity_m > 0.0
+    moved_m = math.hypot(jump[0], jump[1])
+    assert f'jumped by {moved_m:.2f} m, {math.degrees(jump[2]):.0f} deg within 0.20 s' in (
+        step.discontinuity
+    )
+
+
+@pytest.mark.parametrize('jump', JUMPS)
+def test_odometry_that_is_reset_while_it_is_silent_is_a_discontinuity(jump):
+    """Its samples end for 5 s, in which a robot could have driven that far."""
+    pairing = ScanOdometrySynchronizer()
+    increments = OdometryIncrements()
+    steps = []
+    for k in range(200):
+        s = k / 20
+        is_silent = 4.0 < s < 9.0
+        T_odom_base = jump if s >= 9.0 else np.zeros(3)
+        pairs = [] if is_silent else pairing.add_odometry(round(s * SECOND), T_odom_base)
+        pairs += pairing.add_scan(scan_at(round((s - 0.01) * SECOND))) if k % 4 == 0 else []
+        steps += [increments.add(*pair) for pair in pairs]
+    assert [step.discontinuity_m > 0.0 for step in steps].count(True) == 1
+    assert not any(step.T_before_base.any() for step in steps)
+
+
+def test_a_drive_past_a_silent_laser_is_known():
+    """Odometry comes at its usual rate while scans are missing for 5 s."""
+    pairing = ScanOdometrySynchronizer()
+    increments = OdometryIncrements()
+    steps = []
+    for k in range(200):
+        s = k / 20
+        pairs = pairing.add_odometry(round(s * SECOND), se2.pose(0.5 * s, 0.0, 0.0))
+        is_silent = 4.0 < s < 9.0
+        pairs += [] if is_silent or k % 4 else pairing.add_scan(scan_at(round(s * SECOND)))
+        steps += [increments.add(*pair) for pair in pairs]
+    assert max(float(step.T_before_base[0]) for step in steps) == pytest.approx(2.6, abs=0.11)
+    assert not any(step.discontinuity for step in steps)
+
+
+def test_a_pose_within_a_jump_is_not_interpolated():
+    buffer = OdometryBuffer()
+    buffer.add(0, np.zeros(3))
+    buffer.add(SECOND // 20, se2.pose(0.0, 0.0, 1.0))
+    assert buffer.interpolate(SECOND // 40) is None

@@ -226,7 +226,7 @@ def pair_by_stamp(shared: None, rng: np.random.Generator, folder: Path) -> None:
         for scan, T_odom_base in ready:
             finite(T_odom_base)
             used.append(scan.stamp_ns)
-            step = increments.add(scan.stamp_ns, T_odom_base)
+            step = increments.add(scan, T_odom_base)
             finite(step.T_before_base, step.seconds, step.discontinuity_m)
         assert scans == len(used) + pairs.dropped + pairs.waiting
     last = [ns for ns in good if ns > good[-1] - _LAST_S * SECOND_NS][:-1]

@@ -29,6 +29,7 @@ class Estimate:
     local area. inlier_ratio: share of the scan points in known space that fit the map.
     is_lost: the pose is unknown; the covariance is accordingly large.
     blind_reason: why the laser does not confirm the pose, which follows the odometry; '': it does.
+    odometry_discontinuity: description of an odometry jump since the previous scan; '': none.
     correction: keyframe poses before and after, if this step closed a loop; T_map_base is then the
     corrected pose.
     """
@@ -43,4 +44,5 @@ class Estimate:
     inlier_ratio: float = 0.0
     is_lost: bool = False
     blind_reason: str = ''
+    odometry_discontinuity: str = ''
     correction: Correction | None = None

@@ -4,7 +4,7 @@ import math
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,42 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, Field
 from thinmap_ros.core.stamps import SECOND_NS
+
+
+@dataclass(frozen=True)
+class OdometryLimits:
+    """Motion that odometry can report of one drive; a larger one is a discontinuity.
+
+    The speeds are above those of indoor robots. The jumps allow for stamps that come in bunches.
+    """
+
+    jump_m: float = 0.5
+    jump_rad: float = 0.3
+    max_speed_m_s: float = 3.0
+    max_speed_rad_s: float = 4.0
+    max_gap_ns: int = 120_000_000_000
+
+    def distance_m(self, seconds: float) -> float:
+        """Largest distance between two samples so many seconds apart, m.
+
+        After a longer gap than `max_gap_ns` it is not larger: nobody has seen that drive.
+        """
+        return self.jump_m + self.max_speed_m_s * self._bounded(seconds)
+
+    def turn_rad(self, seconds: float) -> float:
+        """Largest rotation between two samples so many seconds apart, rad."""
+        return self.jump_rad + self.max_speed_rad_s * self._bounded(seconds)
+
+    def allow(self, moved: Array, seconds: float) -> bool:
+        """Whether a robot can move by `moved` (3,) within so many seconds."""
+        is_near = math.hypot(moved[0], moved[1]) <= self.distance_m(seconds)
+        return is_near and abs(float(moved[2])) <= self.turn_rad(seconds)
+
+    def _bounded(self, seconds: float) -> float:
+        return min(max(seconds, 0.0), self.max_gap_ns / SECOND_NS)
+
+
+_LIMITS = OdometryLimits()
 
 
 class OdometryBuffer:
@@ -70,7 +106,8 @@ class OdometryBuffer:
     def interpolate(self, stamp_ns: int) -> Array | None:
         """Pose at a stamp.
 
-        Exact at a sample, interpolated between two, None outside the buffer and in a long gap.
+        Exact at a sample, interpolated between two, None outside the buffer, in a long gap and
+        within a discontinuity.
         """
         index = bisect_left(self._stamps, stamp_ns)
         if index == len(self._stamps):
@@ -82,6 +119,9 @@ class OdometryBuffer:
         before = self._stamps[index - 1]
         after = self._stamps[index]
         if self._max_gap_ns is not None and after - before > self._max_gap_ns:
+            return None
+        moved = se2.between(self._poses[index - 1], self._poses[index])
+        if not _LIMITS.allow(moved, (after - before) / SECOND_NS):
             return None
         share = (stamp_ns - before) / (after - before)
         return se2.interpolate(self._poses[index - 1], self._poses[index], share)
@@ -95,31 +135,15 @@ class OdometryBuffer:
 
 # Between samples that are further apart, the robot need not have moved evenly.
 MAX_ODOMETRY_GAP_NS = SECOND_NS
+# A stream is silent when several samples are missing; stamps of real robots come in bunches.
+_GAP_PERIODS = 3.0
+_USUAL_SAMPLES = 15
 
 FIELDS = {
     'stamp_ns': Field(np.int64, (), 0, MAX_COUNT),
     'T_map_odom': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
     'T_odom_base': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
 }
-
-
-@dataclass(frozen=True)
-class OdometryLimits:
-    """Motion that odometry can report of one drive; a larger one is a discontinuity."""
-
-    jump_m: float = 0.5
-    max_speed_m_s: float = 3.0
-    max_gap_ns: int = 120_000_000_000
-
-    def distance_m(self, seconds: float) -> float:
-        """Largest distance between two samples so many seconds apart, m.
-
-        After a longer gap than `max_gap_ns` it is not larger: nobody has seen that drive.
-        """
-        return self.jump_m + self.max_speed_m_s * min(seconds, self.max_gap_ns / SECOND_NS)
-
-
-_LIMITS = OdometryLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +174,8 @@ class OdometryAnchor:
         It is not earlier, not much later, and not too far away.
         """
         gap_ns = stamp_ns - self.stamp_ns
-        moved = math.dist(self.T_odom_base[:2], T_odom_base[:2])
-        return 0 <= gap_ns <= _LIMITS.max_gap_ns and moved <= _LIMITS.distance_m(gap_ns / 1e9)
+        moved = se2.between(self.T_odom_base, T_odom_base)
+        return 0 <= gap_ns <= _LIMITS.max_gap_ns and _LIMITS.allow(moved, gap_ns / SECOND_NS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,12 +183,35 @@ class OdometryIncrement:
     """Motion since the previous scan, by odometry.
 
     T_before_base (3,), within `seconds`. discontinuity_m: 0; after an odometry discontinuity, where
-    the increment is unknown, the distance (m) that the robot may have travelled.
+    the increment is unknown, the distance (m) that the robot may have travelled. discontinuity: its
+    description; '' without one.
     """
 
     T_before_base: Array
     seconds: float
-    discontinuity_m: float
+    discontinuity_m: float = 0.0
+    discontinuity: str = ''
+
+
+class SilenceDetector:
+    """Detects by the stamps of a stream that it was silent for longer than usual."""
+
+    def __init__(self) -> None:
+        self._periods: deque[int] = deque(maxlen=_USUAL_SAMPLES)
+        self._stamp_ns: int | None = None
+
+    def add(self, stamp_ns: int) -> float:
+        """Time (s) by which the time since the previous sample exceeds the usual period.
+
+        0 unless that is a gap: longer than MAX_ODOMETRY_GAP_NS and than several usual periods.
+        """
+        period_ns = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
+        self._stamp_ns = stamp_ns
+        usual_ns = float(np.median(self._periods)) if self._periods else math.inf
+        if period_ns > 0:
+            self._periods.append(period_ns)
+        is_gap = period_ns > max(MAX_ODOMETRY_GAP_NS, _GAP_PERIODS * usual_ns)
+        return (period_ns - usual_ns) / SECOND_NS if is_gap else 0.0
 
 
 class OdometryIncrements:
@@ -175,27 +222,38 @@ class OdometryIncrements:
 
     def __init__(self) -> None:
         self.rejected = 0
+        self._silence = SilenceDetector()
         self.T_odom_base: Array = np.zeros(3)  # of the last scan
         self._is_begun = False
         self.stamp_ns: int | None = None  # of the last scan
 
-    def add(self, stamp_ns: int, T_odom_base: Array) -> OdometryIncrement:
-        """Increment up to an odometry pose (3,) at a stamp; zero for the first one."""
-        seconds = 0.0 if self.stamp_ns is None else (stamp_ns - self.stamp_ns) / 1e9
-        self.stamp_ns = stamp_ns
+    def add(self, scan: Scan, T_odom_base: Array) -> OdometryIncrement:
+        """Increment up to the odometry pose (3,) of a scan; zero for the first one.
+
+        An odometry that is reset while it is silent looks as if the robot had driven meanwhile. So
+        the limits of a motion grow only with the time in which odometry came at its usual rate.
+        """
+        silence_s = self._silence.add(scan.stamp_ns)
+        if scan.odometry_silence_s is not None:
+            silence_s = scan.odometry_silence_s
+        seconds = 0.0 if self.stamp_ns is None else (scan.stamp_ns - self.stamp_ns) / SECOND_NS
+        self.stamp_ns = scan.stamp_ns
         if not se2.is_finite(T_odom_base):
             self.rejected += 1
-            return OdometryIncrement(np.zeros(3), seconds, 0.0)
+            return OdometryIncrement(np.zeros(3), seconds)
         before = self.T_odom_base if self._is_begun else T_odom_base
         self._is_begun = True
         self.T_odom_base = np.array(T_odom_base, dtype=np.float64)
         # Rounded, so that text logs, bags and messages give identical results.
         moved = np.round(se2.between(before, self.T_odom_base), 9)
-        discontinuity_m = _LIMITS.distance_m(max(seconds, 1.0))
-        if math.hypot(moved[0], moved[1]) <= discontinuity_m:
-            return OdometryIncrement(moved, seconds, 0.0)
+        if _LIMITS.allow(moved, seconds - silence_s):
+            return OdometryIncrement(moved, seconds)
         self.rejected += 1
-        return OdometryIncrement(np.zeros(3), seconds, discontinuity_m)
+        jump = (
+            f'odometry jumped by {math.hypot(moved[0], moved[1]):.2f} m, '
+            f'{math.degrees(float(moved[2])):.0f} deg within {seconds:.2f} s'
+        )
+        return OdometryIncrement(np.zeros(3), seconds, _LIMITS.distance_m(max(seconds, 1.0)), jump)
 
 
 class ScanOdometrySynchronizer:
@@ -208,6 +266,8 @@ class ScanOdometrySynchronizer:
     def __init__(self, capacity: int = 20) -> None:
         self._buffer = OdometryBuffer(max_gap_ns=MAX_ODOMETRY_GAP_NS)
         self._laser = LaserMonitor()
+        self._silence = SilenceDetector()
+        self._silence_s = 0.0  # since the last scan
         self._waiting: deque[Scan] = deque()
         self._capacity = capacity
         self.dropped = 0
@@ -228,6 +288,7 @@ class ScanOdometrySynchronizer:
         Returns the scans that are ready now, each with its T_odom_base (3,).
         """
         self._buffer.add(stamp_ns, T_odom_base)
+        self._silence_s += self._silence.add(stamp_ns)
         return self._ready()
 
     def add_scan(self, scan: Scan) -> list[tuple[Scan, Array]]:
@@ -254,5 +315,7 @@ class ScanOdometrySynchronizer:
             if T_odom_base is None:
                 self.dropped += 1
             else:
+                scan = replace(scan, odometry_silence_s=self._silence_s)
+                self._silence_s = 0.0
                 ready.append((self._laser.checked(scan, T_odom_base), T_odom_base))
         return ready

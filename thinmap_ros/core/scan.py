@@ -26,7 +26,8 @@ class Scan:
     angle_min_rad + i * angle_increment_rad in the laser frame (a negative increment is a clockwise
     laser); T_base_laser (3,): the laser's pose on the robot; zero_is_no_return: whether this
     laser's driver publishes 0 for a beam without return; fault: why the ranges of the laser were
-    replaced by invalid ones. Use `Scan.create` to make one.
+    replaced by invalid ones; odometry_silence_s: by how much the odometry was silent for longer
+    than usual since the previous scan; None: unknown. Use `Scan.create` to make one.
 
     Each range is one of `hit`, `no_return`, `below_range_min`, or invalid (`valid` is False).
     Source: REP 117, with range_max as a finite value for "no return", which many drivers publish.
@@ -41,6 +42,7 @@ class Scan:
     T_base_laser: Array
     zero_is_no_return: bool = False
     fault: str = ''
+    odometry_silence_s: float | None = None
 
     @staticmethod
     def create(

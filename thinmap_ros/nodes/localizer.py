@@ -233,6 +233,11 @@ class LocalizerNode(ThinmapNode):
             estimate = self._localizer.step(scan, T_odom_base)
             step_ms = 1000.0 * (perf_counter() - started)
             self._publish(scan, estimate, step_ms)
+            if estimate.odometry_discontinuity:
+                self.get_logger().warning(
+                    f'{estimate.odometry_discontinuity}: the motion of the robot is unknown, and '
+                    'its pose follows from the scan alone'
+                )
             if not estimate.is_lost:
                 self._last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         diagnostics = self.diagnostics

@@ -826,10 +826,11 @@ def test_where_the_map_would_become_too_large_a_new_one_begins():
     rows = on(localizer, 3, START, np.zeros(3), rng)
     truth, _, odom = rows[-1]
     for leap in range(1, 4):
-        # As far as odometry can have come while there were no scans.
+        # As far as odometry can have come while only the scans were missing.
         odom = se2.compose(odom, np.array([240.0, 240.0, 0.0]))
         stamp = localizer._prediction.stamp_ns + 1000 * PERIOD_NS
-        estimate = localizer.step(scan_in(ROOM, truth, rng, stamp), odom)
+        scan = replace(scan_in(ROOM, truth, rng, stamp), odometry_silence_s=0.0)
+        estimate = localizer.step(scan, odom)
         assert (localizer.rejected, estimate.is_lost) == ((0, False) if leap < 3 else (1, True))
     after = on(localizer, 10, truth, odom, rng)
     assert localizer.rejected == 1

@@ -173,7 +173,8 @@ class EkfLocalizer:
 
         One step: predict, extract lines, update.
         """
-        self._predict(self._odometry.add(scan.stamp_ns, T_odom_base))
+        increment = self._odometry.add(scan, T_odom_base)
+        self._predict(increment)
         observed = 0
         matched = 0
         if not se2.is_finite(scan.T_base_laser):
@@ -197,6 +198,7 @@ class EkfLocalizer:
             len(self._features),
             len(self._filter.area),
             blind_reason=scan.blind_reason,
+            odometry_discontinuity=increment.discontinuity,
         )
 
     def optimized_trajectory(self) -> Array:

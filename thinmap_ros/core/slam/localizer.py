@@ -241,7 +241,8 @@ class Localizer:
             self._apply(correction)
         self._map.render(self.keyframes)
         self._record_pose(scan)
-        return self._estimate(match, correction, blind_reason)
+        estimate = self._estimate(match, correction, blind_reason)
+        return replace(estimate, odometry_discontinuity=prediction.discontinuity)
 
     def optimized_trajectory(self) -> Array:
         """Poses (N, 3) of all steps since the start, after all corrections."""

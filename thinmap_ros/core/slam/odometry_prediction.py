@@ -6,7 +6,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.models import odometry_variances
-from thinmap_ros.core.odometry import OdometryIncrements
+from thinmap_ros.core.odometry import OdometryIncrement, OdometryIncrements
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import rotated_covariance
@@ -31,13 +31,15 @@ class Reversal:
 class Prediction:
     """Predicted pose T_map_base (3,), and covariance (3, 3) of its motion, map frame.
 
-    motion: the increment in the robot frame; T_before (3,): pose before the motion, map frame.
+    motion: the increment in the robot frame; T_before (3,): pose before the motion, map frame;
+    discontinuity: description of an odometry jump; '' without one.
     """
 
     T_before: Array
     T_map_base: Array
     covariance: Array
     motion: MotionPrediction
+    discontinuity: str
 
 
 class OdometryPrediction:
@@ -68,12 +70,14 @@ class OdometryPrediction:
 
     def predict(self, scan: Scan, T_odom_base: Array, T_before: Array) -> Prediction:
         """Predict the pose of a scan by its odometry pose (3,) and the previous pose (3,)."""
-        motion = self._motion(scan, T_odom_base)
+        increment = self._increments.add(scan, T_odom_base)
+        motion = self._motion(increment)
         reversal = self._reversal
         self._reversal = Reversal()
         expected = se2.compose(T_before, motion.increment) + reversal.mean
         covariance = rotated_covariance(motion.covariance, float(T_before[2])) + reversal.covariance
-        return Prediction(T_before, se2.pose(*expected.tolist()), covariance, motion)
+        T_map_base = se2.pose(*expected.tolist())
+        return Prediction(T_before, T_map_base, covariance, motion, increment.discontinuity)
 
     def contradict(self, prediction: Prediction, match: Match, accepted: bool) -> None:
         """Expect that the next increment may reverse the innovation of an unexpected match."""
@@ -96,9 +100,8 @@ class OdometryPrediction:
         self._begins_known = False
         self._calibration.reset_segment()
 
-    def _motion(self, scan: Scan, T_odom_base: Array) -> MotionPrediction:
+    def _motion(self, increment: OdometryIncrement) -> MotionPrediction:
         """Motion since the last scan, robot frame; wide after an odometry discontinuity."""
-        increment = self._increments.add(scan.stamp_ns, T_odom_base)
         variances = odometry_variances(increment.T_before_base, self._config)[[0, 2]]
         moved, systematic = self._calibration.corrected(increment.T_before_base, variances)
         motion = self._model.predict(moved, systematic)
