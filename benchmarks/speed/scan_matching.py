@@ -126,12 +126,12 @@ def _ours(before: list[tuple[Scan, Array]], errors: tuple[float, float]) -> Matc
     matcher = Matcher()
     local_map = LocalMap()
     for scan, T in before:
-        local_map.add_scan(surface_points(scan, _RANGE_M), scan.T_base_laser, T)
+        local_map.add_scan(surface_points(scan), scan.T_base_laser, T)
     sigmas = np.array([errors[0], errors[0], np.radians(errors[1])]) / np.sqrt(3.0)
     covariance = np.diag(np.square(sigmas))
     return lambda scan, prior: (
         matcher.match(
-            surface_points(scan, _RANGE_M), scan.T_base_laser, local_map, prior, covariance
+            surface_points(scan), scan.T_base_laser, local_map, prior, covariance
         ).T_map_base
     )
 

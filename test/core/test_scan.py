@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import LaserConfig, Scan
 
 
 def scan_of(ranges, **changes):
@@ -93,11 +93,11 @@ def test_each_range_is_a_hit_or_free_or_invalid(value, name):
 
 def test_zero_may_be_configured_as_no_return():
     """The LDS of the TurtleBot 3; a range of zero still frees no cells."""
-    scan = one_range(0.0, zero_is_no_return=True)
+    scan = one_range(0.0, laser=LaserConfig(zero_is_no_return=True))
     assert scan.valid.all()
     assert not scan.is_blind
     assert not scan.no_return.any()
-    assert one_range(np.nan, zero_is_no_return=True).is_blind
+    assert one_range(np.nan, laser=LaserConfig(zero_is_no_return=True)).is_blind
 
 
 @pytest.mark.parametrize('valid, blind', [(0, True), (9, True), (10, False), (50, False)])

@@ -206,7 +206,7 @@ def test_presets_fit_together():
             flat(content[f'/**/{name}']['ros__parameters'])
             for name in ('sim', 'grid_mapper', 'localizer')
         )
-        assert localizer['matching.max_range_m'] <= sim['range_max_m']
-        assert grid['max_range_m'] <= sim['range_max_m']
-        reach_m = max(grid['no_return_clear_range_m'], min(grid['max_range_m'], 4.0))
+        max_range_m = content['/**']['ros__parameters']['max_range_m']
+        assert localizer['lines.max_range_m'] <= max_range_m <= sim['range_max_m']
+        reach_m = max(grid['no_return_clear_range_m'], min(max_range_m, 4.0))
         assert grid['local_map_size_m'] >= 2.0 * reach_m

@@ -75,7 +75,7 @@ def test_every_name_has_a_target_or_a_reason():
 
 CASES = [
     ('slam_toolbox', 'localizer', {'transform_tolerance': 0.3, 'keyframes.distance_m': 0.4,
-     'initial_x_m': 1.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.5,
+     'initial_x_m': 1.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.5, 'max_range_m': 20.0,
      'base_frame': 'base_footprint'}, 40),
     ('slam_toolbox', 'grid_mapper', {'resolution_m': 0.05, 'map_update_interval': 5.0,
      'max_range_m': 20.0, 'base_frame': 'base_footprint'}, 40),

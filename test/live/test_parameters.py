@@ -95,10 +95,10 @@ def test_localizer_and_grid_mapper_keep_their_map_while_parameters_change(graph)
     result = change(graph, 'grid_mapper', occupied_thresh=0.3, free_thresh=0.4)
     assert not result.successful and 'free_thresh = 0.4' in result.reason
 
-    names = ('lost_threshold', 'loop_closure.min_inlier_ratio', 'matching.max_range_m')
-    values = dict(zip(names, (8.0, 0.9, 6.0), strict=True))
+    names = ('lost_threshold', 'loop_closure.min_inlier_ratio', 'matching.noise_m')
+    values = dict(zip(names, (8.0, 0.9, 0.06), strict=True))
     assert change(graph, 'localizer', **values).successful
-    assert current(graph, 'localizer', *names) == [8.0, 0.9, 6.0]
+    assert current(graph, 'localizer', *names) == [8.0, 0.9, 0.06]
     result = change(graph, 'localizer', lost_threshold=-1.0)
     assert not result.successful and 'lost_threshold' in result.reason
     before = len(states)

@@ -73,7 +73,7 @@ def seen_in(
     segments: np.ndarray, T_world_base: np.ndarray, rng: np.random.Generator | None = None
 ) -> np.ndarray:
     """Surface points (N, 5) of a scan, robot frame."""
-    return surface_points(scan_in(segments, T_world_base, rng), RANGE_MAX_M)
+    return surface_points(scan_in(segments, T_world_base, rng))
 
 
 def on_wall(points: np.ndarray, angle_rad: float = math.pi / 2.0, share: float = 1.0) -> np.ndarray:

@@ -1,11 +1,13 @@
 """Detects scans that a laser did not measure, by the scans before and the motion of the robot."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.dropouts import DropoutDetector
+from thinmap_ros.core.no_return_range import NoReturnRange
 from thinmap_ros.core.scan import MIN_HITS, Scan, is_most_missed
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
@@ -79,30 +81,42 @@ class _Surfaces:
         # A single beam has no increment.
         beams = np.rint(np.mod(ahead, 2.0 * math.pi) / max(step, _MIN_STEP_RAD))
         beams = beams[beams < scan.ranges_m.size].astype(np.int64)
-        return is_most_missed(scan, int(np.count_nonzero(scan.no_return[beams])))
+        return is_most_missed(scan, int(np.count_nonzero(scan.without_return[beams])))
 
 
 class LaserMonitor:
-    """Replaces scans that the laser did not measure by blind ones.
+    """Replaces scans that the laser did not measure by blind ones, and recognizes dropouts.
 
     A frozen driver repeats its ranges with new stamps. A laser that has failed may report no return
     for its beams: walls do not vanish from one scan to the next. Such a scan is blind, until walls
     are measured again, or scans agree with each other for some time (the robot was carried away).
+    The scans of a laser that often has no return from surfaces in range are marked (`drops_out`).
     """
 
     def __init__(self) -> None:
         self._freeze = _FreezeDetector()
+        self._no_return = NoReturnRange()
+        self._dropouts = DropoutDetector()
         self._trusted = _Surfaces()
         self._previous = _Surfaces()
         self._doubted_ns: int | None = None  # first scan of a series that agrees with itself only
 
+    @property
+    def warnings(self) -> list[str]:
+        """What the laser or its driver do otherwise than REP 117, a line each."""
+        return [text for text in (self._no_return.warning, self._dropouts.warning) if text]
+
     def checked(self, scan: Scan, T_odom_base: Array) -> Scan:
         """The scan, or a blind one with the reason; T_odom_base (3,): pose, without jumps."""
+        scan = self._no_return.applied(scan)
         if self._freeze.is_frozen(scan, T_odom_base):
             return scan.blinded(FROZEN)
         if scan.is_blind:
             return scan
-        return scan.blinded(NO_RETURNS) if self._has_failed(scan, T_odom_base) else scan
+        if self._has_failed(scan, T_odom_base):
+            return scan.blinded(NO_RETURNS)
+        drops_out = self._dropouts.update(scan, T_odom_base)
+        return replace(scan, drops_out=True) if drops_out else scan
 
     def _has_failed(self, scan: Scan, T_odom_base: Array) -> bool:
         surfaces = _Surfaces.of(scan, T_odom_base)

@@ -278,6 +278,11 @@ class ScanOdometrySynchronizer:
         return self._buffer.discarded
 
     @property
+    def warnings(self) -> list[str]:
+        """What the laser or its driver do otherwise than REP 117, a line each."""
+        return self._laser.warnings
+
+    @property
     def waiting(self) -> int:
         """Scans that wait for odometry."""
         return len(self._waiting)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 
@@ -16,6 +17,27 @@ MIN_VALID_BEAM_RATIO = 0.1
 MIN_HITS = 10
 # Maximum distance of a laser from the centre of its robot.
 MAX_MOUNT_OFFSET_M = 100.0
+# Range up to which a beam without return shows free space.
+NO_RETURN_CLEAR_RANGE_M = 8.0
+
+
+@dataclass(frozen=True)
+class LaserConfig(Config):
+    """Parameters of the laser, for everything that uses its scans."""
+
+    max_range_m: float = parameter(
+        30.0,
+        'Usable range of the laser (m). Longer ranges are not matched, make no line and mark no '
+        'obstacle; their beams clear cells up to here. Lower it for a laser that measures badly '
+        'far away.',
+        low=0.5,
+        high=200.0,
+    )
+    zero_is_no_return: bool = parameter(
+        False,
+        'A range of 0 means no return, as for the LDS of the TurtleBot 3. false: the beam is '
+        'invalid.',
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +47,14 @@ class Scan:
     stamp_ns: time of the scan; ranges_m (N,): raw, may hold inf, NaN and nonsense; beam i points to
     angle_min_rad + i * angle_increment_rad in the laser frame (a negative increment is a clockwise
     laser); T_base_laser (3,): the laser's pose on the robot; zero_is_no_return: whether this
-    laser's driver publishes 0 for a beam without return; fault: why the ranges of the laser were
-    replaced by invalid ones; odometry_silence_s: by how much the odometry was silent for longer
-    than usual since the previous scan; None: unknown. Use `Scan.create` to make one.
+    laser's driver publishes 0 for a beam without return; max_range_m: usable range of the laser.
+    drops_out: this laser often has no return from surfaces in range, so that a beam without return
+    says nothing; fault: why the ranges of the laser were replaced by invalid ones;
+    odometry_silence_s: by how much the odometry was silent for longer than usual since the previous
+    scan; None: unknown. Use `Scan.create` to make one.
 
-    Each range is one of `hit`, `no_return`, `below_range_min`, or invalid (`valid` is False).
+    Each range is one of `hit`, `distant_hit`, `no_return`, `below_range_min`, or invalid (`valid`
+    is False).
     Source: REP 117, with range_max as a finite value for "no return", which many drivers publish.
     """
 
@@ -41,6 +66,8 @@ class Scan:
     range_max_m: float
     T_base_laser: Array
     zero_is_no_return: bool = False
+    max_range_m: float = LaserConfig.max_range_m
+    drops_out: bool = False
     fault: str = ''
     odometry_silence_s: float | None = None
 
@@ -53,11 +80,11 @@ class Scan:
         range_min_m: float,
         range_max_m: float,
         T_base_laser: Array | None = None,
-        zero_is_no_return: bool = False,
+        laser: LaserConfig | None = None,
     ) -> 'Scan':
         """Make a scan, rounded to float32 as sensor_msgs/LaserScan is.
 
-        Text log, bag and live agree bit for bit.
+        Text log, bag and live agree bit for bit. laser: parameters; None: their defaults.
 
         Raises InputError if the geometry is invalid: NaN angles, an increment of 0, an empty or
         negative range interval, a laser pose that is not finite or beyond MAX_MOUNT_OFFSET_M.
@@ -90,7 +117,18 @@ class Scan:
                 f'scan at {stamp_ns} ns: laser mounted at {mount}: '
                 f'expected finite numbers, at most {MAX_MOUNT_OFFSET_M:g} m'
             )
-        return Scan(int(stamp_ns), ranges, first, step, low, high, T_base_laser, zero_is_no_return)
+        laser = laser or LaserConfig()
+        return Scan(
+            int(stamp_ns),
+            ranges,
+            first,
+            step,
+            low,
+            high,
+            T_base_laser,
+            laser.zero_is_no_return,
+            laser.max_range_m,
+        )
 
     @cached_property
     def angles_rad(self) -> Array:
@@ -99,7 +137,7 @@ class Scan:
         return self.angle_min_rad + self.angle_increment_rad * beams
 
     @cached_property
-    def hit(self) -> NDArray[np.bool_]:
+    def returned(self) -> NDArray[np.bool_]:
         """Beams that hit an obstacle: range_min <= range < range_max, (N,)."""
         return (
             (self.ranges_m >= self.range_min_m)
@@ -108,9 +146,24 @@ class Scan:
         )
 
     @cached_property
-    def no_return(self) -> NDArray[np.bool_]:
-        """Beams without an obstacle in range: range >= range_max or +inf (REP 117), (N,)."""
+    def hit(self) -> NDArray[np.bool_]:
+        """Beams that hit an obstacle within the usable range, (N,)."""
+        return self.returned & (self.ranges_m < self.max_range_m)
+
+    @cached_property
+    def distant_hit(self) -> NDArray[np.bool_]:
+        """Beams that hit an obstacle beyond the usable range: free up to there, (N,)."""
+        return self.returned & (self.ranges_m >= self.max_range_m)
+
+    @cached_property
+    def without_return(self) -> NDArray[np.bool_]:
+        """Beams without return: range >= range_max or +inf (REP 117), (N,)."""
         return self.ranges_m >= self.range_max_m
+
+    @cached_property
+    def no_return(self) -> NDArray[np.bool_]:
+        """Beams without return that show that there is no obstacle in range, (N,)."""
+        return self.without_return & (not self.drops_out)
 
     @cached_property
     def below_range_min(self) -> NDArray[np.bool_]:
@@ -124,7 +177,7 @@ class Scan:
         With zero_is_no_return a range of 0 is valid: the laser works, and nothing is near. It is
         still not `no_return`: a dark surface gives 0 as well, so the beam clears no cells.
         """
-        valid = self.hit | self.no_return | self.below_range_min
+        valid = self.returned | self.no_return | self.below_range_min
         return valid | (self.ranges_m == 0.0) if self.zero_is_no_return else valid
 
     @cached_property

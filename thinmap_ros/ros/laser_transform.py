@@ -9,7 +9,7 @@ from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError, InputError, quoted
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs.laser_mount import Mount, StaticTransforms
 from thinmap_ros.ros import messages, parameters, qos
@@ -43,15 +43,7 @@ class LaserTransform:
             '',
             'Pose of the laser on the robot as "x,y,yaw" (m, m, rad). Empty: from /tf_static.',
         )
-        self._zero_is_no_return = bool(
-            parameters.declare_parameter(
-                node,
-                'zero_is_no_return',
-                False,
-                'A range of 0 means no return, as for the LDS of the TurtleBot 3. false: the beam '
-                'is invalid.',
-            )
-        )
+        self._laser = parameters.declare_config(node, LaserConfig)
         self._fixed = Mount(_parse_pose(str(given)), upside_down=False) if given else None
         self._transforms = StaticTransforms()
         self._mounts: dict[str, Mount] = {}
@@ -75,7 +67,7 @@ class LaserTransform:
                 f'"{self.base_frame}" to it; publish one on /tf_static or set the parameter '
                 'laser_pose'
             )
-        scan = messages.scan_from_msg(message, mount.T_base_laser, self._zero_is_no_return)
+        scan = messages.scan_from_msg(message, mount.T_base_laser, self._laser)
         return mount.apply(scan)
 
     def pose(self, frame_id: str) -> Array | None:

@@ -30,7 +30,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.rotated import aligned_patch
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Edge, Node, TopologicalMap
@@ -88,8 +88,10 @@ def header(frame_id: str, ns: int) -> Header:
     return Header(frame_id=frame_id, stamp=time_msg(ns))
 
 
-def scan_from_msg(message: LaserScan, T_base_laser: Array, zero_is_no_return: bool = False) -> Scan:
-    """Scan of a message; T_base_laser (3,), zero_is_no_return: what a range of 0 means.
+def scan_from_msg(
+    message: LaserScan, T_base_laser: Array, laser: LaserConfig | None = None
+) -> Scan:
+    """Scan of a message; T_base_laser (3,); laser: parameters, None for their defaults.
 
     Raises InputError as `Scan.create`, and where it has no beams, too many, or impossible angles.
     """
@@ -108,7 +110,7 @@ def scan_from_msg(message: LaserScan, T_base_laser: Array, zero_is_no_return: bo
         message.range_min,
         message.range_max,
         T_base_laser,
-        zero_is_no_return,
+        laser,
     )
 
 

@@ -34,6 +34,7 @@ ROBOT = (
     'robot_radius_m',
     'laser_pose',
     'zero_is_no_return',
+    'max_range_m',
     'map_frame',
     'odom_frame',
     'odom_source',

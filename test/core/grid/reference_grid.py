@@ -68,9 +68,7 @@ class PlainGrid:
     def is_hit(self, scan, i):
         """Whether a beam has a hit within the usable range."""
         return (
-            0 <= i < scan.ranges_m.size
-            and scan.hit[i]
-            and scan.ranges_m[i] < self.config.max_range_m
+            0 <= i < scan.ranges_m.size and scan.returned[i] and scan.ranges_m[i] < scan.max_range_m
         )
 
     def end_of(self, scan, i, heading):
@@ -78,11 +76,11 @@ class PlainGrid:
         config = self.config
         length = 0.0
         if self.is_hit(scan, i):
-            length = min(scan.ranges_m[i] + config.surface_thickness_m, config.max_range_m)
-        elif scan.hit[i]:
-            length = config.max_range_m
+            length = min(scan.ranges_m[i] + config.surface_thickness_m, scan.max_range_m)
+        elif scan.returned[i]:
+            length = scan.max_range_m
         elif scan.no_return[i]:
-            length = min(config.no_return_clear_range_m, scan.range_max_m, config.max_range_m)
+            length = min(config.no_return_clear_range_m, scan.range_max_m, scan.max_range_m)
         angle = heading + scan.angles_rad[i]
         reach = length / config.resolution_m
         return (

@@ -1,5 +1,6 @@
 """A grid that is re-rendered in slices equals one that is re-rendered at once."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +16,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_
 from thinmap_ros.core.grid.patch import UNKNOWN
 from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.tiles import TILE
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import LaserConfig, Scan
 
 WALLS = corridor_ring()
 CORNERS = np.array([[1.2, 1.2], [38.8, 1.2], [38.8, 18.8], [1.2, 18.8], [1.2, 1.2]])
@@ -210,14 +211,14 @@ def test_a_scan_touches_no_tile_beyond_those_that_it_is_thought_to(seed):
     rng = np.random.default_rng(seed)
     config = OccupancyConfig(
         resolution_m=float(rng.choice([0.02, 0.05, 0.1])),
-        max_range_m=float(rng.uniform(2.0, 9.0)),
         no_return_clear_range_m=float(rng.uniform(0.0, 9.0)),
         surface_thickness_m=float(rng.uniform(0.0, 0.5)),
     )
     ranges = rng.uniform(0.0, rng.uniform(1.0, 8.0), 90)
     ranges[rng.random(90) < 0.3] = np.inf
     mount = se2.pose(*rng.uniform(-1.0, 1.0, 2), rng.uniform(-3.0, 3.0))
-    scan = Scan.create(0, ranges, rng.uniform(-3.0, 3.0), 0.02, 0.1, 8.0, mount)
+    laser = LaserConfig(max_range_m=float(rng.uniform(2.0, 9.0)))
+    scan = Scan.create(0, ranges, rng.uniform(-3.0, 3.0), 0.02, 0.1, 8.0, mount, laser)
     T = se2.pose(*rng.uniform(-50.0, 50.0, 2), rng.uniform(-3.0, 3.0))
     grid = OccupancyGrid(config)
     grid.add_scan(scan, T)
@@ -225,7 +226,7 @@ def test_a_scan_touches_no_tile_beyond_those_that_it_is_thought_to(seed):
     low, high = rerendering._tile_boxes([extent], T[None], grid.frame)[0]
     touched = grid.tiles()
     assert (touched >= low).all() and (touched <= high).all()
-    longest = 2.0 * max(config.max_range_m, 1.0) / config.resolution_m / TILE
+    longest = 2.0 * max(laser.max_range_m, 1.0) / config.resolution_m / TILE
     assert (high - low <= 1.5 * longest + 3).all()
 
 
@@ -240,6 +241,57 @@ def test_what_is_rendered_again_at_the_same_poses_is_what_was_there():
     assert grid.update(None, poses[-1]) is None and grid.shown is before
     assert grid.update(None, poses[-1]) is not None and grid.shown is not before
     np.testing.assert_array_equal(grid.shown.known_area().cells, before.known_area().cells)
+
+
+def dropped(scan, rng):
+    """The scan without the returns of half of the beams."""
+    ranges = np.where(rng.random(scan.ranges_m.size) < 0.5, np.inf, scan.ranges_m)
+    return replace(scan, ranges_m=ranges)
+
+
+@pytest.mark.parametrize('keeps_scans', [True, False])
+def test_once_a_laser_proves_to_drop_out_its_beams_without_return_clear_nothing(keeps_scans):
+    rng = np.random.default_rng(5)
+    grid = CorrectableGrid(OccupancyGrid(), keeps_scans)
+    clean = OccupancyGrid()
+    trusted = OccupancyGrid()
+    rebuilt = 0
+    for k in range(40):
+        scan = dropped(SCANS[k], rng)
+        known = replace(scan, drops_out=True)
+        clean.add_scan(known, TRUE[k])
+        trusted.add_scan(scan if k < 20 else known, TRUE[k])
+        moved = grid.update(scan if k < 20 else known, TRUE[k])
+        if moved is not None:
+            np.testing.assert_array_equal(moved.before, moved.after)
+            rebuilt += 1
+    assert rebuilt == keeps_scans
+    assert not grid.is_rerendering
+    expected = clean if keeps_scans else trusted
+    shown = grid.shown.known_area()
+    assert shown.frame == expected.known_area().frame
+    same = shown.cells == expected.known_area().cells
+    assert same.mean() > 0.999, 'scans are rendered in another order'
+    assert trusted.known_area().free.sum() > 2 * clean.known_area().free.sum()
+
+
+def test_a_laser_proves_to_drop_out_while_a_correction_is_rendered(small_slices):
+    rng = np.random.default_rng(6)
+    grid = CorrectableGrid(OccupancyGrid())
+    clean = OccupancyGrid()
+    for k in range(30):
+        scan = dropped(SCANS[k], rng)
+        clean.add_scan(replace(scan, drops_out=True), TRUE[k])
+        grid.update(scan, se2.compose(TRUE[k], se2.pose(0.3, 0.0, 0.0)))
+    grid.apply_correction(np.arange(30), TRUE[:30], 30)
+    for k in range(30, 34):
+        scan = replace(dropped(SCANS[k], rng), drops_out=k > 31)
+        clean.add_scan(replace(scan, drops_out=True), TRUE[k])
+        grid.update(scan, TRUE[k])
+    grid.finish()
+    shown = grid.shown.known_area()
+    assert shown.frame == clean.known_area().frame
+    assert (shown.cells == clean.known_area().cells).mean() > 0.999
 
 
 def test_a_grid_whose_scans_are_not_known_stays_as_it_is():

@@ -513,7 +513,7 @@ def test_other_parameters_apply_at_once_and_keep_the_map(threshold):
     rows, localizer = driven(100)
     frames = list(localizer.keyframes)
     state = {name: array.copy() for name, array in localizer.state().items()}
-    matching = replace(localizer.config.matching, max_range_m=20.0)
+    matching = replace(localizer.config.matching, noise_m=0.06)
     localizer.adjust(LocalizerConfig(lost_threshold=threshold, matching=matching, initial_x_m=-5.0))
     assert localizer.config.initial_x_m == AT_START['initial_x_m'], 'for a reset'
     assert localizer.keyframes == frames

@@ -79,7 +79,7 @@ class ActiveSearch:
         self, places: Places, config: GlobalLocalizationConfig, driving: NavigatorConfig
     ) -> None:
         self._places = places
-        self._range_m = config.max_range_m
+        self._range_m = config.compared_range_m
         self._driving = driving
         self._navigator = Navigator(driving)
         self._view: Viewpoint | None = None

@@ -1,4 +1,6 @@
-"""Occupancy grid that is corrected after loop closures."""
+"""Occupancy grid that is corrected after loop closures, and once a laser proves to drop out."""
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from thinmap_ros.core.se2 import Array
 class CorrectableGrid:
     """A grid that is re-rendered from stored scans after a correction, one slice per scan.
 
+    So it is when the beams without return of a laser turn out to show no free space (`drops_out`).
     `shown` is the published map. It is always complete: each tile shows the old rendering until its
     new one is complete. `corrected_ns` is the stamp of the newest correction that has been
     applied to the whole map.
@@ -26,6 +29,7 @@ class CorrectableGrid:
         """Start with a grid. If keeps_scans is False, it is never corrected."""
         self.shown = grid
         self.corrected_ns = corrected_ns
+        self._drops_out = False
         self._refusals: list[str] = []
         self._history: PoseHistory[StoredScan] | None = PoseHistory() if keeps_scans else None
         self._pending_ns: int | None = None
@@ -62,6 +66,7 @@ class CorrectableGrid:
         self._T_map_base = T_map_base
         moved = self._render_slice()
         if scan is not None:
+            self._set_drops_out(scan.drops_out)
             try:
                 self._add_scan(scan, T_map_base)
             except InputError as error:
@@ -80,6 +85,21 @@ class CorrectableGrid:
         while self.is_rerendering:
             moved = self._render_slice()
         return moved
+
+    def _set_drops_out(self, drops_out: bool) -> None:
+        """Render the stored scans again if what their beams without return say has changed."""
+        if drops_out == self._drops_out:
+            return
+        self._drops_out = drops_out
+        if self._history is None:
+            return
+        config = self.shown.config
+        self._history.replace_kept(
+            lambda kept: StoredScan.of(replace(kept.scan, drops_out=drops_out), config)
+        )
+        self._rerendering = None
+        if self._pending_ns is None:
+            self._pending_ns = self.corrected_ns
 
     def _add_scan(self, scan: Scan, T_map_base: Array) -> None:
         self.shown.add_scan(scan, T_map_base)

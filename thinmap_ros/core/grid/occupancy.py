@@ -17,7 +17,7 @@ from thinmap_ros.core.grid.raytrace import fill_segment
 from thinmap_ros.core.grid.rendered_map import RenderedMap
 from thinmap_ros.core.grid.tiles import MAX_TILE_INDEX, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import NO_RETURN_CLEAR_RANGE_M, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, Field
 
@@ -78,17 +78,10 @@ class OccupancyConfig(Config):
         low=0.6,
         high=0.997,
     )
-    max_range_m: float = parameter(
-        30.0,
-        'Longer ranges clear cells up to here and mark no obstacle (m). Set it to the usable '
-        'range of the laser.',
-        low=0.5,
-        high=200.0,
-    )
     no_return_clear_range_m: float = parameter(
-        8.0,
-        'Range up to which a beam without return clears cells (m). 0: it clears nothing, as for '
-        'lasers that do not see dark or glass walls.',
+        NO_RETURN_CLEAR_RANGE_M,
+        'Range up to which a beam without return clears cells (m). 0: it clears nothing. A laser '
+        'that often has no return from walls is recognized, and its beams clear nothing either.',
         low=0.0,
         high=200.0,
     )
@@ -210,7 +203,7 @@ class OccupancyGrid:
             place = f'{T_map_laser[0]:g}, {T_map_laser[1]:g} m'
             raise InputError(f'scan at {scan.stamp_ns} ns: laser at {place}: too far to be mapped')
         resolution = self.frame.resolution
-        usable = self.config.max_range_m
+        usable = scan.max_range_m
         depth = self.config.surface_thickness_m
         x = (float(T_map_laser[0]) - self.frame.origin_x) / resolution
         y = (float(T_map_laser[1]) - self.frame.origin_y) / resolution
@@ -232,7 +225,7 @@ class OccupancyGrid:
         heading = float(T_map_laser[2])
         bend = 2.0 * math.cos(scan.angle_increment_rad)
         turn = (math.cos(heading), math.sin(heading))
-        beams = (scan.ranges_m, scan.hit, scan.no_return, self._cosines, self._sines)
+        beams = (scan.ranges_m, scan.returned, scan.no_return, self._cosines, self._sines)
         limits = (usable, without_return, depth, resolution, bend)
         box = _draw(increments, laser, turn, *beams, limits, self._steps)
         self._merge(tile_row, tile_col, box, laser)

@@ -36,8 +36,8 @@ class StoredScan(NamedTuple):
     @staticmethod
     def of(scan: Scan, config: OccupancyConfig) -> 'StoredScan':
         """Store a scan, with the extent that a grid of this configuration renders."""
-        usable = config.max_range_m
-        ranges = np.where(scan.hit, scan.ranges_m, 0.0)
+        usable = scan.max_range_m
+        ranges = np.where(scan.returned, scan.ranges_m, 0.0)
         reach = np.minimum(ranges + config.surface_thickness_m, usable)
         without_return = min(config.no_return_clear_range_m, scan.range_max_m, usable)
         reach = np.where(scan.no_return, without_return, reach)

@@ -22,12 +22,7 @@ class GlobalLocalizationConfig(Config):
         low=8,
         high=1000,
     )
-    max_range_m: float = parameter(
-        15.0,
-        'Longer ranges are not compared with the map (m). Set it to the usable range of the laser.',
-        low=1.0,
-        high=100.0,
-    )
+    compared_range_m: float = 15.0  # longer ranges decide little and take time
     robot_radius_m: float = robot_radius()
     node_window_m: float = parameter(
         10.0,

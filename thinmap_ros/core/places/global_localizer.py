@@ -174,7 +174,7 @@ class GlobalLocalization:
             self._T_step = T_odom_base
             return self._waiting('odometry has jumped: the search is reset')
         self._T_step = T_odom_base
-        if scan.is_blind or not (scan.hit | scan.no_return).any():
+        if scan.is_blind or not (scan.returned | scan.no_return).any():
             return self._waiting(f'scan at {scan.stamp_ns} ns: laser blind (too few valid beams)')
         novelty = self._novelty(T_odom_base)
         if novelty > 0.0:

@@ -50,12 +50,12 @@ def observe(scan: Scan, resolution_m: float, config: GlobalLocalizationConfig) -
 
 def observed_beams(scan: Scan, config: GlobalLocalizationConfig) -> Observation:
     """Observation of a scan without its nodes: beams alone."""
-    usable = np.flatnonzero(scan.hit | scan.no_return)
+    usable = np.flatnonzero(scan.returned | scan.no_return)
     if usable.size > config.max_beams:
         usable = usable[
             np.linspace(0.0, usable.size - 1.0, config.max_beams).round().astype(np.int64)
         ]
-    farthest = min(scan.range_max_m, config.max_range_m)
+    farthest = min(scan.range_max_m, scan.max_range_m, config.compared_range_m)
     met = scan.hit[usable] & (scan.ranges_m[usable] < farthest)
     ranges = np.where(met, scan.ranges_m[usable], farthest)
     bearings = scan.angles_rad[usable]
@@ -79,11 +79,10 @@ def observed_nodes(
             resolution_m=resolution_m,
             p_miss=_P_FREE,
             p_hit=_P_OCCUPIED,
-            max_range_m=max(half, 0.5),
             no_return_clear_range_m=half,
         )
     )
-    grid.add_scan(scan, np.zeros(3))
+    grid.add_scan(replace(scan, max_range_m=min(scan.max_range_m, half)), np.zeros(3))
     window = grid.window(0.0, 0.0, config.node_window_m)
     topology = build(window, (0.0, 0.0), TopologyConfig(robot_radius_m=config.robot_radius_m))
     nodes = np.array([node.position for node in topology.nodes.values()]).reshape(-1, 2)

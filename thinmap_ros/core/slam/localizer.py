@@ -225,7 +225,7 @@ class Localizer:
         self._uncertainty.predict(
             self._pose, prediction.T_map_base, prediction.covariance, is_stationary
         )
-        points = surface_points(scan, self.config.matching.max_range_m)
+        points = surface_points(scan)
         match = self._match(scan, points, prediction.T_map_base)
         self._tracking.dead_reckoned = self._tracking.dead_reckoned.moved(prediction)
         self._tracking.update(match)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.slam_room import RANGE_MAX_M, ROOM, scan_in
+from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph import keyframes as module
@@ -33,7 +33,7 @@ def frame(pose, path_m=0.0, stamp_ns=0, covariance=None):
     pose = np.asarray(pose, dtype=np.float64)
     scan = scan_in(ROOM, pose, stamp_ns=stamp_ns)
     covariance = np.zeros((3, 3)) if covariance is None else covariance
-    return Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, path_m, covariance, 0)
+    return Keyframe(scan, surface_points(scan), pose, path_m, covariance, 0)
 
 
 def along(poses, steps=STEP):

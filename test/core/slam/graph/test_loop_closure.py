@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.slam_room import RANGE_MAX_M, ROOM, corridor_ring, scan_in
+from support.slam_room import ROOM, corridor_ring, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph import loop_closure as module
@@ -81,7 +81,7 @@ class Driver:
         self.truths.append(truth)
         self.largest = max(self.largest, float(np.hypot(*(self.pose - truth)[:2])))
         scan = scan_in(self.walls, truth, self.rng, len(self.truths) - 1)
-        points = surface_points(scan, RANGE_MAX_M)
+        points = surface_points(scan)
         frame = Keyframe(scan, points, self.pose, self.path_m(), self.covariance, 0)
         if len(points) >= FEWEST_POINTS and self.loops.needs_keyframe(self.pose):
             self.loops.add(frame, STEP, NONE)
@@ -183,7 +183,7 @@ def straight():
     poses += [se2.pose(11 - k, 1.0, np.pi) for k in range(12)]
     for k, pose in enumerate(poses):
         scan = scan_in(ROOM, pose, stamp_ns=k)
-        frame = Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, float(k), NONE, 0)
+        frame = Keyframe(scan, surface_points(scan), pose, float(k), NONE, 0)
         loops.keyframes.add(frame, STEP)
     return loops
 
@@ -274,9 +274,7 @@ def test_a_robot_that_stands_about_keeps_one_scan(rng):
         pose = np.array([2.0, 2.0, 0.0]) + rng.normal(0.0, 0.1, 3)
         if loops.needs_keyframe(pose):
             scan = scan_in(ROOM, pose, rng, k)
-            loops.add(
-                Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, 0.0, NONE, 0), STEP, NONE
-            )
+            loops.add(Keyframe(scan, surface_points(scan), pose, 0.0, NONE, 0), STEP, NONE)
             kept += 1
         loops.step()
     assert kept == 1
@@ -289,7 +287,7 @@ def test_the_path_is_measured_in_straight_lines():
     for k, x in enumerate((0.0, 1.0, 2.0)):
         pose = se2.pose(2.0 + x, 2.0, 0.0)
         scan = scan_in(ROOM, pose, stamp_ns=k)
-        frame = Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, loops.path_m(pose), NONE, 0)
+        frame = Keyframe(scan, surface_points(scan), pose, loops.path_m(pose), NONE, 0)
         loops.add(frame, STEP, NONE)
     assert loops.path_m(np.array([4.0, 5.0, 0.0])) == pytest.approx(5.0)
 
@@ -301,7 +299,7 @@ def test_a_step_with_a_jump_is_measured_again(rng):
     told = truths + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.2, 0.05]]
     for k, jump in enumerate([NONE, NONE, np.diag([0.1, 0.1, 0.01])]):
         scan = scan_in(ROOM[:4] / 2.0, truths[k], rng, k, beams=361)
-        points = surface_points(scan, RANGE_MAX_M)
+        points = surface_points(scan)
         loops.add(Keyframe(scan, points, told[k], float(k), STEP + jump, 0), STEP, jump)
         loops.step()
     assert [(edge.a, edge.b) for edge in loops.edges] == [(1, 2)]
@@ -315,7 +313,7 @@ def test_what_has_jumped_is_as_uncertain_as_step_and_jump_together():
     for k, jump in enumerate([NONE, np.diag([0.09, 0.01, 0.02])]):
         pose = se2.pose(2.0, 2.0 + k, 0.5 * np.pi)
         scan = scan_in(ROOM, pose, stamp_ns=k)
-        points = surface_points(scan, RANGE_MAX_M)
+        points = surface_points(scan)
         loops.add(Keyframe(scan, points, pose, float(k), NONE, 0), STEP, jump)
     (job,) = loops._jobs
     # In the map frame: along the robot's way is y.
@@ -326,9 +324,7 @@ def test_the_step_covariance_is_that_of_the_step(rng):
     loops = loop_closure()
     for k, pose in enumerate([np.zeros(3), np.array([1.0, 0.0, 0.2])]):
         scan = scan_in(ROOM, pose + [2.0, 2.0, 0.0], rng, k)
-        loops.add(
-            Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, float(k), NONE, 0), STEP, NONE
-        )
+        loops.add(Keyframe(scan, surface_points(scan), pose, float(k), NONE, 0), STEP, NONE)
     loops.finish()
     np.testing.assert_allclose(inverse(loops.keyframes.steps[0].information), STEP)
 
@@ -340,7 +336,7 @@ def test_an_edge_to_what_is_seen_again_holds_the_errors_of_step_and_match(rng):
     frames = []
     for k, pose in enumerate(poses):
         scan = scan_in(ROOM, pose, stamp_ns=k)
-        frames.append(Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, 10.0 * k, NONE, 0))
+        frames.append(Keyframe(scan, surface_points(scan), pose, 10.0 * k, NONE, 0))
     for frame in frames[:2]:
         loops.keyframes.add(frame, STEP)
     by_match = np.diag(np.square([0.02, 0.01, 0.05]))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.slam_room import RANGE_MAX_M, ROOM, scan_in
+from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
@@ -21,7 +21,7 @@ def frames():
     for k in range(30):
         pose = se2.pose(2.0 + 0.2 * k, 2.0 + 0.1 * k, 0.1 * k)
         scan = scan_in(ROOM, pose, stamp_ns=k)
-        points = surface_points(scan, RANGE_MAX_M)
+        points = surface_points(scan)
         kept.append(Keyframe(scan, points, pose, float(k), np.zeros((3, 3)), 0))
     return kept
 

@@ -1,6 +1,7 @@
 """Scan-to-map matching: accuracy, and covariance in directions without walls."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -186,8 +187,10 @@ def test_in_a_corridor_without_visible_end_the_prior_decides():
         local_map = LocalMap()
         for x in np.arange(-10.0, 0.1, 1.0):
             pose = np.array([x, 0.0, 0.0])
-            local_map.add_scan(surface_points(scan_in(CORRIDOR, pose, rng), 6.0), LASER, pose)
-        points = surface_points(scan_in(CORRIDOR, truth, rng), 6.0)
+            local_map.add_scan(
+                surface_points(replace(scan_in(CORRIDOR, pose, rng), max_range_m=6.0)), LASER, pose
+            )
+        points = surface_points(replace(scan_in(CORRIDOR, truth, rng), max_range_m=6.0))
         found = match(local_map, points, truth, covariance)
         back.append(truth[0] - found.T_map_base[0])
     # At most the prior's sigma: without information along the corridor, the prior decides.
@@ -271,7 +274,7 @@ def test_some_outliers_do_not_pull(rng, room):
     blocked = type(scan).create(
         0, ranges, scan.angle_min_rad, scan.angle_increment_rad, 0.05, RANGE_MAX_M
     )
-    points = surface_points(blocked, RANGE_MAX_M)
+    points = surface_points(blocked)
     found = match(room, points, TRUTH + [0.05, -0.03, 0.02])
     assert np.hypot(*off(found)[:2]) < 0.025
     assert 0.05 < 1.0 - found.inlier_ratio < 0.6
@@ -331,9 +334,7 @@ def test_a_point_counts_as_much_as_its_spacing():
 
 def test_a_scan_of_twice_the_beams_has_no_more_information_at_close_range(room):
     sparse, dense = (
-        match(
-            room, surface_points(scan_in(ROOM, TRUTH, beams=beams), RANGE_MAX_M), TRUTH
-        ).scan_information
+        match(room, surface_points(scan_in(ROOM, TRUTH, beams=beams)), TRUTH).scan_information
         for beams in (721, 1441)
     )
     np.testing.assert_allclose(np.diag(dense), np.diag(sparse), rtol=0.4)

@@ -1,6 +1,7 @@
 """Surface points: normals from neighbours on one surface, and no false surfaces."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -135,7 +136,7 @@ def test_normals_of_a_flat_wall_at_all_incidences(rng, incidence, away_m):
     number = 0
     for _ in range(20):
         scan = scan_in(wall, np.zeros(3), rng, beams=361)
-        points = surface_points(scan, RANGE_MAX_M)
+        points = surface_points(scan)
         number += np.count_nonzero(scan.hit)
         inside = np.abs((points[:, :2] - middle) @ along) < 1.8
         off.append(off_normal(points[inside], incidence))
@@ -153,7 +154,7 @@ def test_normals_without_noise_are_exact_on_a_turned_robot():
     for mount in ([0.0, 0.0, 0.0], [0.2, -0.1, 0.4]):
         for heading in (0.0, 0.5, -0.7):
             scan = scan_in(wall, np.array([0.0, 0.0, heading]), T_base_laser=np.array(mount))
-            points = surface_points(scan, RANGE_MAX_M)
+            points = surface_points(scan)
             assert len(points) > 50
             assert off_normal(points, -heading).max() < 1e-3
             np.testing.assert_allclose(sureness_of(points), 1.0, atol=1e-6)
@@ -195,7 +196,7 @@ def in_corridor(rng, beams, edges=False):
         ranges = ranges_in(CORRIDOR, pose, step * np.arange(beams) - math.pi / 2.0)
         ranges = np.minimum(ranges, 2.0 * RANGE_MAX_M) + rng.normal(0.0, 0.01, beams)
         scan = Scan.create(0, ranges, -math.pi / 2.0, step, 0.05, RANGE_MAX_M)
-    points = surface_points(scan, RANGE_MAX_M)
+    points = surface_points(scan)
     assert len(points) > 0.4 * beams
     return points, off_normal(points, 0.5 * math.pi - pose[2])
 
@@ -222,11 +223,11 @@ def test_points_that_are_left_out_part_the_scan_too():
     """Points beyond the range are dropped, and do not link others."""
     walls = np.array([[-50.0, -1.0, 50.0, -1.0], [50.0, 1.0, -50.0, 1.0], [7.0, -1.0, 7.0, 1.0]])
     scan = scan_in(walls, np.zeros(3), beams=61)
-    points = surface_points(scan, 5.0)
+    points = surface_points(replace(scan, max_range_m=5.0))
     assert np.hypot(*points[:, :2].T).max() < 5.0
     assert off_normal(points, 0.5 * math.pi).max() < 1e-3
-    assert len(surface_points(scan, RANGE_MAX_M)) > len(points)
-    assert len(surface_points(scan, 0.9)) == 0
+    assert len(surface_points(scan)) > len(points)
+    assert len(surface_points(replace(scan, max_range_m=0.9))) == 0
 
 
 def test_lone_points_are_dropped():
@@ -270,14 +271,13 @@ def test_the_spacing_is_the_gap_to_the_nearest_neighbour_on_the_surface():
 def test_an_empty_scan_has_no_surface():
     nothing = seen_in(np.array([[1e3, -1.0, 1e3, 1.0]]), np.zeros(3))
     assert nothing.shape == (0, 5)
-    assert surface_points(scan_in(ROOM, np.array([5.0, 3.0, 0.0]), beams=2), 8.0).shape == (0, 5)
+    assert surface_points(scan_in(ROOM, np.array([5.0, 3.0, 0.0]), beams=2)).shape == (0, 5)
 
 
 def test_a_clockwise_laser_sees_the_same(rng):
     pose = np.array([2.0, 2.0, 0.3])
     one, other = (
-        surface_points(scan_in(ROOM, pose, clockwise=clockwise), RANGE_MAX_M)
-        for clockwise in (False, True)
+        surface_points(scan_in(ROOM, pose, clockwise=clockwise)) for clockwise in (False, True)
     )
     np.testing.assert_allclose(one, other[::-1], atol=1e-5)
 

@@ -29,12 +29,6 @@ class MatchingConfig(Config):
     of convergence, compared with these sigmas of the prior.
     """
 
-    max_range_m: float = parameter(
-        30.0,
-        'Points beyond this range are not matched (m). Set it to the usable range of the laser.',
-        low=1.0,
-        high=200.0,
-    )
     noise_m: float = parameter(
         0.05,
         'Standard deviation of a scan point around its wall (m). Raise it for a noisy laser or '

@@ -21,15 +21,13 @@ _ALIGNED = 0.8  # smallest squared cosine between two steps along one surface
 _ALIKE = 9.0  # largest squared ratio of their lengths
 
 
-def surface_points(scan: Scan, range_m: float) -> Array:
-    """Surface points (N, 5) of a scan within a range (m), robot frame, in the order of the beams.
+def surface_points(scan: Scan) -> Array:
+    """Surface points (N, 5) of a scan, robot frame, in the order of the beams.
 
     Columns: x, y; cosine and sine of twice the angle of the surface normal, shortened if the
     neighbours scatter by more than the range noise; spacing of the points, m.
     """
-    near = scan.ranges_m[scan.hit] < range_m
-    points = np.ascontiguousarray(scan.points_base()[near])
-    return _surface(points, np.flatnonzero(scan.hit)[near])
+    return _surface(scan.points_base(), np.flatnonzero(scan.hit))
 
 
 @inlined
