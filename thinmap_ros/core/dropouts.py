@@ -111,7 +111,8 @@ def _surfaces(scan: Scan) -> Array:
     ranges = np.where(scan.hit, scan.ranges_m, np.inf)
     with np.errstate(invalid='ignore'):
         near = np.abs(np.diff(ranges)) < _SAME_SURFACE_M
-    return scan.points_base()[(np.append(near, False) | np.append(False, near))[scan.hit]]
+    surfaces = (np.append(near, False) | np.append(False, near))[scan.hit]
+    return np.asarray(scan.points_base()[surfaces])
 
 
 @kernel

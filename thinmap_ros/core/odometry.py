@@ -1,16 +1,18 @@
 """Odometry at the stamps of scans, and its increments from scan to scan."""
 
 import math
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
+from thinmap_ros.core.deskewing import SweepTiming, deskewed
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.laser_monitor import LaserMonitor
 from thinmap_ros.core.scan import Scan
@@ -125,6 +127,23 @@ class OdometryBuffer:
             return None
         share = (stamp_ns - before) / (after - before)
         return se2.interpolate(self._poses[index - 1], self._poses[index], share)
+
+    def between(self, begin_ns: int, end_ns: int) -> tuple[NDArray[np.int64], Array] | None:
+        """Stamps (K,) and poses (K, 3) of samples that cover a period; None where none do.
+
+        Neither do samples in a long gap, nor those within a discontinuity.
+        """
+        first = bisect_right(self._stamps, begin_ns) - 1
+        end = bisect_left(self._stamps, end_ns) + 1
+        if first < 0 or end > len(self._stamps):
+            return None
+        inner = [begin_ns, *self._stamps[first + 1 : end - 1], end_ns]
+        poses = [self.interpolate(stamp_ns) for stamp_ns in inner]
+        known = [pose for pose in poses if pose is not None]
+        middles = [(a + b) // 2 for a, b in pairwise(inner)]
+        if len(known) < len(poses) or any(self.interpolate(ns) is None for ns in middles):
+            return None
+        return np.array(inner, dtype=np.int64), np.array(known)
 
     def _drop_old(self) -> None:
         first = bisect_left(self._stamps, self._stamps[-1] - self._span_ns)
@@ -266,6 +285,7 @@ class ScanOdometrySynchronizer:
     def __init__(self, capacity: int = 20) -> None:
         self._buffer = OdometryBuffer(max_gap_ns=MAX_ODOMETRY_GAP_NS)
         self._laser = LaserMonitor()
+        self._timing = SweepTiming()
         self._silence = SilenceDetector()
         self._silence_s = 0.0  # since the last scan
         self._waiting: deque[Scan] = deque()
@@ -302,6 +322,7 @@ class ScanOdometrySynchronizer:
         while self._waiting and self._waiting[-1].stamp_ns > scan.stamp_ns + SECOND_NS:
             self._waiting.pop()
             self.dropped += 1
+        self._timing.add(scan)
         self._waiting.append(scan)
         if len(self._waiting) > self._capacity:
             self._waiting.popleft()
@@ -314,7 +335,9 @@ class ScanOdometrySynchronizer:
         while self._waiting and latest is not None:
             scan = self._waiting[0]
             T_odom_base = self._buffer.interpolate(scan.stamp_ns)
-            if T_odom_base is None and scan.stamp_ns > latest:
+            if latest < self._needed_until(scan) or (
+                T_odom_base is None and scan.stamp_ns > latest
+            ):
                 break
             self._waiting.popleft()
             if T_odom_base is None:
@@ -322,5 +345,17 @@ class ScanOdometrySynchronizer:
             else:
                 scan = replace(scan, odometry_silence_s=self._silence_s)
                 self._silence_s = 0.0
-                ready.append((self._laser.checked(scan, T_odom_base), T_odom_base))
+                checked = self._laser.checked(scan, T_odom_base)
+                ready.append((self._deskewed(checked), T_odom_base))
         return ready
+
+    def _needed_until(self, scan: Scan) -> int:
+        """Time until which a scan needs odometry, ns."""
+        return scan.end_ns if self._timing.is_plausible(scan) else scan.stamp_ns
+
+    def _deskewed(self, scan: Scan) -> Scan:
+        """The scan with all beams at its stamp, if their times and the motion are known."""
+        if scan.is_blind or not self._timing.is_plausible(scan):
+            return scan
+        sweep = self._buffer.between(scan.begin_ns, scan.end_ns)
+        return scan if sweep is None else deskewed(scan, *sweep)

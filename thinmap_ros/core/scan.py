@@ -10,6 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
 
 # With a smaller share of valid beams, the space in front of the laser is unobserved.
 MIN_VALID_BEAM_RATIO = 0.1
@@ -19,6 +20,9 @@ MIN_HITS = 10
 MAX_MOUNT_OFFSET_M = 100.0
 # Range up to which a beam without return shows free space.
 NO_RETURN_CLEAR_RANGE_M = 8.0
+# What the stamp of a scan is the time of.
+AT_START = 'start'
+AT_END = 'end'
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,13 @@ class LaserConfig(Config):
         'A range of 0 means no return, as for the LDS of the TurtleBot 3. false: the beam is '
         'invalid.',
     )
+    scan_stamp: str = parameter(
+        AT_START,
+        'Beam whose time is the stamp of a scan. start: the first one, as sensor_msgs/LaserScan '
+        'defines. end: the last one, as of drivers that stamp a scan when it is complete. It '
+        'matters where the driver publishes time_increment.',
+        choices=(AT_START, AT_END),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +59,9 @@ class Scan:
     angle_min_rad + i * angle_increment_rad in the laser frame (a negative increment is a clockwise
     laser); T_base_laser (3,): the laser's pose on the robot; zero_is_no_return: whether this
     laser's driver publishes 0 for a beam without return; max_range_m: usable range of the laser.
-    drops_out: this laser often has no return from surfaces in range, so that a beam without return
+    first_beam_s, beam_period_s: time of beam 0 since the stamp, and from each beam to the next (s),
+    as the driver states them; scan_time_s: time of a whole scan; each 0 if unknown. drops_out: this
+    laser often has no return from surfaces in range, so that a beam without return
     says nothing; fault: why the ranges of the laser were replaced by invalid ones;
     odometry_silence_s: by how much the odometry was silent for longer than usual since the previous
     scan; None: unknown. Use `Scan.create` to make one.
@@ -67,6 +80,9 @@ class Scan:
     T_base_laser: Array
     zero_is_no_return: bool = False
     max_range_m: float = LaserConfig.max_range_m
+    first_beam_s: float = 0.0
+    beam_period_s: float = 0.0
+    scan_time_s: float = 0.0
     drops_out: bool = False
     fault: str = ''
     odometry_silence_s: float | None = None
@@ -81,10 +97,13 @@ class Scan:
         range_max_m: float,
         T_base_laser: Array | None = None,
         laser: LaserConfig | None = None,
+        time_increment_s: float = 0.0,
+        scan_time_s: float = 0.0,
     ) -> 'Scan':
         """Make a scan, rounded to float32 as sensor_msgs/LaserScan is.
 
         Text log, bag and live agree bit for bit. laser: parameters; None: their defaults.
+        time_increment_s, scan_time_s: time between two beams and of a scan, as in the message.
 
         Raises InputError if the geometry is invalid: NaN angles, an increment of 0, an empty or
         negative range interval, a laser pose that is not finite or beyond MAX_MOUNT_OFFSET_M.
@@ -118,6 +137,9 @@ class Scan:
                 f'expected finite numbers, at most {MAX_MOUNT_OFFSET_M:g} m'
             )
         laser = laser or LaserConfig()
+        if not np.isfinite([time_increment_s, scan_time_s]).all():
+            time_increment_s = scan_time_s = 0.0
+        is_at_end = laser.scan_stamp == AT_END
         return Scan(
             int(stamp_ns),
             ranges,
@@ -128,6 +150,9 @@ class Scan:
             T_base_laser,
             laser.zero_is_no_return,
             laser.max_range_m,
+            first_beam_s=-time_increment_s * (ranges.size - 1) if is_at_end else 0.0,
+            beam_period_s=time_increment_s,
+            scan_time_s=scan_time_s,
         )
 
     @cached_property
@@ -135,6 +160,18 @@ class Scan:
         """Bearing of each beam in the laser frame, (N,)."""
         beams = np.arange(self.ranges_m.size, dtype=np.float64)
         return self.angle_min_rad + self.angle_increment_rad * beams
+
+    @property
+    def end_ns(self) -> int:
+        """Time of the last beam, or the stamp if that is later, ns."""
+        last_s = self.first_beam_s + self.beam_period_s * (self.ranges_m.size - 1)
+        return self.stamp_ns + round(max(self.first_beam_s, last_s, 0.0) * SECOND_NS)
+
+    @property
+    def begin_ns(self) -> int:
+        """Time of the first beam, or the stamp if that is earlier, ns."""
+        last_s = self.first_beam_s + self.beam_period_s * (self.ranges_m.size - 1)
+        return self.stamp_ns + round(min(self.first_beam_s, last_s, 0.0) * SECOND_NS)
 
     @cached_property
     def returned(self) -> NDArray[np.bool_]:

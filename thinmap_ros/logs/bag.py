@@ -280,4 +280,6 @@ def _scan(message: Any) -> Scan:
             message.angle_increment,
             message.range_min,
             message.range_max,
+            time_increment_s=message.time_increment,
+            scan_time_s=message.scan_time,
         )

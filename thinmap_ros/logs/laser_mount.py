@@ -52,7 +52,12 @@ class Mount:
         last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
         ranges = np.ascontiguousarray(scan.ranges_m[::-1])
         return dataclasses.replace(
-            scan, ranges_m=ranges, angle_min_rad=-last, T_base_laser=self.T_base_laser
+            scan,
+            ranges_m=ranges,
+            angle_min_rad=-last,
+            T_base_laser=self.T_base_laser,
+            first_beam_s=scan.first_beam_s + scan.beam_period_s * (scan.ranges_m.size - 1),
+            beam_period_s=-scan.beam_period_s,
         )
 
 

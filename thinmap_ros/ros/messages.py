@@ -111,6 +111,8 @@ def scan_from_msg(
         message.range_max,
         T_base_laser,
         laser,
+        message.time_increment,
+        message.scan_time,
     )
 
 
