@@ -65,7 +65,7 @@ def deskewed(scan: Scan, stamps_ns: NDArray[np.int64], poses: Array) -> Scan:
 
     poses (K, 3): odometry at ascending stamps (K,) that cover the stamp and the times of all beams.
     Beams keep their bearings: the surface between two moved ends gives the range in between. A
-    bearing that no beam covers any more is invalid (NaN).
+    bearing that no beam covers any more is invalid (NaN). Rounded to float32 as `Scan.create` does.
     """
     headings = np.unwrap(poses[:, 2])
     since_s = (stamps_ns - scan.stamp_ns) / SECOND_NS
@@ -78,7 +78,8 @@ def deskewed(scan: Scan, stamps_ns: NDArray[np.int64], poses: Array) -> Scan:
     if np.abs(moved[:, 2]).max() < 0.01 * step and np.abs(moved[:, :2]).max() < 1e-4:
         return scan
     fan = (scan.angle_min_rad, scan.angle_increment_rad)
-    ranges = _moved_beams(scan.ranges_m, scan.returned, moved, fan)
+    moved_m = _moved_beams(scan.ranges_m, scan.returned, moved, fan)
+    ranges = moved_m.astype(np.float32).astype(np.float64)
     return replace(scan, ranges_m=ranges, beam_period_s=0.0, first_beam_s=0.0)
 
 
@@ -103,8 +104,9 @@ def _range_at(
     ranges: Array, hit: NDArray[np.bool_], x: Array, y: Array, i: int, k: int, angle: float
 ) -> float:
     """Range of beam i at an angle, on the surface between its end and that of its neighbour k."""
+    measured: float = ranges[i]
     if not hit[i]:
-        return ranges[i]
+        return measured
     own = math.hypot(x[i], y[i])
     if k < 0 or k >= ranges.size or not hit[k]:
         return own

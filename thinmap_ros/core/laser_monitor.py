@@ -102,9 +102,10 @@ class LaserMonitor:
         self._doubted_ns: int | None = None  # first scan of a series that agrees with itself only
 
     @property
-    def warnings(self) -> list[str]:
-        """What the laser or its driver do otherwise than REP 117, a line each."""
-        return [text for text in (self._no_return.warning, self._dropouts.warning) if text]
+    def warnings(self) -> dict[str, str]:
+        """What the laser or its driver do otherwise than REP 117, by kind."""
+        texts = {'no return': self._no_return.warning, 'dropouts': self._dropouts.warning}
+        return {kind: text for kind, text in texts.items() if text}
 
     def checked(self, scan: Scan, T_odom_base: Array) -> Scan:
         """The scan, or a blind one with the reason; T_odom_base (3,): pose, without jumps."""

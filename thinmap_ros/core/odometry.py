@@ -298,8 +298,8 @@ class ScanOdometrySynchronizer:
         return self._buffer.discarded
 
     @property
-    def warnings(self) -> list[str]:
-        """What the laser or its driver do otherwise than REP 117, a line each."""
+    def warnings(self) -> dict[str, str]:
+        """What the laser or its driver do otherwise than REP 117, by kind."""
         return self._laser.warnings
 
     @property

@@ -25,12 +25,11 @@ from thinmap_ros.core.grid.occupancy import (
     OccupancyGrid,
     WindowConfig,
 )
-from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.mapping.map_output import MapOutputConfig, MapPublishers
-from thinmap_ros.nodes.mapping.scan_pairs import ScanPairs
+from thinmap_ros.nodes.mapping.scan_pairs import LocatedScan, ScanPairs
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.laser_transform import LaserTransform
@@ -74,7 +73,9 @@ class _Settings:
 
 
 class GridMapperNode(ThinmapNode):
-    """/scan, /pose and /slam_status in; /map and /grid, /local_grid at every scan out.
+    """/scan or /localized_scan, /pose and /slam_status in; /map, /grid and /local_grid out.
+
+    /local_grid follows every scan.
 
     Services save_map, load_map; map and dynamic_map return the present map.
 
@@ -101,6 +102,7 @@ class GridMapperNode(ThinmapNode):
         subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_status, qos.STREAM)
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        subscribe_guarded(self, LaserScan, 'localized_scan', self._on_localized, qos.STREAM)
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         # Mapping continues while a map is saved, and waits while one is loaded: no window of the
         # old map reaches the new graph.
@@ -161,22 +163,26 @@ class GridMapperNode(ThinmapNode):
     def _on_scan(self, message: LaserScan) -> None:
         self._add_scan(self._pairs.add_scan(message))
 
+    def _on_localized(self, message: LaserScan) -> None:
+        self._add_scan(self._pairs.add_localized_scan(message))
+
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._add_scan(self._pairs.add_pose(message))
 
     def _on_status(self, message: SlamStatus) -> None:
         self._add_scan(self._pairs.add_status(message))
 
-    def _add_scan(self, complete: tuple[LaserScan, Array, bool] | None) -> None:
+    def _add_scan(self, located: LocatedScan | None) -> None:
         self.diagnostics.set_drop_total('scans and poses without a partner', self._pairs.dropped)
-        if complete is None:
+        if located is None:
             return
-        message, T_map_base, is_known = complete
-        scan = self._laser_transform.to_scan(message)
+        measured = self._laser_transform.to_scan(located.message)
+        scan = replace(measured, drops_out=located.drops_out)
+        T_map_base = located.T_map_base
         if self._stamp.is_restarted_by(scan.stamp_ns):
             self.reset_state()
         with self.diagnostics.time_step('map update'):
-            is_mapped = self._settings.mapping and is_known
+            is_mapped = self._settings.mapping and located.is_known
             moved = self._grid.update(scan if is_mapped else None, T_map_base)
             x, y, _ = T_map_base
             window = self._grid.shown.window(x, y, self._settings.local_map_size_m)

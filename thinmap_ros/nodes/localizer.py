@@ -37,7 +37,7 @@ from thinmap_ros.nodes.localization.known_area import require_near_map
 from thinmap_ros.nodes.localization.map_source import load_localizer
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.decoding.topology_reader import read_topology
-from thinmap_ros.ros.diagnostics import ERROR, OK
+from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
@@ -61,6 +61,7 @@ class _PosePublishers:
         self.map_frame = parameters.declare_map_frame(node)
         self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
         self._features = node.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
+        self._scan = node.create_publisher(LaserScan, 'localized_scan', qos.STREAM)
         self._status = node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
         self._trajectory = node.create_publisher(Path, 'trajectory', qos.LATCHED)
 
@@ -85,6 +86,10 @@ class _PosePublishers:
         status.rejected = localizer.rejected
         status.inlier_ratio = estimate.inlier_ratio
         self._status.publish(status)
+
+    def publish_scan(self, message: LaserScan) -> None:
+        """Publish a scan as it was localized: at one instant, and NaN where it did not measure."""
+        self._scan.publish(message)
 
     def publish_trajectory(self, stamp_ns: int, stamps_ns: list[int], poses: Array) -> None:
         """Publish the corrected poses (N, 3) of the keyframes, with their stamps."""
@@ -161,6 +166,7 @@ class LocalizerNode(ThinmapNode):
         self.enable_checkpoint(self._state, self._restore)
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('pose')
+        self.diagnostics.add_check(WARN, lambda: '; '.join(self._pairing.warnings.values()))
         # Before the scans: of messages that wait together, the executor processes the graph of the
         # last scan first.
         subscribe_guarded(
@@ -190,6 +196,7 @@ class LocalizerNode(ThinmapNode):
         self._broadcaster.reset()
         self._odometry.reset()
         self._pairing = ScanOdometrySynchronizer()
+        self._reported: set[str] = set()
         self._last: OdometryAnchor | None = None
         self._topology: Graph | None = None
         self._relocation: _Relocation | None = None
@@ -240,11 +247,19 @@ class LocalizerNode(ThinmapNode):
                 )
             if not estimate.is_lost:
                 self._last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
+        self._report_warnings()
         diagnostics = self.diagnostics
         diagnostics.set_drop_total('scans without odometry at their time', self._pairing.dropped)
         discarded = self._pairing.discarded_odometry
         diagnostics.set_drop_total('odometry with stamps ahead of those after it', discarded)
         diagnostics.set_drop_total('invalid scans or odometry', self._localizer.rejected)
+
+    def _report_warnings(self) -> None:
+        """Log each kind of warning once."""
+        for kind, text in self._pairing.warnings.items():
+            if kind not in self._reported:
+                self.get_logger().warning(f'scan: {text}')
+                self._reported.add(kind)
 
     def _subscribe_map_once(self, relocation: _Relocation) -> None:
         """Subscribe once to the map that was built before the crash."""
@@ -345,7 +360,8 @@ class LocalizerNode(ThinmapNode):
         if state != SlamStatus.NO_MAP:
             self._broadcaster.update(estimate.T_map_odom)
         self._given.publish(scan.stamp_ns, estimate, state)
-        status = SlamStatus(state=state, step_time_ms=step_ms)
+        status = SlamStatus(state=state, step_time_ms=step_ms, no_return_is_unknown=scan.drops_out)
+        self._output.publish_scan(self._laser_transform.to_message(scan))
         self._output.publish_estimate(scan.stamp_ns, estimate, self._localizer, status)
 
 

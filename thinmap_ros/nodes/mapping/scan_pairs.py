@@ -1,5 +1,7 @@
 """Scans with the pose and the status that the localizer found for them."""
 
+from typing import NamedTuple
+
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
@@ -10,55 +12,72 @@ from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.ros import messages
 
 
+class LocatedScan(NamedTuple):
+    """A scan and the pose T_map_base (3,) at which it was made.
+
+    is_known: whether the pose belongs to a place in the map; drops_out: whether its beams without
+    return show no free space.
+    """
+
+    message: LaserScan
+    T_map_base: Array
+    is_known: bool = True
+    drops_out: bool = False
+
+
 class ScanPairs:
     """Pairs each scan with its pose and, where a localizer publishes it, its status.
 
-    A pose of a lost robot, or of one without a map, belongs to no place in the map, and a blind
-    scan observes nothing.
+    A localizer that publishes the scans that it has localized, corrected for motion, is preferred
+    to the laser. A pose of a lost robot, or of one without a map, belongs to no place in the map,
+    and a blind scan observes nothing.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self._scan_topic = node.resolve_topic_name('localized_scan')
         self._status_topic = node.resolve_topic_name('slam_status')
         self._poses: StampMatcher[LaserScan, Array] = StampMatcher()
-        self._states: StampMatcher[tuple[LaserScan, Array], int] = StampMatcher()
+        self._states: StampMatcher[LocatedScan, SlamStatus] = StampMatcher()
 
     @property
     def dropped(self) -> int:
         """Number of scans, poses and states without a partner."""
         return self._poses.dropped + self._states.dropped
 
-    def add_scan(self, message: LaserScan) -> tuple[LaserScan, Array, bool] | None:
-        """Add a scan; returns scan, T_map_base (3,), whether it is known, once complete."""
+    def add_scan(self, message: LaserScan) -> LocatedScan | None:
+        """Add a scan of the laser; returns a scan with its pose once that is complete."""
+        is_localized = self._node.count_publishers(self._scan_topic) > 0
+        return None if is_localized else self.add_localized_scan(message)
+
+    def add_localized_scan(self, message: LaserScan) -> LocatedScan | None:
+        """Add a scan as the localizer has used it."""
         ns = messages.stamp_ns(message.header.stamp)
         return self._with_state(ns, self._poses.add_left(ns, message))
 
-    def add_pose(self, message: PoseWithCovarianceStamped) -> tuple[LaserScan, Array, bool] | None:
+    def add_pose(self, message: PoseWithCovarianceStamped) -> LocatedScan | None:
         """Add a pose."""
         ns = messages.stamp_ns(message.header.stamp)
         T_map_base = messages.pose_from_msg(message.pose.pose)
         return self._with_state(ns, self._poses.add_right(ns, T_map_base))
 
-    def add_status(self, message: SlamStatus) -> tuple[LaserScan, Array, bool] | None:
+    def add_status(self, message: SlamStatus) -> LocatedScan | None:
         """Add a status."""
-        return _complete(
-            self._states.add_right(messages.stamp_ns(message.header.stamp), message.state)
-        )
+        return _complete(self._states.add_right(messages.stamp_ns(message.header.stamp), message))
 
-    def _with_state(
-        self, ns: int, pair: tuple[LaserScan, Array] | None
-    ) -> tuple[LaserScan, Array, bool] | None:
+    def _with_state(self, ns: int, pair: tuple[LaserScan, Array] | None) -> LocatedScan | None:
         if pair is None:
             return None
+        located = LocatedScan(*pair)
         if self._node.count_publishers(self._status_topic) == 0:
-            return *pair, True
-        return _complete(self._states.add_left(ns, pair))
+            return located
+        return _complete(self._states.add_left(ns, located))
 
 
-def _complete(
-    found: tuple[tuple[LaserScan, Array], int] | None,
-) -> tuple[LaserScan, Array, bool] | None:
+def _complete(found: tuple[LocatedScan, SlamStatus] | None) -> LocatedScan | None:
     if found is None:
         return None
-    pair, state = found
-    return *pair, state == SlamStatus.TRACKING
+    located, status = found
+    return located._replace(
+        is_known=status.state == SlamStatus.TRACKING, drops_out=status.no_return_is_unknown
+    )
