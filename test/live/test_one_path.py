@@ -4,6 +4,8 @@ Equal means: poses to 1e-9 m and rad (a live pose travels as a quaternion), and 
 cell.
 """
 
+from dataclasses import replace as replace_fields
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -13,6 +15,7 @@ from support.doctor import Doctor
 from support.slam_room import drive_round_the_block
 from support.timeouts import PATIENCE_S
 
+from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.files import occupancy_maps, package_data, sessions
@@ -41,6 +44,7 @@ CONNECTIONS = {
     },
     'grid_mapper': {
         'scan: publishers': 1,
+        'localized_scan: publishers': 1,
         'pose: publishers': 1,
         'slam_status: publishers': 1,
         'trajectory: publishers': 1,
@@ -73,6 +77,27 @@ class SimulatedLog:
             if moment.scan is not None:
                 yield ScanEvent(moment.scan)
             moment = simulation.step(0.2, 0.25)
+
+
+class CheapLaserLog(SimulatedLog):
+    """The same drive with a laser that states the times of its beams, and drops half of them."""
+
+    def events(self):
+        rng = np.random.default_rng(1)
+        for event in super().events():
+            if isinstance(event, OdometryEvent):
+                yield event
+                continue
+            scan = event.scan
+            kept = np.repeat(rng.random(-(-scan.ranges_m.size // 6)) < 0.5, 6)[: scan.ranges_m.size]
+            beam_s = np.float32(0.2 * scan.angle_increment_rad / (2.0 * np.pi))
+            yield ScanEvent(
+                replace_fields(
+                    scan,
+                    ranges_m=np.where(kept, scan.ranges_m, np.inf),
+                    beam_period_s=float(beam_s),
+                )
+            )
 
 
 class LoopLog:
@@ -154,6 +179,20 @@ def test_the_filter_of_the_paper_gives_the_same_live_and_replayed(graph, tmp_pat
     assert len(expected.pipeline.localizer.features) > 3
     convert(SimulatedLog(), tmp_path / 'bag')
     assert_live_is_same(graph, tmp_path / 'bag', expected, tmp_path, slam='ekf_ti')
+
+
+def test_a_laser_that_sweeps_and_drops_out_is_treated_alike(graph, tmp_path):
+    expected = replay(CheapLaserLog(), PipelineConfig())
+    free = expected.pipeline.grid.known_area().free
+    assert (
+        free.sum()
+        < 1.05 * replay(SimulatedLog(), PipelineConfig()).pipeline.grid.known_area().free.sum()
+    )
+    convert(CheapLaserLog(), tmp_path / 'bag')
+    statuses = graph.heard('slam_status', SlamStatus)
+    assert_live_is_same(graph, tmp_path / 'bag', expected, tmp_path)
+    assert not statuses[0].no_return_is_unknown and statuses[-1].no_return_is_unknown
+    assert 'taken as unknown, not as free' in graph.log('localizer')
 
 
 def places(topology):

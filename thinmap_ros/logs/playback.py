@@ -56,6 +56,16 @@ class Playback:
             return None
         return self._take()
 
+    @property
+    def is_scan_due(self) -> bool:
+        """Whether the next message is a scan that is due."""
+        following = self._next
+        return following is not None and is_scan(following) and following.log_ns <= self.played_ns
+
+    def hold(self) -> None:
+        """Stop the time of the bag at the next message: it is held back."""
+        self.played_ns = self.clock_ns
+
     def step(self) -> list[RawMessage]:
         """Messages up to and including the next scan; without scans, the next message."""
         has_scans = any(self._bag.topics[topic] == _SCAN for topic in self._topics)

@@ -183,16 +183,30 @@ class BagPlayerNode(Node):
             self._start_s = now_s + _SECONDS.settle if self._has_subscribers() else None
         if self._start_s is None or now_s < self._start_s:
             return
-        # Time spent waiting does not count: the messages keep their intervals.
-        if not self._paused and (not self._lockstep.is_waiting or self._lockstep.timed_out()):
+        if not self._paused:
             self._play(passed_s)
         self._clock_publisher.publish_if_due(self._playback.clock_ns, now_s)
-        self.finished = self._playback.finished and not self._lockstep.is_waiting
+        is_answered = not self._lockstep.is_waiting or self._lockstep.timed_out()
+        self.finished = self._playback.finished and is_answered
 
     def _play(self, passed_s: float) -> None:
+        """Send what is due. In lockstep, the next scan is held back until the result of the last.
+
+        What is between them is sent: a scan may need odometry that follows it.
+        """
         self._playback.advance(1e9 * passed_s * self._config.rate)
-        while not self._lockstep.is_waiting and (message := self._playback.pop_due()) is not None:
+        while not self._is_held() and (message := self._playback.pop_due()) is not None:
             self._send(message)
+
+    def _is_held(self) -> bool:
+        """Whether a scan is due and the result of the last one is missing."""
+        if not (self._playback.is_scan_due and self._lockstep.is_waiting):
+            return False
+        if self._lockstep.timed_out():
+            return False
+        # Time spent waiting does not count: the messages keep their intervals.
+        self._playback.hold()
+        return True
 
     def _send(self, message: RawMessage) -> None:
         self._clock_publisher.publish(message.log_ns)

@@ -125,6 +125,7 @@ def scan_msg(scan: Scan, frame_id: str, scan_time_s: float) -> LaserScan:
         angle_min=scan.angle_min_rad,
         angle_max=scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1),
         angle_increment=scan.angle_increment_rad,
+        time_increment=scan.beam_period_s,
         range_min=scan.range_min_m,
         range_max=scan.range_max_m,
         scan_time=scan_time_s,
