@@ -132,6 +132,22 @@ def test_maps_of_one_value(
     assert len(features) == 0 if warned else len(features) > 0
 
 
+def test_a_map_of_map_saver_has_no_graph_round_the_building(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grey = corridors()
+    grey[:8] = grey[40:] = 205
+    graphs = {}
+    for free_thresh in (0.196, 0.25):
+        path = written(tmp_path, grey, free_thresh=free_thresh)
+        assert run(monkeypatch, path, '-o', tmp_path / 'g.geojson') == 0
+        graphs[free_thresh] = (tmp_path / 'g.geojson').read_text()
+        said = capsys.readouterr().err
+        assert ('2520 cells of grey 205' in said) is (free_thresh == 0.25)
+        assert said.count('\n') == (free_thresh == 0.25)
+    assert graphs[0.25] == graphs[0.196]
+
+
 @pytest.mark.parametrize(
     'changes',
     [

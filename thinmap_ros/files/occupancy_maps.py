@@ -4,8 +4,11 @@ Images are read within limits (`files/images.py`): at most 33,554,432 pixels, a 
 0.05 m a cell, and 16,384 on a side, 819 m. A rotated map has at most as many cells.
 """
 
-from dataclasses import dataclass
-from enum import IntEnum
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +18,22 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted
-from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 from thinmap_ros.files.atomic import atomic_write, write_text
-from thinmap_ros.files.images import read_cells
+from thinmap_ros.files.images import CellRule, ImageCells, read_cells
 from thinmap_ros.files.limits import FILES
 from thinmap_ros.files.regular_files import open_regular_file
-from thinmap_ros.files.yaml import read_mapping
+from thinmap_ros.files.yaml import boolean_of, number_of, read_texts
 
+Report = Callable[[str], object]
+"""Receives a line that the user of a map should know."""
 _MARK = '# written by thinmap'
+# map_saver writes 0.25 beside the same grey values, but map_server takes each pixel below
+# free_thresh as free, and unknown is 50/255 = 0.19608 dark: the map would lose what is unknown.
+# Another grey value would not be unknown to readers that expect 205.
+_KEEPS_UNKNOWN = 0.196
 
 
 class _Grey(IntEnum):
@@ -70,31 +79,45 @@ def _description(image: str, patch: GridPatch) -> dict[str, Any]:
         'origin': [round(frame.origin_x, 6), round(frame.origin_y, 6), 0.0],
         'negate': 0,
         'occupied_thresh': OCCUPIED_AT_LEAST / 100,
-        # map_saver writes 0.25 beside the same grey values, but map_server takes each pixel below
-        # free_thresh as free, and unknown is 50/255 = 0.19608 dark: the map would lose what is
-        # unknown. Another grey value would not be unknown to readers that expect 205.
-        'free_thresh': 0.196,
+        'free_thresh': _KEEPS_UNKNOWN,
     }
 
 
-def read_map(path: Path, folder: Path | None = None) -> GridPatch:
-    """Read a map from its YAML file; trinary and scale modes.
+def warn(text: str) -> None:
+    """Report a line on a map as a Python warning."""
+    warnings.warn(text, stacklevel=3)
 
-    folder: if given, the image must be inside of it. Raises InputError with file, key, value and
-    expectation. A map with a yaw in its origin is resampled.
+
+def read_map(
+    path: Path,
+    folder: Path | None = None,
+    report: Report = warn,
+    *,
+    keeps_unknown: bool = False,
+) -> GridPatch:
+    """Read a map from its YAML file, in the modes trinary, scale and raw, as map_server does.
+
+    folder: if given, the image must be inside of it. Where free_thresh makes the grey free that
+    map_saver writes for unknown, a line is reported; keeps_unknown: and the grey is unknown.
+    Raises InputError with file, key, value and expectation. A map with a yaw in its origin is
+    resampled.
     """
-    content = read_mapping(path, 'a map_server YAML file')
+    content = read_texts(path, 'a map_server YAML file')
     image = _image_of(path, content, folder)
     resolution = _resolution(path, content)
     origin = _origin(path, content)
     shades = _Shades.of(path, content)
-    cells = _cells(path, image, shades)
-    return aligned_patch(origin, resolution, cells, FILES.image_pixels)
+    read = _read_image(path, image, shades)
+    if freed := shades.freed_unknown(read.counts):
+        report(shades.freed_text(path, freed, keeps_unknown))
+        if keeps_unknown:
+            read = _read_image(path, image, replace(shades, keeps_unknown=True))
+    return aligned_patch(origin, resolution, read.cells, FILES.image_pixels)
 
 
 def read_resolution(path: Path) -> float:
     """Edge of a cell (m) of a map, from its YAML file. Raises InputError as `read_map`."""
-    return _resolution(path, read_mapping(path, 'a map_server YAML file'))
+    return _resolution(path, read_texts(path, 'a map_server YAML file'))
 
 
 def _resolution(path: Path, content: dict[str, Any]) -> float:
@@ -112,73 +135,132 @@ def _image_of(path: Path, content: dict[str, Any], folder: Path | None) -> Path:
 
 
 def _number(
-    path: Path,
-    content: dict[str, Any],
-    key: str,
-    low: float,
-    high: float,
-    default: float | None = None,
+    path: Path, content: dict[str, Any], key: str, low: float, high: float, default: str = ''
 ) -> float:
-    value = content.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise InputError(f'{path}: {key}: {quoted(value)}: expected a number from {low} to {high}')
-    return float(value)
+    text = content.get(key, default)
+    try:
+        value = number_of(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise InputError(f'{path}: {key}: {quoted(text)}: expected a number from {low} to {high}')
+    return value
 
 
 def _is_negated(path: Path, content: dict[str, Any]) -> bool:
-    value = content.get('negate', 0)
-    if value not in (0, 1):  # false and true count as such
-        raise InputError(f'{path}: negate: {quoted(value)}: expected 0 or 1')
-    return bool(value)
+    try:
+        return boolean_of(content.get('negate', '0'))
+    except ValueError as error:
+        raise InputError(f'{path}: negate: {error}') from error
 
 
 def _origin(path: Path, content: dict[str, Any]) -> Array:
     value = content.get('origin')
-    numbers = value if isinstance(value, list) else []
-    fit = all(isinstance(v, int | float) and abs(v) <= MAX_COORDINATE_M for v in numbers)
-    if len(numbers) != 3 or not fit:
+    try:
+        numbers = [number_of(text) for text in value] if isinstance(value, list) else []
+    except ValueError:
+        numbers = []
+    if len(numbers) != 3 or not all(abs(number) <= MAX_COORDINATE_M for number in numbers):
         raise InputError(f'{path}: origin: {quoted(value)}: expected [x, y, yaw] in m, m, rad')
-    return se2.pose(*(float(v) for v in numbers))
+    return se2.pose(*numbers)
+
+
+class _Mode(StrEnum):
+    """What the grey of a pixel means, by map_server."""
+
+    TRINARY = 'trinary'
+    SCALE = 'scale'
+    RAW = 'raw'
+
+    @staticmethod
+    def of(path: Path, content: dict[str, Any]) -> '_Mode':
+        name = content.get('mode', _Mode.TRINARY)
+        if not isinstance(name, str) or name.lower() not in list(_Mode):
+            raise InputError(f'{path}: mode: {quoted(name)}: expected {", ".join(_Mode)}')
+        return _Mode(name.lower())
 
 
 @dataclass(frozen=True)
 class _Shades:
-    """Thresholds for the conversion of grey values to cells."""
+    """Conversion of levels, from black to white, to cells; keeps_unknown as in `read_map`.
+
+    Source: loadMapFromFile in map_io.cpp of nav2_map_server (Jazzy). It averages alpha with the
+    colours in mode trinary, so that a transparent pixel can be a wall: here it is unknown.
+    """
 
     occupied: float
     free: float
-    scale: bool
+    mode: _Mode
     negate: bool
+    keeps_unknown: bool = False
 
     @staticmethod
     def of(path: Path, content: dict[str, Any]) -> '_Shades':
-        occupied = _number(path, content, 'occupied_thresh', 0.0, 1.0, default=0.65)
-        free = _number(path, content, 'free_thresh', 0.0, 1.0, default=0.25)
-        mode = content.get('mode', 'trinary')
-        if mode not in ('trinary', 'scale'):
-            raise InputError(f'{path}: mode: {quoted(mode)}: expected trinary or scale')
+        occupied = _number(path, content, 'occupied_thresh', 0.0, 1.0, default='0.65')
+        free = _number(path, content, 'free_thresh', 0.0, 1.0, default='0.25')
+        mode = _Mode.of(path, content)
         if not free < occupied:
             expected = f'expected less than occupied_thresh ({occupied})'
             raise InputError(f'{path}: free_thresh: {free}: {expected}')
-        return _Shades(occupied, free, mode == 'scale', _is_negated(path, content))
+        return _Shades(occupied, free, mode, _is_negated(path, content))
 
-    def table(self, greys: int) -> NDArray[np.int8]:
-        """Cell value of each grey value from 0 to greys - 1."""
-        shade = np.arange(greys) / (greys - 1)
+    @property
+    def rule(self) -> CellRule:
+        """The conversion of an image; in mode scale only opaque pixels are known."""
+        return CellRule(self._table, 255 if self.mode is _Mode.SCALE else 1)
+
+    def freed_unknown(self, counts: NDArray[np.int64]) -> int:
+        """Number of pixels of map_saver's unknown that are free, of the counts of all levels.
+
+        0 in a picture whose grey is mostly another one.
+        """
+        levels = len(counts)
+        unknown = self._level(_Grey.UNKNOWN, levels)
+        ends = (self._level(_Grey.OCCUPIED, levels), self._level(_Grey.FREE, levels))
+        grey = int(counts[min(ends) + 1 : max(ends)].sum())
+        is_free = 0 <= self._table(levels)[unknown] <= FREE_AT_MOST
+        return int(counts[unknown]) if is_free and 2 * counts[unknown] > grey else 0
+
+    def freed_text(self, path: Path, count: int, keeps_unknown: bool) -> str:
+        """A line on what becomes of map_saver's unknown, and what to do about it."""
+        grey = 255 - _Grey.UNKNOWN if self.negate else _Grey.UNKNOWN
+        remedy = f'free_thresh: {_KEEPS_UNKNOWN}'
+        if self.mode is _Mode.SCALE:
+            remedy = f'mode: trinary with {remedy}'
+        cells = f'{path}: {count} cells of grey {grey}, which map_saver writes for unknown,'
+        if keeps_unknown:
+            return f'{cells} are unknown here, but free in map_server: {remedy} in that file'
+        return f'{cells} are free, as in map_server: {remedy} in that file keeps them unknown'
+
+    def _level(self, grey: int, levels: int) -> int:
+        """The level of a grey of 255."""
+        level = grey * (levels - 1) // 255
+        return levels - 1 - level if self.negate else level
+
+    def _table(self, levels: int) -> NDArray[np.int8]:
+        """Cell value of each level from 0 to levels - 1."""
+        shade = np.arange(levels) / (levels - 1)
         darkness = shade if self.negate else 1.0 - shade
-        cells = np.full(greys, UNKNOWN, dtype=np.int8)
-        if self.scale:
+        cells = np.full(levels, UNKNOWN, dtype=np.int8)
+        if self.mode is _Mode.RAW:
+            values = np.floor(255.0 * shade + 0.5)
+            known = values <= 100.0
+            cells[known] = values[known]
+            return cells
+        if self.mode is _Mode.SCALE:
             share = np.clip((darkness - self.free) / (self.occupied - self.free), 0.0, 1.0)
-            cells = (1 + 98 * share).astype(np.int8)
+            cells = np.rint(100.0 * share).astype(np.int8)
         cells[darkness < self.free] = 0
         cells[darkness > self.occupied] = 100
+        if self.keeps_unknown:
+            cells[self._level(_Grey.UNKNOWN, levels)] = UNKNOWN
         return cells
 
 
-def _cells(path: Path, image: Path, shades: _Shades) -> NDArray[np.int8]:
-    """Cells (H, W) of an image, bottom row first. Raises InputError where it cannot be read."""
+def _read_image(path: Path, image: Path, shades: _Shades) -> ImageCells:
+    """Cells of an image. Raises InputError where it cannot be read."""
     try:
-        return read_cells(image, shades.table)
+        return read_cells(image, shades.rule)
     except Exception as error:  # Pillow raises many types for corrupt images
         reason = getattr(error, 'strerror', None) or one_line_reason(error)
         raise InputError(f'{image}: {reason}: expected an image that {path} names') from error

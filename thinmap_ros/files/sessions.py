@@ -19,7 +19,14 @@ from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.files.atomic import atomic_write
-from thinmap_ros.files.occupancy_maps import is_own_map, read_map, read_resolution, write_map
+from thinmap_ros.files.occupancy_maps import (
+    Report,
+    is_own_map,
+    read_map,
+    read_resolution,
+    warn,
+    write_map,
+)
 from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.files.snapshots import is_snapshot, read_snapshot, write_snapshot
 
@@ -181,11 +188,14 @@ def save_grid(path: str, grid: OccupancyGrid, shown: GridPatch | None = None) ->
 
 
 def load_grid(
-    path: str, config: OccupancyConfig | None = None, folder: Path | None = None
+    path: str,
+    config: OccupancyConfig | None = None,
+    folder: Path | None = None,
+    report: Report = warn,
 ) -> OccupancyGrid:
     """Read STEM.grid.npz or, where it is missing, STEM.yaml and its image: any map_server map.
 
-    The grid has the resolution of the file. folder: where given, the image has to lie below it.
+    The grid has the resolution of the file. folder, report: as in `read_map`.
     Raises InputError where both are missing, or one is broken.
     """
     stem = stem_of(path)
@@ -194,7 +204,7 @@ def load_grid(
         return GRID.load(path, config)
     if not _exists(description):
         raise InputError(f'{stem}: neither {GRID.file(path).name} nor {description.name} exists')
-    return OccupancyGrid.from_patch(read_map(description, folder), config)
+    return OccupancyGrid.from_patch(read_map(description, folder, report), config)
 
 
 def load_topology(path: str, config: TopologyConfig | None = None) -> TopologyBuilder:

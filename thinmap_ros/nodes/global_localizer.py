@@ -270,7 +270,8 @@ class GlobalLocalizerNode(ThinmapNode):
         self._patch: GridPatch | None = None
         self._topology: Topology | None = None
         if self._settings.node.map_path:
-            self._patch = occupancy_maps.read_map(Path(self._settings.node.map_path))
+            file = Path(self._settings.node.map_path)
+            self._patch = occupancy_maps.read_map(file, report=self.get_logger().warning)
             self._topology = build(self._patch, None, TopologyConfig())
         warm_up.global_localizer()
         self._output = _LocalizationPublishers(self, self._settings.map_frame)

@@ -1,5 +1,6 @@
 """The occupancy grid: each scan is added at the pose that the localizer found for it."""
 
+import pathlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -135,13 +136,17 @@ class GridMapperNode(ThinmapNode):
         has_map = self._session or self._stamp.latest_ns is not None
         self._stamp.latest_ns = None
         if self._session:
-            grid = sessions.load_grid(self._session, self._settings.grid)
+            grid = self._load_grid(self._session)
             self._grid = CorrectableGrid(grid, keeps_scans=False)
         else:
             self._grid = CorrectableGrid(OccupancyGrid(self._settings.grid))
         if has_map:
             self._stamp.latest_ns = self.get_clock().now().nanoseconds
             self._publish_map()
+
+    def _load_grid(self, path: str, folder: pathlib.Path | None = None) -> OccupancyGrid:
+        report = self.get_logger().warning
+        return sessions.load_grid(path, self._settings.grid, folder, report)
 
     def _state(self) -> State | None:
         if self._stamp.latest_ns is None:
@@ -251,7 +256,7 @@ class GridMapperNode(ThinmapNode):
         """Load grid and graph, or neither."""
         try:
             path = self._save_directory.resolve(request.path)
-            grid = sessions.load_grid(path, self._settings.grid, self._save_directory.path)
+            grid = self._load_grid(path, self._save_directory.path)
             result = await self._session_client.load(path, lambda: self._replace_grid(grid))
         except ThinmapError as error:
             response.success = False

@@ -334,7 +334,9 @@ class LocalizerNode(ThinmapNode):
         """Localizer in a saved map, at the present pose; None where there is no such map."""
         config = config_at(self._config, self._localizer.pose)
         folder = self._save_directory
-        return load_localizer(folder.resolve(path), config, folder.path)
+        return load_localizer(
+            folder.resolve(path), config, folder.path, report=self.get_logger().warning
+        )
 
     def _load(self, path: str) -> str:
         """Replace the map by that of a session, or by any map_server map; lost until scans fit."""

@@ -4,10 +4,11 @@ import argparse
 import shlex
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import TypeVar
+from typing import TextIO, TypeVar
 
 import numpy as np
 
@@ -34,6 +35,7 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
     if sys.argv[0].startswith('thinmap '):
         parser.prog = sys.argv[0]
     arguments = parser.parse_args()
+    _print_warnings(parser.prog)
     compilation = report_compilation()
     try:
         _catch_interrupts()
@@ -46,6 +48,26 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
         sys.exit(INTERRUPTED)
     finally:
         compilation.end()
+
+
+def _print_warnings(program: str) -> None:
+    """Have warnings for the user printed as one line each, without the place in the code."""
+    show = warnings.showwarning
+
+    def show_line(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if category is UserWarning:
+            print(f'{program}: warning: {message}', file=sys.stderr)
+        else:
+            show(message, category, filename, lineno, file, line)
+
+    warnings.showwarning = show_line
 
 
 def command_line() -> str:

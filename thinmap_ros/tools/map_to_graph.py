@@ -48,7 +48,7 @@ def _work(arguments: argparse.Namespace) -> None:
         raise InputError(f'{arguments.picture}: expected a name that ends in .png')
     start = _start(arguments.start)
     config = _config(arguments)
-    patch = occupancy_maps.read_map(arguments.map)
+    patch = occupancy_maps.read_map(arguments.map, keeps_unknown=True)
     topology = build(patch, start, config)
     regions = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius))
     graphs.write_graph(arguments.out, topology, membership_of(topology, regions))

@@ -31,7 +31,9 @@ class GivenMap:
         self._node = node
         self.config = config
         self._settings = parameters.declare_config(node, LocalizationConfig)
-        self.source = MapSource(config, self._settings, parameters.declare_session(node))
+        report = node.get_logger().warning
+        session = parameters.declare_session(node)
+        self.source = MapSource(config, self._settings, session, report)
         self._last_pose = LastPose(
             node, self._settings.pose_file, self._settings.save_pose_rate, self.source.name
         )

@@ -11,7 +11,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.files import sessions
-from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.files.occupancy_maps import Report, read_map
 from thinmap_ros.files.sessions import LOCALIZER
 from thinmap_ros.nodes.localization.config import LocalizationConfig
 from thinmap_ros.ros import messages, qos
@@ -27,9 +27,17 @@ class MapSource:
     """
 
     def __init__(
-        self, config: LocalizerConfig, localization: LocalizationConfig, session: str
+        self,
+        config: LocalizerConfig,
+        localization: LocalizationConfig,
+        session: str,
+        report: Report,
     ) -> None:
-        """Raises ConfigError where the parameters contradict each other, InputError for a file."""
+        """report: receives lines on the map that is read.
+
+        Raises ConfigError where the parameters contradict each other, InputError for a file.
+        """
+        self._report = report
         self._session = session
         self._is_mapping = config.is_mapping
         self._first_map_only = localization.first_map_only
@@ -47,7 +55,7 @@ class MapSource:
                 'line features'
             )
         if file:
-            self.patch = read_map(Path(file))
+            self.patch = read_map(Path(file), report=report)
 
     @property
     def has_map(self) -> bool:
@@ -68,7 +76,7 @@ class MapSource:
         if self.patch is not None:
             return Localizer.in_occupancy_map(self.patch, config)
         if self._session:
-            loaded = load_localizer(self._session, config)
+            loaded = load_localizer(self._session, config, report=self._report)
             if loaded is not None:
                 return loaded
         return localizer_class(config)(config)
@@ -101,14 +109,15 @@ class MapSource:
 
 
 def load_localizer(
-    path: str, config: LocalizerConfig, folder: Path | None = None
+    path: str, config: LocalizerConfig, folder: Path | None = None, *, report: Report
 ) -> AnyLocalizer | None:
     """Localizer in the map of a session, or in its grid: any map_server map.
 
-    folder: where given, an image has to lie below it. None: no map that this localizer can use.
+    folder, report: as in `read_map`. None: no map that this localizer can use.
     Raises InputError where a file is broken, or the path names no map.
     """
     loaded = LOCALIZER.load_optional(path, config)
     if loaded is not None or localizer_class(config) is not Localizer:
         return loaded
-    return Localizer.in_occupancy_map(sessions.load_grid(path, None, folder).known_area(), config)
+    grid = sessions.load_grid(path, None, folder, report)
+    return Localizer.in_occupancy_map(grid.known_area(), config)
