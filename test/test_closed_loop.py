@@ -7,6 +7,7 @@ from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.world import World
 
 NODE = EndNode(1, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True, np.zeros(3))
@@ -39,3 +40,27 @@ def test_a_target_that_stays_although_it_was_reached_has_failed():
     outcome = loop.run(goal, 60.0, lambda seconds, coverage: None)
     assert outcome.finished
     assert strategy.failures == ['reached, but the target stays']
+
+
+def explored(beams, limit_s):
+    """Outcome and path length (m) of an exploration with a laser of a number of beams."""
+    world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
+    start = np.asarray(world.start)
+    laser = LaserScannerConfig(beams=beams, field_of_view_deg=360.0)
+    loop = make_loop(world, start, Options(localization='slam', laser=laser))
+    outcome = loop.run(observable_cells(world, start, 0.25, 8.0), limit_s, lambda *shown: None)
+    steps = np.diff([pose[:2] for pose in loop.log.true_poses], axis=0)
+    return outcome, float(np.hypot(*steps.T).sum())
+
+
+def test_with_too_few_beams_the_robot_stands_still_and_nothing_is_explored():
+    outcome, path_m = explored(8, 30.0)
+    assert not outcome.finished and path_m == 0.0
+    assert '8 valid beams of 8: expected at least 10' in outcome.reason
+
+
+def test_what_cannot_be_explored_is_not_resolved():
+    """Between twelve beams no place is free enough to drive to."""
+    outcome, path_m = explored(12, 100.0)
+    assert outcome.finished and path_m == 0.0
+    assert '1 end nodes left, of which visits showed no more' in outcome.reason

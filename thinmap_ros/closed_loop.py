@@ -102,6 +102,7 @@ class ClosedLoop:
         self._observation: Observation | None = None
         self._drive = _Drive()
         self._T_map_odom = np.zeros(3)
+        self._blind_reason = ''
 
     def run(
         self,
@@ -135,6 +136,8 @@ class ClosedLoop:
             if self.decision is not None and finished
             else f'time limit of {limit_s:.0f} s'
         )
+        if self._blind_reason:
+            reason = f'{reason}; laser blind ({self._blind_reason})'
         return ExplorationOutcome(finished, reason, self.simulation.robot.collisions)
 
     @property
@@ -149,7 +152,10 @@ class ClosedLoop:
             return
         estimate = self.pipeline.step(scan, T_odom_base).estimate
         self.log_poses(scan, estimate)
-        if self.mishap is None or not self.mishap.is_lost:
+        self._blind_reason = estimate.blind_reason
+        if self._blind_reason:
+            self._drive.command = (0.0, 0.0)
+        elif self.mishap is None or not self.mishap.is_lost:
             self.decide(scan, estimate)
 
     def log_poses(self, scan: Scan, estimate: Estimate) -> None:
@@ -206,8 +212,8 @@ class ClosedLoop:
 
     def _control(self, moment: SensorReadings) -> None:
         observation = self._observation
-        if observation is None:
-            return
+        if observation is None or self._blind_reason:
+            return  # as the nodes: a robot whose laser is blind stands still
         T_map_base = se2.compose(self._T_map_odom, moment.T_odom_base)
         command = self.navigator.step(
             T_map_base, observation.patch, observation.scan, _CONTROL_STEPS * STEP_NS / 1e9

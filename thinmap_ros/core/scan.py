@@ -249,3 +249,14 @@ def is_most_missed(scan: Scan, missed: int) -> bool:
     """
     fewest = max(MIN_HITS, MIN_VALID_BEAM_RATIO * scan.ranges_m.size)
     return bool(missed >= fewest and missed > np.count_nonzero(scan.hit))
+
+
+def few_beams_reason(scan: Scan) -> str:
+    """Why no scan with these beams confirms a pose, wherever the robot is; '' where one may.
+
+    A beam without return is valid: there is no wall in its direction.
+    """
+    valid = int(np.count_nonzero(scan.valid))
+    if scan.is_blind or valid >= MIN_HITS:
+        return ''
+    return f'{valid} valid beams of {scan.ranges_m.size}: expected at least {MIN_HITS}'

@@ -1,6 +1,7 @@
 """Missions: budgets, distance, area, return to the start, timeouts of inputs."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -103,6 +104,7 @@ class Scripted:
         self.area_m2 = area_m2
         self.patch = None
         self.failures = []
+        self.left = {}  # fields of the decision: end nodes that remain
 
     def step(self, topology, patch, scan, T_map_base):
         self.patch = patch
@@ -110,7 +112,8 @@ class Scripted:
         if self.goal is not None:
             target = EndNode(1, 0.0, 0.0, 0.5, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, True, self.goal)
         finished = self.code != FinishCode.NONE
-        return Decision(target, finished, 'words', self.code, [], [], self.area_m2)
+        decision = Decision(target, finished, 'words', self.code, [], [], self.area_m2)
+        return replace(decision, **self.left)
 
     def target_failed(self, reason):
         self.failures.append(reason)
@@ -143,6 +146,24 @@ def test_a_mission_drives_where_the_strategy_decides_and_ends_with_it():
     assert end == Finish(FinishCode.ALL_RESOLVED, 'words')
     assert end.is_success
     assert mission.state == MissionState.FINISHED
+
+
+def test_nothing_left_to_do_is_not_nothing_could_be_done():
+    for remaining, unreachable, places, succeeds in (
+        (0, [], [0.0], True),  # a closet that is seen from the start
+        (1, [], [0.0, 0.005], False),
+        (1, [], [0.0, 0.5, 0.0], True),
+        (1, [7], [0.0], True),  # a closed door
+    ):
+        strategy = Scripted()
+        strategy.left = {'remaining': remaining, 'unreachable': unreachable}
+        mission = mission_of(strategy)
+        for x in places:
+            assert mission.step(at(x)) is None
+        strategy.code = FinishCode.UNREACHABLE
+        end = mission.step(at(0.0))
+        assert (end.code, end.is_success) == (FinishCode.UNREACHABLE, succeeds)
+        assert ('has not driven' in end.reason) is not succeeds
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from array import array
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
@@ -15,7 +16,7 @@ from support.doctor import Doctor
 from support.peers.standing_robot import StandingRobot
 
 from thinmap_msgs.action import Explore
-from thinmap_msgs.msg import SlamStatus
+from thinmap_msgs.msg import ExplorationStatus, SlamStatus
 from thinmap_ros.ros import qos
 
 pytestmark = pytest.mark.live
@@ -87,6 +88,28 @@ def test_a_blind_laser_pauses_an_exploration_until_ranges_return(graph):
         relay.whole()
         graph.until(lambda: statuses[-1].state == SlamStatus.TRACKING, 'it tracks again')
     graph.until(lambda: commands[-1].linear.x > 0.3, 'it drives on')
+
+
+def test_with_too_few_beams_an_exploration_fails_and_the_robot_stands(graph):
+    commands = graph.heard('cmd_vel', Twist)
+    truth = graph.heard('ground_truth', PoseStamped)
+    statuses = graph.heard('slam_status', SlamStatus)
+    doctor = Doctor(graph)
+    start = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.9}
+    graph.start('thinmap', arguments=NODES, use_sim_time=True, **start)
+    laser = {'beams': 8, 'field_of_view_deg': 360.0}
+    graph.start('sim', start='2.0,2.0,0.9', wait_for_subscribers=1, real_time_factor=4.0, **laser)
+    client = ActionClient(graph.node, Explore, 'explore')
+    handle = graph.send_goal(client, Explore.Goal())
+    ended = handle.get_result_async()
+    text = 'laser blind (8 valid beams of 8: expected at least 10)'
+    graph.until(lambda: text in doctor.status('localizer').message, 'the reason')
+    graph.until(ended.done, 'the exploration is given up')
+    assert ended.result().status == GoalStatus.STATUS_ABORTED
+    assert ended.result().result.status.reason_code == ExplorationStatus.SENSOR_TIMEOUT
+    assert {status.state for status in statuses} == {SlamStatus.BLIND}
+    assert not any(command.linear.x or command.angular.z for command in commands)
+    assert truth[-1].pose == truth[0].pose
 
 
 class Robot(StandingRobot):

@@ -26,7 +26,7 @@ from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odom
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor, OdometryIncrement, OdometryIncrements
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
@@ -197,7 +197,7 @@ class EkfLocalizer:
             matched,
             len(self._features),
             len(self._filter.area),
-            blind_reason=scan.blind_reason,
+            blind_reason=scan.blind_reason or few_beams_reason(scan),
             odometry_discontinuity=increment.discontinuity,
         )
 

@@ -105,15 +105,20 @@ class DriveTo(NamedTuple):
 
 
 class Finish(NamedTuple):
-    """Order to stop, with the reason why the mission ended."""
+    """Order to stop, with the reason why the mission ended.
+
+    has_explored: False where end nodes are left that no drive has failed to reach, and the robot
+    never drove: the laser shows too little.
+    """
 
     code: FinishCode
     reason: str
+    has_explored: bool = True
 
     @property
     def is_success(self) -> bool:
         """Whether the mission ended as planned."""
-        return self.code in (*_EXPLORED, FinishCode.BUDGET_EXHAUSTED)
+        return self.has_explored and self.code in (*_EXPLORED, FinishCode.BUDGET_EXHAUSTED)
 
 
 Action = DriveTo | Finish | None
@@ -241,7 +246,7 @@ class Mission:
             observation.topology, patch, observation.scan, observation.T_map_base
         )
         if self.decision.finished:
-            return self._finish_exploring(Finish(self.decision.code, self.decision.reason))
+            return self._finish_exploring(self._end_of(self.decision))
         target = self.decision.target
         return None if target is None else DriveTo(target.goal)
 
@@ -285,6 +290,12 @@ class Mission:
     def cancel(self, reason: str) -> Finish:
         """End the mission before it is done."""
         return self._finish(Finish(FinishCode.CANCELLED, reason))
+
+    def _end_of(self, decision: Decision) -> Finish:
+        is_left = decision.remaining > 0 and not decision.unreachable
+        if is_left and self.odometer.distance_m == 0.0:
+            return Finish(decision.code, f'{decision.reason}; the robot has not driven', False)
+        return Finish(decision.code, decision.reason)
 
     def _finish_exploring(self, end: Finish) -> Action:
         """Return to the start if that was asked for, else finish."""

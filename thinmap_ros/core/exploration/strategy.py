@@ -103,9 +103,9 @@ def finish_reason(finished: bool, unreachable: list[int], left: int) -> tuple[Fi
     """Code and words for the state of an exploration with a number of end nodes left."""
     if not finished:
         return FinishCode.NONE, f'{left} end nodes left'
-    if not unreachable:
-        return FinishCode.ALL_RESOLVED, 'all end nodes resolved'
-    return (
-        FinishCode.UNREACHABLE,
-        f'{len(unreachable)} end nodes left, none of them reachable',
-    )
+    if unreachable:
+        reason = f'{len(unreachable)} end nodes left, none of them reachable'
+        return FinishCode.UNREACHABLE, reason
+    if left:
+        return FinishCode.UNREACHABLE, f'{left} end nodes left, of which visits showed no more'
+    return FinishCode.ALL_RESOLVED, 'all end nodes resolved'

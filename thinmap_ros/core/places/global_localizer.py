@@ -20,7 +20,7 @@ from thinmap_ros.core.places.observation import Observation, observe
 from thinmap_ros.core.places.observation_model import NodeModel, calibrate
 from thinmap_ros.core.places.place_database import Places
 from thinmap_ros.core.places.search import KeyView, candidates, judged_before, moved
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
@@ -174,8 +174,10 @@ class GlobalLocalization:
             self._T_step = T_odom_base
             return self._waiting('odometry has jumped: the search is reset')
         self._T_step = T_odom_base
-        if scan.is_blind or not (scan.returned | scan.no_return).any():
-            return self._waiting(f'scan at {scan.stamp_ns} ns: laser blind (too few valid beams)')
+        blind_reason = scan.blind_reason or few_beams_reason(scan)
+        if blind_reason or not (scan.returned | scan.no_return).any():
+            reason = blind_reason or 'no beam shows anything'
+            return self._waiting(f'scan at {scan.stamp_ns} ns: laser blind ({reason})')
         novelty = self._novelty(T_odom_base)
         if novelty > 0.0:
             self._look(scan, T_odom_base, novelty)

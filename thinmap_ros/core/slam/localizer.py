@@ -21,7 +21,7 @@ from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.active_map import ActiveMap
 from thinmap_ros.core.slam.covariance import UNKNOWN, PoseUncertainty
@@ -231,7 +231,7 @@ class Localizer:
         self._tracking.update(match)
         self._update(match, prediction, is_stationary)
         self._tracking.record_pose(self._pose, self._uncertainty.since_match)
-        blind_reason = self._blind_reason(scan, match)
+        blind_reason = self._blind_reason(scan, points, match)
         if not self.config.is_mapping:
             self._detect_loss()
         elif not self._tracking.is_delocalized:
@@ -301,13 +301,31 @@ class Localizer:
         covariance = self._uncertainty.since_match
         return self._matcher.match(points, scan.T_base_laser, self._map.map, prior, covariance)
 
-    def _blind_reason(self, scan: Scan, match: Match | None) -> str:
+    def _blind_reason(self, scan: Scan, points: Array, match: Match | None) -> str:
         """Why the laser does not confirm the pose; '' if it does, or if no wall is in range."""
-        if match is not None or scan.is_blind or self._tracking.is_lost:
+        if match is not None or scan.is_blind:
             return scan.blind_reason
+        sparse_reason = few_beams_reason(scan) or self._sparse_reason(scan, points)
+        if sparse_reason or self._tracking.is_lost:
+            return sparse_reason
         covariance = self._uncertainty.since_match
         misses = misses_walls(scan, self._map.map, self._pose, covariance)
         return _NO_RETURNS if misses else ''
+
+    def _sparse_reason(self, scan: Scan, points: Array) -> str:
+        """Why walls in range do not confirm a pose that no scan has confirmed; '' if they may.
+
+        Behind a room, in a hall with isolated posts, the pose is one that scans have confirmed.
+        """
+        has_confirmed = not self.config.is_mapping or bool(self.keyframes)
+        hits = int(np.count_nonzero(scan.hit))
+        is_sparse = len(points) < FEWEST_POINTS <= hits
+        if not is_sparse or (has_confirmed and not self._tracking.is_delocalized):
+            return ''
+        return (
+            f'{hits} returns, {len(points)} of them side by side on a surface: '
+            f'expected at least {FEWEST_POINTS}'
+        )
 
     def _update(self, match: Match | None, prediction: Prediction, is_stationary: bool) -> None:
         """Set the pose to that of an accepted match, or else to the predicted one."""
