@@ -1,5 +1,6 @@
 """/diagnostics of the nodes, their states, and the common services of all nodes."""
 
+import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -12,9 +13,10 @@ from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import SetBool, Trigger
 from support.doctor import Doctor
+from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import ProbabilityGrid, TopologicalMap
-from thinmap_ros.ros import diagnostics, qos
+from thinmap_ros.ros import diagnostics, messages, qos
 
 pytestmark = pytest.mark.live
 AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.0}
@@ -90,6 +92,64 @@ def test_another_publisher_of_velocity_commands_is_reported(graph):
     graph.until(
         lambda: 'publish /cmd_vel' not in doctor.status('navigator').message, 'the complaint ends'
     )
+
+
+def test_two_sources_of_scans_and_odometry_are_reported_by_name(graph):
+    doctor = Doctor(graph)
+    localizer = {'use_sim_time': True, 'initial_x_m': 2.0, 'initial_y_m': 2.0}
+    graph.start('localizer', **localizer)
+    graph.start('sim')
+
+    def is_healthy():
+        received = doctor.number('localizer', 'scan: received') > 5
+        return received and doctor.level('localizer') == DiagnosticStatus.OK
+
+    graph.until(is_healthy, 'one simulation')
+    graph.start('sim', label='other', remap=('__node:=other', 'clock:=other_clock'))
+    for topic in ('scan', 'odom'):
+        line = f'2 nodes publish /{topic}: /other, /sim: stop all but one'
+        graph.until(lambda text=line: text in graph.log('localizer'), f'two sources of {topic}')
+    assert doctor.level('localizer') == DiagnosticStatus.WARN
+    graph.stop('other')
+    graph.until(lambda: 'nodes publish' not in doctor.status('localizer').message, 'one again')
+
+
+def test_a_source_that_is_restarted_is_no_second_one(graph):
+    doctor = Doctor(graph)
+    graph.start('localizer', laser_pose='0,0,0')
+    for _ in range(3):
+        graph.start('sim')
+        graph.until(lambda: doctor.number('localizer', 'scan: publishers') == 1, 'a source')
+        graph.stop('sim')
+        graph.until(lambda: doctor.number('localizer', 'scan: publishers') == 0, 'none')
+    assert 'nodes publish' not in graph.log('localizer')
+
+
+@pytest.mark.parametrize('is_static', [False, True])
+def test_a_second_source_of_the_pose_on_tf_is_reported_by_name(graph, is_static):
+    doctor = Doctor(graph)
+    graph.start('localizer', laser_pose='0,0,0', use_sim_time=True)
+    graph.start('sim')
+    graph.until(lambda: doctor.number('localizer', 'pose: received') >= 0, 'diagnostics')
+    graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.OK, 'one source')
+    rival = 'map -> odom on /tf_static' if is_static else 'map -> odom on /tf:'
+    if is_static:
+        topic = graph.node.create_publisher(TFMessage, '/tf_static', qos.STATIC_TRANSFORMS)
+        transform = messages.transform_msg(np.zeros(3), 'map', 'odom', 0)
+        topic.publish(TFMessage(transforms=[transform]))
+    else:
+        rules = ('__node:=amcl', 'pose:=amcl_pose', 'slam_status:=amcl_status')
+        graph.start('localizer', label='amcl', remap=rules, laser_pose='0,0,0', use_sim_time=True)
+    graph.until(lambda: rival in doctor.status('localizer').message, 'the second source')
+    message = doctor.status('localizer').message
+    assert ('/test_client' if is_static else '/amcl') in message and 'publish_tf: false' in message
+    assert doctor.level('localizer') == DiagnosticStatus.WARN
+    assert '/localizer' not in message
+    if is_static:
+        graph.node.destroy_publisher(topic)
+    else:
+        graph.stop('amcl')
+    graph.until(lambda: 'map -> odom' not in doctor.status('localizer').message, 'one again')
 
 
 def test_past_errors_are_not_reported_first(ros_domain, monkeypatch):

@@ -174,7 +174,9 @@ class LocalizerNode(ThinmapNode):
         )
         self._odometry.subscribe()
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        poses = InitialPoses(self, self._output.map_frame, self._on_initial_pose)
+        poses = InitialPoses(
+            self, self._output.map_frame, self._on_initial_pose, self._broadcaster.received
+        )
         self._given.source.subscribe(self, self._on_new_map)
         self._given.create_interface(self._output.map_frame, poses)
         self.create_service(SaveMap, 'save_localizer', self._on_save)

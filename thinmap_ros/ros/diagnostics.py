@@ -273,19 +273,14 @@ class NodeDiagnostics:
         self._update_callbacks.append(work)
 
     def check_sole_publisher(self, topic: str, level: bytes = ERROR) -> None:
-        """Report at a level that another node publishes a topic of this node."""
+        """Report at a level that several nodes publish a topic, an output or an input."""
         name = self._node.resolve_topic_name(topic)
 
         def rivals() -> str:
             if self._node.count_publishers(name) < 2:
                 return ''
-            nodes = [
-                f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-                for info in self._node.get_publishers_info_by_topic(name)
-            ]
-            return (
-                f'{len(nodes)} nodes publish {name}: {", ".join(sorted(nodes))}: stop all but one'
-            )
+            nodes = publisher_names(self._node, name)
+            return f'{len(nodes)} nodes publish {name}: {", ".join(nodes)}: stop all but one'
 
         self.add_check(level, rivals)
 
@@ -334,6 +329,12 @@ class NodeDiagnostics:
                 name = subscription.topic_name.lstrip('/')
                 found[f'{name}: publishers'] = _publishers(self._node, subscription)
         return found
+
+
+def publisher_names(node: Node, topic: str) -> list[str]:
+    """Full names of the nodes that publish a topic, sorted, one for each publisher."""
+    infos = node.get_publishers_info_by_topic(topic)
+    return sorted(f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos)
 
 
 def _subscribers(node: Node, publisher: Publisher) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
+from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.qos import (
@@ -24,10 +25,13 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 WARN_PERIOD_S = 5.0  # between two warnings of the same kind
 _TIMEOUT_S = 3.0
+# Data of one sensor: those of two mixed are of none. Positions of two odometries jump.
+_SOLE_SOURCE = (LaserScan, Odometry)
 _ENCAPSULATION = 4  # bytes before the first field of a serialized message
 _STAMP_BYTES = 8
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
@@ -76,6 +80,8 @@ class _GuardedSubscription:
         node.diagnostics.expect_topic(topic)
         is_raw = read is not None
         AdaptiveSubscription(node, kind, topic, self._on_message, profile, is_raw)
+        if kind in _SOLE_SOURCE:
+            node.diagnostics.check_sole_publisher(topic, WARN)
         if self._is_scan:
             node.diagnostics.add_timeout_check(topic, _TIMEOUT_S)
         if self._is_latched:

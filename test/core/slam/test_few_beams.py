@@ -1,4 +1,4 @@
-"""Lasers with too few beams, or none side by side: they confirm no pose, and that is said."""
+"""Lasers with too few beams, or none side by side: they confirm no pose, and report why."""
 
 import numpy as np
 import pytest

@@ -171,6 +171,21 @@ def test_a_map_that_map_saver_wrote_has_the_cells_that_map_server_gives_it(tmp_p
     assert np.array_equal(expected, cells) is (free_thresh < 0.2)
 
 
+def test_nodes_say_that_unknown_cells_of_a_file_are_free(graph, tmp_path):
+    cells = np.full((40, 60), -1, dtype=np.int8)
+    cells[10:30, 10:30] = 0
+    cells[10, 10:30] = 100
+    Image.fromarray(map_readers.map_saver_image(cells)).save(tmp_path / 'm.pgm')
+    path = tmp_path / 'm.yaml'
+    path.write_text('image: m.pgm\nresolution: 5e-2\norigin: [0, 0, 0]\nfree_thresh: .25\n')
+    graph.start('localizer', mode='localization', map_file_name=str(path))
+    graph.start('global_localizer', map_path=str(path))
+    graph.start('grid_mapper', session_path=str(tmp_path / 'm'))
+    for node in graph.processes:
+        line = f'{path}: 2000 cells of grey 205, which map_saver writes for unknown, are free'
+        graph.until(lambda name=node, text=line: text in graph.log(name), f'a line of {node}')
+
+
 def test_services_metadata_and_late_subscribers_have_the_present_map(graph):
     mapping = Mapping(graph, map_values='probability', map_update_interval=0.3)
     shown, exact = mapping.drive()

@@ -1,6 +1,7 @@
 """Initial poses of a user, in any frame."""
 
 from collections.abc import Callable
+from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
@@ -21,11 +22,16 @@ class InitialPoses:
     """
 
     def __init__(
-        self, node: ThinmapNode, map_frame: str, process: Callable[[Array, Array], None]
+        self,
+        node: ThinmapNode,
+        map_frame: str,
+        process: Callable[[Array, Array], None],
+        transform_received: Callable[[Any, bool], None],
     ) -> None:
+        """transform_received: is called with each transform, and whether it is static."""
         self._map_frame = map_frame
         self._process = process
-        self._transforms = TransformListener(node)
+        self._transforms = TransformListener(node, transform_received)
         subscribe_guarded(node, PoseWithCovarianceStamped, 'initialpose', self.add_pose, qos.STREAM)
 
     def add_pose(self, message: PoseWithCovarianceStamped) -> None:

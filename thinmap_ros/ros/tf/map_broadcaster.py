@@ -1,6 +1,7 @@
 """The transform from the map to the odometry frame, published ahead of time."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from tf2_msgs.msg import TFMessage
@@ -9,6 +10,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.tf.sole_broadcaster import SoleBroadcaster
 
 
 @dataclass(frozen=True)
@@ -54,9 +56,11 @@ class MapBroadcaster:
             node, BroadcastConfig, self._on_config, live=('transform_tolerance',)
         )
         self._T_map_odom: Array | None = None
+        self._sole: SoleBroadcaster | None = None
         if not self._config.publish_tf:
             return
         self._publisher = node.create_publisher(TFMessage, '/tf', qos.TRANSFORMS)
+        self._sole = SoleBroadcaster(node, self._frames)
         if self._config.transform_publish_period > 0.0:
             node.create_active_timer(self._config.transform_publish_period, self._publish)
 
@@ -70,6 +74,11 @@ class MapBroadcaster:
         if self._config.publish_tf and (is_first or self._config.transform_publish_period == 0.0):
             self._publish()
 
+    def received(self, transform: Any, is_static: bool) -> None:
+        """A geometry_msgs/TransformStamped was received, of this node or another one."""
+        if self._sole is not None:
+            self._sole.add(transform, is_static)
+
     def reset(self) -> None:
         """Publish nothing until the next `update`."""
         self._T_map_odom = None
@@ -79,6 +88,8 @@ class MapBroadcaster:
             return
         ahead_ns = round(1e9 * self._config.transform_tolerance)
         stamp_ns = self._node.get_clock().now().nanoseconds + ahead_ns
+        if self._sole is not None:
+            self._sole.add_own(stamp_ns)
         poses = [self._T_map_odom, np.zeros(3)]
         self._publisher.publish(
             TFMessage(

@@ -4,6 +4,7 @@ Our own buffer: tf2_ros has no wheel, and one buffer everywhere behaves the same
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -144,8 +145,12 @@ class TransformBuffer:
 class TransformListener:
     """A buffer that is filled from /tf and /tf_static."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(
+        self, node: Node, received: Callable[[Any, bool], None] = lambda transform, is_static: None
+    ) -> None:
+        """received: is called with each transform, and whether it is static."""
         self._node = node
+        self._received = received
         self._buffer = TransformBuffer()
         node.create_subscription(TFMessage, '/tf', self._on_transforms, qos.TRANSFORMS)
         node.create_subscription(TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS)
@@ -169,6 +174,7 @@ class TransformListener:
 
     def _add(self, message: TFMessage, is_static: bool) -> None:
         for transform in message.transforms:
+            self._received(transform, is_static)
             try:
                 self._buffer.add(transform, is_static)
             except InputError as error:
