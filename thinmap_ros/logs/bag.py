@@ -15,7 +15,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.limits import LOGS
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag_directory import DecompressedFile, bag_files
-from thinmap_ros.logs.laser_mount import Mount, StaticTransforms, rotation_matrix
+from thinmap_ros.logs.frames.laser_mount import Mount, StaticTransforms, rotation_matrix
 from thinmap_ros.logs.log import (
     Event,
     OdometryEvent,
