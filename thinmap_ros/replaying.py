@@ -22,7 +22,7 @@ from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
-from thinmap_ros.logs.log import Event, Log, OdometryEvent
+from thinmap_ros.logs.log import Event, Log, OdometryEvent, recording_events
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import summary_figure
@@ -71,7 +71,7 @@ def replay(
     tidy_up = compiler_memory_releaser()
     with _errors_kept(result, keep_partial), ProgressBar('replay', not show_progress) as bar:
         expected = None
-        for number, event in enumerate(log.events()):
+        for number, event in enumerate(recording_events(log)):
             _add_event(result, pairing, event, watcher)
             tidy_up()
             if show_progress:
@@ -134,9 +134,9 @@ def write_outputs(
     patch = pipeline.grid.known_area()
     poses = np.array(result.poses)
     folder.mkdir(parents=True, exist_ok=True)
-    trajectories.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
-    final = list(pipeline.localizer.optimized_trajectory())[: len(poses)]
-    trajectories.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
+    _write_trajectory(folder / 'trajectory.tum', result.stamps_ns, poses)
+    final = np.array(list(pipeline.localizer.optimized_trajectory())[: len(poses)])
+    _write_trajectory(folder / 'trajectory_final.tum', result.stamps_ns, final)
     occupancy_maps.write_map(folder / 'map', patch)
     topology = pipeline.topology.map
     robot_radius_m = pipeline.config.topology.robot_radius_m
@@ -147,6 +147,12 @@ def write_outputs(
     report = _report(result, poses, seconds)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
     return report
+
+
+def _write_trajectory(path: Path, stamps_ns: list[int], poses: Array) -> None:
+    """Write poses (N, 3) in the order of their stamps, the first one of each stamp."""
+    ordered, first = np.unique(np.array(stamps_ns, dtype=np.int64), return_index=True)
+    trajectories.write_tum(path, ordered.tolist(), list(poses[first]))
 
 
 def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[str, Any]:

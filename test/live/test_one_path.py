@@ -61,6 +61,8 @@ CONNECTIONS = {
 class SimulatedLog:
     """Scans and odometry of a robot that drives in circles through the room."""
 
+    is_sorted = True
+
     def __init__(self):
         self.skipped = SkippedRecords()
 
@@ -77,6 +79,8 @@ class SimulatedLog:
 
 class LoopLog:
     """Scans and odometry of a robot that returns to its start after its map has drifted."""
+
+    is_sorted = True
 
     def __init__(self):
         self.skipped = SkippedRecords()

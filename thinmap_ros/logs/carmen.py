@@ -72,6 +72,7 @@ class CarmenLog:
     path: Path
     options: LaserOptions = field(default_factory=LaserOptions)
     skipped: SkippedRecords = field(default_factory=SkippedRecords)
+    is_sorted: bool = field(default=True, init=False)
     _T_base_laser: Array | None = field(default=None, init=False)
 
     def events(self) -> Iterator[Event]:

@@ -1,7 +1,9 @@
 """Events of a log or bag, in the order of writing, and detection of file formats."""
 
+import warnings
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -15,16 +17,22 @@ from thinmap_ros.logs.mcap_records import MAGIC as _MCAP
 if TYPE_CHECKING:
     from thinmap_ros.logs.carmen import LaserOptions
 
+_MAX_REASONS = 20
+_OTHER = 'other reasons'
 _ROS1 = b'#ROSBAG V'
 _SQLITE = b'SQLite format 3\0'
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryEvent:
-    """An odometry sample: T_odom_base (3,) at stamp_ns."""
+    """An odometry sample: T_odom_base (3,) at stamp_ns.
+
+    is_measured: False in a log without odometry, in which the robot never moves in its frame.
+    """
 
     stamp_ns: int
     T_odom_base: Array
+    is_measured: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,20 +47,32 @@ Event = OdometryEvent | ScanEvent
 
 @dataclass
 class SkippedRecords:
-    """Number of unusable records, and the first one."""
+    """Number of unusable records, the first one, and how many have each of the first reasons.
+
+    notes: what was assumed while the log was read, a line each.
+    """
 
     count: int = 0
     first: str = ''
+    reasons: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
 
     def add(self, where: str) -> None:
         """Count a record."""
         self.count += 1
         self.first = self.first or where
+        is_new = where not in self.reasons
+        self.reasons[_OTHER if is_new and len(self.reasons) >= _MAX_REASONS else where] += 1
 
     def add_first(self, where: str) -> None:
         """Count a record and report it as the first one."""
-        self.count += 1
+        self.add(where)
         self.first = where
+
+    def note(self, text: str) -> None:
+        """Add a note, once."""
+        if text not in self.notes:
+            self.notes.append(text)
 
 
 class Log(Protocol):
@@ -66,6 +86,11 @@ class Log(Protocol):
     @property
     def expected_scans(self) -> int | None:
         """Number of scans, roughly, for a progress bar; None if unknown."""
+        ...
+
+    @property
+    def is_sorted(self) -> bool:
+        """Whether the order of the file is right, even where stamps step back."""
         ...
 
     def events(self) -> Iterator[Event]:
@@ -97,18 +122,37 @@ def open_log(
     return CarmenLog(path, laser or LaserOptions())
 
 
+def recording_events(log: Log) -> Iterator[Event]:
+    """Odometry and scans of one recording; late messages of a bag are put in the order of stamps.
+
+    Raises ClockJumpError, an InputError, after the last event before another recording begins: the
+    clock jumped back, and the odometry does not continue.
+    """
+    # Imported here: both modules import this one.
+    from thinmap_ros.logs.order.clock_jumps import ClockJumps
+    from thinmap_ros.logs.order.stamp_order import by_stamp
+
+    events = ClockJumps(lambda text: log.skipped.note(text)).events(log.events())
+    return events if log.is_sorted else by_stamp(events)
+
+
 def paired_scans(log: Log) -> Iterator[tuple[Scan, Array]]:
     """Scans of a log in their order, each with the odometry pose T_odom_base (3,) at its stamp.
 
-    A scan without odometry around its stamp is left out. Raises InputError where the log cannot be
-    read.
+    A scan without odometry around its stamp is left out. Another recording in the same log is left
+    out with a warning (see `recording_events`). Raises InputError where the log cannot be read.
     """
+    from thinmap_ros.logs.order.clock_jumps import ClockJumpError
+
     pairing = ScanOdometrySynchronizer()
-    for event in log.events():
-        if isinstance(event, OdometryEvent):
-            yield from pairing.add_odometry(event.stamp_ns, event.T_odom_base)
-        else:
-            yield from pairing.add_scan(event.scan)
+    try:
+        for event in recording_events(log):
+            if isinstance(event, OdometryEvent):
+                yield from pairing.add_odometry(event.stamp_ns, event.T_odom_base)
+            else:
+                yield from pairing.add_scan(event.scan)
+    except ClockJumpError as error:
+        warnings.warn(str(error), stacklevel=2)
 
 
 def refuse_foreign(path: Path) -> None:

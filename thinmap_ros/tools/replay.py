@@ -126,6 +126,11 @@ class _InterruptibleLog:
         """Expected number of scans of the log."""
         return self._log.expected_scans
 
+    @property
+    def is_sorted(self) -> bool:
+        """Whether the order of the file is right."""
+        return self._log.is_sorted
+
     def events(self) -> Iterator[Event]:
         """Events of the log; raises KeyboardInterrupt between two of them."""
         for event in self._log.events():

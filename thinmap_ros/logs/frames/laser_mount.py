@@ -125,6 +125,11 @@ class StaticTransforms:
         wanted = _without_slash(frame)
         return wanted in self._first or any(wanted == link.parent for link in self._first.values())
 
+    def child_of(self, frame: str) -> str:
+        """A frame with this parent; empty if there is none."""
+        parent = _without_slash(frame)
+        return next((child for child, link in self._first.items() if link.parent == parent), '')
+
     def add(self, message: Any) -> bool:
         """Add a geometry_msgs/TransformStamped; returns whether it is the first of its frame.
 

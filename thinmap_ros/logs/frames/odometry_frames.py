@@ -39,6 +39,7 @@ class OdometryFrames:
         self._note = note
         self._noted: set[str] = set()
         self._static = StaticTransforms() if static is None else static
+        self._found: dict[tuple[str, str], Array] = {}
 
     def add_static(self, transform: Any) -> None:
         """Add a static geometry_msgs/TransformStamped. Raises InputError where it is invalid."""
@@ -66,12 +67,16 @@ class OdometryFrames:
             self._note_once(field, expected)
             return np.zeros(3)
         self._subscribe_once()
-        found = self._static.pose(expected, frame)
+        key = (expected, frame)
+        found = self._found.get(key)
+        if found is None:
+            found = self._static.pose(expected, frame)
         if found is None:
             raise InputError(
                 f'{field} {quoted(frame)}: expected {quoted(expected)} ({parameter}), '
                 'or a frame that static transforms connect to it'
             )
+        self._found[key] = found
         return found
 
     def _subscribe_once(self) -> None:
