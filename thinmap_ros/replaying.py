@@ -2,6 +2,7 @@
 
 import json
 import resource
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,16 +23,50 @@ from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
-from thinmap_ros.logs.log import Event, Log, OdometryEvent, recording_events
+from thinmap_ros.logs.log import WAITING_SCANS, Event, Log, OdometryEvent, recording_events
+from thinmap_ros.logs.order.unused_scans import UnusedScans
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import summary_figure
 
 
 @dataclass(eq=False)
+class ScanCounts:
+    """Scans that did not change the map, by reason: without odometry, blind, and of a lost robot.
+
+    records: unusable records of the log, by reason.
+    """
+
+    without_odometry: dict[str, int] = field(default_factory=dict)
+    blind: Counter[str] = field(default_factory=Counter)
+    lost: int = 0
+    records: Counter[str] = field(default_factory=Counter)
+
+    def add(self, estimate: Estimate) -> None:
+        """Count the estimate of a scan."""
+        if estimate.blind_reason:
+            self.blind[estimate.blind_reason] += 1
+        elif estimate.is_lost:
+            self.lost += 1
+
+    @property
+    def unused(self) -> int:
+        """Number of scans that did not change the map."""
+        return sum(self.without_odometry.values()) + self.blind.total() + self.lost
+
+    def words(self) -> list[str]:
+        """Reasons with the number of their scans, the most frequent first."""
+        reasons = Counter({f'scans {text}': n for text, n in self.without_odometry.items()})
+        reasons.update({f'blind scans: {text}': n for text, n in self.blind.items()})
+        reasons.update({'scans of a lost robot': self.lost} if self.lost else {})
+        return [f'{count} {text}' for text, count in reasons.most_common()]
+
+
+@dataclass(eq=False)
 class Replay:
     """Result of a replay: the pipeline at the end, and the pose (3,) of every scan.
 
+    counts: of scans that did not change the map. notes: what was assumed of the log, a line each.
     ended_by: what ended the replay before the end of the log; None if nothing did.
     """
 
@@ -41,6 +76,8 @@ class Replay:
     local_features: list[int] = field(default_factory=list)
     skipped: int = 0
     first_skipped: str = ''
+    counts: ScanCounts = field(default_factory=ScanCounts)
+    notes: list[str] = field(default_factory=list)
     ended_by: Exception | KeyboardInterrupt | None = None
 
 
@@ -67,12 +104,15 @@ def replay(
     (`Replay.ended_by`) instead of being raised.
     """
     result = Replay(Pipeline(config))
-    pairing = ScanOdometrySynchronizer()
+    pairing = ScanOdometrySynchronizer(WAITING_SCANS)
+    unused = UnusedScans()
     tidy_up = compiler_memory_releaser()
     with _errors_kept(result, keep_partial), ProgressBar('replay', not show_progress) as bar:
         expected = None
         for number, event in enumerate(recording_events(log)):
-            _add_event(result, pairing, event, watcher)
+            unused.add(event)
+            for stamp_ns in _add_event(result, pairing, event, watcher):
+                unused.pair(stamp_ns)
             tidy_up()
             if show_progress:
                 # Of a bag it is known once the bag has been opened.
@@ -82,8 +122,14 @@ def replay(
         result.pipeline.finish()
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
+    result.counts.without_odometry = unused.reasons()
+    result.counts.records = log.skipped.reasons
+    result.notes = log.skipped.notes
     if not result.poses:
-        raise InputError(f'no scan with odometry around its stamp; {result.skipped} skipped')
+        reasons = '; '.join(result.counts.words())
+        raise InputError(
+            f'no scan with odometry around its stamp; {result.skipped} skipped: {reasons}'
+        )
     if watcher is not None:
         with _errors_kept(result, keep_partial):
             watcher.finish(result.stamps_ns[-1], result.pipeline)
@@ -111,8 +157,8 @@ def _errors_kept(result: Replay, keep_partial: bool) -> Iterator[None]:
 
 def _add_event(
     result: Replay, pairing: ScanOdometrySynchronizer, event: Event, watcher: Watcher | None
-) -> None:
-    """Process the scans that are complete with this event."""
+) -> Iterator[int]:
+    """Process the scans that are complete with this event; yields the stamp of each."""
     if isinstance(event, OdometryEvent):
         ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
     else:
@@ -122,8 +168,10 @@ def _add_event(
         result.stamps_ns.append(scan.stamp_ns)
         result.poses.append(step.estimate.T_map_base)
         result.local_features.append(step.estimate.n_local_features)
+        result.counts.add(step.estimate)
         if watcher is not None:
             watcher.step(scan, T_odom_base, step.estimate, result.pipeline)
+        yield scan.stamp_ns
 
 
 def write_outputs(
@@ -167,6 +215,15 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'scans': len(poses),
         'skipped': result.skipped,
         'first_skipped': result.first_skipped,
+        'without_odometry': sum(result.counts.without_odometry.values()),
+        'blind': result.counts.blind.total(),
+        'lost': result.counts.lost,
+        'reasons': {
+            **result.counts.records,
+            **result.counts.without_odometry,
+            **result.counts.blind,
+        },
+        'notes': result.notes,
         'refused': len(refusals),
         'first_refused': refusals[0] if refusals else '',
         'ended_by': '' if result.ended_by is None else one_line_reason(result.ended_by),

@@ -93,8 +93,9 @@ class OdometryBuffer:
             del self._stamps[:first], self._poses[:first]
 
 
-# Between samples that are further apart, the robot need not have moved evenly.
-MAX_ODOMETRY_GAP_NS = SECOND_NS
+# Between samples that are further apart, the robot need not have moved evenly. Odometry at 1 Hz is
+# interpolated, with one lost sample.
+MAX_ODOMETRY_GAP_NS = 2 * SECOND_NS
 
 FIELDS = {
     'stamp_ns': Field(np.int64, (), 0, MAX_COUNT),

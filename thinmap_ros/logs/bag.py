@@ -240,7 +240,7 @@ class BagLog:
         if source == TF:
             return OdometryByTransforms(frames)
         topic = self._topic(bag, _ODOMETRY, self.odometry_topic, 'odometry')
-        return OdometryOnTopic(topic, frames)
+        return OdometryOnTopic(topic, frames.of_odometry(topic))
 
     def _topic(self, bag: Bag, type_name: str, wanted: str, what: str) -> str:
         found = sorted(topic for topic, name in bag.topics.items() if name == type_name)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 _MAX_REASONS = 20
 _OTHER = 'other reasons'
+# Scans of a log that may wait for odometry: those of a fast laser between two samples.
+WAITING_SCANS = 200
 _ROS1 = b'#ROSBAG V'
 _SQLITE = b'SQLite format 3\0'
 
@@ -144,7 +146,7 @@ def paired_scans(log: Log) -> Iterator[tuple[Scan, Array]]:
     """
     from thinmap_ros.logs.order.clock_jumps import ClockJumpError
 
-    pairing = ScanOdometrySynchronizer()
+    pairing = ScanOdometrySynchronizer(WAITING_SCANS)
     try:
         for event in recording_events(log):
             if isinstance(event, OdometryEvent):

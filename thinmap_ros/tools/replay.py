@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
 
@@ -173,16 +174,42 @@ def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
     title = f'{arguments.log.name}: {len(result.poses)} scans'
     report = write_outputs(result, arguments.out, title, seconds)
     report_page.write(arguments.out, title, report, cli.command_line())
-    skipped = f', {result.skipped} skipped' if result.skipped else ''
-    if result.first_skipped:
-        skipped += f' (first: {result.first_skipped})'
-    if report['refused']:
-        skipped += f', {report["refused"]} not mapped (first: {report["first_refused"]})'
-    print(
-        f'{arguments.out}: {report["scans"]} scans{skipped}, {report["distance"]:.1f} m, '
-        f'{report["ms_per_scan"]["all"]["median"]:.1f} ms a scan'
-    )
+    print(f'{arguments.out}: {_summary(result, report)}')
+    _print_notes(result)
     return result
+
+
+def _summary(result: Replay, report: dict[str, Any]) -> str:
+    """Counts, distance and time in one line."""
+    reasons = result.counts.words()
+    if result.first_skipped:
+        reasons.append(f'first: {result.first_skipped}')
+    parts = [f'{report["scans"]} scans']
+    if result.skipped:
+        parts.append(f'{result.skipped} skipped')
+    if reasons:
+        parts[-1] += f' ({"; ".join(reasons)})'
+    if report['refused']:
+        parts.append(f'{report["refused"]} not mapped (first: {report["first_refused"]})')
+    parts += [
+        f'{report["distance"]:.1f} m',
+        f'{report["ms_per_scan"]["all"]["median"]:.1f} ms a scan',
+    ]
+    return ', '.join(parts)
+
+
+def _print_notes(result: Replay) -> None:
+    """What was assumed, and loudly that most of the scans were not used."""
+    for note in result.notes:
+        print(f'replay: note: {note}', file=sys.stderr)
+    unused = result.counts.unused
+    scans = len(result.poses) + sum(result.counts.without_odometry.values())
+    if 2 * unused > scans:
+        reasons = '; '.join(result.counts.words())
+        print(
+            f'replay: warning: only {scans - unused} of {scans} scans were used: {reasons}',
+            file=sys.stderr,
+        )
 
 
 def main() -> None:

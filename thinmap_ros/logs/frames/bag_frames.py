@@ -68,14 +68,14 @@ class BagFrames:
             self._mounts[frame] = self._laser_mount(frame)
         return self._mounts[frame]
 
-    def of_odometry(self, first: Any) -> OdometryFrames:
-        """Reader of odometry in the frames of the first nav_msgs/Odometry of its topic.
+    def of_odometry(self, topic: str) -> OdometryFrames:
+        """Reader of the odometry on a topic, in the frames of its first message.
 
         Where the user does not name them, the odometry frame is that of the message, and the
         robot's frame is base_link, or that of the message where nothing names base_link.
         """
-        child = first.child_frame_id.lstrip('/')
-        self.odom_frame = self._options.odom_frame or first.header.frame_id or _ODOM
+        parent, child = self._frames_of_first(topic)
+        self.odom_frame = self._options.odom_frame or parent or _ODOM
         static = self._connecting(self.base_frame, child) if child else self._static
         if child and not (self._options.base_frame or static.names(self.base_frame)):
             self._assume_base(child)
@@ -83,6 +83,16 @@ class BagFrames:
         return OdometryFrames(
             self.odom_frame, self.base_frame, lambda: None, self._note_of_odometry, static
         )
+
+    def _frames_of_first(self, topic: str) -> tuple[str, str]:
+        """Frame and child frame of the first readable odometry."""
+        for message in self._bag.messages({topic}):
+            try:
+                first = self._bag.decode(message)
+            except InputError:
+                continue  # counted when it is read again
+            return first.header.frame_id.lstrip('/'), first.child_frame_id.lstrip('/')
+        return '', ''
 
     def by_transforms(self) -> TransformOdometry:
         """Odometry by the transform from the odometry frame to that of the robot."""

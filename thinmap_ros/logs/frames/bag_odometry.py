@@ -41,17 +41,14 @@ class BagOdometry(Protocol):
 class OdometryOnTopic:
     """nav_msgs/Odometry, in the frames of the robot or in frames connected to them."""
 
-    def __init__(self, topic: str, frames: BagFrames) -> None:
+    def __init__(self, topic: str, frames: OdometryFrames) -> None:
         self.name = topic
         self.topics = {topic}
         self.missing = ''
-        self._robot_frames = frames
-        self._frames: OdometryFrames | None = None
+        self._frames = frames
 
     def samples(self, message: Any) -> Iterator[OdometryEvent]:
         """The sample of a message."""
-        if self._frames is None:
-            self._frames = self._robot_frames.of_odometry(message)
         T_odom_base = self._frames.pose(message)
         if not se2.is_bounded_pose(T_odom_base):
             raise InputError(

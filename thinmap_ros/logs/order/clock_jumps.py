@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterable, Iterator
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.stamps import CLOCK_JUMP_NS, SECOND_NS
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
 
 # Odometry continues where it moves at most so many steps as before: two samples may be lost.
@@ -41,7 +40,7 @@ class _Stream:
 
     def add(self, ns: int) -> None:
         """Take the next stamp."""
-        if self.before_ns is None and self.last_ns - ns > MAX_ODOMETRY_GAP_NS:
+        if self.before_ns is None and self.last_ns - ns > CLOCK_JUMP_NS:
             self.before_ns = self.last_ns
         elif self.before_ns is not None and not self.is_after_step(ns):
             self.before_ns = None  # a single stamp was wrong
@@ -49,15 +48,15 @@ class _Stream:
 
     def is_after_step(self, ns: int) -> bool:
         """Whether a stamp belongs to the time after the step back."""
-        return self.before_ns is not None and ns < self.before_ns - MAX_ODOMETRY_GAP_NS
+        return self.before_ns is not None and ns < self.before_ns - CLOCK_JUMP_NS
 
 
 class ClockJumps:
     """Filters the events of a log, in the order of their arrival.
 
     Stamps of real robots step back a little now and then, and single ones are wrong. The clock has
-    jumped back where odometry and scans both go on from more than `MAX_ODOMETRY_GAP_NS` earlier,
-    which also clears the odometry buffer of live nodes. Where the odometry continues, the clock was
+    jumped back where odometry and scans both go on from more than `CLOCK_JUMP_NS` earlier, as
+    for the clock of live nodes. Where the odometry continues, the clock was
     set back while the robot drove on: later stamps are moved on by the jump. Where it does not,
     another recording begins.
     """
@@ -92,7 +91,7 @@ class ClockJumps:
         others = [stream for stream in streams if stream.before_ns is None]
         if not others:
             yield from self._jumped()
-        elif not stepped or any(s.last_ns - s.begun_ns > MAX_ODOMETRY_GAP_NS for s in others):
+        elif not stepped or any(s.last_ns - s.begun_ns > CLOCK_JUMP_NS for s in others):
             # A single stamp was wrong, or that of one stream alone.
             yield from self._released(self._held)
 

@@ -5,13 +5,13 @@ from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS
+from thinmap_ros.core.stamps import CLOCK_JUMP_NS
 from thinmap_ros.logs.log import Event, OdometryEvent
 from thinmap_ros.logs.order.clock_jumps import ClockJumpError, stamp_of
 
 
 def by_stamp(events: Iterable[Event]) -> Iterator[Event]:
-    """Put events in the order of their stamps, within `MAX_ODOMETRY_GAP_NS`.
+    """Put events in the order of their stamps, within `CLOCK_JUMP_NS`.
 
     Where the stamps of the odometry step back, too, either it came late as well, or the clock
     stepped back: the order in which the odometry is the shorter path is right.
@@ -20,7 +20,7 @@ def by_stamp(events: Iterable[Event]) -> Iterator[Event]:
     try:
         for event in events:
             waiting.append(event)
-            while stamp_of(event) - min(map(stamp_of, waiting)) > MAX_ODOMETRY_GAP_NS:
+            while stamp_of(event) - min(map(stamp_of, waiting)) > CLOCK_JUMP_NS:
                 yield _pop(waiting)
     except ClockJumpError:
         yield from _rest(waiting)
