@@ -106,13 +106,19 @@ def open_log(
     scan_topic: str = '',
     odometry_topic: str = '',
     T_base_laser: Array | None = None,
-    base_frame: str = 'base_link',
+    base_frame: str = '',
+    *,
+    odometry_source: str = '',
+    odom_frame: str = '',
+    zero_is_no_return: bool = False,
 ) -> Log:
     """Return the log of a path: a rosbag2 folder, an MCAP file, or else a CARMEN log.
 
-    laser describes the laser of a CARMEN log. For a bag: scan_topic and odometry_topic, empty for
-    the only topic of their type; T_base_laser (3,), the laser on the robot, None for the one of
-    /tf_static; base_frame, the robot's frame. The log is read when its events are.
+    laser describes the laser of a CARMEN log; T_base_laser (3,): the laser on the robot, None for
+    that of the log; zero_is_no_return: what a range of 0 means. For a bag: scan_topic and
+    odometry_topic, empty for the only topic of their type; base_frame and odom_frame, empty for
+    those of the bag; odometry_source: topic, tf or none, empty for topic, or tf without one. The
+    log is read when its events are. Raises InputError for a source that a CARMEN log does not have.
     """
     # Imported here: both modules import this one.
     from thinmap_ros.logs.bag import BagLog
@@ -120,8 +126,21 @@ def open_log(
 
     path = Path(path)
     if path.is_dir() or path.suffix == '.mcap' or is_mcap(path):
-        return BagLog(path, scan_topic, odometry_topic, T_base_laser, base_frame)
-    return CarmenLog(path, laser or LaserOptions())
+        return BagLog(
+            path,
+            scan_topic,
+            odometry_topic,
+            T_base_laser,
+            base_frame,
+            odometry_source,
+            odom_frame,
+            zero_is_no_return,
+        )
+    if odometry_source not in ('', 'topic'):
+        raise InputError(
+            f'{path}: odometry source {odometry_source}: a CARMEN log has its own odometry'
+        )
+    return CarmenLog(path, laser or LaserOptions(), T_base_laser, zero_is_no_return)
 
 
 def recording_events(log: Log) -> Iterator[Event]:

@@ -15,22 +15,26 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import line_features
+from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs.log import Event, Log, SkippedRecords
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.replaying import Replay, replay, write_outputs
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.parameter_file import NodeParameters, read_parameter_file
 from thinmap_ros.view import report_page
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
 # Large data are converted once a second: a view does not draw them more often.
 _PERIOD_NS = 1_000_000_000
+# Whose parameters replay takes from a file.
+_NODES = ('localizer', 'grid_mapper', 'topology_builder')
 _STAGES = {'localizer': 'localizer', 'grid': 'map update', 'topology': 'graph update'}
 
 
@@ -159,17 +163,29 @@ def _interruptible(log: Log) -> Iterator[_InterruptibleLog]:
             signal.signal(number, handler)
 
 
-def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
-    config = PipelineConfig(
-        localizer=cli.config_from(arguments, LocalizerConfig),
-        grid=cli.config_from(arguments, OccupancyConfig),
+def _config(arguments: argparse.Namespace, parameters: NodeParameters) -> PipelineConfig:
+    """Parameters of all stages: those of the command line come before those of a file."""
+    localizer = parameters.config('localizer', LocalizerConfig())
+    grid = parameters.config('grid_mapper', OccupancyConfig())
+    return PipelineConfig(
+        localizer=cli.config_from(arguments, LocalizerConfig, localizer),
+        grid=cli.config_from(arguments, OccupancyConfig, grid),
+        window=parameters.config('grid_mapper', WindowConfig()),
+        topology=parameters.config('topology_builder', TopologyConfig()),
     )
+
+
+def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
+    file = arguments.params_file
+    parameters = read_parameter_file(file, _NODES) if file else NodeParameters()
+    config = _config(arguments, parameters)
     wall = time.perf_counter()
     cpu = time.process_time()
-    with _interruptible(cli.open_log(arguments)) as log:
+    with _interruptible(cli.open_log(arguments, parameters)) as log:
         result = replay(
             log, config, show_progress=not arguments.quiet, watcher=shown, keep_partial=True
         )
+    result.notes = [*parameters.notes, *result.notes]
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{arguments.log.name}: {len(result.poses)} scans'
     report = write_outputs(result, arguments.out, title, seconds)
@@ -217,6 +233,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog='replay', description=__doc__)
     cli.add_log_options(parser)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
+    parser.add_argument(
+        '--params-file',
+        type=Path,
+        help='parameter file of the nodes, as config/robots/turtlebot4.yaml; options come before it',
+    )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument(
         '--view', action='store_true', help='show it in rerun, until the viewer is closed'

@@ -16,6 +16,7 @@ from thinmap_ros.logs.log import OdometryEvent
 TOPIC = 'topic'
 TF = 'tf'
 NONE = 'none'
+SOURCES = (TOPIC, TF, NONE)
 
 
 class BagOdometry(Protocol):

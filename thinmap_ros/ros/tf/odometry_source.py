@@ -11,15 +11,12 @@ from tf2_msgs.msg import TFMessage
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.logs.frames.bag_odometry import NONE, SOURCES, TF, TOPIC
 from thinmap_ros.logs.frames.odometry_frames import OdometryFrames
 from thinmap_ros.logs.frames.transforms import TransformOdometry
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded
-
-TOPIC = 'topic'
-TF = 'tf'
-NONE = 'none'
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class OdometryInputConfig(Config):
         'in frames that static transforms connect to these. tf: the transform from odom_frame to '
         'base_frame. none: the robot has no odometry; the localizer follows it by '
         'scan matching alone and publishes odom_frame -> base_frame as identity.',
-        choices=(TOPIC, TF, NONE),
+        choices=SOURCES,
     )
 
 
