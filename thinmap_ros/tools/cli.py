@@ -25,6 +25,7 @@ from thinmap_ros.tools.parameter_file import NodeParameters
 BAD_INPUT = 2
 INTERRUPTED = 130
 AnyConfig = TypeVar('AnyConfig', bound=Config)
+_NO_PARAMETERS = NodeParameters()
 # argparse's base class of parsers and groups of options.
 Options = argparse._ActionsContainer
 
@@ -153,7 +154,7 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def open_log(arguments: argparse.Namespace, parameters: NodeParameters = NodeParameters()) -> Log:
+def open_log(arguments: argparse.Namespace, parameters: NodeParameters = _NO_PARAMETERS) -> Log:
     """Return the log that the arguments name.
 
     A laser pose that is given comes before that of the log. parameters: of the node localizer, for

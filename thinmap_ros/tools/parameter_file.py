@@ -92,8 +92,8 @@ def _unknown(path: Path, given: dict[str, dict[str, Any]]) -> list[str]:
     nodes = ', '.join(given)
     wrong = ', '.join(name + suggestion(name, known) for name in unknown)
     if any(values.get(_STRICT) is True for values in given.values()):
-        raise ConfigError(f'{path}: node {nodes} has no parameter {wrong}')
-    return [f'{path}: ignored parameters that node {nodes} does not have: {wrong}']
+        raise ConfigError(f'{path}: nodes {nodes} have no parameter {wrong}')
+    return [f'{path}: ignored parameters that nodes {nodes} do not have: {wrong}']
 
 
 def _names_of(node: str) -> set[str]:

@@ -236,7 +236,8 @@ def main() -> None:
     parser.add_argument(
         '--params-file',
         type=Path,
-        help='parameter file of the nodes, as config/robots/turtlebot4.yaml; options come before it',
+        help='parameter file of the nodes, such as config/robots/turtlebot4.yaml; options come '
+        'before it',
     )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument(
