@@ -14,6 +14,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.limits import LOGS
+from thinmap_ros.files.regular_files import require_regular_file
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag_directory import DecompressedFile, bag_files
 from thinmap_ros.logs.frames.bag_frames import BagFrames, FrameOptions
@@ -29,14 +30,18 @@ from thinmap_ros.logs.log import (
     Event,
     ScanEvent,
     SkippedRecords,
-    is_mcap,
-    refuse_foreign,
+    is_bag,
+    is_ros1,
+    is_sqlite,
 )
 from thinmap_ros.logs.mcap_records import DamagedError, decompress
-from thinmap_ros.logs.storage import RawMessage, Storage, storage_of
+from thinmap_ros.logs.ros1_storage import Ros1Storage
+from thinmap_ros.logs.storage import McapStorage, RawMessage, SqliteStorage, Storage
 
 _SCAN = 'sensor_msgs/msg/LaserScan'
 _ODOMETRY = 'nav_msgs/msg/Odometry'
+_EXPECTED = 'a rosbag2 folder, an MCAP or SQLite file, or a ROS 1 bag'
+_ZSTD = b'\x28\xb5\x2f\xfd'  # begin of a message that is compressed by itself
 _MAX_WARNINGS = 8
 
 
@@ -49,12 +54,9 @@ class Bag:
     def __init__(self, path: Path) -> None:
         """Open a bag. Raises InputError with the file name if it has no intact message."""
         if not path.exists():
-            raise InputError(
-                f'{path}: no such file or folder: expected a rosbag2 folder or an MCAP file'
-            )
-        refuse_foreign(path)
-        if not (path.is_dir() or path.suffix == '.mcap' or is_mcap(path)):
-            raise InputError(f'{path}: expected a rosbag2 folder or a file that ends in .mcap')
+            raise InputError(f'{path}: no such file or folder: expected {_EXPECTED}')
+        if not is_bag(path):
+            raise InputError(f'{path}: expected {_EXPECTED}')
         self.path = path
         self.topics: dict[str, str] = {}
         self.offers: dict[str, list[Qos]] = {}
@@ -68,8 +70,7 @@ class Bag:
         except OSError as error:
             raise InputError(f'{error.filename or path}: {error.strerror or error}') from error
         if self.damage and not any(storage.has_messages for storage in self._storages):
-            expected = 'expected a rosbag2 folder or an MCAP file'
-            raise InputError(f'{path}: {self.damage}: no intact message: {expected}')
+            raise InputError(f'{path}: {self.damage}: no intact message: expected {_EXPECTED}')
 
     @property
     def is_truncated(self) -> bool:
@@ -85,6 +86,11 @@ class Bag:
         if self._unreadable:
             words.append(f'{self._unreadable} messages that cannot be decompressed')
         return '; '.join(words[:_MAX_WARNINGS])
+
+    @property
+    def note(self) -> str:
+        """How the files were found, in one line; empty if metadata.yaml names them."""
+        return self._files.note
 
     @property
     def repair_hint(self) -> str:
@@ -105,7 +111,7 @@ class Bag:
         """Intact messages of the given topics, or of all, in log order."""
         for storage in self._storages:
             for message in storage.messages(topics):
-                if not self._files.compressed_messages:
+                if not (self._files.compressed_messages or message.data.startswith(_ZSTD)):
                     yield message
                     continue
                 try:
@@ -132,11 +138,11 @@ class Bag:
 
     def _opened(self, file: Path) -> Storage:
         if file.suffix != '.zstd':
-            return storage_of(file)
+            return _storage_of(file)
         unpacked = DecompressedFile(file)
         self._unpacked.append(unpacked)
         try:
-            return storage_of(unpacked.path)
+            return _storage_of(unpacked.path)
         except InputError as error:
             raise InputError(str(error).replace(str(unpacked.path), str(file))) from error
 
@@ -147,6 +153,14 @@ class Bag:
             self.offers.setdefault(
                 topic, offers
             )  # the files of a bag repeat the entries of their topics
+
+
+def _storage_of(path: Path) -> Storage:
+    """Open a file of a bag. Raises InputError if it is invalid, OSError if it is no file."""
+    require_regular_file(path)
+    if is_ros1(path):
+        return Ros1Storage(path)
+    return SqliteStorage(path) if path.suffix == '.db3' or is_sqlite(path) else McapStorage(path)
 
 
 @dataclass
@@ -201,6 +215,8 @@ class BagLog:
                 yield event
         if bag.repair_hint:
             self.skipped.add_first(bag.repair_hint)
+        if bag.note:
+            self.skipped.note(bag.note)
         for name in (scan_topic, odometry.name):
             if used[name] == 0:
                 first = f': {self.skipped.first}' if self.skipped.first else odometry.missing

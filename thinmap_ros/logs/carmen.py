@@ -125,7 +125,7 @@ class CarmenLog:
         return round(scans * size / max(read, 1)) or None
 
     def _lines(self) -> Iterator[tuple[int, str]]:
-        refuse_foreign(self.path)
+        refuse_foreign(self.path, 'a CARMEN log')
         if is_mcap(self.path):
             raise InputError(f'{self.path}: an MCAP file, which is a bag: expected a CARMEN log')
         try:

@@ -112,7 +112,7 @@ def open_log(
     odom_frame: str = '',
     zero_is_no_return: bool = False,
 ) -> Log:
-    """Return the log of a path: a rosbag2 folder, an MCAP file, or else a CARMEN log.
+    """Return the log of a path: a rosbag2 folder or file, a ROS 1 bag, or else a CARMEN log.
 
     laser describes the laser of a CARMEN log; T_base_laser (3,): the laser on the robot, None for
     that of the log; zero_is_no_return: what a range of 0 means. For a bag: scan_topic and
@@ -125,7 +125,7 @@ def open_log(
     from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 
     path = Path(path)
-    if path.is_dir() or path.suffix == '.mcap' or is_mcap(path):
+    if is_bag(path):
         return BagLog(
             path,
             scan_topic,
@@ -176,26 +176,38 @@ def paired_scans(log: Log) -> Iterator[tuple[Scan, Array]]:
         warnings.warn(str(error), stacklevel=2)
 
 
-def refuse_foreign(path: Path) -> None:
-    """Raise InputError, with a command for conversion, for a ROS 1 bag or a bare SQLite file."""
-    begin = _begin(path)
-    convert = f'rosbags-convert --src {path} --dst {path.stem} --dst-storage mcap'
-    if begin.startswith(_ROS1):
-        raise InputError(
-            f'{path}: a ROS 1 bag: expected a ROS 2 bag or a CARMEN log: convert it with '
-            f'`{convert} --dst-typestore ros2_jazzy`'
-        )
-    if begin.startswith(_SQLITE):
-        raise InputError(
-            f'{path}: an SQLite file of a rosbag2 bag: expected the folder that holds it and '
-            'metadata.yaml; a missing one is written by `ros2 bag reindex -s sqlite3 FOLDER`, '
-            f'or a new bag by `{convert}`'
-        )
+def refuse_foreign(path: Path, expected: str) -> None:
+    """Raise InputError, with a command for conversion, for a ROS 1 bag or an SQLite file."""
+    kinds = ((is_ros1, 'a ROS 1 bag'), (is_sqlite, 'an SQLite file of a rosbag2 bag'))
+    for is_kind, name in kinds:
+        if is_kind(path):
+            convert = f'rosbags-convert --src {path} --dst {path.stem} --dst-storage mcap'
+            raise InputError(
+                f'{path}: {name}: expected {expected}: it is converted by '
+                f'`{convert} --dst-typestore ros2_jazzy`'
+            )
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a folder, or a file of a bag by its name or its first bytes."""
+    if path.is_dir() or path.suffix in ('.mcap', '.db3', '.bag', '.zstd'):
+        return True
+    return is_mcap(path) or is_ros1(path) or is_sqlite(path)
 
 
 def is_mcap(path: Path) -> bool:
     """Whether a file begins with the magic bytes of MCAP."""
     return _begin(path).startswith(_MCAP)
+
+
+def is_ros1(path: Path) -> bool:
+    """Whether a file begins as a ROS 1 bag."""
+    return _begin(path).startswith(_ROS1)
+
+
+def is_sqlite(path: Path) -> bool:
+    """Whether a file begins as an SQLite database."""
+    return _begin(path).startswith(_SQLITE)
 
 
 def _begin(path: Path) -> bytes:

@@ -100,17 +100,16 @@ class ClockJumps:
         before = [event for event in held if not self._is_after(event)]
         first = next((e for e in held if isinstance(e, OdometryEvent) and self._is_after(e)), None)
         yield from self._passed_on(before)
-        back_s = self._back_ns() / SECOND_NS
         if first is None or not self._continues(first):
             raise ClockJumpError(
-                f'clock jumped back by {back_s:.1f} s at scan {self._scans}: '
+                f'clock jumped back by {self._back_ns() / SECOND_NS:.1f} s at scan {self._scans}: '
                 'the rest is another recording'
             )
+        shift_ns = self._last[-1].stamp_ns + self._period_ns() - first.stamp_ns
         self._note(
-            f'clock was set back by {back_s:.1f} s at scan {self._scans} while the '
+            f'clock was set back by {shift_ns / SECOND_NS:.1f} s at scan {self._scans} while the '
             'odometry continues: later stamps are moved on by that'
         )
-        shift_ns = self._last[-1].stamp_ns + self._period_ns() - first.stamp_ns
         after = [_moved(event, shift_ns) for event in held if self._is_after(event)]
         for stream in self._streams.values():
             stream.shift_ns += shift_ns

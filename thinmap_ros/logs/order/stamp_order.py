@@ -16,35 +16,48 @@ def by_stamp(events: Iterable[Event]) -> Iterator[Event]:
     Where the stamps of the odometry step back, too, either it came late as well, or the clock
     stepped back: the order in which the odometry is the shorter path is right.
     """
-    waiting: list[Event] = []
+    waiting = _Waiting()
     try:
         for event in events:
-            waiting.append(event)
-            while stamp_of(event) - min(map(stamp_of, waiting)) > CLOCK_JUMP_NS:
-                yield _pop(waiting)
+            yield from waiting.add(event)
     except ClockJumpError:
-        yield from _rest(waiting)
+        yield from waiting.rest()
         raise
-    yield from _rest(waiting)
+    yield from waiting.rest()
 
 
-def _rest(waiting: list[Event]) -> Iterator[Event]:
-    while waiting:
-        yield _pop(waiting)
+class _Waiting:
+    """Events that an earlier one may still follow, in the order of their arrival."""
 
+    def __init__(self) -> None:
+        self._events: list[Event] = []
+        self._last: list[OdometryEvent] = []  # the one that was passed on last, if any
 
-def _pop(waiting: list[Event]) -> Event:
-    """Remove the event that is next."""
-    stamps = [stamp_of(event) for event in waiting]
-    index = stamps.index(min(stamps))
-    return waiting.pop(index if index and _stamps_are_right(waiting) else 0)
+    def add(self, event: Event) -> Iterator[Event]:
+        """Add an event; yields those that none can precede any more."""
+        self._events.append(event)
+        while stamp_of(event) - min(map(stamp_of, self._events)) > CLOCK_JUMP_NS:
+            yield self._pop()
 
+    def rest(self) -> Iterator[Event]:
+        """The events that are left, at the end."""
+        while self._events:
+            yield self._pop()
 
-def _stamps_are_right(events: list[Event]) -> bool:
-    """Whether the odometry of events in the order of arrival is the shorter path by its stamps."""
-    arrived = [event for event in events if isinstance(event, OdometryEvent)]
-    ordered = sorted(arrived, key=stamp_of)
-    return ordered == arrived or _path(ordered) < _path(arrived)
+    def _pop(self) -> Event:
+        stamps = [stamp_of(event) for event in self._events]
+        index = stamps.index(min(stamps))
+        event = self._events.pop(index if index and self._stamps_are_right() else 0)
+        if isinstance(event, OdometryEvent):
+            self._last = [event]
+        return event
+
+    def _stamps_are_right(self) -> bool:
+        """Whether the odometry is the shorter path in the order of its stamps, not of arrival."""
+        waiting = [event for event in self._events if isinstance(event, OdometryEvent)]
+        arrived = [*self._last, *waiting]
+        ordered = sorted(arrived, key=stamp_of)
+        return ordered == arrived or _path(ordered) < _path(arrived)
 
 
 def _path(samples: list[OdometryEvent]) -> float:
