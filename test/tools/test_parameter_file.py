@@ -46,7 +46,8 @@ def test_the_file_of_a_node_is_that_of_its_defaults(node: str) -> None:
 def test_the_robot_is_described_for_all_nodes(tmp_path: Path) -> None:
     parameters = read(
         tmp_path,
-        '/**:\n  ros__parameters: {base_frame: base, robot_radius_m: 0.3, zero_is_no_return: true}\n'
+        '/**:\n  ros__parameters:\n'
+        '    {base_frame: base, robot_radius_m: 0.3, zero_is_no_return: true}\n'
         '/robot1/localizer:\n  ros__parameters: {base_frame: own}\n',
     )
     assert parameters.value('localizer', 'base_frame', '') == 'own'
