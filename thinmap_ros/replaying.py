@@ -54,12 +54,15 @@ class ScanCounts:
         """Number of scans that did not change the map."""
         return sum(self.without_odometry.values()) + self.blind.total() + self.lost
 
-    def words(self) -> list[str]:
-        """Reasons with the number of their scans, the most frequent first."""
-        reasons = Counter({f'scans {text}': n for text, n in self.without_odometry.items()})
-        reasons.update({f'blind scans: {text}': n for text, n in self.blind.items()})
-        reasons.update({'scans of a lost robot': self.lost} if self.lost else {})
-        return [f'{count} {text}' for text, count in reasons.most_common()]
+    def unpaired(self) -> list[str]:
+        """Reasons of the scans without odometry, with their number, the most frequent first."""
+        reasons = Counter(self.without_odometry).most_common()
+        return [f'{count} scan{"s"[: count > 1]} {text}' for text, count in reasons]
+
+    def unmapped(self) -> list[str]:
+        """Reasons of the processed scans that did not change the map, with their number."""
+        reasons = [f'{count} blind: {text}' for text, count in self.blind.most_common()]
+        return reasons + ([f'{self.lost} of a lost robot'] if self.lost else [])
 
 
 @dataclass(eq=False)
@@ -126,7 +129,7 @@ def replay(
     result.counts.records = log.skipped.reasons
     result.notes = log.skipped.notes
     if not result.poses:
-        reasons = '; '.join(result.counts.words())
+        reasons = '; '.join(result.counts.unpaired())
         raise InputError(
             f'no scan with odometry around its stamp; {result.skipped} skipped: {reasons}'
         )

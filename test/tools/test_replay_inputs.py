@@ -151,7 +151,7 @@ def test_blind_scans_are_counted_and_told_loudly(tmp_path: Path) -> None:
     done, report = replayed(tmp_path, bag(tmp_path / 'bag', messages))
     assert (report['scans'], report['blind'], report['lost']) == (SCANS, SCANS - 10, 0)
     assert report['reasons'] == {'too few valid beams': SCANS - 10}
-    assert f'only 10 of {SCANS} scans were used: {SCANS - 10} blind scans' in done.stderr
+    assert f'only 10 of {SCANS} scans were used: {SCANS - 10} blind: too few' in done.stderr
 
 
 @pytest.mark.programs

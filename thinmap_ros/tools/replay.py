@@ -197,14 +197,11 @@ def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
 
 def _summary(result: Replay, report: dict[str, Any]) -> str:
     """Counts, distance and time in one line."""
-    reasons = result.counts.words()
-    if result.first_skipped:
-        reasons.append(f'first: {result.first_skipped}')
-    parts = [f'{report["scans"]} scans']
+    counts = result.counts
+    parts = [f'{report["scans"]} scans{_bracketed(counts.unmapped())}']
     if result.skipped:
-        parts.append(f'{result.skipped} skipped')
-    if reasons:
-        parts[-1] += f' ({"; ".join(reasons)})'
+        first = [f'first: {result.first_skipped}'] if result.first_skipped else []
+        parts.append(f'{result.skipped} skipped{_bracketed(counts.unpaired() + first)}')
     if report['refused']:
         parts.append(f'{report["refused"]} not mapped (first: {report["first_refused"]})')
     parts += [
@@ -214,6 +211,10 @@ def _summary(result: Replay, report: dict[str, Any]) -> str:
     return ', '.join(parts)
 
 
+def _bracketed(reasons: list[str]) -> str:
+    return f' ({"; ".join(reasons)})' if reasons else ''
+
+
 def _print_notes(result: Replay) -> None:
     """What was assumed, and loudly that most of the scans were not used."""
     for note in result.notes:
@@ -221,7 +222,7 @@ def _print_notes(result: Replay) -> None:
     unused = result.counts.unused
     scans = len(result.poses) + sum(result.counts.without_odometry.values())
     if 2 * unused > scans:
-        reasons = '; '.join(result.counts.words())
+        reasons = '; '.join(result.counts.unpaired() + result.counts.unmapped())
         print(
             f'replay: warning: only {scans - unused} of {scans} scans were used: {reasons}',
             file=sys.stderr,

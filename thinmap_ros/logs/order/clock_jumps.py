@@ -145,7 +145,7 @@ class ClockJumps:
         return self._last[-1].stamp_ns - self._last[0].stamp_ns
 
     def _continues(self, first: OdometryEvent) -> bool:
-        """Whether the odometry goes on to this sample as it did to the last one.
+        """Whether the odometry continues to this sample as it did to the last one.
 
         A log without odometry cannot tell.
         """
