@@ -2,6 +2,7 @@
 
 import json
 import resource
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,16 +23,54 @@ from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
-from thinmap_ros.logs.log import Event, Log, OdometryEvent
+from thinmap_ros.logs.log import WAITING_SCANS, Event, Log, OdometryEvent, recording_events
+from thinmap_ros.logs.order.unused_scans import UnusedScans
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import summary_figure
 
 
 @dataclass(eq=False)
+class ScanCounts:
+    """Scans that did not change the map, by reason: without odometry, blind, and of a lost robot.
+
+    records: unusable records of the log, by reason.
+    """
+
+    without_odometry: dict[str, int] = field(default_factory=dict)
+    blind: Counter[str] = field(default_factory=Counter)
+    lost: int = 0
+    records: Counter[str] = field(default_factory=Counter)
+
+    def add(self, estimate: Estimate) -> None:
+        """Count the estimate of a scan."""
+        if estimate.blind_reason:
+            self.blind[estimate.blind_reason] += 1
+        elif estimate.is_lost:
+            self.lost += 1
+
+    @property
+    def unused(self) -> int:
+        """Number of scans that did not change the map."""
+        return sum(self.without_odometry.values()) + self.blind.total() + self.lost
+
+    def unpaired(self) -> list[str]:
+        """Reasons of the scans without odometry, with their number, the most frequent first."""
+        reasons = Counter(self.without_odometry).most_common()
+        return [f'{count} scan{"s"[: count > 1]} {text}' for text, count in reasons]
+
+    def unmapped(self) -> list[str]:
+        """Reasons of the processed scans that did not change the map, with their number."""
+        reasons = [f'{count} blind: {text}' for text, count in self.blind.most_common()]
+        return reasons + ([f'{self.lost} of a lost robot'] if self.lost else [])
+
+
+@dataclass(eq=False)
 class Replay:
     """Result of a replay: the pipeline at the end, and the pose (3,) of every scan.
 
+    counts: of scans that did not change the map. notes: what was assumed of the log, a line each.
+    odometry_jumps: discontinuities of the odometry, a line each.
     ended_by: what ended the replay before the end of the log; None if nothing did.
     """
 
@@ -41,6 +80,9 @@ class Replay:
     local_features: list[int] = field(default_factory=list)
     skipped: int = 0
     first_skipped: str = ''
+    counts: ScanCounts = field(default_factory=ScanCounts)
+    notes: list[str] = field(default_factory=list)
+    odometry_jumps: list[str] = field(default_factory=list)
     ended_by: Exception | KeyboardInterrupt | None = None
 
 
@@ -67,27 +109,47 @@ def replay(
     (`Replay.ended_by`) instead of being raised.
     """
     result = Replay(Pipeline(config))
-    pairing = ScanOdometrySynchronizer()
+    pairing = ScanOdometrySynchronizer(WAITING_SCANS)
+    unused = UnusedScans()
     tidy_up = compiler_memory_releaser()
     with _errors_kept(result, keep_partial), ProgressBar('replay', not show_progress) as bar:
         expected = None
-        for number, event in enumerate(log.events()):
-            _add_event(result, pairing, event, watcher)
+        for number, event in enumerate(recording_events(log)):
+            unused.add(event)
+            for stamp_ns in _process(result, _add_event(pairing, event), watcher):
+                unused.pair(stamp_ns)
             tidy_up()
             if show_progress:
                 # Of a bag it is known once the bag has been opened.
                 expected = log.expected_scans if number == 0 else expected
                 _show(bar, len(result.poses), expected)
     with _errors_kept(result, keep_partial):
+        for stamp_ns in _process(result, pairing.finish(), watcher):
+            unused.pair(stamp_ns)
         result.pipeline.finish()
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
+    result.counts.without_odometry = unused.reasons()
+    result.counts.records = log.skipped.reasons
+    result.notes = [*log.skipped.notes, *pairing.warnings.values()]
+    result.notes += _jump_notes(result.odometry_jumps)
     if not result.poses:
-        raise InputError(f'no scan with odometry around its stamp; {result.skipped} skipped')
+        reasons = '; '.join(result.counts.unpaired())
+        raise InputError(
+            f'no scan with odometry around its stamp; {result.skipped} skipped: {reasons}'
+        )
     if watcher is not None:
         with _errors_kept(result, keep_partial):
             watcher.finish(result.stamps_ns[-1], result.pipeline)
     return result
+
+
+def _jump_notes(jumps: list[str]) -> list[str]:
+    """Note on the discontinuities of the odometry; none without any."""
+    if not jumps:
+        return []
+    times = f' ({len(jumps)} times; the first time)' if len(jumps) > 1 else ''
+    return [f'{jumps[0]}{times}: the pose follows from the scan there']
 
 
 def _show(bar: ProgressBar, scans: int, expected: int | None) -> None:
@@ -109,21 +171,28 @@ def _errors_kept(result: Replay, keep_partial: bool) -> Iterator[None]:
         result.ended_by = result.ended_by or error
 
 
-def _add_event(
-    result: Replay, pairing: ScanOdometrySynchronizer, event: Event, watcher: Watcher | None
-) -> None:
-    """Process the scans that are complete with this event."""
+def _add_event(pairing: ScanOdometrySynchronizer, event: Event) -> list[tuple[Scan, Array]]:
+    """Scans that are complete with this event, each with its odometry pose (3,)."""
     if isinstance(event, OdometryEvent):
-        ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
-    else:
-        ready = pairing.add_scan(event.scan)
+        return pairing.add_odometry(event.stamp_ns, event.T_odom_base)
+    return pairing.add_scan(event.scan)
+
+
+def _process(
+    result: Replay, ready: list[tuple[Scan, Array]], watcher: Watcher | None
+) -> Iterator[int]:
+    """Process scans with their odometry poses (3,); yields the stamp of each."""
     for scan, T_odom_base in ready:
         step = result.pipeline.step(scan, T_odom_base)
         result.stamps_ns.append(scan.stamp_ns)
         result.poses.append(step.estimate.T_map_base)
         result.local_features.append(step.estimate.n_local_features)
+        result.counts.add(step.estimate)
+        if step.estimate.odometry_discontinuity:
+            result.odometry_jumps.append(step.estimate.odometry_discontinuity)
         if watcher is not None:
             watcher.step(scan, T_odom_base, step.estimate, result.pipeline)
+        yield scan.stamp_ns
 
 
 def write_outputs(
@@ -134,9 +203,9 @@ def write_outputs(
     patch = pipeline.grid.known_area()
     poses = np.array(result.poses)
     folder.mkdir(parents=True, exist_ok=True)
-    trajectories.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
-    final = list(pipeline.localizer.optimized_trajectory())[: len(poses)]
-    trajectories.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
+    _write_trajectory(folder / 'trajectory.tum', result.stamps_ns, poses)
+    final = np.array(list(pipeline.localizer.optimized_trajectory())[: len(poses)])
+    _write_trajectory(folder / 'trajectory_final.tum', result.stamps_ns, final)
     occupancy_maps.write_map(folder / 'map', patch)
     topology = pipeline.topology.map
     robot_radius_m = pipeline.config.topology.robot_radius_m
@@ -147,6 +216,12 @@ def write_outputs(
     report = _report(result, poses, seconds)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
     return report
+
+
+def _write_trajectory(path: Path, stamps_ns: list[int], poses: Array) -> None:
+    """Write poses (N, 3) in the order of their stamps, the first one of each stamp."""
+    ordered, first = np.unique(np.array(stamps_ns, dtype=np.int64), return_index=True)
+    trajectories.write_tum(path, ordered.tolist(), list(poses[first]))
 
 
 def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[str, Any]:
@@ -161,6 +236,15 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'scans': len(poses),
         'skipped': result.skipped,
         'first_skipped': result.first_skipped,
+        'without_odometry': sum(result.counts.without_odometry.values()),
+        'blind': result.counts.blind.total(),
+        'lost': result.counts.lost,
+        'reasons': {
+            **result.counts.records,
+            **result.counts.without_odometry,
+            **result.counts.blind,
+        },
+        'notes': result.notes,
         'refused': len(refusals),
         'first_refused': refusals[0] if refusals else '',
         'ended_by': '' if result.ended_by is None else one_line_reason(result.ended_by),

@@ -11,7 +11,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.deskewing import SweepTiming, deskewed
 from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.scan import AT_END, LaserConfig, Scan
-from thinmap_ros.logs.laser_mount import Mount
+from thinmap_ros.logs.frames.laser_mount import Mount
 
 SECOND = 1_000_000_000
 PERIOD_S = 0.2

@@ -65,6 +65,8 @@ CONNECTIONS = {
 class SimulatedLog:
     """Scans and odometry of a robot that drives in circles through the room."""
 
+    is_sorted = True
+
     def __init__(self):
         self.skipped = SkippedRecords()
 
@@ -102,6 +104,8 @@ class CheapLaserLog(SimulatedLog):
 
 class LoopLog:
     """Scans and odometry of a robot that returns to its start after its map has drifted."""
+
+    is_sorted = True
 
     def __init__(self):
         self.skipped = SkippedRecords()

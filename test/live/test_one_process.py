@@ -19,6 +19,7 @@ from support.timeouts import PATIENCE_S
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import TopologicalMap
+from thinmap_ros.logs import decode
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -111,7 +112,7 @@ def test_two_robots_in_namespaces_keep_to_themselves(graph):
     def drives():
         commands.publish(messages.twist_msg(0.1, 0.3))
         last = heard['robot1'][-1].pose.pose
-        return abs(messages.yaw_of(last.orientation)) > 0.5
+        return abs(decode.yaw(last.orientation)) > 0.5
 
     graph.until(drives, 'the first one turns')
     last = {name: messages.pose_from_msg(poses[-1].pose.pose) for name, poses in heard.items()}

@@ -290,19 +290,34 @@ def test_beam_counts_may_change(tmp_path):
 
 
 @pytest.mark.programs
-def test_stamps_that_jump_back_do_no_harm(tmp_path):
+def test_another_recording_in_the_same_log_ends_it(tmp_path):
     path = tmp_path / 'some.log'
     lines = carmen_lines()
     path.write_text('\n'.join(lines[:41] + lines[21:]))
     done = run(path, '-o', tmp_path / 'out', '--quiet')
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 2
+    reason = 'clock jumped back by 1.8 s at scan 20: the rest is another recording'
+    assert done.stderr.splitlines()[-1].startswith(f'replay: error: {reason}; the 20 scans before')
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
-    assert report['scans'] + report['skipped'] == 40
-    # As in real logs: a robot's clock is sometimes set back, and its log continues.
-    assert report['scans'] >= 38
-    poses = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
-    assert np.isfinite(poses).all()
-    assert np.abs(poses[:, 1]).max() < 1.0
+    assert (report['scans'], report['ended_by']) == (20, reason)
+    assert len(np.loadtxt(tmp_path / 'out' / 'trajectory.tum')) == 20
+
+
+@pytest.mark.programs
+def test_a_clock_that_is_set_back_while_the_robot_drives_on_loses_nothing(tmp_path):
+    path = tmp_path / 'some.log'
+    lines = carmen_lines(start_s=10.0)
+    later = [
+        re.sub(r'(\S+) robot \S+$', lambda m: f'{float(m[1]) - 7.0:.3f} robot 0', line)
+        for line in lines[31:]
+    ]
+    path.write_text('\n'.join(lines[:31] + later))
+    done = run(path, '-o', tmp_path / 'out', '--quiet')
+    assert done.returncode == 0, done.stderr
+    assert 'clock was set back by 6.8 s at scan 15 while the odometry continues' in done.stderr
+    trajectory = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
+    np.testing.assert_allclose(trajectory[:, 0], 10.0 + 0.2 * np.arange(30), atol=1e-6)
+    assert np.abs(trajectory[:, 1] - 0.03 * np.arange(30)).max() < 0.03
 
 
 @pytest.mark.programs

@@ -8,7 +8,8 @@ Python only, and are no parameters of nodes.
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any, TypeVar
 
 from thinmap_ros.core.errors import ConfigError, quoted
@@ -110,6 +111,14 @@ def with_values(config: AnyConfig, values: Mapping[str, Any]) -> AnyConfig:
         elif field.name in values:
             own[field.name] = values[field.name]
     return dataclasses.replace(config, **own)
+
+
+def suggestion(name: str, known: Collection[str]) -> str:
+    """The parameter that was probably meant: in another group, or with a similar name."""
+    last = name.split('.')[-1]
+    same = [other for other in sorted(known) if other.split('.')[-1] == last]
+    likely = same or get_close_matches(name, sorted(known), n=1, cutoff=0.75)
+    return f' (did you mean {", ".join(likely)}?)' if likely else ''
 
 
 def check_safety(start: Config, changed: Config) -> None:

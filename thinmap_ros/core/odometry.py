@@ -74,16 +74,18 @@ class OdometryBuffer:
         self.discarded = 0
         self._span_ns = span_ns
         self._max_gap_ns = max_gap_ns
+        self._silence = SilenceDetector()
         self._stamps: list[int] = []
         self._poses: list[Array] = []
+        self._silences_s: list[float] = []  # before each sample
 
     @property
     def latest_stamp_ns(self) -> int | None:
         """Stamp of the newest sample, or None where there is none."""
         return self._stamps[-1] if self._stamps else None
 
-    def add(self, stamp_ns: int, T_odom_base: Array) -> None:
-        """Add a sample, (3,).
+    def add(self, stamp_ns: int, T_odom_base: Array) -> float:
+        """Add a sample, (3,); returns the silence before it, see `SilenceDetector`, s.
 
         Raises InputError if the pose is not finite, or beyond MAX_COORDINATE_M.
         """
@@ -97,13 +99,17 @@ class OdometryBuffer:
             self.discarded += len(self._stamps) - bisect_left(self._stamps, stamp_ns)
             self._stamps = []
             self._poses = []
+            self._silences_s = []
         index = bisect_left(self._stamps, stamp_ns)
         if index < len(self._stamps) and self._stamps[index] == stamp_ns:
             self._poses[index] = T_odom_base
-            return
+            return 0.0
+        silence_s = self._silence.add(stamp_ns)
         self._stamps.insert(index, stamp_ns)
         self._poses.insert(index, T_odom_base)
+        self._silences_s.insert(index, silence_s)
         self._drop_old()
+        return silence_s
 
     def interpolate(self, stamp_ns: int) -> Array | None:
         """Pose at a stamp.
@@ -123,7 +129,7 @@ class OdometryBuffer:
         if self._max_gap_ns is not None and after - before > self._max_gap_ns:
             return None
         moved = se2.between(self._poses[index - 1], self._poses[index])
-        if not _LIMITS.allow(moved, (after - before) / SECOND_NS):
+        if not _LIMITS.allow(moved, (after - before) / SECOND_NS - self._silences_s[index]):
             return None
         share = (stamp_ns - before) / (after - before)
         return se2.interpolate(self._poses[index - 1], self._poses[index], share)
@@ -149,12 +155,14 @@ class OdometryBuffer:
         first = bisect_left(self._stamps, self._stamps[-1] - self._span_ns)
         # In blocks, so that a long buffer is not shifted at every sample.
         if first > 256:
-            del self._stamps[:first], self._poses[:first]
+            del self._stamps[:first], self._poses[:first], self._silences_s[:first]
 
 
-# Between samples that are further apart, the robot need not have moved evenly.
-MAX_ODOMETRY_GAP_NS = SECOND_NS
+# Between samples that are further apart, the robot need not have moved evenly. Odometry at 1 Hz is
+# interpolated, with one lost sample.
+MAX_ODOMETRY_GAP_NS = 2 * SECOND_NS
 # A stream is silent when several samples are missing; stamps of real robots come in bunches.
+_SHORTEST_GAP_NS = SECOND_NS
 _GAP_PERIODS = 3.0
 _USUAL_SAMPLES = 15
 
@@ -222,14 +230,14 @@ class SilenceDetector:
     def add(self, stamp_ns: int) -> float:
         """Time (s) by which the time since the previous sample exceeds the usual period.
 
-        0 unless that is a gap: longer than MAX_ODOMETRY_GAP_NS and than several usual periods.
+        0 unless that is a gap: longer than a second and than several usual periods.
         """
         period_ns = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
         self._stamp_ns = stamp_ns
         usual_ns = float(np.median(self._periods)) if self._periods else math.inf
         if period_ns > 0:
             self._periods.append(period_ns)
-        is_gap = period_ns > max(MAX_ODOMETRY_GAP_NS, _GAP_PERIODS * usual_ns)
+        is_gap = period_ns > max(_SHORTEST_GAP_NS, _GAP_PERIODS * usual_ns)
         return (period_ns - usual_ns) / SECOND_NS if is_gap else 0.0
 
 
@@ -286,7 +294,6 @@ class ScanOdometrySynchronizer:
         self._buffer = OdometryBuffer(max_gap_ns=MAX_ODOMETRY_GAP_NS)
         self._laser = LaserMonitor()
         self._timing = SweepTiming()
-        self._silence = SilenceDetector()
         self._silence_s = 0.0  # since the last scan
         self._waiting: deque[Scan] = deque()
         self._capacity = capacity
@@ -312,8 +319,7 @@ class ScanOdometrySynchronizer:
 
         Returns the scans that are ready now, each with its T_odom_base (3,).
         """
-        self._buffer.add(stamp_ns, T_odom_base)
-        self._silence_s += self._silence.add(stamp_ns)
+        self._silence_s += self._buffer.add(stamp_ns, T_odom_base)
         return self._ready()
 
     def add_scan(self, scan: Scan) -> list[tuple[Scan, Array]]:
@@ -329,6 +335,17 @@ class ScanOdometrySynchronizer:
             self.dropped += 1
         return self._ready()
 
+    def finish(self) -> list[tuple[Scan, Array]]:
+        """Scans at the end of a log, for whose last beams the odometry has ended."""
+        ready = []
+        for scan in self._waiting:
+            T_odom_base = self._buffer.interpolate(scan.stamp_ns)
+            if T_odom_base is not None:
+                ready.append(self._complete(scan, T_odom_base))
+        paired = {scan.stamp_ns for scan, _ in ready}
+        self._waiting = deque(scan for scan in self._waiting if scan.stamp_ns not in paired)
+        return ready
+
     def _ready(self) -> list[tuple[Scan, Array]]:
         ready = []
         latest = self._buffer.latest_stamp_ns
@@ -343,11 +360,14 @@ class ScanOdometrySynchronizer:
             if T_odom_base is None:
                 self.dropped += 1
             else:
-                scan = replace(scan, odometry_silence_s=self._silence_s)
-                self._silence_s = 0.0
-                checked = self._laser.checked(scan, T_odom_base)
-                ready.append((self._deskewed(checked), T_odom_base))
+                ready.append(self._complete(scan, T_odom_base))
         return ready
+
+    def _complete(self, scan: Scan, T_odom_base: Array) -> tuple[Scan, Array]:
+        scan = replace(scan, odometry_silence_s=self._silence_s)
+        self._silence_s = 0.0
+        checked = self._laser.checked(scan, T_odom_base)
+        return self._deskewed(checked), T_odom_base
 
     def _needed_until(self, scan: Scan) -> int:
         """Time until which a scan needs odometry, ns."""

@@ -28,6 +28,14 @@ def world_path(name: str) -> Path:
     raise InputError(f'world {quoted(name)}: expected a file, or one of {installed}')
 
 
+def config_file(node: str) -> Path:
+    """Path of the file with all parameters of a node. Raises InputError if it is not installed."""
+    for folder in _folders(_PACKAGE, 'config'):
+        if (file := folder / f'{node}.yaml').is_file():
+            return file
+    raise InputError(f'config/{node}.yaml: not installed')
+
+
 def message_definitions(package: str) -> dict[str, str]:
     """Texts of a package's message definitions by full name, for bags.
 

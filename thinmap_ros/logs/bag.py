@@ -1,5 +1,6 @@
 """rosbag2 folders and MCAP files: raw messages, and scans with odometry."""
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,28 +9,39 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Qos
 
-from thinmap_ros.core import se2, validation
+from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.limits import LOGS
+from thinmap_ros.files.regular_files import require_regular_file
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag_directory import DecompressedFile, bag_files
-from thinmap_ros.logs.laser_mount import Mount, StaticTransforms, rotation_matrix
+from thinmap_ros.logs.frames.bag_frames import BagFrames, FrameOptions
+from thinmap_ros.logs.frames.bag_odometry import (
+    NONE,
+    TF,
+    BagOdometry,
+    NoOdometry,
+    OdometryByTransforms,
+    OdometryOnTopic,
+)
 from thinmap_ros.logs.log import (
     Event,
-    OdometryEvent,
     ScanEvent,
     SkippedRecords,
-    is_mcap,
-    refuse_foreign,
+    is_bag,
+    is_ros1,
+    is_sqlite,
 )
 from thinmap_ros.logs.mcap_records import DamagedError, decompress
-from thinmap_ros.logs.storage import RawMessage, Storage, storage_of
+from thinmap_ros.logs.ros1_storage import Ros1Storage
+from thinmap_ros.logs.storage import McapStorage, RawMessage, SqliteStorage, Storage
 
 _SCAN = 'sensor_msgs/msg/LaserScan'
 _ODOMETRY = 'nav_msgs/msg/Odometry'
-_TF = 'tf2_msgs/msg/TFMessage'
+_EXPECTED = 'a rosbag2 folder, an MCAP or SQLite file, or a ROS 1 bag'
+_ZSTD = b'\x28\xb5\x2f\xfd'  # begin of a message that is compressed by itself
 _MAX_WARNINGS = 8
 
 
@@ -42,12 +54,9 @@ class Bag:
     def __init__(self, path: Path) -> None:
         """Open a bag. Raises InputError with the file name if it has no intact message."""
         if not path.exists():
-            raise InputError(
-                f'{path}: no such file or folder: expected a rosbag2 folder or an MCAP file'
-            )
-        refuse_foreign(path)
-        if not (path.is_dir() or path.suffix == '.mcap' or is_mcap(path)):
-            raise InputError(f'{path}: expected a rosbag2 folder or a file that ends in .mcap')
+            raise InputError(f'{path}: no such file or folder: expected {_EXPECTED}')
+        if not is_bag(path):
+            raise InputError(f'{path}: expected {_EXPECTED}')
         self.path = path
         self.topics: dict[str, str] = {}
         self.offers: dict[str, list[Qos]] = {}
@@ -61,8 +70,7 @@ class Bag:
         except OSError as error:
             raise InputError(f'{error.filename or path}: {error.strerror or error}') from error
         if self.damage and not any(storage.has_messages for storage in self._storages):
-            expected = 'expected a rosbag2 folder or an MCAP file'
-            raise InputError(f'{path}: {self.damage}: no intact message: {expected}')
+            raise InputError(f'{path}: {self.damage}: no intact message: expected {_EXPECTED}')
 
     @property
     def is_truncated(self) -> bool:
@@ -78,6 +86,11 @@ class Bag:
         if self._unreadable:
             words.append(f'{self._unreadable} messages that cannot be decompressed')
         return '; '.join(words[:_MAX_WARNINGS])
+
+    @property
+    def note(self) -> str:
+        """How the files were found, in one line; empty if metadata.yaml names them."""
+        return self._files.note
 
     @property
     def repair_hint(self) -> str:
@@ -98,7 +111,7 @@ class Bag:
         """Intact messages of the given topics, or of all, in log order."""
         for storage in self._storages:
             for message in storage.messages(topics):
-                if not self._files.compressed_messages:
+                if not (self._files.compressed_messages or message.data.startswith(_ZSTD)):
                     yield message
                     continue
                 try:
@@ -125,11 +138,11 @@ class Bag:
 
     def _opened(self, file: Path) -> Storage:
         if file.suffix != '.zstd':
-            return storage_of(file)
+            return _storage_of(file)
         unpacked = DecompressedFile(file)
         self._unpacked.append(unpacked)
         try:
-            return storage_of(unpacked.path)
+            return _storage_of(unpacked.path)
         except InputError as error:
             raise InputError(str(error).replace(str(unpacked.path), str(file))) from error
 
@@ -142,21 +155,35 @@ class Bag:
             )  # the files of a bag repeat the entries of their topics
 
 
+def _storage_of(path: Path) -> Storage:
+    """Open a file of a bag. Raises InputError if it is invalid, OSError if it is no file."""
+    require_regular_file(path)
+    if is_ros1(path):
+        return Ros1Storage(path)
+    return SqliteStorage(path) if path.suffix == '.db3' or is_sqlite(path) else McapStorage(path)
+
+
 @dataclass
 class BagLog:
     """Scans and odometry of a bag. Empty topic name: the only topic of that type.
 
-    T_base_laser (3,): pose of the laser on the robot; None: from /tf_static. expected_scans: as in
-    `Log`, from the first event on.
+    T_base_laser (3,): pose of the laser on the robot; None: from the transforms. base_frame,
+    odom_frame: frames of robot and odometry; empty: those of the bag (see `BagFrames`).
+    odometry_source: topic, tf or none as for the nodes; empty: the topic, or tf without one.
+    laser: its parameters. expected_scans: as in `Log`, from the first event on.
     """
 
     path: Path
     scan_topic: str = ''
     odometry_topic: str = ''
     T_base_laser: Array | None = None
-    base_frame: str = 'base_link'
+    base_frame: str = ''
+    odometry_source: str = ''
+    odom_frame: str = ''
+    laser: LaserConfig = field(default_factory=LaserConfig)
     skipped: SkippedRecords = field(default_factory=SkippedRecords)
     expected_scans: int | None = field(default=None, init=False)
+    is_sorted: bool = field(default=False, init=False)
 
     def events(self) -> Iterator[Event]:
         """Odometry and scans in the order of the log. Unusable messages are skipped and counted.
@@ -174,42 +201,61 @@ class BagLog:
             raise
 
     def _events(self, bag: Bag) -> Iterator[Event]:
-        used = {
-            self._topic(bag, _SCAN, self.scan_topic, 'laser scans'): 0,
-            self._topic(bag, _ODOMETRY, self.odometry_topic, 'odometry'): 0,
-        }
-        self.expected_scans = bag.message_count(next(iter(used)))
-        transforms = self._static_transforms(bag)
-        mounts: dict[str, Mount] = {}
-        for message in bag.messages(set(used)):
-            event = self._event(bag, message)
-            if event is None:
-                continue
-            frame, value = event
-            if isinstance(value, Scan):
-                mounts[frame] = mounts.get(frame) or self._mount(frame, transforms)
-                yield ScanEvent(mounts[frame].apply(value))
-            else:
-                yield value
-            used[message.topic] += 1
+        scan_topic = self._topic(bag, _SCAN, self.scan_topic, 'laser scans')
+        self.expected_scans = bag.message_count(scan_topic)
+        frames = BagFrames(
+            bag, FrameOptions(self.T_base_laser, self.base_frame, self.odom_frame), self.skipped
+        )
+        odometry = self._odometry(bag, frames)
+        used = Counter[str]()
+        for message in bag.messages({scan_topic, *odometry.topics}):
+            for event in self._of_message(bag, message, frames, odometry):
+                used[scan_topic if isinstance(event, ScanEvent) else odometry.name] += 1
+                yield event
         if bag.repair_hint:
             self.skipped.add_first(bag.repair_hint)
-        for topic, count in used.items():
-            if count == 0:
-                first = f': {self.skipped.first}' if self.skipped.first else ''
-                name = validation.quoted_name(topic)
-                raise InputError(f'{self.path}: {name}: no usable message{first}')
+        if bag.note:
+            self.skipped.note(bag.note)
+        for name in (scan_topic, odometry.name):
+            if used[name] == 0:
+                first = f': {self.skipped.first}' if self.skipped.first else odometry.missing
+                raise InputError(
+                    f'{self.path}: {validation.quoted_name(name)}: no usable message{first}'
+                )
 
-    def _event(self, bag: Bag, message: RawMessage) -> tuple[str, OdometryEvent | Scan] | None:
-        """Frame and value of a message; None, and counted, if it is unusable."""
+    def _of_message(
+        self, bag: Bag, message: RawMessage, frames: BagFrames, odometry: BagOdometry
+    ) -> Iterator[Event]:
+        """Events of a message; none, and counted, if it is unusable."""
         try:
             decoded = bag.decode(message)
-            value = _odometry(decoded) if message.type_name == _ODOMETRY else _scan(decoded)
+            if message.type_name != _SCAN:
+                yield from odometry.samples(decoded)
+                return
+            scan = _scan(decoded, self.laser)
         except InputError as error:
             where = f'{self.path}: {validation.quoted_name(message.topic)}: '
             self.skipped.add(where + str(error).removeprefix(where))
-            return None
-        return decoded.header.frame_id, value
+            return
+        yield from odometry.at_scan(scan.stamp_ns)
+        yield ScanEvent(frames.laser_mount(decoded.header.frame_id).apply(scan))
+
+    def _odometry(self, bag: Bag, frames: BagFrames) -> BagOdometry:
+        """The source of odometry that the user chose, or that the bag has."""
+        source = self.odometry_source
+        has_topic = self.odometry_topic or _ODOMETRY in bag.topics.values()
+        if not source and not has_topic and frames.tf_topics and frames.has_odometry():
+            source = TF
+            self.skipped.note(
+                f'no odometry topic: odometry is the transform from "{frames.odom_frame}" to '
+                f'"{frames.base_frame}" on /tf (--odom-source tf)'
+            )
+        if source == NONE:
+            return NoOdometry()
+        if source == TF:
+            return OdometryByTransforms(frames)
+        topic = self._topic(bag, _ODOMETRY, self.odometry_topic, 'odometry')
+        return OdometryOnTopic(topic, frames.of_odometry(topic))
 
     def _topic(self, bag: Bag, type_name: str, wanted: str, what: str) -> str:
         found = sorted(topic for topic, name in bag.topics.items() if name == type_name)
@@ -225,47 +271,8 @@ class BagLog:
         names = validation.quoted_names(found)
         raise InputError(f'{self.path}: {what} on several topics: choose one of {names}')
 
-    def _static_transforms(self, bag: Bag) -> StaticTransforms:
-        transforms = StaticTransforms()
-        topics = {t for t, n in bag.topics.items() if n == _TF and t.endswith('tf_static')}
-        for message in bag.messages(topics) if topics and self.T_base_laser is None else ():
-            try:
-                for transform in bag.decode(message).transforms:
-                    transforms.add(transform)
-            except InputError as error:
-                where = f'{self.path}: {validation.quoted_name(message.topic)}: '
-                self.skipped.add(where + str(error).removeprefix(where))
-        return transforms
 
-    def _mount(self, frame: str, transforms: StaticTransforms) -> Mount:
-        if self.T_base_laser is not None:
-            return Mount(self.T_base_laser, upside_down=False)
-        try:
-            mount = transforms.laser_mount(frame, self.base_frame)
-        except InputError as error:
-            raise InputError(f'{self.path}: /tf_static: {error}') from error
-        if mount is None:
-            known = validation.quoted_names(transforms.frames)
-            where = f'from "{validation.quoted_name(frame)}" to "{self.base_frame}"'
-            raise InputError(
-                f'{self.path}: /tf_static has no transform {where} (it has {known}): '
-                'give --base-frame, or --offset-m for a laser straight ahead'
-            )
-        return mount
-
-
-def _odometry(message: Any) -> OdometryEvent:
-    rotation_matrix(message.pose.pose.orientation)  # raises InputError if it is invalid
-    T_odom_base = decode.pose(message.pose.pose)
-    if not se2.is_bounded_pose(T_odom_base):
-        raise InputError(
-            f'pose {T_odom_base.tolist()}: expected finite numbers, at most '
-            f'{se2.MAX_COORDINATE_M:g} m'
-        )
-    return OdometryEvent(decode.stamp_ns(message), T_odom_base)
-
-
-def _scan(message: Any) -> Scan:
+def _scan(message: Any, laser: LaserConfig) -> Scan:
     if len(message.ranges) == 0:
         raise InputError('scan without ranges')
     if len(message.ranges) > validation.MAX_BEAMS:
@@ -282,4 +289,5 @@ def _scan(message: Any) -> Scan:
             message.range_max,
             time_increment_s=message.time_increment,
             scan_time_s=message.scan_time,
+            laser=laser,
         )

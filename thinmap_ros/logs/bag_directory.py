@@ -19,22 +19,25 @@ class BagFiles:
     """The files of a bag in the order of recording.
 
     compressed_messages: whether messages are compressed individually; without_metadata: why
-    metadata.yaml was not used, empty if it was.
+    metadata.yaml was not used, empty if it was, or if nothing is missed with it; note: the same for
+    files that need none.
     """
 
     files: list[Path]
     compressed_messages: bool = False
     without_metadata: str = ''
+    note: str = ''
 
 
 def bag_files(path: Path) -> BagFiles:
     """Files of a bag: the given file, or those of a folder.
 
-    MCAP files are found even if metadata.yaml is missing or unreadable. Raises InputError if there
-    are no files.
+    Files are found even if metadata.yaml is missing or unreadable: a killed recorder does not write
+    it. Raises InputError if there are no files.
     """
     if not path.is_dir():
-        return BagFiles([path])
+        is_sqlite = path.suffixes[:1] == ['.db3']
+        return BagFiles([path], note=f'{path}: read without metadata.yaml' if is_sqlite else '')
     metadata = path / 'metadata.yaml'
     found = mcap_files_in(path)
     try:
@@ -43,8 +46,9 @@ def bag_files(path: Path) -> BagFiles:
         reason = f'{metadata}: {one_line_reason(error).removeprefix(f"{metadata}: ")}'
     if found:
         return BagFiles(found, without_metadata=reason)
-    if any(path.glob('*.db3')):
-        raise InputError(f'{reason}: `ros2 bag reindex -s sqlite3 {path}` writes a new one')
+    bare = sorted([*path.glob('*.db3'), *path.glob('*.db3.zstd')], key=_number)
+    if bare:
+        return BagFiles(bare, note=f'{reason}: its SQLite files are read without it')
     raise InputError(
         f'{path}: expected a rosbag2 folder, with metadata.yaml and MCAP or SQLite files'
     )
@@ -57,7 +61,7 @@ def mcap_files_in(folder: Path) -> list[Path]:
 
 def _number(file: Path) -> tuple[int, str]:
     """Number of a file of a bag: rosbag2 names them name_0, name_1, ... name_10."""
-    number = file.stem.rpartition('_')[2]
+    number = Path(file.name.removesuffix('.zstd')).stem.rpartition('_')[2]
     return (int(number) if number.isdecimal() and len(number) < 10 else -1, file.name)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import LATEST_S, SECOND_NS
 from thinmap_ros.files.limits import LOGS
@@ -67,12 +67,19 @@ class LaserOptions(Config):
 
 @dataclass
 class CarmenLog:
-    """A CARMEN log file. `events()` plays it in file order; `skipped` counts invalid lines."""
+    """A CARMEN log file. `events()` plays it in file order; `skipped` counts invalid lines.
+
+    T_base_laser (3,): pose of the laser on the robot; None: by the options, or the lines.
+    laser: its parameters for all logs.
+    """
 
     path: Path
     options: LaserOptions = field(default_factory=LaserOptions)
+    T_base_laser: Array | None = None
+    laser: LaserConfig = field(default_factory=LaserConfig)
     skipped: SkippedRecords = field(default_factory=SkippedRecords)
-    _T_base_laser: Array | None = field(default=None, init=False)
+    is_sorted: bool = field(default=True, init=False)
+    _measured: Array | None = field(default=None, init=False)  # T_base_laser of the lines
 
     def events(self) -> Iterator[Event]:
         """Odometry and scans in file order; the odometry of a scan line precedes its scan.
@@ -81,7 +88,7 @@ class CarmenLog:
         text, or has no scan.
         """
         self.skipped = SkippedRecords()
-        self._T_base_laser = None
+        self._measured = None
         scans = 0
         for number, line in self._lines():
             try:
@@ -118,7 +125,7 @@ class CarmenLog:
         return round(scans * size / max(read, 1)) or None
 
     def _lines(self) -> Iterator[tuple[int, str]]:
-        refuse_foreign(self.path)
+        refuse_foreign(self.path, 'a CARMEN log')
         if is_mcap(self.path):
             raise InputError(f'{self.path}: an MCAP file, which is a bag: expected a CARMEN log')
         try:
@@ -207,16 +214,19 @@ class CarmenLog:
         T_odom_base = _pose(rest[3:6])
         # The laser is mounted rigidly: the offset of the first valid line is used for all, without
         # its rounding errors.
-        measured = self._T_base_laser
+        measured = self._measured
         if measured is None:
             measured = np.round(se2.between(T_odom_base, T_odom_laser), 3)
-        mount = self._offset() if self.options.offset_m else measured
+        is_given = self.T_base_laser is not None or self.options.offset_m
+        mount = self._offset() if is_given else measured
         limit = min(max_range, self.options.range_max_m)
         scan = self._scan(_stamp(rest[11]), words[9 : 9 + count], (start, step), limit, mount)
-        self._T_base_laser = measured
+        self._measured = measured
         return [OdometryEvent(scan.stamp_ns, T_odom_base), ScanEvent(scan)]
 
     def _offset(self) -> Array:
+        if self.T_base_laser is not None:
+            return self.T_base_laser
         return np.array([self.options.offset_m, 0.0, 0.0])
 
     def _scan(
@@ -232,7 +242,13 @@ class CarmenLog:
         values = np.array(ranges, dtype=np.float64)
         with np.errstate(over='ignore'):  # a range beyond float32 is a "no return", as inf
             return Scan.create(
-                stamp_ns, values, *fan, self.options.range_min_m, limit, T_base_laser
+                stamp_ns,
+                values,
+                *fan,
+                self.options.range_min_m,
+                limit,
+                T_base_laser,
+                self.laser,
             )
 
 

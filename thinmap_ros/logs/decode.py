@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.core import se2, validation
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
@@ -13,9 +14,26 @@ from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 
+def time_ns(stamp: Any) -> int:
+    """Time message as whole nanoseconds. Raises InputError if it is invalid."""
+    if stamp.sec < 0 or stamp.nanosec >= SECOND_NS:
+        raise InputError(
+            f'stamp {stamp.sec} s, {stamp.nanosec} ns: '
+            f'expected a time after 1970, ns below {SECOND_NS}'
+        )
+    return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
+
+
 def stamp_ns(message: Any) -> int:
-    """Stamp of a message's header, ns."""
-    return int(message.header.stamp.sec) * SECOND_NS + int(message.header.stamp.nanosec)
+    """Stamp of a message's header, ns. Raises InputError if it is invalid."""
+    return time_ns(message.header.stamp)
+
+
+def require_rotation(q: Any) -> None:
+    """Raise InputError unless the norm of a quaternion with fields x, y, z, w is 1."""
+    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+    if not abs(norm - 1.0) < 0.01:
+        raise InputError(f'quaternion ({q.x}, {q.y}, {q.z}, {q.w}): expected norm 1, not {norm}')
 
 
 def yaw(q: Any) -> float:
@@ -26,6 +44,16 @@ def yaw(q: Any) -> float:
 def pose(message: Any) -> Array:
     """Planar pose (3,) of a geometry_msgs/Pose."""
     return se2.pose(message.position.x, message.position.y, yaw(message.orientation))
+
+
+def checked_pose(message: Any) -> Array:
+    """Planar pose (3,) of a geometry_msgs/Pose.
+
+    Raises InputError where it is beyond 1000 km or no rotation.
+    """
+    validation.require_bounded('position', (message.position.x, message.position.y))
+    require_rotation(message.orientation)
+    return pose(message)
 
 
 def patch(message: Any) -> GridPatch:

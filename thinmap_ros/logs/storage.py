@@ -17,7 +17,6 @@ from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.limits import LOGS
-from thinmap_ros.files.regular_files import require_regular_file
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.mcap_reader import Damage, McapFile
 
@@ -132,12 +131,6 @@ class SqliteStorage:
 
     def _reader(self) -> AnyReader:
         return AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
-
-
-def storage_of(path: Path) -> Storage:
-    """Open a file of a bag. Raises InputError if it is invalid, OSError if it is no file."""
-    require_regular_file(path)
-    return SqliteStorage(path) if path.suffix == '.db3' else McapStorage(path)
 
 
 def typestore_of(schema: Schema) -> Typestore:

@@ -31,6 +31,7 @@ from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.files.sessions import LOCALIZER
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.logs.frames.bag_odometry import NONE
 from thinmap_ros.nodes.localization.given_map import GivenMap, config_at
 from thinmap_ros.nodes.localization.initial_poses import InitialPoses
 from thinmap_ros.nodes.localization.known_area import require_near_map
@@ -44,7 +45,7 @@ from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.tf.map_broadcaster import MapBroadcaster
-from thinmap_ros.ros.tf.odometry_source import NONE, OdometrySource
+from thinmap_ros.ros.tf.odometry_source import OdometrySource
 
 _MAP_WAIT_S = 3.0  # after a restart; the navigator drives for so long without a new pose
 _HEALTH = {

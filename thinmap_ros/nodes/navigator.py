@@ -18,6 +18,7 @@ from thinmap_ros.core.planning.navigator import (
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.logs.frames.bag_odometry import NONE
 from thinmap_ros.nodes.navigation.map_input import MapInput
 from thinmap_ros.nodes.navigation.robot_state import RobotState
 from thinmap_ros.nodes.navigation.tasks import ErrorCode, NavigationTask, TaskReader
@@ -28,7 +29,7 @@ from thinmap_ros.ros.diagnostics import OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
-from thinmap_ros.ros.tf.odometry_source import NONE, OdometrySource
+from thinmap_ros.ros.tf.odometry_source import OdometrySource
 from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
 
 # As in Nav2, there is no estimate of the remaining time below this speed or distance.

@@ -1,25 +1,18 @@
 """The pose of the laser on the robot, from /tf_static or from a parameter."""
 
-import math
-
-import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from thinmap_ros.core import se2
-from thinmap_ros.core.errors import ConfigError, InputError, quoted
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.logs.laser_mount import Mount, StaticTransforms
+from thinmap_ros.logs.frames.laser_mount import Mount, StaticTransforms, parse_laser_pose
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 _MAX_FRAMES = 1000
-# Smaller changes are of rounding, or of a calibration that was refined.
-_MAX_CHANGE_M = 0.01
-_MAX_CHANGE_RAD = 0.01
 
 
 class LaserTransform:
@@ -44,7 +37,7 @@ class LaserTransform:
             'Pose of the laser on the robot as "x,y,yaw" (m, m, rad). Empty: from /tf_static.',
         )
         self._laser = parameters.declare_config(node, LaserConfig)
-        self._fixed = Mount(_parse_pose(str(given)), upside_down=False) if given else None
+        self._fixed = Mount(parse_laser_pose(str(given)), upside_down=False) if given else None
         self._transforms = StaticTransforms()
         self._mounts: dict[str, Mount] = {}
         self._frame_id = ''  # of the last scan
@@ -105,36 +98,5 @@ class LaserTransform:
             frame: f'static transform of laser {quoted(frame)} {change}: the first one is used; '
             'expected a laser that does not move on the robot: restart the node for the new one'
             for frame in self._mounts
-            if (change := self._change(frame))
+            if (change := self._transforms.change(frame, self.base_frame))
         }
-
-    def _change(self, frame_id: str) -> str:
-        """How the transform of a laser frame differs from the one that is used; '' if it does not.
-
-        While its chain of frames is not complete, nothing is known.
-        """
-        try:
-            found = self._transforms.laser_mount(frame_id, self.base_frame)
-        except InputError as error:
-            return f'has changed: {error}'
-        if found is None:
-            return ''
-        used = self._mounts[frame_id]
-        x, y, yaw = np.abs(se2.pose_difference(found.T_base_laser, used.T_base_laser)).tolist()
-        moved_m = math.hypot(x, y)
-        if found.upside_down != used.upside_down:
-            return 'has been turned over'
-        if moved_m <= _MAX_CHANGE_M and yaw <= _MAX_CHANGE_RAD:
-            return ''
-        return f'has changed by {moved_m:.2f} m, {yaw:.2f} rad'
-
-
-def _parse_pose(text: str) -> Array:
-    try:
-        x, y, yaw = (float(part) for part in text.split(','))
-        T = se2.pose(x, y, yaw)
-    except ValueError:
-        T = np.full(3, np.nan)
-    if not se2.is_finite(T):
-        raise ConfigError(f'laser_pose = {quoted(text)}: expected "x,y,yaw" in m, m, rad')
-    return T

@@ -12,6 +12,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from thinmap_ros.core.errors import ThinmapError, one_line_reason
 from thinmap_ros.core.snapshot import State
+from thinmap_ros.core.stamps import CLOCK_JUMP_NS
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint
 from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
@@ -21,7 +22,7 @@ from thinmap_ros.ros.services import fill_response
 _CHECKPOINT_PERIOD_S = 0.5
 RCLError = rclpy_implementation.RCLError
 _BACKWARD = JumpThreshold(
-    min_forward=None, min_backward=Duration(seconds=-1.0), on_clock_change=False
+    min_forward=None, min_backward=Duration(nanoseconds=-CLOCK_JUMP_NS), on_clock_change=False
 )
 
 

@@ -25,7 +25,7 @@ from std_msgs.msg import Header
 
 from thinmap_msgs.msg import ProbabilityGrid, TopologicalEdge, TopologicalNode
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
-from thinmap_ros.core import se2, validation
+from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M
 from thinmap_ros.core.grid.patch import GridPatch
@@ -34,6 +34,7 @@ from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Edge, Node, TopologicalMap
+from thinmap_ros.logs import decode
 
 # A bag or a publisher cannot name anything else to import.
 _TYPE_NAME = re.compile(r'([a-z]\w*)/msg/([A-Z]\w*)', re.ASCII)
@@ -59,12 +60,7 @@ def message_class(type_name: str) -> Any:
 
 def stamp_ns(stamp: Time) -> int:
     """Time message as whole nanoseconds. Raises InputError where it is invalid."""
-    if stamp.sec < 0 or stamp.nanosec >= SECOND_NS:
-        raise InputError(
-            f'stamp {stamp.sec} s, {stamp.nanosec} ns: '
-            f'expected a time after 1970, ns below {SECOND_NS}'
-        )
-    return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
+    return decode.time_ns(stamp)
 
 
 def time_msg(ns: int) -> Time:
@@ -133,14 +129,6 @@ def scan_msg(scan: Scan, frame_id: str, scan_time_s: float) -> LaserScan:
     )
 
 
-def yaw_of(q: Quaternion) -> float:
-    """Yaw of a quaternion, rad. Raises InputError where its norm is not 1."""
-    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
-    if not abs(norm - 1.0) < 0.01:
-        raise InputError(f'quaternion ({q.x}, {q.y}, {q.z}, {q.w}): expected norm 1, not {norm}')
-    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-
-
 def quaternion_msg(yaw_rad: float) -> Quaternion:
     """Quaternion of a rotation about z."""
     return Quaternion(z=math.sin(yaw_rad / 2.0), w=math.cos(yaw_rad / 2.0))
@@ -148,8 +136,7 @@ def quaternion_msg(yaw_rad: float) -> Quaternion:
 
 def pose_from_msg(message: Pose) -> Array:
     """Planar pose (3,). Raises InputError where it is beyond 1000 km or no rotation."""
-    validation.require_bounded('position', (message.position.x, message.position.y))
-    return se2.pose(message.position.x, message.position.y, yaw_of(message.orientation))
+    return decode.checked_pose(message)
 
 
 def pose_msg(T: Array) -> Pose:

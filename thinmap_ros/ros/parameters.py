@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from difflib import get_close_matches
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import (
@@ -23,10 +22,11 @@ from thinmap_ros.core.config import (
     check_safety,
     parameters_of,
     require_number,
+    suggestion,
     with_values,
 )
 from thinmap_ros.core.errors import ConfigError
-from thinmap_ros.ros.foreign.translation import is_known
+from thinmap_ros.ros.foreign.values import is_known
 
 STRICT = 'strict_parameters'
 # What describes the robot: one file may give it to all nodes, also to those that do not need it.
@@ -235,7 +235,7 @@ def reject_unknown(node: Node) -> None:
     unknown = sorted(given - known)
     if not unknown:
         return
-    wrong = ', '.join(name + _suggestion(name, known) for name in unknown)
+    wrong = ', '.join(name + suggestion(name, known) for name in unknown)
     if node.has_parameter(STRICT) and not node.get_parameter(STRICT).value:
         node.get_logger().warning(
             f'ignored parameters that node {names} does not have: {wrong}; '
@@ -243,14 +243,6 @@ def reject_unknown(node: Node) -> None:
         )
         return
     raise ConfigError(f'node {names} has no parameter {wrong}; it has: {", ".join(sorted(known))}')
-
-
-def _suggestion(name: str, known: set[str]) -> str:
-    """The parameter that was probably meant: in another group, or with a similar name."""
-    last = name.split('.')[-1]
-    same = [other for other in sorted(known) if other.split('.')[-1] == last]
-    likely = same or get_close_matches(name, sorted(known), n=1, cutoff=0.75)
-    return f' (did you mean {", ".join(likely)}?)' if likely else ''
 
 
 @dataclasses.dataclass

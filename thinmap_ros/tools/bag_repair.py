@@ -16,7 +16,7 @@ def files_of(bag: Path) -> list[Path]:
 
     Raises InputError if it has none.
     """
-    refuse_foreign(bag)
+    refuse_foreign(bag, 'an MCAP file')
     files = mcap_files_in(bag) if bag.is_dir() else [bag]
     if not files or not files[0].is_file() or not (files[0].suffix == '.mcap' or is_mcap(files[0])):
         raise InputError(f'{bag}: expected an MCAP file, or a folder with MCAP files in it')

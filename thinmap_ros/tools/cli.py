@@ -1,12 +1,13 @@
 """Common parts of command line programs: arguments, errors in one line, exit codes."""
 
 import argparse
+import re
 import shlex
 import signal
 import sys
 import warnings
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TextIO, TypeVar
 
@@ -14,14 +15,19 @@ import numpy as np
 
 from thinmap_ros.core.config import Config, is_parameter
 from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.logs import log
 from thinmap_ros.logs.carmen import LaserOptions
+from thinmap_ros.logs.frames.bag_odometry import SOURCES
+from thinmap_ros.logs.frames.laser_mount import parse_laser_pose
 from thinmap_ros.logs.log import Log
+from thinmap_ros.tools.parameter_file import NodeParameters
 
 BAD_INPUT = 2
 INTERRUPTED = 130
 AnyConfig = TypeVar('AnyConfig', bound=Config)
+_NO_PARAMETERS = NodeParameters()
 # argparse's base class of parsers and groups of options.
 Options = argparse._ActionsContainer
 
@@ -34,6 +40,8 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
     """
     if sys.argv[0].startswith('thinmap '):
         parser.prog = sys.argv[0]
+    # A list of numbers may begin with a minus sign, as in --laser-pose -0.1,0,0.
+    parser._negative_number_matcher = re.compile(r'-[\d.]')
     arguments = parser.parse_args()
     _print_warnings(parser.prog)
     compilation = report_compilation()
@@ -110,24 +118,42 @@ def add_config(parser: Options, config: type[Config], names: list[str] | None = 
             help_text = f'{field.metadata["description"]} (default {field.default})'
             kind = type(field.default)
             choices = field.metadata.get('choices')
+            if kind is bool:
+                parser.add_argument(
+                    option, action='store_true', default=argparse.SUPPRESS, help=help_text
+                )
+                continue
             parser.add_argument(
                 option, type=kind, default=argparse.SUPPRESS, choices=choices, help=help_text
             )
 
 
-def config_from(arguments: argparse.Namespace, config: type[AnyConfig]) -> AnyConfig:
-    """Config from the command line. Raises ConfigError if a value is out of range."""
+def config_from(
+    arguments: argparse.Namespace, config: type[AnyConfig], base: AnyConfig | None = None
+) -> AnyConfig:
+    """Config from the command line; base: values of what is not given there; None: the defaults.
+
+    Raises ConfigError if a value is out of range.
+    """
     names = [field.name for field in fields(config)]
-    return config(**{name: getattr(arguments, name) for name in names if hasattr(arguments, name)})
+    given = {name: getattr(arguments, name) for name in names if hasattr(arguments, name)}
+    return config(**given) if base is None else replace(base, **given)
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Add the log, and options for its laser pose and topics."""
+    """Add the log, and options for its laser pose, topics and frames."""
     parser.add_argument(
-        'log', type=Path, help='CARMEN log (plain or gzip), rosbag2 folder, or MCAP file'
+        'log', type=Path, help='CARMEN log (plain or gzip), rosbag2 folder or file, or ROS 1 bag'
     )
     carmen = parser.add_argument_group('laser of a CARMEN log', 'Only --offset-m applies to bags.')
     add_config(carmen, LaserOptions)
+    parser.add_argument(
+        '--laser-pose',
+        default='',
+        metavar='X,Y,YAW',
+        help='pose of the laser on the robot (m, m, rad), instead of that of the log',
+    )
+    add_config(parser, LaserConfig)
     parser.add_argument(
         '--scan-topic', default='', help='bag: topic of the scans, if there are several'
     )
@@ -135,23 +161,48 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
         '--odom-topic', default='', help='bag: topic of the odometry, if there are several'
     )
     parser.add_argument(
-        '--base-frame', default='base_link', help="bag: the robot's frame (default base_link)"
+        '--odom-source',
+        default='',
+        choices=SOURCES,
+        help='bag: odometry from its topic, from the transform of --odom-frame to --base-frame, or '
+        'none: by scan matching alone (default: topic, or tf without one)',
+    )
+    parser.add_argument(
+        '--base-frame',
+        default='',
+        help="bag: the robot's frame (default base_link, or that of the odometry where nothing "
+        'names base_link)',
+    )
+    parser.add_argument(
+        '--odom-frame', default='', help='bag: frame of the odometry (default that of the bag)'
     )
 
 
-def open_log(arguments: argparse.Namespace) -> Log:
+def open_log(arguments: argparse.Namespace, parameters: NodeParameters = _NO_PARAMETERS) -> Log:
     """Return the log that the arguments name.
 
-    A laser offset that is given comes before a bag's /tf_static.
+    A laser pose that is given comes before that of the log. parameters: of the node localizer, for
+    what is not among the arguments.
     """
-    T_base_laser = (
-        np.array([arguments.offset_m, 0.0, 0.0]) if hasattr(arguments, 'offset_m') else None
-    )
+
+    def text(name: str) -> str:
+        return str(parameters.value('localizer', name, ''))
+
+    given = arguments.laser_pose
+    if not given and not hasattr(arguments, 'offset_m'):
+        given = text('laser_pose')
+    offset = getattr(arguments, 'offset_m', None)
+    T_base_laser = None if offset is None else np.array([offset, 0.0, 0.0])
     return log.open_log(
         arguments.log,
         config_from(arguments, LaserOptions),
         arguments.scan_topic,
         arguments.odom_topic,
-        T_base_laser,
-        arguments.base_frame,
+        parse_laser_pose(given) if given else T_base_laser,
+        arguments.base_frame or text('base_frame'),
+        odometry_source=arguments.odom_source or text('odom_source'),
+        odom_frame=arguments.odom_frame or text('odom_frame'),
+        laser_config=config_from(
+            arguments, LaserConfig, parameters.config('localizer', LaserConfig())
+        ),
     )

@@ -8,28 +8,33 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import line_features
+from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs.log import Event, Log, SkippedRecords
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.replaying import Replay, replay, write_outputs
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.parameter_file import NodeParameters, read_parameter_file
 from thinmap_ros.view import report_page
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
 # Large data are converted once a second: a view does not draw them more often.
 _PERIOD_NS = 1_000_000_000
+# Whose parameters replay takes from a file.
+_NODES = ('localizer', 'grid_mapper', 'topology_builder')
 _STAGES = {'localizer': 'localizer', 'grid': 'map update', 'topology': 'graph update'}
 
 
@@ -126,6 +131,11 @@ class _InterruptibleLog:
         """Expected number of scans of the log."""
         return self._log.expected_scans
 
+    @property
+    def is_sorted(self) -> bool:
+        """Whether the order of the file is right."""
+        return self._log.is_sorted
+
     def events(self) -> Iterator[Event]:
         """Events of the log; raises KeyboardInterrupt between two of them."""
         for event in self._log.events():
@@ -153,31 +163,70 @@ def _interruptible(log: Log) -> Iterator[_InterruptibleLog]:
             signal.signal(number, handler)
 
 
-def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
-    config = PipelineConfig(
-        localizer=cli.config_from(arguments, LocalizerConfig),
-        grid=cli.config_from(arguments, OccupancyConfig),
+def _config(arguments: argparse.Namespace, parameters: NodeParameters) -> PipelineConfig:
+    """Parameters of all stages: those of the command line come before those of a file."""
+    localizer = parameters.config('localizer', LocalizerConfig())
+    grid = parameters.config('grid_mapper', OccupancyConfig())
+    return PipelineConfig(
+        localizer=cli.config_from(arguments, LocalizerConfig, localizer),
+        grid=cli.config_from(arguments, OccupancyConfig, grid),
+        window=parameters.config('grid_mapper', WindowConfig()),
+        topology=parameters.config('topology_builder', TopologyConfig()),
     )
+
+
+def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
+    file = arguments.params_file
+    parameters = read_parameter_file(file, _NODES) if file else NodeParameters()
+    config = _config(arguments, parameters)
     wall = time.perf_counter()
     cpu = time.process_time()
-    with _interruptible(cli.open_log(arguments)) as log:
+    with _interruptible(cli.open_log(arguments, parameters)) as log:
         result = replay(
             log, config, show_progress=not arguments.quiet, watcher=shown, keep_partial=True
         )
+    result.notes = [*parameters.notes, *result.notes]
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{arguments.log.name}: {len(result.poses)} scans'
     report = write_outputs(result, arguments.out, title, seconds)
     report_page.write(arguments.out, title, report, cli.command_line())
-    skipped = f', {result.skipped} skipped' if result.skipped else ''
-    if result.first_skipped:
-        skipped += f' (first: {result.first_skipped})'
-    if report['refused']:
-        skipped += f', {report["refused"]} not mapped (first: {report["first_refused"]})'
-    print(
-        f'{arguments.out}: {report["scans"]} scans{skipped}, {report["distance"]:.1f} m, '
-        f'{report["ms_per_scan"]["all"]["median"]:.1f} ms a scan'
-    )
+    print(f'{arguments.out}: {_summary(result, report)}')
+    _print_notes(result)
     return result
+
+
+def _summary(result: Replay, report: dict[str, Any]) -> str:
+    """Counts, distance and time in one line."""
+    counts = result.counts
+    parts = [f'{report["scans"]} scans{_bracketed(counts.unmapped())}']
+    if result.skipped:
+        first = [f'first: {result.first_skipped}'] if result.first_skipped else []
+        parts.append(f'{result.skipped} skipped{_bracketed(counts.unpaired() + first)}')
+    if report['refused']:
+        parts.append(f'{report["refused"]} not mapped (first: {report["first_refused"]})')
+    parts += [
+        f'{report["distance"]:.1f} m',
+        f'{report["ms_per_scan"]["all"]["median"]:.1f} ms a scan',
+    ]
+    return ', '.join(parts)
+
+
+def _bracketed(reasons: list[str]) -> str:
+    return f' ({"; ".join(reasons)})' if reasons else ''
+
+
+def _print_notes(result: Replay) -> None:
+    """What was assumed, and loudly that most of the scans were not used."""
+    for note in result.notes:
+        print(f'replay: note: {note}', file=sys.stderr)
+    unused = result.counts.unused
+    scans = len(result.poses) + sum(result.counts.without_odometry.values())
+    if 2 * unused > scans:
+        reasons = '; '.join(result.counts.unpaired() + result.counts.unmapped())
+        print(
+            f'replay: warning: only {scans - unused} of {scans} scans were used: {reasons}',
+            file=sys.stderr,
+        )
 
 
 def main() -> None:
@@ -185,15 +234,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog='replay', description=__doc__)
     cli.add_log_options(parser)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
+    parser.add_argument(
+        '--params-file',
+        type=Path,
+        help='parameter file of the nodes, such as config/robots/turtlebot4.yaml; options come '
+        'before it',
+    )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument(
         '--view', action='store_true', help='show it in rerun, until the viewer is closed'
     )
     parser.add_argument('--recording', type=Path, help="file for rerun's recording (.rrd)")
     cli.add_config(parser, LocalizerConfig, ['slam'])
-    cli.add_config(
-        parser, OccupancyConfig, ['resolution_m', 'no_return_clear_range_m', 'max_range_m']
-    )
+    cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_clear_range_m'])
     cli.run(_work, parser)
 
 

@@ -16,7 +16,7 @@ from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
-from thinmap_ros.logs.laser_mount import StaticTransforms
+from thinmap_ros.logs.frames.laser_mount import StaticTransforms
 from thinmap_ros.view import palette
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View

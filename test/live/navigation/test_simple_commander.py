@@ -16,6 +16,7 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient
 from support.halls import AT_START, START
 
+from thinmap_ros.logs import decode
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -127,7 +128,7 @@ def test_its_sequence_of_calls_drives_the_simulated_robot(graph):
     assert commander.get_result() is TaskResult.SUCCEEDED
     assert max(remaining) == pytest.approx(math.sqrt(2.0), abs=0.3)
     assert math.dist(position(), (3.0, 3.0)) < 0.3
-    yaw = messages.yaw_of(truth[-1].pose.orientation)
+    yaw = decode.yaw(truth[-1].pose.orientation)
     assert abs(yaw - math.pi / 2) < 0.3, 'the heading of the goal counts'
 
     assert commander.go_to_pose(pose_at(2.0, 2.0))

@@ -5,8 +5,8 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.logs.frames.odometry_frames import OdometryFrames
 from thinmap_ros.ros import messages
-from thinmap_ros.ros.tf.odometry_frames import OdometryFrames
 
 T_ODOM_BASE = se2.pose(3.0, -1.0, 0.7)
 T_BASE_WHEELS = se2.pose(0.3, 0.1, 0.4)

@@ -8,8 +8,8 @@ from geometry_msgs.msg import TransformStamped
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.logs.frames.transforms import TransformBuffer
 from thinmap_ros.ros import messages
-from thinmap_ros.ros.tf.transform_listener import TransformBuffer
 
 SECOND_NS = 10**9
 

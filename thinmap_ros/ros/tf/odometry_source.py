@@ -11,15 +11,12 @@ from tf2_msgs.msg import TFMessage
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.logs.frames.bag_odometry import NONE, SOURCES, TF, TOPIC
+from thinmap_ros.logs.frames.odometry_frames import OdometryFrames
+from thinmap_ros.logs.frames.transforms import TransformOdometry
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded
-from thinmap_ros.ros.tf.odometry_frames import OdometryFrames
-from thinmap_ros.ros.tf.transform_listener import TransformBuffer
-
-TOPIC = 'topic'
-TF = 'tf'
-NONE = 'none'
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class OdometryInputConfig(Config):
         'in frames that static transforms connect to these. tf: the transform from odom_frame to '
         'base_frame. none: the robot has no odometry; the localizer follows it by '
         'scan matching alone and publishes odom_frame -> base_frame as identity.',
-        choices=(TOPIC, TF, NONE),
+        choices=SOURCES,
     )
 
 
@@ -48,7 +45,6 @@ class OdometrySource:
     ) -> None:
         self._node = node
         self._process = process
-        self._base_frame = base_frame
         self.odom_frame = str(
             parameters.declare_parameter(
                 node, 'odom_frame', 'odom', 'Frame of the odometry (REP 105).'
@@ -61,8 +57,7 @@ class OdometrySource:
             self._subscribe_static,
             lambda note: node.get_logger().info(f'odom: {note}'),
         )
-        self._transforms = TransformBuffer()
-        self._last_ns: int | None = None
+        self._transforms = TransformOdometry(self.odom_frame, base_frame)
 
     def subscribe(self) -> None:
         """Start to receive samples."""
@@ -77,7 +72,6 @@ class OdometrySource:
     def reset(self) -> None:
         """Forget the samples: the time was set back."""
         self._transforms.clear()
-        self._last_ns = None
 
     def add_scan_stamp(self, stamp_ns: int) -> None:
         """A scan was made: without odometry, the robot is where it was."""
@@ -100,13 +94,12 @@ class OdometrySource:
         """Add transforms; the sample is that of the newest time at which all of them are known."""
         self._node.handle_time_jump()
         self._add(message, is_static=False)
-        stamp_ns = self._transforms.latest_common_ns(self.odom_frame, self._base_frame)
-        if not self._node.is_active or stamp_ns is None or stamp_ns == self._last_ns:
+        if not self._node.is_active:
             return
-        self._last_ns = stamp_ns
         try:
-            T_odom_base = self._transforms.lookup(self.odom_frame, self._base_frame, stamp_ns)
-            self._process(stamp_ns, T_odom_base)
+            sample = self._transforms.next_sample()
+            if sample is not None:
+                self._process(*sample)
         except InputError as error:
             self._node.diagnostics.message_rejected('/tf', str(error))
 
@@ -121,9 +114,5 @@ class OdometrySource:
 
     def _report(self) -> None:
         """Report on /diagnostics what is missing of the chain of transforms."""
-        try:
-            self._transforms.lookup(self.odom_frame, self._base_frame)
-        except InputError as error:
-            self._node.diagnostics.set_value('odometry by TF', error)
-        else:
-            self._node.diagnostics.set_value('odometry by TF', 'received')
+        missing = self._transforms.missing
+        self._node.diagnostics.set_value('odometry by TF', missing or 'received')

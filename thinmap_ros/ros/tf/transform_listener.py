@@ -1,145 +1,15 @@
-"""Transforms between the frames of a robot: from /tf and /tf_static, interpolated, in the plane.
+"""Transforms between the frames of a robot, from /tf and /tf_static."""
 
-Our own buffer: tf2_ros has no wheel, and one buffer everywhere behaves the same everywhere.
-"""
-
-import math
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from rclpy.node import Node
 from tf2_msgs.msg import TFMessage
 
-from thinmap_ros.core import se2, validation
-from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.odometry import OdometryBuffer
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.logs.laser_mount import rotation_matrix
-from thinmap_ros.ros import messages, qos
-
-_MAX_FRAMES = 1000
-
-
-class _Edge:
-    """The transforms from a parent frame to one child; static ones hold at every time."""
-
-    def __init__(self, parent: str) -> None:
-        self.parent = parent
-        self._fixed: Array | None = None
-        self._samples = OdometryBuffer()
-
-    @property
-    def latest_stamp_ns(self) -> int | None:
-        """Stamp of the newest sample; None for a static transform."""
-        return None if self._fixed is not None else self._samples.latest_stamp_ns
-
-    def add(self, stamp_ns: int, T_parent_child: Array, is_static: bool) -> None:
-        """Add a transform (3,)."""
-        if is_static:
-            self._fixed = T_parent_child
-        else:
-            self._fixed = None
-            self._samples.add(stamp_ns, T_parent_child)
-
-    def at(self, stamp_ns: int) -> Array | None:
-        """T_parent_child (3,) at a stamp; None outside of the samples."""
-        return self._samples.interpolate(stamp_ns) if self._fixed is None else self._fixed
-
-
-class TransformBuffer:
-    """The last ten seconds of all transforms, looked up along the tree of frames."""
-
-    def __init__(self) -> None:
-        self._edges: dict[str, _Edge] = {}
-
-    def clear(self) -> None:
-        """Forget all but the static transforms: the time was set back."""
-        self._edges = {
-            child: edge for child, edge in self._edges.items() if edge.latest_stamp_ns is None
-        }
-
-    def add(self, transform: Any, is_static: bool) -> None:
-        """Add a geometry_msgs/TransformStamped. Raises InputError where it is invalid."""
-        child = _frame_name(transform.child_frame_id)
-        parent = _frame_name(transform.header.frame_id)
-        T_parent_child = _planar_pose(transform)
-        edge = self._edges.get(child)
-        if edge is None or edge.parent != parent:
-            if edge is None and len(self._edges) >= _MAX_FRAMES:
-                raise InputError(f'transform to {quoted(child)}: more than {_MAX_FRAMES} frames')
-            edge = _Edge(parent)
-            self._edges[child] = edge
-        edge.add(messages.stamp_ns(transform.header.stamp), T_parent_child, is_static)
-
-    def lookup(self, target_frame: str, source_frame: str, stamp_ns: int | None = None) -> Array:
-        """Pose of the source frame in the target frame, T_target_source (3,).
-
-        stamp_ns: None for the newest time at which all transforms between them are known.
-        Raises InputError where the frames are not connected, or not at that time.
-        """
-        up, down = self._path(target_frame, source_frame)
-        ns = (self._latest_common_ns(up + down) or 0) if stamp_ns is None else stamp_ns
-        return se2.compose(se2.invert(self._chain(up, ns)), self._chain(down, ns))
-
-    def latest_common_ns(self, target_frame: str, source_frame: str) -> int | None:
-        """Newest stamp at which all transforms between two frames are known; None: never."""
-        try:
-            up, down = self._path(target_frame, source_frame)
-        except InputError:
-            return None
-        return self._latest_common_ns(up + down)
-
-    def _path(self, target_frame: str, source_frame: str) -> tuple[list[str], list[str]]:
-        """Frames from the target, and from the source, up to below their common ancestor."""
-        target = self._path_to_root(_frame_name(target_frame))
-        source = self._path_to_root(_frame_name(source_frame))
-        common = next((frame for frame in source if frame in target), None)
-        if common is None:
-            raise InputError(
-                f'no transform from {quoted(source_frame)} to {quoted(target_frame)}: '
-                f'{self._missing(target_frame, source_frame)}'
-            )
-        return target[: target.index(common)], source[: source.index(common)]
-
-    def _path_to_root(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on; a cycle ends where it closes."""
-        path = [frame]
-        while frame in self._edges:
-            frame = self._edges[frame].parent
-            if frame in path:
-                break
-            path.append(frame)
-        return path
-
-    def _chain(self, frames: list[str], ns: int) -> Array:
-        """Pose of the first frame in the parent of the last one, (3,)."""
-        T = np.zeros(3)
-        for frame in frames:
-            T_parent_frame = self._edges[frame].at(ns)
-            if T_parent_frame is None:
-                raise InputError(self._no_sample(frame, ns))
-            T = se2.compose(T_parent_frame, T)
-        return T
-
-    def _latest_common_ns(self, frames: list[str]) -> int | None:
-        stamps = [self._edges[frame].latest_stamp_ns for frame in frames]
-        return min((stamp for stamp in stamps if stamp is not None), default=None)
-
-    def _no_sample(self, frame: str, ns: int) -> str:
-        edge = self._edges[frame]
-        name = f'transform from {quoted(frame)} to {quoted(edge.parent)}'
-        latest_ns = edge.latest_stamp_ns
-        if latest_ns is not None and ns > latest_ns:
-            return f'{name}: the newest is {(ns - latest_ns) / 1e9:.3f} s older than requested'
-        return f'{name}: none at {ns / 1e9:.3f} s'
-
-    def _missing(self, target_frame: str, source_frame: str) -> str:
-        known = set(self._edges) | {edge.parent for edge in self._edges.values()}
-        unknown = [f for f in (target_frame, source_frame) if _frame_name(f) not in known]
-        if unknown:
-            return f'frame {", ".join(quoted(frame) for frame in unknown)} is not on /tf'
-        return 'they are in trees that are not connected'
+from thinmap_ros.logs.frames.transforms import TransformBuffer
+from thinmap_ros.ros import qos
 
 
 class TransformListener:
@@ -179,16 +49,3 @@ class TransformListener:
                 self._buffer.add(transform, is_static)
             except InputError as error:
                 self._node.get_logger().warning(f'/tf: {error}', throttle_duration_sec=5.0)
-
-
-def _planar_pose(transform: Any) -> Array:
-    moved = transform.transform.translation
-    name = f'transform to {quoted(transform.child_frame_id)}'
-    validation.require_bounded(name, (moved.x, moved.y, moved.z))
-    rotation = rotation_matrix(transform.transform.rotation)
-    return se2.pose(moved.x, moved.y, math.atan2(rotation[1, 0], rotation[0, 0]))
-
-
-def _frame_name(frame: str) -> str:
-    """Frame name without the leading slash of ROS 1."""
-    return str(frame).lstrip('/')

@@ -4,13 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from nav_msgs.msg import Odometry
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.ros import messages
-from thinmap_ros.ros.tf.transform_listener import TransformBuffer
+from thinmap_ros.logs import decode
+from thinmap_ros.logs.frames.laser_mount import StaticTransforms
 
 
 class OdometryFrames:
@@ -27,10 +26,11 @@ class OdometryFrames:
         base_frame: str,
         subscribe: Callable[[], None],
         note: Callable[[str], None],
+        static: StaticTransforms | None = None,
     ) -> None:
         """subscribe: is called once, when static transforms are needed: for `add_static`.
 
-        note: receives, once for each field, that it is empty.
+        note: receives, once for each field, that it is empty. static: those that are known already.
         """
         self._odom_frame = odom_frame.lstrip('/')
         self._base_frame = base_frame.lstrip('/')
@@ -38,16 +38,19 @@ class OdometryFrames:
         self._is_subscribed = False
         self._note = note
         self._noted: set[str] = set()
-        self._static = TransformBuffer()
+        self._static = StaticTransforms() if static is None else static
         self._found: dict[tuple[str, str], Array] = {}
 
     def add_static(self, transform: Any) -> None:
         """Add a static geometry_msgs/TransformStamped. Raises InputError where it is invalid."""
-        self._static.add(transform, is_static=True)
+        self._static.add(transform)
 
-    def pose(self, message: Odometry) -> Array:
-        """T_odom_base (3,) of a message. Raises InputError where it is invalid, or its frames."""
-        T_parent_child = messages.pose_from_msg(message.pose.pose)
+    def pose(self, message: Any) -> Array:
+        """T_odom_base (3,) of a nav_msgs/Odometry.
+
+        Raises InputError where it is invalid, or its frames.
+        """
+        T_parent_child = decode.checked_pose(message.pose.pose)
         parent = message.header.frame_id.lstrip('/')
         child = message.child_frame_id.lstrip('/')
         if parent != self._odom_frame:
@@ -65,15 +68,16 @@ class OdometryFrames:
             return np.zeros(3)
         self._subscribe_once()
         key = (expected, frame)
-        if key not in self._found:
-            try:
-                self._found[key] = self._static.lookup(expected, frame)
-            except InputError as error:
-                raise InputError(
-                    f'{field} {quoted(frame)}: expected {quoted(expected)} ({parameter}), '
-                    'or a frame that static transforms connect to it'
-                ) from error
-        return self._found[key]
+        found = self._found.get(key)
+        if found is None:
+            found = self._static.pose(expected, frame)
+        if found is None:
+            raise InputError(
+                f'{field} {quoted(frame)}: expected {quoted(expected)} ({parameter}), '
+                'or a frame that static transforms connect to it'
+            )
+        self._found[key] = found
+        return found
 
     def _subscribe_once(self) -> None:
         if not self._is_subscribed:

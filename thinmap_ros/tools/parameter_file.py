@@ -1,0 +1,103 @@
+"""Parameter files of nodes (ros__parameters), for programs that run the same code without ROS."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from thinmap_ros.core.config import Config, parameters_of, suggestion, with_values
+from thinmap_ros.core.errors import ConfigError, InputError, quoted
+from thinmap_ros.files.package_data import config_file
+from thinmap_ros.files.yaml import read_mapping
+from thinmap_ros.ros.foreign.tables import PACKAGES
+from thinmap_ros.ros.foreign.values import is_known, translated
+
+_STRICT = 'strict_parameters'
+_WILDCARDS = ('**', '*')
+_EXPECTED = 'a parameter file: NODE: ros__parameters: NAME: VALUE'
+AnyConfig = TypeVar('AnyConfig', bound=Config)
+
+
+@dataclass(frozen=True)
+class NodeParameters:
+    """Parameters of nodes by node and full name, and notes on those that no node has."""
+
+    of_node: dict[str, dict[str, Any]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def config(self, node: str, base: AnyConfig) -> AnyConfig:
+        """The config with the values that a node was given.
+
+        Raises ConfigError where one is not allowed.
+        """
+        given = self.of_node.get(node, {})
+        names = {name for name, _, _ in parameters_of(base)}
+        return with_values(base, {name: given[name] for name in given.keys() & names})
+
+    def value(self, node: str, name: str, default: Any) -> Any:
+        """Value of a parameter. Raises ConfigError where it has another type than the default."""
+        value = self.of_node.get(node, {}).get(name, default)
+        if type(value) is not type(default):
+            raise ConfigError(f'{name} = {quoted(value)}: expected a {type(default).__name__}')
+        return value
+
+
+def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> NodeParameters:
+    """Parameters of a file for some nodes, with those of other packages translated.
+
+    Those for all nodes come before those for one. Raises InputError with the file name if it has
+    no parameters for them, and ConfigError, with `strict_parameters`, for those that no node has.
+    """
+    content = read_mapping(path, _EXPECTED)
+    given: dict[str, dict[str, Any]] = {node: {} for node in nodes}
+    for key in sorted(content, key=lambda key: key.split('/')[-1] not in _WILDCARDS):
+        own = [node for node in nodes if _is_meant(key.split('/')[-1], node)]
+        values = dict(_flat(path, key, content[key])) if own else {}
+        for node in own:
+            given[node].update(values)
+    if not any(given.values()):
+        raise InputError(f'{path}: no parameters of {", ".join(nodes)}: expected {_EXPECTED}')
+    own_values = {node: translated(node, values) for node, values in given.items()}
+    return NodeParameters(own_values, _unknown(path, own_values))
+
+
+def _is_meant(key: str, node: str) -> bool:
+    """Whether the parameters below a name are for a node, or for the one that it replaces."""
+    replaced = any(package.name == key and node in package.nodes for package in PACKAGES)
+    return key in (*_WILDCARDS, node) or replaced
+
+
+def _flat(path: Path, key: str, tree: Any) -> Iterator[tuple[str, Any]]:
+    values = tree.get('ros__parameters') if isinstance(tree, dict) else None
+    if not isinstance(values, dict):
+        raise InputError(f'{path}: {quoted(key)}: expected {_EXPECTED}')
+    yield from _leaves(values, '')
+
+
+def _leaves(values: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}', value
+
+
+def _unknown(path: Path, given: dict[str, dict[str, Any]]) -> list[str]:
+    """Notes on the parameters that none of the nodes has: most of them are typing errors."""
+    known = {name for node in given for name in _names_of(node)}
+    names = {name for values in given.values() for name in values}
+    unknown = sorted(name for name in names - known if not is_known(name))
+    if not unknown:
+        return []
+    nodes = ', '.join(given)
+    wrong = ', '.join(name + suggestion(name, known) for name in unknown)
+    if any(values.get(_STRICT) is True for values in given.values()):
+        raise ConfigError(f'{path}: nodes {nodes} have no parameter {wrong}')
+    return [f'{path}: ignored parameters that nodes {nodes} do not have: {wrong}']
+
+
+def _names_of(node: str) -> set[str]:
+    """Names of all parameters of a node."""
+    file = config_file(node)
+    values = read_mapping(file, _EXPECTED)['/**']
+    return {name for name, _ in _flat(file, '/**', values)}
