@@ -1,6 +1,6 @@
 """Clocks that jump back in a log: another recording, a clock that was set, or wrong stamps."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ import pytest
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.stamps import SECOND_NS
-from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
+from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, SkippedRecords, paired_scans
 from thinmap_ros.logs.order.clock_jumps import ClockJumpError, ClockJumps, stamp_of
 
 PERIOD_NS = SECOND_NS // 20
@@ -115,3 +115,23 @@ def test_small_steps_back_stay_as_they_are() -> None:
         for moved in shifted([event], -int(rng.integers(0, 9 * SECOND_NS // 10)))
     ]
     assert filtered(log) == (log, [], '')
+
+
+class TwoLaps:
+    """The same drive twice."""
+
+    is_sorted = False
+    expected_scans = None
+
+    def __init__(self) -> None:
+        self.skipped = SkippedRecords()
+
+    def events(self) -> Iterator[Event]:
+        yield from drive(100)
+        yield from drive(100)
+
+
+def test_scans_with_odometry_are_those_of_the_first_recording() -> None:
+    with pytest.warns(UserWarning, match='the rest is another recording'):
+        scans = [scan.stamp_ns for scan, _ in paired_scans(TwoLaps())]
+    assert scans == [event.scan.stamp_ns for event in drive(100) if isinstance(event, ScanEvent)]

@@ -29,7 +29,7 @@ from thinmap_ros.logs.order.clock_jumps import ClockJumpError
 from thinmap_ros.logs.order.unused_scans import UnusedScans
 from thinmap_ros.tools.parameter_file import read_parameter_file
 
-_PRESETS = sorted((Path(__file__).resolve().parents[2] / 'config').glob('*/*.yaml'))
+_PRESETS = sorted((Path(__file__).resolve().parents[3] / 'config').glob('*/*.yaml'))
 _SIZES_S = (0.0, 0.01, 0.3, 0.9, 1.1, 5.0, 20.0, 1e4, 1e8)
 
 
