@@ -257,6 +257,21 @@ def _sizes(rng: np.random.Generator) -> Change:
     return change
 
 
+def _sparse(rng: np.random.Generator) -> Change:
+    """One beam of several: no two returns side by side, or fewer beams than a laser needs."""
+    every = int(chosen(rng, (2, 3, 20, 40)))
+    value = float(chosen(rng, (np.inf, np.nan, 0.0)))
+
+    def change(_: np.random.Generator, message: Any) -> list[Any]:
+        if isinstance(message, LaserScan):
+            ranges = np.full(len(message.ranges), value, dtype=np.float32)
+            ranges[::every] = message.ranges[::every]
+            message.ranges = array('f', ranges.tolist())
+        return [message]
+
+    return change
+
+
 def _jump(rng: np.random.Generator) -> Change:
     """Poses elsewhere."""
     size_m = float(chosen(rng, (0.2, 1.0, 5.0, 100.0, 1e5)))
@@ -284,5 +299,6 @@ _KINDS = (
     ('lost messages', _lost),
     ('strange numbers', _numbers),
     ('wrong sizes', _sizes),
+    ('sparse beams', _sparse),
     ('jumps', _jump),
 )
