@@ -10,7 +10,7 @@ from thinmap_ros.ros.diagnostics import WARN, publisher_names
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 _RECENT_S = 3.0  # a source that publishes more rarely is one that has ended
-_OWN_STAMPS = 2 * qos.TRANSFORMS.depth  # more are never on their way back to this node
+_OWN_STAMPS = 2 * qos.TRANSFORMS.depth  # at most the depth is queued
 
 
 class SoleBroadcaster:
