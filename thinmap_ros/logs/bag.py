@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rosbags.interfaces import Qos
 
 from thinmap_ros.core import se2, validation
@@ -204,7 +203,11 @@ class BagLog:
         """Frame and value of a message; None, and counted, if it is unusable."""
         try:
             decoded = bag.decode(message)
-            value = _odometry(decoded) if message.type_name == _ODOMETRY else _scan(decoded)
+            value = (
+                _odometry(decoded)
+                if message.type_name == _ODOMETRY
+                else decode.scan(decoded, decode.stamp_ns(decoded))
+            )
         except InputError as error:
             where = f'{self.path}: {validation.quoted_name(message.topic)}: '
             self.skipped.add(where + str(error).removeprefix(where))
@@ -263,21 +266,3 @@ def _odometry(message: Any) -> OdometryEvent:
             f'{se2.MAX_COORDINATE_M:g} m'
         )
     return OdometryEvent(decode.stamp_ns(message), T_odom_base)
-
-
-def _scan(message: Any) -> Scan:
-    if len(message.ranges) == 0:
-        raise InputError('scan without ranges')
-    if len(message.ranges) > validation.MAX_BEAMS:
-        raise InputError(
-            f'scan of {len(message.ranges)} ranges: expected at most {validation.MAX_BEAMS}'
-        )
-    with np.errstate(invalid='ignore'):  # NaN is kept, whatever its bits
-        return Scan.create(
-            decode.stamp_ns(message),
-            message.ranges,
-            message.angle_min,
-            message.angle_increment,
-            message.range_min,
-            message.range_max,
-        )

@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.core import se2, validation
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
@@ -26,6 +28,32 @@ def yaw(q: Any) -> float:
 def pose(message: Any) -> Array:
     """Planar pose (3,) of a geometry_msgs/Pose."""
     return se2.pose(message.position.x, message.position.y, yaw(message.orientation))
+
+
+def scan(
+    message: Any, ns: int, T_base_laser: Array | None = None, zero_is_no_return: bool = False
+) -> Scan:
+    """Scan of a sensor_msgs/LaserScan at a stamp (ns), of a bag or live.
+
+    T_base_laser (3,): pose of the laser; zero_is_no_return: what a range of 0 means. Raises
+    InputError as `Scan.create`, and where it has no beams, too many, or impossible angles.
+    """
+    count = len(message.ranges)
+    if not 0 < count <= validation.MAX_BEAMS:
+        raise InputError(f'{count} beams: expected 1 to {validation.MAX_BEAMS}')
+    validation.require_angles(message.angle_min, message.angle_increment, count)
+    with np.errstate(invalid='ignore'):  # NaN is kept, whatever its bits
+        return Scan.create(
+            ns,
+            message.ranges,
+            message.angle_min,
+            message.angle_increment,
+            message.range_min,
+            message.range_max,
+            T_base_laser,
+            zero_is_no_return,
+            message.angle_max,
+        )
 
 
 def patch(message: Any) -> GridPatch:

@@ -34,6 +34,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Edge, Node, TopologicalMap
+from thinmap_ros.logs import decode
 
 # A bag or a publisher cannot name anything else to import.
 _TYPE_NAME = re.compile(r'([a-z]\w*)/msg/([A-Z]\w*)', re.ASCII)
@@ -91,25 +92,10 @@ def header(frame_id: str, ns: int) -> Header:
 def scan_from_msg(message: LaserScan, T_base_laser: Array, zero_is_no_return: bool = False) -> Scan:
     """Scan of a message; T_base_laser (3,), zero_is_no_return: what a range of 0 means.
 
-    Raises InputError as `Scan.create`, and where it has no beams, too many, or impossible angles.
+    Raises InputError as `decode.scan`, and where its stamp is invalid.
     """
-    count = len(message.ranges)
-    if not 0 < count <= validation.MAX_BEAMS:
-        raise InputError(f'{count} beams: expected 1 to {validation.MAX_BEAMS}')
-    last = message.angle_min + message.angle_increment * (count - 1)
-    validation.require_bounded(
-        'angle of the first or last beam', (message.angle_min, last), validation.MAX_ANGLE_RAD
-    )
-    return Scan.create(
-        stamp_ns(message.header.stamp),
-        np.frombuffer(message.ranges, dtype=np.float32),
-        message.angle_min,
-        message.angle_increment,
-        message.range_min,
-        message.range_max,
-        T_base_laser,
-        zero_is_no_return,
-    )
+    ns = stamp_ns(message.header.stamp)
+    return decode.scan(message, ns, T_base_laser, zero_is_no_return)
 
 
 def scan_msg(scan: Scan, frame_id: str, scan_time_s: float) -> LaserScan:
