@@ -102,6 +102,7 @@ class ClosedLoop:
         self._observation: Observation | None = None
         self._drive = _Drive()
         self._T_map_odom = np.zeros(3)
+        self._mount_fault = ''
 
     def run(
         self,
@@ -163,6 +164,7 @@ class ClosedLoop:
     def decide(self, scan: Scan, estimate: Estimate) -> None:
         """Choose a target in the present map."""
         self._T_map_odom = estimate.T_map_odom
+        self._mount_fault = estimate.mount_fault
         observation = Observation(
             self.pipeline.topology.map, self.pipeline.grid.known_area(), scan, estimate.T_map_base
         )
@@ -207,6 +209,10 @@ class ClosedLoop:
     def _control(self, moment: SensorReadings) -> None:
         observation = self._observation
         if observation is None:
+            return
+        if self._mount_fault:
+            self.navigator.reset_velocity()
+            self._drive.command = (0.0, 0.0)
             return
         T_map_base = se2.compose(self._T_map_odom, moment.T_odom_base)
         command = self.navigator.step(

@@ -163,6 +163,7 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'first_skipped': result.first_skipped,
         'refused': len(refusals),
         'first_refused': refusals[0] if refusals else '',
+        'warnings': result.pipeline.warnings,
         'ended_by': '' if result.ended_by is None else one_line_reason(result.ended_by),
         'wall_s': round(seconds[0], 3),
         'cpu_s': round(seconds[1], 3),

@@ -29,8 +29,11 @@ class Estimate:
     local area. inlier_ratio: share of the scan points in known space that fit the map.
     is_lost: the pose is unknown; the covariance is accordingly large.
     blind_reason: why the laser does not confirm the pose, which follows the odometry; '': it does.
+    mount_fault: why the pose of the laser on the robot must be wrong, by so much that the robot
+    must not drive; '': it need not be.
     correction: keyframe poses before and after, if this step closed a loop; T_map_base is then the
-    corrected pose.
+    corrected pose. scan_information: information (3, 3) of the scan alone, map frame; None: no
+    match that fits has set the pose.
     """
 
     T_map_base: Array
@@ -43,4 +46,6 @@ class Estimate:
     inlier_ratio: float = 0.0
     is_lost: bool = False
     blind_reason: str = ''
+    mount_fault: str = ''
     correction: Correction | None = None
+    scan_information: Array | None = None

@@ -1,5 +1,6 @@
 """The pose of the robot: each scan, with the odometry at its stamp, is a step of the localizer."""
 
+from dataclasses import dataclass, field
 from time import monotonic, perf_counter
 
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
@@ -12,6 +13,7 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import se2
+from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Estimate
@@ -37,7 +39,7 @@ from thinmap_ros.nodes.localization.known_area import require_near_map
 from thinmap_ros.nodes.localization.map_source import load_localizer
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.decoding.topology_reader import read_topology
-from thinmap_ros.ros.diagnostics import ERROR, OK
+from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
@@ -91,6 +93,14 @@ class _PosePublishers:
         self._trajectory.publish(
             messages.trajectory_msg(stamps_ns, poses, self.map_frame, stamp_ns)
         )
+
+
+@dataclass(eq=False)
+class _Input:
+    """Scans with the odometry at their stamps, and the check of both."""
+
+    pairing: ScanOdometrySynchronizer = field(default_factory=ScanOdometrySynchronizer)
+    consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
 
 
 class _Relocation:
@@ -161,6 +171,9 @@ class LocalizerNode(ThinmapNode):
         self.enable_checkpoint(self._state, self._restore)
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('pose')
+        self.diagnostics.add_check(
+            WARN, lambda: '; '.join(self._input.consistency.warnings.values())
+        )
         # Before the scans: of messages that wait together, the executor processes the graph of the
         # last scan first.
         subscribe_guarded(
@@ -189,7 +202,7 @@ class LocalizerNode(ThinmapNode):
         self._localizer = self._given.create_localizer()
         self._broadcaster.reset()
         self._odometry.reset()
-        self._pairing = ScanOdometrySynchronizer()
+        self._input = _Input()
         self._last: OdometryAnchor | None = None
         self._topology: Graph | None = None
         self._relocation: _Relocation | None = None
@@ -204,12 +217,12 @@ class LocalizerNode(ThinmapNode):
         self._subscribe_map_once(self._relocation)
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
-        self._process(self._pairing.add_odometry(stamp_ns, T_odom_base))
+        self._process(self._input.pairing.add_odometry(stamp_ns, T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(message)
         self._odometry.add_scan_stamp(scan.stamp_ns)
-        self._process(self._pairing.add_scan(scan))
+        self._process(self._input.pairing.add_scan(scan))
 
     def _on_initial_pose(self, T_map_base: Array, covariance: Array) -> None:
         require_near_map(T_map_base, self._localizer)
@@ -231,13 +244,16 @@ class LocalizerNode(ThinmapNode):
         for scan, T_odom_base in ready:
             started = perf_counter()
             estimate = self._localizer.step(scan, T_odom_base)
+            estimate = self._input.consistency.checked(scan, T_odom_base, estimate)
             step_ms = 1000.0 * (perf_counter() - started)
             self._publish(scan, estimate, step_ms)
             if not estimate.is_lost:
                 self._last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         diagnostics = self.diagnostics
-        diagnostics.set_drop_total('scans without odometry at their time', self._pairing.dropped)
-        discarded = self._pairing.discarded_odometry
+        diagnostics.set_drop_total(
+            'scans without odometry at their time', self._input.pairing.dropped
+        )
+        discarded = self._input.pairing.discarded_odometry
         diagnostics.set_drop_total('odometry with stamps ahead of those after it', discarded)
         diagnostics.set_drop_total('invalid scans or odometry', self._localizer.rejected)
 
@@ -348,6 +364,8 @@ def _state_of(estimate: Estimate) -> int:
     """State of a SlamStatus; of a blind laser it is unknown whether the robot is lost."""
     if estimate.blind_reason:
         return int(SlamStatus.BLIND)
+    if estimate.mount_fault:
+        return int(SlamStatus.MISALIGNED)
     return int(SlamStatus.LOST if estimate.is_lost else SlamStatus.TRACKING)
 
 
@@ -355,6 +373,8 @@ def _health(state: int, estimate: Estimate) -> tuple[bytes, str]:
     """Level and text for /diagnostics."""
     if state == SlamStatus.BLIND:
         return ERROR, f'laser blind ({estimate.blind_reason}): dead reckoning'
+    if state == SlamStatus.MISALIGNED:
+        return ERROR, f'laser misaligned: {estimate.mount_fault}'
     return _HEALTH[state]
 
 

@@ -177,6 +177,8 @@ def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
         f'{arguments.out}: {report["scans"]} scans{skipped}, {report["distance"]:.1f} m, '
         f'{report["ms_per_scan"]["all"]["median"]:.1f} ms a scan'
     )
+    for warning in report['warnings']:
+        print(f'{arguments.log}: warning: {warning}')
     return result
 
 

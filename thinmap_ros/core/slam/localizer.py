@@ -229,7 +229,7 @@ class Localizer:
         match = self._match(scan, points, prediction.T_map_base)
         self._tracking.dead_reckoned = self._tracking.dead_reckoned.moved(prediction)
         self._tracking.update(match)
-        self._update(match, prediction, is_stationary)
+        fitting = self._update(match, prediction, is_stationary)
         self._tracking.record_pose(self._pose, self._uncertainty.since_match)
         blind_reason = self._blind_reason(scan, match)
         if not self.config.is_mapping:
@@ -241,7 +241,9 @@ class Localizer:
             self._apply(correction)
         self._map.render(self.keyframes)
         self._record_pose(scan)
-        return self._estimate(match, correction, blind_reason)
+        estimate = self._estimate(match, correction, blind_reason)
+        information = None if fitting is None else fitting.scan_information
+        return replace(estimate, scan_information=information)
 
     def optimized_trajectory(self) -> Array:
         """Poses (N, 3) of all steps since the start, after all corrections."""
@@ -308,8 +310,13 @@ class Localizer:
         misses = misses_walls(scan, self._map.map, self._pose, covariance)
         return _NO_RETURNS if misses else ''
 
-    def _update(self, match: Match | None, prediction: Prediction, is_stationary: bool) -> None:
-        """Set the pose to that of an accepted match, or else to the predicted one."""
+    def _update(
+        self, match: Match | None, prediction: Prediction, is_stationary: bool
+    ) -> Match | None:
+        """Set the pose to that of an accepted match, or else to the predicted one.
+
+        Returns the accepted match if it fits.
+        """
         prior = prediction.T_map_base
         is_unexpected = match is not None and self._uncertainty.is_unexpected(match, prior)
         accepted = match is not None and not self._is_rejected(match, is_unexpected)
@@ -319,12 +326,13 @@ class Localizer:
         if match is None or not accepted:
             self._pose = prior
             self._uncertainty.coast(prior, prediction.covariance, is_stationary)
-            return
+            return None
         self._pose = match.T_map_base
         fits = match.inlier_ratio >= self.config.matching.min_inlier_ratio
         if fits:
             self._prediction.update(prediction, match)
         self._uncertainty.update(match, prior, prediction.covariance, fits, is_stationary)
+        return match if fits else None
 
     def _is_rejected(self, match: Match, is_unexpected: bool) -> bool:
         """Whether the pose of a match is worse than the predicted one.
