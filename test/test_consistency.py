@@ -1,4 +1,4 @@
-"""What a pipeline reports of lasers that are not where or as they are said to be."""
+"""What a pipeline reports of lasers that are mirrored, or mounted elsewhere than given."""
 
 import math
 import re

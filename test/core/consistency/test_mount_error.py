@@ -142,7 +142,7 @@ def test_pushes_slips_and_jumps_of_the_odometry_are_outliers():
     for number, motion in enumerate(true_motion(drive.rng, 40.0)):
         if number % 150 == 40:  # a robot that is pushed to the side
             drive.truth = se2.compose(drive.truth, np.array([0.0, 0.4, 0.0]))
-        if number % 150 == 90:  # wheels that spin on the spot
+        if number % 150 == 90:  # wheels that spin
             drive.odom = se2.compose(drive.odom, np.array([0.3, 0.0, 0.2]))
         if number == 200:  # a driver that was restarted
             drive.odom = np.zeros(3)

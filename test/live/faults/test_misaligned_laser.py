@@ -40,7 +40,7 @@ class Mount:
 
 
 class Robot:
-    """A robot that drives to and fro between two places of a room."""
+    """A robot that drives back and forth between two places of a room."""
 
     def __init__(self, graph):
         self.graph = graph
