@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.validation import angle_warning
 
 # With a smaller share of valid beams, the space in front of the laser is unobserved.
 MIN_VALID_BEAM_RATIO = 0.1
@@ -27,7 +26,7 @@ class Scan:
     angle_min_rad + i * angle_increment_rad in the laser frame (a negative increment is a clockwise
     laser); T_base_laser (3,): the laser's pose on the robot; zero_is_no_return: whether this
     laser's driver publishes 0 for a beam without return; fault: why the ranges of the laser were
-    replaced by invalid ones; warning: what the header of the scan contradicts itself in. Use
+    replaced by invalid ones; warning: how the angles of its message contradict its beams. Use
     `Scan.create` to make one.
 
     Each range is one of `hit`, `no_return`, `below_range_min`, or invalid (`valid` is False).
@@ -55,12 +54,10 @@ class Scan:
         range_max_m: float,
         T_base_laser: Array | None = None,
         zero_is_no_return: bool = False,
-        angle_max_rad: float | None = None,
     ) -> 'Scan':
         """Make a scan, rounded to float32 as sensor_msgs/LaserScan is.
 
-        Text log, bag and live agree bit for bit. angle_max_rad: bearing of the last beam according
-        to the driver, for `warning`; None: not given.
+        Text log, bag and live agree bit for bit.
 
         Raises InputError if the geometry is invalid: NaN angles, an increment of 0, an empty or
         negative range interval, a laser pose that is not finite or beyond MAX_MOUNT_OFFSET_M.
@@ -93,20 +90,7 @@ class Scan:
                 f'scan at {stamp_ns} ns: laser mounted at {mount}: '
                 f'expected finite numbers, at most {MAX_MOUNT_OFFSET_M:g} m'
             )
-        warning = (
-            '' if angle_max_rad is None else angle_warning(first, angle_max_rad, step, ranges.size)
-        )
-        return Scan(
-            int(stamp_ns),
-            ranges,
-            first,
-            step,
-            low,
-            high,
-            T_base_laser,
-            zero_is_no_return,
-            warning=warning,
-        )
+        return Scan(int(stamp_ns), ranges, first, step, low, high, T_base_laser, zero_is_no_return)
 
     @cached_property
     def angles_rad(self) -> Array:

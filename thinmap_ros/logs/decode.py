@@ -1,6 +1,7 @@
 """Conversion of messages of a bag (rosbags' classes, with the fields of ROS) to core values."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ def scan(
         raise InputError(f'{count} beams: expected 1 to {validation.MAX_BEAMS}')
     validation.require_angles(message.angle_min, message.angle_increment, count)
     with np.errstate(invalid='ignore'):  # NaN is kept, whatever its bits
-        return Scan.create(
+        made = Scan.create(
             ns,
             message.ranges,
             message.angle_min,
@@ -52,8 +53,11 @@ def scan(
             message.range_max,
             T_base_laser,
             zero_is_no_return,
-            message.angle_max,
         )
+    warning = validation.angle_warning(
+        message.angle_min, message.angle_max, message.angle_increment, count
+    )
+    return replace(made, warning=warning)
 
 
 def patch(message: Any) -> GridPatch:
