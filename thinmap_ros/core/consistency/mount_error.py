@@ -18,7 +18,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
 
 _SIGMAS = 3.0
-_ITERATIONS = 5
+_ITERATIONS = 3
 
 
 @dataclass(frozen=True)
