@@ -1,5 +1,8 @@
 """The closed loop treats a strategy as the node does."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
 from thinmap_ros.closed_loop import Options, make_loop
@@ -64,3 +67,29 @@ def test_what_cannot_be_explored_is_not_resolved():
     outcome, path_m = explored(12, 100.0)
     assert outcome.finished and path_m == 0.0
     assert '1 end nodes left, of which visits showed no more' in outcome.reason
+
+
+def test_a_robot_stands_still_once_its_laser_has_slipped():
+    slip_s = 20.0
+    world = World.from_patch(*read_world(package_data.world_path('lab')))
+    start = np.asarray(world.start)
+    loop = make_loop(world, start, Options(speed_m_s=0.5, seed=3, localization='slam'))
+    simulation = loop.simulation
+    read_sensors = simulation.read_sensors
+    path_m = [0.0]
+
+    def read():
+        if simulation.stamp_ns >= slip_s * 1e9:
+            simulation.laser.T_base_laser = np.array([0.0, 0.0, math.radians(45.0)])
+            path_m.append(path_m[-1] + 0.05 * abs(simulation.robot.v))
+        moment = read_sensors()
+        as_given = moment.scan and replace(moment.scan, T_base_laser=np.zeros(3))
+        return replace(moment, scan=as_given)
+
+    simulation.read_sensors = read
+    goal = observable_cells(world, start, 0.25, 8.0)
+    outcome = loop.run(goal, 60.0, lambda seconds, coverage: None)
+    assert outcome.collisions == 0
+    assert path_m[-1] < 8.0
+    assert path_m[-1] == path_m[-100], 'it stands in the last seconds'
+    assert any('laser turned by' in warning for warning in loop.pipeline.warnings)

@@ -102,7 +102,7 @@ class ClosedLoop:
         self._observation: Observation | None = None
         self._drive = _Drive()
         self._T_map_odom = np.zeros(3)
-        self._blind_reason = ''
+        self._stop_reason = ''  # as of the navigator
 
     def run(
         self,
@@ -136,8 +136,8 @@ class ClosedLoop:
             if self.decision is not None and finished
             else f'time limit of {limit_s:.0f} s'
         )
-        if self._blind_reason:
-            reason = f'{reason}; laser blind ({self._blind_reason})'
+        if self._stop_reason:
+            reason = f'{reason}; {self._stop_reason}'
         return ExplorationOutcome(finished, reason, self.simulation.robot.collisions)
 
     @property
@@ -152,10 +152,12 @@ class ClosedLoop:
             return
         estimate = self.pipeline.step(scan, T_odom_base).estimate
         self.log_poses(scan, estimate)
-        self._blind_reason = estimate.blind_reason
-        if self._blind_reason:
+        self._stop_reason = _stop_reason(estimate)
+        if self._stop_reason:
+            self.navigator.reset_velocity()
             self._drive.command = (0.0, 0.0)
-        elif self.mishap is None or not self.mishap.is_lost:
+        is_carried = self.mishap is not None and self.mishap.is_lost
+        if not (estimate.blind_reason or is_carried):
             self.decide(scan, estimate)
 
     def log_poses(self, scan: Scan, estimate: Estimate) -> None:
@@ -212,8 +214,8 @@ class ClosedLoop:
 
     def _control(self, moment: SensorReadings) -> None:
         observation = self._observation
-        if observation is None or self._blind_reason:
-            return  # as the nodes: a robot whose laser is blind stands still
+        if observation is None or self._stop_reason:
+            return
         T_map_base = se2.compose(self._T_map_odom, moment.T_odom_base)
         command = self.navigator.step(
             T_map_base, observation.patch, observation.scan, _CONTROL_STEPS * STEP_NS / 1e9
@@ -284,3 +286,10 @@ def make_loop(
 
 def no_progress(seconds: float, coverage: float) -> None:
     """Show no progress."""
+
+
+def _stop_reason(estimate: Estimate) -> str:
+    """Why the robot must not drive on; '' for no reason."""
+    if estimate.blind_reason:
+        return f'laser blind ({estimate.blind_reason})'
+    return estimate.mount_fault

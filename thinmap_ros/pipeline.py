@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
 
+from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
@@ -61,23 +62,30 @@ class Pipeline:
         self._scans = 0
         self._window: GridPatch | None = None
         self._locate = pose_source or self.localizer.step
+        self._consistency = ConsistencyMonitor()
 
     @property
     def grid(self) -> OccupancyGrid:
         """The published map; another object after a correction."""
         return self._grid.shown
 
+    @property
+    def warnings(self) -> list[str]:
+        """What the scans so far contradict: their own angles, the odometry, or their mount."""
+        return list(self._consistency.reported.values())
+
     def step(self, scan: Scan, T_odom_base: Array) -> PipelineResult:
         """Localize and map one scan with the odometry pose (3,) at its stamp."""
         with self._timed('localizer'):
             estimate = self._locate(scan, T_odom_base)
+            estimate = self._consistency.checked(scan, T_odom_base, estimate)
         with self._timed('grid'):
             if estimate.correction is not None:
                 self.corrections += self._grid.apply_correction(
                     *self.localizer.keyframe_trajectory(), scan.stamp_ns
                 )
             # As in grid_mapper: a lost robot is at no place of the map, a blind laser sees nothing.
-            is_mapped = not (estimate.is_lost or estimate.blind_reason)
+            is_mapped = not (estimate.is_lost or estimate.blind_reason or estimate.mount_fault)
             moved = self._grid.update(scan if is_mapped else None, estimate.T_map_base)
             self.refusals += self._grid.take_refusals()
         if moved is not None:

@@ -13,12 +13,12 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.regions.config import RegionConfig
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
@@ -70,7 +70,8 @@ class Replay:
     """Result of a replay: the pipeline at the end, and the pose (3,) of every scan.
 
     counts: of scans that did not change the map. notes: what was assumed of the log, a line each.
-    odometry_jumps: discontinuities of the odometry, a line each.
+    warnings: contradictions within the log, a line each. odometry_jumps: discontinuities of the
+    odometry, a line each.
     ended_by: what ended the replay before the end of the log; None if nothing did.
     """
 
@@ -82,6 +83,7 @@ class Replay:
     first_skipped: str = ''
     counts: ScanCounts = field(default_factory=ScanCounts)
     notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     odometry_jumps: list[str] = field(default_factory=list)
     ended_by: Exception | KeyboardInterrupt | None = None
 
@@ -131,8 +133,9 @@ def replay(
     result.first_skipped = log.skipped.first
     result.counts.without_odometry = unused.reasons()
     result.counts.records = log.skipped.reasons
-    result.notes = [*log.skipped.notes, *pairing.warnings.values()]
-    result.notes += _jump_notes(result.odometry_jumps)
+    result.notes = log.skipped.notes
+    result.warnings = [*pairing.warnings.values(), *result.pipeline.warnings]
+    result.warnings += _jump_warnings(result.odometry_jumps)
     if not result.poses:
         reasons = '; '.join(result.counts.unpaired())
         raise InputError(
@@ -144,8 +147,8 @@ def replay(
     return result
 
 
-def _jump_notes(jumps: list[str]) -> list[str]:
-    """Note on the discontinuities of the odometry; none without any."""
+def _jump_warnings(jumps: list[str]) -> list[str]:
+    """Warning of the discontinuities of the odometry; none without any."""
     if not jumps:
         return []
     times = f' ({len(jumps)} times; the first time)' if len(jumps) > 1 else ''
@@ -247,6 +250,7 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'notes': result.notes,
         'refused': len(refusals),
         'first_refused': refusals[0] if refusals else '',
+        'warnings': result.warnings,
         'ended_by': '' if result.ended_by is None else one_line_reason(result.ended_by),
         'wall_s': round(seconds[0], 3),
         'cpu_s': round(seconds[1], 3),

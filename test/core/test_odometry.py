@@ -7,8 +7,9 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.odometry import OdometryBuffer, OdometryIncrements, ScanOdometrySynchronizer
+from thinmap_ros.core.odometry import OdometryBuffer, OdometryIncrements
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 
 SECOND = 1_000_000_000
 

@@ -9,6 +9,8 @@ from support.slam_room import ROOM, scan_in
 from fuzz.cases import Source, chosen, finite, nothing, tried
 from fuzz.files import small_graph, sound_graph, sound_patch
 from thinmap_ros.core import se2
+from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
@@ -133,6 +135,27 @@ def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
     tried(lambda: kind.from_state(localizer.state(), config))
 
 
+def check_consistency(shared: None, rng: np.random.Generator, folder: Path) -> None:
+    """Poses of whatever localizer and odometry, with any mount, and scans that fit or do not."""
+    drive = Drive(rng, folder)
+    monitor = ConsistencyMonitor()
+    error = np.append(rng.uniform(-0.5, 0.5, 2), rng.uniform(-4.0, 4.0))
+    for _ in range(int(rng.integers(20, 300))):
+        drive.move()
+        scan = drive.scan()
+        if scan is None:
+            continue
+        noise = float(chosen(rng, (0.0, 0.0, 1e-9, 0.01, 10.0)))
+        T = se2.compose(drive.T, error) + rng.normal(0.0, noise, 3)
+        factor = rng.normal(0.0, 1.0, (3, 3)) * float(chosen(rng, (0.0, 1e-6, 1.0, 1e3, 1e8)))
+        information = factor @ factor.T if rng.random() < 0.9 else None
+        drive.tell('estimate', T.tolist(), factor.tolist(), drive.T_odom.tolist())
+        estimate = Estimate(T, np.eye(3), np.zeros(3), scan_information=information)
+        found = monitor.checked(scan, drive.T_odom, estimate)
+        for text in (found.mount_fault, *monitor.warnings.values()):
+            assert 'nan' not in text.replace('angle_max nan', '') and text.isprintable(), text
+
+
 def known_room(folder: Path) -> tuple[GridPatch, Any]:
     grid = OccupancyGrid()
     builder = TopologyBuilder()
@@ -208,4 +231,5 @@ SOURCES = (
     Source('localizer', nothing, localize),
     Source('global', known_room, localize_globally),
     Source('navigator', nothing, navigate),
+    Source('consistency', nothing, check_consistency),
 )

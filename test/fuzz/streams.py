@@ -286,6 +286,36 @@ def _jump(rng: np.random.Generator) -> Change:
     return change
 
 
+def _turned_laser(rng: np.random.Generator) -> Change:
+    """A laser that is turned on its mount, or mirrored."""
+    beams = int(chosen(rng, (3, 12, 30, 90)))
+    is_mirrored = bool(rng.random() < 0.3)
+
+    def change(_: np.random.Generator, message: Any) -> list[Any]:
+        if isinstance(message, LaserScan):
+            ranges = np.array(message.ranges, dtype=np.float32)
+            ranges = ranges[::-1] if is_mirrored else np.roll(ranges, beams)
+            message.ranges = array('f', ranges.tolist())
+        elif isinstance(message, Odometry) and is_mirrored:
+            message.pose.pose.orientation.z *= -1.0
+        return [message]
+
+    return change
+
+
+def _angles(rng: np.random.Generator) -> Change:
+    """Angles of a scan that do not fit its beams, or are in degrees."""
+    name = str(chosen(rng, ('angle_min', 'angle_max', 'angle_increment')))
+    factor = float(chosen(rng, (-1.0, 0.0, 0.5, 2.0, 57.3, 1e30, np.nan)))
+
+    def change(_: np.random.Generator, message: Any) -> list[Any]:
+        if isinstance(message, LaserScan):
+            setattr(message, name, max(min(factor * getattr(message, name), 1e30), -1e30))
+        return [message]
+
+    return change
+
+
 _KINDS = (
     ('shifted stamps', _shift),
     ('shifted stamps', _shift),
@@ -301,4 +331,6 @@ _KINDS = (
     ('wrong sizes', _sizes),
     ('sparse beams', _sparse),
     ('jumps', _jump),
+    ('a turned laser', _turned_laser),
+    ('contradictory angles', _angles),
 )

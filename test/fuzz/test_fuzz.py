@@ -20,7 +20,7 @@ from fuzz.cases import Source, damaged_bytes, damaged_text, nothing, tried
 from fuzz.runner import Runner, rng_of
 from fuzz.sources import SOURCES
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.odometry import ScanOdometrySynchronizer
+from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.logs import carmen
 from thinmap_ros.nodes.mapping import scan_pairs

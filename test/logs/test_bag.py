@@ -190,7 +190,7 @@ def with_empty_scans(writer: BagWriter, make: Maker) -> None:
     [
         (without_odometry, 'no odometry .*it has /scan .sensor_msgs/msg/LaserScan'),
         (without_scans, 'no laser scans .*it has /odom'),
-        (with_empty_scans, '/scan: no usable message.*without ranges'),
+        (with_empty_scans, '/scan: no usable message.*: 0 beams'),
         (lambda w, m: None, 'no laser scans'),
     ],
 )
@@ -318,7 +318,7 @@ def test_a_scan_of_too_many_beams_is_skipped(tmp_path: Path) -> None:
 
     log = BagLog(write(tmp_path / 'bag', fill))
     assert len(scans(list(log.events()))) == 3
-    assert (log.skipped.count, '200001 ranges' in log.skipped.first) == (1, True)
+    assert (log.skipped.count, '200001 beams' in log.skipped.first) == (1, True)
 
 
 def test_definitions_are_those_of_the_bag(tmp_path: Path) -> None:
@@ -356,3 +356,26 @@ def test_the_number_of_scans_is_known_from_the_first_event_on(tmp_path: Path, na
     assert log.expected_scans is None
     next(iter(log.events()))
     assert log.expected_scans == 7
+
+
+def test_a_scan_whose_angles_contradict_its_beams_is_read_with_a_warning(tmp_path: Path) -> None:
+    def fill(writer: BagWriter, make: Maker) -> None:
+        drive(writer, make, 1)
+        writer.write('/scan', SCAN, 2 * 10**9, make.scan(2 * 10**9, 2 * RANGES))
+
+    first, second = scans(read(write(tmp_path / 'bag', fill)))
+    assert first.warning == ''
+    assert 'fits 5 beams, 10 came' in second.warning
+    assert second.ranges_m.size == 10
+
+
+def test_a_scan_with_angles_in_degrees_is_skipped_with_the_reason(tmp_path: Path) -> None:
+    def fill(writer: BagWriter, make: Maker) -> None:
+        drive(writer, make)
+        wrong = make.scan(2 * 10**9, RANGES)
+        wrong.angle_increment = 30.0
+        writer.write('/scan', SCAN, 2 * 10**9, wrong)
+
+    log = BagLog(write(tmp_path / 'bag', fill))
+    assert len(scans(list(log.events()))) == 3
+    assert log.skipped.count == 1 and 'degrees' in log.skipped.first

@@ -18,6 +18,7 @@ from support.hidden_library import hide
 from support.timeouts import PATIENCE_S
 
 from thinmap_ros.files import occupancy_maps
+from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.pipeline import PipelineConfig
@@ -73,6 +74,25 @@ def test_files_and_figures(log, tmp_path, form):
     patch = occupancy_maps.read_map(out / 'map.yaml')
     wall = patch.frame.cells_of(np.array([[3.0, 0.0]]))[0]
     assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
+
+
+@pytest.mark.programs
+def test_contradictory_scans_are_mapped_with_a_warning(log, tmp_path):
+    whole = tmp_path / 'whole'
+    convert(CarmenLog(log, LaserOptions()), whole)
+    bag = Bag(whole)
+    with BagWriter(tmp_path / 'bag') as writer:
+        for message in bag.messages():
+            decoded = bag.decode(message)
+            if message.topic == '/scan':
+                decoded.angle_max *= 2.0
+            writer.write(message.topic, message.type_name, message.log_ns, decoded)
+    done = run(tmp_path / 'bag', '-o', tmp_path / 'out', '--quiet')
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    (warning,) = report['warnings']
+    assert 'fits 271 beams, 181 came' in warning and report['scans'] == 30
+    assert f'{tmp_path / "bag"}: warning: {warning}' in done.stdout
+    assert 'fits 271 beams' in (tmp_path / 'out' / 'report.html').read_text()
 
 
 @pytest.mark.programs

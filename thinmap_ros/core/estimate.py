@@ -30,8 +30,11 @@ class Estimate:
     is_lost: the pose is unknown; the covariance is accordingly large.
     blind_reason: why the laser does not confirm the pose, which follows the odometry; '': it does.
     odometry_discontinuity: description of an odometry jump since the previous scan; '': none.
+    mount_fault: why the pose of the laser on the robot must be wrong, by so much that the robot
+    must not drive; '': it need not be.
     correction: keyframe poses before and after, if this step closed a loop; T_map_base is then the
-    corrected pose.
+    corrected pose. scan_information: information (3, 3) of the scan alone, map frame; None: no
+    match that fits has set the pose.
     """
 
     T_map_base: Array
@@ -45,4 +48,6 @@ class Estimate:
     is_lost: bool = False
     blind_reason: str = ''
     odometry_discontinuity: str = ''
+    mount_fault: str = ''
     correction: Correction | None = None
+    scan_information: Array | None = None

@@ -61,10 +61,10 @@ class Scan:
     laser's driver publishes 0 for a beam without return; max_range_m: usable range of the laser.
     first_beam_s, beam_period_s: time of beam 0 since the stamp, and from each beam to the next (s),
     as the driver states them; scan_time_s: time of a whole scan; each 0 if unknown. drops_out: this
-    laser often has no return from surfaces in range, so that a beam without return
-    says nothing; fault: why the ranges of the laser were replaced by invalid ones;
-    odometry_silence_s: by how much the odometry was silent for longer than usual since the previous
-    scan; None: unknown. Use `Scan.create` to make one.
+    laser often has no return from surfaces in range, so that a beam without return says nothing;
+    fault: why the ranges of the laser were replaced by invalid ones; warning: how the angles of its
+    message contradict its beams; odometry_silence_s: by how much the odometry was silent for longer
+    than usual since the previous scan; None: unknown. Use `Scan.create` to make one.
 
     Each range is one of `hit`, `distant_hit`, `no_return`, `below_range_min`, or invalid (`valid`
     is False).
@@ -85,6 +85,7 @@ class Scan:
     scan_time_s: float = 0.0
     drops_out: bool = False
     fault: str = ''
+    warning: str = ''
     odometry_silence_s: float | None = None
 
     @staticmethod

@@ -1,5 +1,6 @@
 """Bounds on the contents of messages and files."""
 
+import math
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
 
@@ -12,6 +13,10 @@ from thinmap_ros.core.errors import MAX_QUOTE_LENGTH, InputError
 MAX_COORDINATE_M = se2.MAX_COORDINATE_M
 MAX_ANGLE_RAD = 4.0 * np.pi
 MAX_BEAMS = 200_000
+# Drivers round the increment, as to 0.0175 rad for 1 degree, and some give the end of the last
+# interval as angle_max.
+_ROUNDING = 0.005
+_INTERVALS = 1.0
 
 
 def require_bounded(what: str, values: Iterable[float], limit: float = MAX_COORDINATE_M) -> None:
@@ -19,6 +24,35 @@ def require_bounded(what: str, values: Iterable[float], limit: float = MAX_COORD
     for value in values:
         if not abs(value) <= limit:
             raise InputError(f'{what}: {value}: expected a number from {-limit:g} to {limit:g}')
+
+
+def require_angles(angle_min_rad: float, angle_increment_rad: float, count: int) -> None:
+    """Raise InputError unless first and last beam point to angles of a few turns at most."""
+    last = angle_min_rad + angle_increment_rad * (count - 1)
+    if not max(abs(angle_min_rad), abs(last)) <= MAX_ANGLE_RAD:
+        raise InputError(
+            f'{count} beams from {angle_min_rad:g} to {last:g} rad: expected angles from '
+            f'-{MAX_ANGLE_RAD:.3g} to {MAX_ANGLE_RAD:.3g} rad: are they in degrees?'
+        )
+
+
+def angle_warning(
+    angle_min_rad: float, angle_max_rad: float, angle_increment_rad: float, count: int
+) -> str:
+    """How angle_max contradicts the number of beams; '' where it fits.
+
+    The beams are used as angle_min and angle_increment say.
+    """
+    if count < 2:
+        return ''
+    fitting = (angle_max_rad - angle_min_rad) / angle_increment_rad + 1.0
+    if abs(fitting - count) <= _INTERVALS + _ROUNDING * count:
+        return ''
+    fits = f'fits {fitting:.0f} beams' if math.isfinite(fitting) else 'fits no number of beams'
+    return (
+        f'angle_max {angle_max_rad:g} {fits}, {count} came (angle_min {angle_min_rad:g}, '
+        f'angle_increment {angle_increment_rad:g} rad): is the map bent or mirrored?'
+    )
 
 
 def require_lengths(what: str, lengths: Iterable[float]) -> None:

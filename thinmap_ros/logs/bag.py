@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rosbags.interfaces import Qos
 
 from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.scan import LaserConfig, Scan
+from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.limits import LOGS
 from thinmap_ros.files.regular_files import require_regular_file
@@ -232,7 +231,7 @@ class BagLog:
             if message.type_name != _SCAN:
                 yield from odometry.samples(decoded)
                 return
-            scan = _scan(decoded, self.laser)
+            scan = decode.scan(decoded, decode.stamp_ns(decoded), laser=self.laser)
         except InputError as error:
             where = f'{self.path}: {validation.quoted_name(message.topic)}: '
             self.skipped.add(where + str(error).removeprefix(where))
@@ -270,24 +269,3 @@ class BagLog:
             raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {has}')
         names = validation.quoted_names(found)
         raise InputError(f'{self.path}: {what} on several topics: choose one of {names}')
-
-
-def _scan(message: Any, laser: LaserConfig) -> Scan:
-    if len(message.ranges) == 0:
-        raise InputError('scan without ranges')
-    if len(message.ranges) > validation.MAX_BEAMS:
-        raise InputError(
-            f'scan of {len(message.ranges)} ranges: expected at most {validation.MAX_BEAMS}'
-        )
-    with np.errstate(invalid='ignore'):  # NaN is kept, whatever its bits
-        return Scan.create(
-            decode.stamp_ns(message),
-            message.ranges,
-            message.angle_min,
-            message.angle_increment,
-            message.range_min,
-            message.range_max,
-            time_increment_s=message.time_increment,
-            scan_time_s=message.scan_time,
-            laser=laser,
-        )

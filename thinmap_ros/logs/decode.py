@@ -1,6 +1,7 @@
 """Conversion of messages of a bag (rosbags' classes, with the fields of ROS) to core values."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
@@ -54,6 +56,37 @@ def checked_pose(message: Any) -> Array:
     validation.require_bounded('position', (message.position.x, message.position.y))
     require_rotation(message.orientation)
     return pose(message)
+
+
+def scan(
+    message: Any, ns: int, T_base_laser: Array | None = None, laser: LaserConfig | None = None
+) -> Scan:
+    """Scan of a sensor_msgs/LaserScan at a stamp (ns), of a bag or live.
+
+    T_base_laser (3,): pose of the laser; laser: its parameters, None for their defaults. Raises
+    InputError as `Scan.create`, and where it has no beams, too many, or impossible angles.
+    """
+    count = len(message.ranges)
+    if not 0 < count <= validation.MAX_BEAMS:
+        raise InputError(f'{count} beams: expected 1 to {validation.MAX_BEAMS}')
+    validation.require_angles(message.angle_min, message.angle_increment, count)
+    with np.errstate(invalid='ignore'):  # NaN is kept, whatever its bits
+        made = Scan.create(
+            ns,
+            message.ranges,
+            message.angle_min,
+            message.angle_increment,
+            message.range_min,
+            message.range_max,
+            T_base_laser,
+            laser,
+            message.time_increment,
+            message.scan_time,
+        )
+    warning = validation.angle_warning(
+        message.angle_min, message.angle_max, message.angle_increment, count
+    )
+    return replace(made, warning=warning)
 
 
 def patch(message: Any) -> GridPatch:

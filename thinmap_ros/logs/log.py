@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.logs.mcap_records import MAGIC as _MCAP
 

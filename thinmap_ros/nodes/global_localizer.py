@@ -15,7 +15,6 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.active_localization import ActiveSearch
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.places.global_localizer import (
     GlobalLocalization,
     GlobalLocalizationConfig,
@@ -31,6 +30,7 @@ from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.files import occupancy_maps

@@ -1,5 +1,6 @@
 """The pose of the robot: each scan, with the odometry at its stamp, is a step of the localizer."""
 
+from dataclasses import dataclass, field
 from time import monotonic, perf_counter
 
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
@@ -12,13 +13,15 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import se2
+from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import OdometryAnchor, ScanOdometrySynchronizer
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.slam.localizer import LIVE_PARAMETERS, LocalizerConfig
 from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
@@ -99,6 +102,23 @@ class _PosePublishers:
         )
 
 
+@dataclass(eq=False)
+class _Input:
+    """Scans with the odometry at their stamps, and the check of both.
+
+    reported: kinds of warnings that are in the log.
+    """
+
+    pairing: ScanOdometrySynchronizer = field(default_factory=ScanOdometrySynchronizer)
+    consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
+    reported: set[str] = field(default_factory=set)
+
+    @property
+    def warnings(self) -> dict[str, str]:
+        """What scans and odometry contradict, by kind."""
+        return self.pairing.warnings | self.consistency.warnings
+
+
 class _Relocation:
     """What a localizer that was killed and restarted waits for: a scan, and the map of before.
 
@@ -167,7 +187,7 @@ class LocalizerNode(ThinmapNode):
         self.enable_checkpoint(self._state, self._restore)
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('pose')
-        self.diagnostics.add_check(WARN, lambda: '; '.join(self._pairing.warnings.values()))
+        self.diagnostics.add_check(WARN, lambda: '; '.join(self._input.warnings.values()))
         # Before the scans: of messages that wait together, the executor processes the graph of the
         # last scan first.
         subscribe_guarded(
@@ -198,8 +218,7 @@ class LocalizerNode(ThinmapNode):
         self._localizer = self._given.create_localizer()
         self._broadcaster.reset()
         self._odometry.reset()
-        self._pairing = ScanOdometrySynchronizer()
-        self._reported: set[str] = set()
+        self._input = _Input()
         self._last: OdometryAnchor | None = None
         self._topology: Graph | None = None
         self._relocation: _Relocation | None = None
@@ -214,12 +233,12 @@ class LocalizerNode(ThinmapNode):
         self._subscribe_map_once(self._relocation)
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
-        self._process(self._pairing.add_odometry(stamp_ns, T_odom_base))
+        self._process(self._input.pairing.add_odometry(stamp_ns, T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(message)
         self._odometry.add_scan_stamp(scan.stamp_ns)
-        self._process(self._pairing.add_scan(scan))
+        self._process(self._input.pairing.add_scan(scan))
 
     def _on_initial_pose(self, T_map_base: Array, covariance: Array) -> None:
         require_near_map(T_map_base, self._localizer)
@@ -241,6 +260,7 @@ class LocalizerNode(ThinmapNode):
         for scan, T_odom_base in ready:
             started = perf_counter()
             estimate = self._localizer.step(scan, T_odom_base)
+            estimate = self._input.consistency.checked(scan, T_odom_base, estimate)
             step_ms = 1000.0 * (perf_counter() - started)
             self._publish(scan, estimate, step_ms)
             if estimate.odometry_discontinuity:
@@ -252,17 +272,19 @@ class LocalizerNode(ThinmapNode):
                 self._last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         self._report_warnings()
         diagnostics = self.diagnostics
-        diagnostics.set_drop_total('scans without odometry at their time', self._pairing.dropped)
-        discarded = self._pairing.discarded_odometry
+        diagnostics.set_drop_total(
+            'scans without odometry at their time', self._input.pairing.dropped
+        )
+        discarded = self._input.pairing.discarded_odometry
         diagnostics.set_drop_total('odometry with stamps ahead of those after it', discarded)
         diagnostics.set_drop_total('invalid scans or odometry', self._localizer.rejected)
 
     def _report_warnings(self) -> None:
         """Log each kind of warning once."""
-        for kind, text in self._pairing.warnings.items():
-            if kind not in self._reported:
+        for kind, text in self._input.warnings.items():
+            if kind not in self._input.reported:
                 self.get_logger().warning(f'scan: {text}')
-                self._reported.add(kind)
+                self._input.reported.add(kind)
 
     def _subscribe_map_once(self, relocation: _Relocation) -> None:
         """Subscribe once to the map that was built before the crash."""
@@ -374,6 +396,8 @@ def _state_of(estimate: Estimate) -> int:
     """State of a SlamStatus; of a blind laser it is unknown whether the robot is lost."""
     if estimate.blind_reason:
         return int(SlamStatus.BLIND)
+    if estimate.mount_fault:
+        return int(SlamStatus.MISALIGNED)
     return int(SlamStatus.LOST if estimate.is_lost else SlamStatus.TRACKING)
 
 
@@ -381,6 +405,8 @@ def _health(state: int, estimate: Estimate) -> tuple[bytes, str]:
     """Level and text for /diagnostics."""
     if state == SlamStatus.BLIND:
         return ERROR, f'laser blind ({estimate.blind_reason}): dead reckoning'
+    if state == SlamStatus.MISALIGNED:
+        return ERROR, f'laser misaligned: {estimate.mount_fault}'
     return _HEALTH[state]
 
 

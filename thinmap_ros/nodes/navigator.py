@@ -38,6 +38,10 @@ _MIN_DISTANCE_M = 0.1
 _MAX_INT16 = 2**15 - 1
 # Of a serialized graph, which is read within one control period: about 50,000 m2 of a building.
 _MAX_TOPOLOGY_BYTES = 2_000_000
+_POSE_FAULTS = {
+    SlamStatus.BLIND: 'laser blind (it does not confirm the pose)',
+    SlamStatus.MISALIGNED: 'laser misaligned (turned on the robot)',
+}
 
 
 class _NavigatorPublishers:
@@ -148,7 +152,7 @@ class NavigatorNode(ThinmapNode):
         self._robot.add_scan(scan)
 
     def _on_slam_status(self, message: SlamStatus) -> None:
-        self._robot.is_confirmed = message.state != SlamStatus.BLIND
+        self._robot.pose_fault = _POSE_FAULTS.get(message.state, '')
 
     def _on_topology(self, data: bytes) -> None:
         if len(data) > _MAX_TOPOLOGY_BYTES:

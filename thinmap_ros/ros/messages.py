@@ -89,27 +89,10 @@ def scan_from_msg(
 ) -> Scan:
     """Scan of a message; T_base_laser (3,); laser: parameters, None for their defaults.
 
-    Raises InputError as `Scan.create`, and where it has no beams, too many, or impossible angles.
+    Raises InputError as `decode.scan`, and where its stamp is invalid.
     """
-    count = len(message.ranges)
-    if not 0 < count <= validation.MAX_BEAMS:
-        raise InputError(f'{count} beams: expected 1 to {validation.MAX_BEAMS}')
-    last = message.angle_min + message.angle_increment * (count - 1)
-    validation.require_bounded(
-        'angle of the first or last beam', (message.angle_min, last), validation.MAX_ANGLE_RAD
-    )
-    return Scan.create(
-        stamp_ns(message.header.stamp),
-        np.frombuffer(message.ranges, dtype=np.float32),
-        message.angle_min,
-        message.angle_increment,
-        message.range_min,
-        message.range_max,
-        T_base_laser,
-        laser,
-        message.time_increment,
-        message.scan_time,
-    )
+    ns = stamp_ns(message.header.stamp)
+    return decode.scan(message, ns, T_base_laser, laser)
 
 
 def scan_msg(scan: Scan, frame_id: str, scan_time_s: float) -> LaserScan:

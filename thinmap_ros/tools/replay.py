@@ -216,9 +216,11 @@ def _bracketed(reasons: list[str]) -> str:
 
 
 def _print_notes(result: Replay) -> None:
-    """What was assumed, and loudly that most of the scans were not used."""
+    """Notes, warnings, and loudly that most of the scans were not used."""
     for note in result.notes:
         print(f'replay: note: {note}', file=sys.stderr)
+    for warning in result.warnings:
+        print(f'replay: warning: {warning}', file=sys.stderr)
     unused = result.counts.unused
     scans = len(result.poses) + sum(result.counts.without_odometry.values())
     if 2 * unused > scans:

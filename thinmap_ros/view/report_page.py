@@ -42,6 +42,7 @@ _FIGURES = (
     _Figure(('lost',), 'Scans of a lost robot'),
     _Figure(('refused',), 'Scans not mapped'),
     _Figure(('first_refused',), 'First scan not mapped'),
+    _Figure(('warnings',), 'Warnings'),
     _Figure(('distance',), 'Path length', 'm', 1.0, 1),
     _Figure(('distance_at', '0.99'), 'Path length to 99 % seen', 'm', 1.0, 1),
     _Figure(('time',), 'Simulated time', 's'),
@@ -140,6 +141,8 @@ def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = []
     for figure in _FIGURES:
         value = _value_of(report, figure.keys)
+        if isinstance(value, list):
+            value = '; '.join(value)
         if value is None or value == '':
             continue
         if not isinstance(value, str):

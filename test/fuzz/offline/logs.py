@@ -12,8 +12,8 @@ from support.ros1_bag import converted
 
 from fuzz.cases import Source, chosen, damaged_bytes, damaged_text, finite, nothing, tried
 from thinmap_ros.core import se2
-from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.logs.bag import Bag

@@ -229,7 +229,7 @@ class Localizer:
         match = self._match(scan, points, prediction.T_map_base)
         self._tracking.dead_reckoned = self._tracking.dead_reckoned.moved(prediction)
         self._tracking.update(match)
-        self._update(match, prediction, is_stationary)
+        fitting = self._update(match, prediction, is_stationary)
         self._tracking.record_pose(self._pose, self._uncertainty.since_match)
         blind_reason = self._blind_reason(scan, points, match)
         if not self.config.is_mapping:
@@ -242,7 +242,11 @@ class Localizer:
         self._map.render(self.keyframes)
         self._record_pose(scan)
         estimate = self._estimate(match, correction, blind_reason)
-        return replace(estimate, odometry_discontinuity=prediction.discontinuity)
+        return replace(
+            estimate,
+            odometry_discontinuity=prediction.discontinuity,
+            scan_information=None if fitting is None else fitting.scan_information,
+        )
 
     def optimized_trajectory(self) -> Array:
         """Poses (N, 3) of all steps since the start, after all corrections."""
@@ -327,8 +331,13 @@ class Localizer:
             f'expected at least {FEWEST_POINTS}'
         )
 
-    def _update(self, match: Match | None, prediction: Prediction, is_stationary: bool) -> None:
-        """Set the pose to that of an accepted match, or else to the predicted one."""
+    def _update(
+        self, match: Match | None, prediction: Prediction, is_stationary: bool
+    ) -> Match | None:
+        """Set the pose to that of an accepted match, or else to the predicted one.
+
+        Returns the accepted match if it fits.
+        """
         prior = prediction.T_map_base
         is_unexpected = match is not None and self._uncertainty.is_unexpected(match, prior)
         accepted = match is not None and not self._is_rejected(match, is_unexpected)
@@ -338,12 +347,13 @@ class Localizer:
         if match is None or not accepted:
             self._pose = prior
             self._uncertainty.coast(prior, prediction.covariance, is_stationary)
-            return
+            return None
         self._pose = match.T_map_base
         fits = match.inlier_ratio >= self.config.matching.min_inlier_ratio
         if fits:
             self._prediction.update(prediction, match)
         self._uncertainty.update(match, prior, prediction.covariance, fits, is_stationary)
+        return match if fits else None
 
     def _is_rejected(self, match: Match, is_unexpected: bool) -> bool:
         """Whether the pose of a match is worse than the predicted one.

@@ -127,7 +127,7 @@ class ObservationSource:
         self._process(self._buffer.add_scan(scan))
 
     def _on_slam_status(self, message: SlamStatus) -> None:
-        self._buffer.is_blind = message.state == SlamStatus.BLIND
+        self._buffer.is_blind = message.state in (SlamStatus.BLIND, SlamStatus.MISALIGNED)
         is_lost = message.state == SlamStatus.LOST
         self.watchdog.add_tracking(is_lost, self._now_ns() / SECOND_NS)
 

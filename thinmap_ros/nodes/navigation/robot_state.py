@@ -3,11 +3,11 @@
 from rclpy.clock import Clock
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.laser_monitor import LaserMonitor
 from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, OdometryBuffer
 from thinmap_ros.core.planning.navigator import SENSOR_TIMEOUT_NS
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.sensing.laser_monitor import LaserMonitor
 from thinmap_ros.core.stamps import SECOND_NS
 
 # Without a new pose the last correction of the odometry holds for a while; without odometry, the
@@ -19,14 +19,14 @@ _POSE_ONLY_TIMEOUT_NS = SECOND_NS
 class RobotState:
     """Pose and view of the robot now, and whether they are recent.
 
-    scan: the last one that is not blind; is_confirmed: False while the localizer reports that the
-    laser does not confirm the pose.
+    scan: the last one that is not blind; pose_fault: why the localizer does not trust its pose, ''
+    where it does.
     """
 
     def __init__(self, clock: Clock, has_odometry: bool) -> None:
         """has_odometry: False where the odometry says that the robot never moves."""
         self.scan: Scan | None = None
-        self.is_confirmed = True
+        self.pose_fault = ''
         self._clock = clock
         self._timeouts_ns = {
             'laser': SENSOR_TIMEOUT_NS,
@@ -74,8 +74,8 @@ class RobotState:
         """Why the robot must not drive on; '' for no reason."""
         if self._blind_reason:
             return f'laser blind ({self._blind_reason})'
-        if not self.is_confirmed:
-            return 'laser blind (it does not confirm the pose)'
+        if self.pose_fault:
+            return self.pose_fault
         now_ns = self._clock.now().nanoseconds
         for source, limit_ns in self._timeouts_ns.items():
             if now_ns - self._received_ns.get(source, now_ns) > limit_ns:

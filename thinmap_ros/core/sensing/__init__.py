@@ -1,0 +1,1 @@
+"""Scans as the rest of the core uses them: paired with odometry, checked, at one instant."""
