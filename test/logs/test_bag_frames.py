@@ -10,6 +10,7 @@ from support.bag_maker import ODOMETRY, RANGES, SCAN, TF, UPRIGHT, Maker, Quater
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.logs.bag import BagLog
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.log import OdometryEvent, ScanEvent
@@ -173,5 +174,5 @@ def test_without_odometry_the_robot_never_moves_in_its_frame(tmp_path: Path) -> 
 def test_a_range_of_zero_means_what_the_user_says(tmp_path: Path) -> None:
     path = write(tmp_path / 'bag', drive)
     for is_set in (False, True):
-        _, scans = events_of(BagLog(path, zero_is_no_return=is_set))
+        _, scans = events_of(BagLog(path, laser=LaserConfig(zero_is_no_return=is_set)))
         assert scans[0].scan.zero_is_no_return == is_set

@@ -6,6 +6,7 @@ import pytest
 
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.tools.parameter_file import NodeParameters, read_parameter_file
@@ -29,10 +30,10 @@ def test_a_preset_has_parameters_of_the_nodes_and_no_others(preset: Path) -> Non
     assert parameters.notes == []
     own = parameters.of_node['localizer']
     localizer = parameters.config('localizer', LocalizerConfig())
-    assert localizer.matching.max_range_m == own['matching.max_range_m']
     assert localizer.lines.range_noise_m == own['lines.range_noise_m']
-    grid = parameters.config('grid_mapper', OccupancyConfig())
-    assert grid.max_range_m == parameters.of_node['grid_mapper']['max_range_m']
+    for node in NODES:
+        laser = parameters.config(node, LaserConfig())
+        assert laser.max_range_m == own['max_range_m']
 
 
 @pytest.mark.parametrize('node', NODES)
@@ -76,8 +77,9 @@ def test_a_file_of_slam_toolbox_is_translated(tmp_path: Path, key: str) -> None:
     )
     grid = parameters.config('grid_mapper', OccupancyConfig())
     localizer = parameters.config('localizer', LocalizerConfig())
-    assert (grid.resolution_m, grid.max_range_m) == (0.07, 9.0)
-    assert localizer.matching.max_range_m == 9.0
+    assert grid.resolution_m == 0.07
+    for node in ('localizer', 'grid_mapper'):
+        assert parameters.config(node, LaserConfig()).max_range_m == 9.0
     assert localizer.loop_closure.search_radius_m == 4.0
     assert parameters.value('localizer', 'base_frame', '') == 'base_footprint'
     (note,) = parameters.notes
@@ -85,10 +87,10 @@ def test_a_file_of_slam_toolbox_is_translated(tmp_path: Path, key: str) -> None:
 
 
 def test_a_typing_error_is_noted_with_what_was_meant(tmp_path: Path) -> None:
-    text = 'localizer:\n  ros__parameters:\n    matchng: {max_range_m: 3.0}\n'
+    text = 'localizer:\n  ros__parameters:\n    matchng: {noise_m: 0.1}\n'
     (note,) = read(tmp_path, text).notes
-    assert 'matchng.max_range_m (did you mean ' in note and 'matching.max_range_m' in note
-    with pytest.raises(ConfigError, match=r'matchng\.max_range_m'):
+    assert 'matchng.noise_m (did you mean ' in note and 'matching.noise_m' in note
+    with pytest.raises(ConfigError, match=r'matchng\.noise_m'):
         read(tmp_path, text + '    strict_parameters: true\n')
 
 
