@@ -18,7 +18,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class, set_topology
@@ -68,8 +68,14 @@ class Drive:
         mount = mount if rng.random() < 0.1 else np.zeros(3)
         stamp = good.stamp_ns + int(chosen(rng, (0, 0, 0, 0, 0, 0, -(10**9), 10**12)))
         self.tell('scan', stamp, ranges.tolist(), numbers, mount.tolist())
-        zero = bool(rng.random() < 0.2)
-        made: Scan | None = tried(lambda: Scan.create(stamp, ranges, *numbers, mount, zero))
+        laser = LaserConfig(
+            zero_is_no_return=bool(rng.random() < 0.2),
+            max_range_m=float(chosen(rng, (30.0, 30.0, 30.0, 2.0))),
+        )
+        sweep = (float(chosen(rng, (0.0, 0.2 / 360, -1.0, np.nan))), 0.2)
+        made: Scan | None = tried(
+            lambda: Scan.create(stamp, ranges, *numbers, mount, laser, *sweep)
+        )
         return made
 
     def tell(self, *words: Any) -> None:

@@ -144,9 +144,10 @@ class Matcher:
     def _refined(
         self, scan: Array, local_map: LocalMap, start: Array, prior: Array, information: Array
     ) -> Match:
-        pose, scan_information, sums, weight = minimize(
+        pose, summed_information, sums, weight = minimize(
             scan, start, prior, information, local_map.lattice, *self._noise
         )
+        scan_information = semidefinite(summed_information)
         cost, total, fitting, in_the_open, _ = sums.tolist()
         covariance = np.linalg.inv(scan_information + weight * information)
         return Match(
@@ -177,3 +178,15 @@ def _thinned(scan: Array, count: int) -> Array:
     sparse = np.ascontiguousarray(scan[:: max(1, len(scan) // count), :3])
     sparse[:, 2] *= len(scan) / len(sparse)
     return sparse
+
+
+def semidefinite(information: Array) -> Array:
+    """Information (3, 3) without negative eigenvalues.
+
+    They are rounding errors of a scan that knows nothing in one direction. Added to the information
+    of a prior that knows nothing either, they would make a negative variance.
+    """
+    values, directions = np.linalg.eigh(information)
+    if values[0] >= 0.0:
+        return information
+    return np.asarray((directions * np.maximum(values, 0.0)) @ directions.T)
