@@ -144,3 +144,19 @@ def test_scans_of_odd_geometry_are_checked(step, count, fault):
     monitor.checked(scan_in(ROOM, START), START)
     scan = Scan.create(PERIOD_NS, np.full(count, np.inf), -1.57, step, 0.05, 8.0)
     assert monitor.checked(scan, START).fault == fault
+
+
+def test_a_laser_that_drops_out_misses_surfaces_and_is_not_blind_until_all_are_missed():
+    """Of two scans one has returns from other surfaces than the one before, as real lasers do."""
+    robot = Drive()
+    robot.steps(200, with_ranges(np.inf, 0.6))
+    assert 'dropouts' in robot.monitor.warnings
+    halves = [np.arange(181) % 40 < 15, np.arange(181) % 40 >= 25]
+
+    def half(scan):
+        ranges = np.where(halves[scan.stamp_ns // PERIOD_NS % 2], scan.ranges_m, np.inf)
+        return replace(scan, ranges_m=ranges)
+
+    assert set(robot.steps(50, half)) == {''}
+    _, checked = robot.step(with_ranges(np.inf))
+    assert checked.is_blind

@@ -114,7 +114,8 @@ class LaserMonitor:
             return scan.blinded(FROZEN)
         if scan.is_blind:
             return scan
-        if self._has_failed(scan, T_odom_base):
+        # Of a laser that drops out, a scan without returns is blind anyway.
+        if not self._dropouts.drops_out and self._has_failed(scan, T_odom_base):
             return scan.blinded(NO_RETURNS)
         drops_out = self._dropouts.update(scan, T_odom_base)
         return replace(scan, drops_out=True) if drops_out else scan
