@@ -316,7 +316,39 @@ def _angles(rng: np.random.Generator) -> Change:
     return change
 
 
+def _sweep(rng: np.random.Generator) -> Change:
+    """A driver that states the times of its beams, rightly or not."""
+    period_s = float(chosen(rng, (0.2, -0.2, 0.05, 5.0, 1e9, np.nan, np.inf)))
+    scan_time_s = float(chosen(rng, (0.0, 0.2, -1.0, np.nan)))
+
+    def change(_: np.random.Generator, message: Any) -> list[Any]:
+        if isinstance(message, LaserScan):
+            message.time_increment = period_s / 360.0
+            message.scan_time = scan_time_s
+        return [message]
+
+    return change
+
+
+def _restarted(rng: np.random.Generator) -> Change:
+    """An odometry that begins at 0 again, wherever it was, with another heading."""
+    turn = float(chosen(rng, (0.0, 0.4, 1.6, 3.1)))
+    first: list[Array] = []
+
+    def change(_: np.random.Generator, message: Any) -> list[Any]:
+        if isinstance(message, Odometry):
+            T = messages.pose_from_msg(message.pose.pose)
+            first.append(T)
+            moved = se2.compose(se2.pose(0.0, 0.0, turn), se2.between(first[0], T))
+            message.pose.pose = messages.pose_msg(moved)
+        return [message]
+
+    return change
+
+
 _KINDS = (
+    ('times of beams', _sweep),
+    ('a restarted odometry', _restarted),
     ('shifted stamps', _shift),
     ('shifted stamps', _shift),
     ('jitter of stamps', _jitter),
