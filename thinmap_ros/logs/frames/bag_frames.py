@@ -139,6 +139,8 @@ class BagFrames:
         self._skipped.note(f'odometry: {note}')
 
     def _assume_base(self, frame: str) -> None:
+        if frame == self.base_frame:
+            return
         name = validation.quoted_name(frame)
         self._skipped.note(
             f'no transform names "{self.base_frame}": the frame of the robot is "{name}", as that '
