@@ -209,7 +209,7 @@ def test_each_source_makes_and_tests_a_case(tmp_path: Path) -> None:
 )
 def test_streams_find_a_planted_fault(tmp_path: Path, source: str, why: str) -> None:
     assert in_new_process([source], 7, 3, '', tmp_path) == []
-    found = in_new_process([source], 7, 30, source, tmp_path)
+    found = in_new_process([source], 7, 60, source, tmp_path)
     assert any(why in text for text in found)
 
 

@@ -164,8 +164,19 @@ def test_topics_are_chosen_or_asked_for(tmp_path: Path) -> None:
         writer.write('/rear/scan', SCAN, 5, make.scan(5, [4.0] * 5))
 
     path = write(tmp_path / 'bag', fill)
-    with pytest.raises(InputError, match=r'choose one of /rear/scan, /scan$'):
-        read(path)
+    log = BagLog(path)
+    assert len(scans(list(log.events()))) > 1
+    assert log.skipped.notes == [
+        'laser scans of /scan, as the nodes subscribe to it; not of /rear/scan'
+    ]
+
+    def without_the_usual_name(writer: BagWriter, make: Maker) -> None:
+        drive(writer, make)
+        writer.write('/front/scan', SCAN, 5, make.scan(5, [4.0] * 5))
+        writer.write('/rear/scan', SCAN, 5, make.scan(5, [4.0] * 5))
+
+    two = write(tmp_path / 'two', without_the_usual_name)
+    assert len(scans(read(two, scan_topic='/front/scan'))) == 1
     assert len(scans(read(path, scan_topic='/rear/scan'))) == 1
     with pytest.raises(InputError, match=r'no laser scans .*front.*it has /odom'):
         read(path, scan_topic='/front')

@@ -114,29 +114,12 @@ class Scan:
             float(np.float32(v))
             for v in (angle_min_rad, angle_increment_rad, range_min_m, range_max_m)
         )
-        if ranges.ndim != 1 or not np.isfinite([first, step, low]).all() or np.isnan(high):
-            limits = f'angles {first}, {step}, range {low} to {high}'
-            raise InputError(f'scan at {stamp_ns} ns: {limits}: expected finite numbers')
-        if step == 0.0 and ranges.size > 1:
-            raise InputError(
-                f'scan at {stamp_ns} ns: {ranges.size} beams, increment 0: '
-                'expected an angle between them'
-            )
-        if not 0.0 <= low < high:
-            raise InputError(
-                f'scan at {stamp_ns} ns: range {low} to {high} m: expected 0 <= min < max'
-            )
-        T_base_laser = (
-            np.zeros(3) if T_base_laser is None else np.asarray(T_base_laser, dtype=np.float64)
-        )
-        if not (
-            se2.is_finite(T_base_laser) and np.abs(T_base_laser[:2]).max() <= MAX_MOUNT_OFFSET_M
-        ):
-            mount = ', '.join(f'{value:g}' for value in T_base_laser.tolist())
-            raise InputError(
-                f'scan at {stamp_ns} ns: laser mounted at {mount}: '
-                f'expected finite numbers, at most {MAX_MOUNT_OFFSET_M:g} m'
-            )
+        mount = np.zeros(3) if T_base_laser is None else np.asarray(T_base_laser, dtype=np.float64)
+        try:
+            _require_geometry(ranges, first, step, low, high)
+            _require_mount(mount)
+        except InputError as error:
+            raise InputError(f'scan at {stamp_ns} ns: {error}') from error
         laser = laser or LaserConfig()
         if not np.isfinite([time_increment_s, scan_time_s]).all():
             time_increment_s = scan_time_s = 0.0
@@ -148,7 +131,7 @@ class Scan:
             step,
             low,
             high,
-            T_base_laser,
+            mount,
             laser.zero_is_no_return,
             laser.max_range_m,
             first_beam_s=-time_increment_s * (ranges.size - 1) if is_at_end else 0.0,
@@ -241,6 +224,27 @@ class Scan:
     def points_base(self) -> Array:
         """End points of the hits, robot frame, (M, 2)."""
         return se2.transform_points(self.T_base_laser, self.points_laser())
+
+
+def _require_geometry(ranges: Array, first: float, step: float, low: float, high: float) -> None:
+    """Raise InputError unless beams (N,) have a first angle, an increment and range limits."""
+    if ranges.ndim != 1 or not np.isfinite([first, step, low]).all() or np.isnan(high):
+        limits = f'angles {first}, {step}, range {low} to {high}'
+        raise InputError(f'{limits}: expected finite numbers')
+    if step == 0.0 and ranges.size > 1:
+        raise InputError(f'{ranges.size} beams, increment 0: expected an angle between them')
+    if not 0.0 <= low < high:
+        raise InputError(f'range {low} to {high} m: expected 0 <= min < max')
+
+
+def _require_mount(T_base_laser: Array) -> None:
+    """Raise InputError unless the pose of a laser (3,) is one on a robot."""
+    if se2.is_finite(T_base_laser) and np.abs(T_base_laser[:2]).max() <= MAX_MOUNT_OFFSET_M:
+        return
+    mount = ', '.join(f'{value:g}' for value in T_base_laser.tolist())
+    raise InputError(
+        f'laser mounted at {mount}: expected finite numbers, at most {MAX_MOUNT_OFFSET_M:g} m'
+    )
 
 
 def is_most_missed(scan: Scan, missed: int) -> bool:

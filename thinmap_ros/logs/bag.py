@@ -42,6 +42,7 @@ _ODOMETRY = 'nav_msgs/msg/Odometry'
 _EXPECTED = 'a rosbag2 folder, an MCAP or SQLite file, or a ROS 1 bag'
 _ZSTD = b'\x28\xb5\x2f\xfd'  # begin of a message that is compressed by itself
 _MAX_WARNINGS = 8
+_USUAL_TOPICS = {_SCAN: '/scan', _ODOMETRY: '/odom'}
 
 
 class Bag:
@@ -164,7 +165,7 @@ def _storage_of(path: Path) -> Storage:
 
 @dataclass
 class BagLog:
-    """Scans and odometry of a bag. Empty topic name: the only topic of that type.
+    """Scans and odometry of a bag. Empty topic name: the only topic of that type, /scan or /odom.
 
     T_base_laser (3,): pose of the laser on the robot; None: from the transforms. base_frame,
     odom_frame: frames of robot and odometry; empty: those of the bag (see `BagFrames`).
@@ -262,6 +263,11 @@ class BagLog:
             return wanted
         if not wanted and len(found) == 1:
             return found[0]
+        usual = _USUAL_TOPICS[type_name]
+        if not wanted and usual in found:
+            others = validation.quoted_names([topic for topic in found if topic != usual])
+            self.skipped.note(f'{what} of {usual}, as the nodes subscribe to it; not of {others}')
+            return usual
         if not found or wanted:
             has = validation.quoted_names(
                 [f'{topic} ({name})' for topic, name in sorted(bag.topics.items())]

@@ -147,7 +147,7 @@ def test_scans_of_odd_geometry_are_checked(step, count, fault):
 
 
 def test_a_laser_that_drops_out_misses_surfaces_and_is_not_blind_until_all_are_missed():
-    """Of two scans one has returns from other surfaces than the one before, as real lasers do."""
+    """Two successive scans have returns from other surfaces, as of real lasers."""
     robot = Drive()
     robot.steps(200, with_ranges(np.inf, 0.6))
     assert 'dropouts' in robot.monitor.warnings

@@ -40,7 +40,8 @@ class ConsistencyMonitor:
     def checked(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> Estimate:
         """The estimate of a scan with odometry pose (3,), with `mount_fault` where there is one.
 
-        A pose that no match has set, or that a loop closure has moved, says nothing of the mount.
+        A pose that no match has set, or that a loop closure has moved, says nothing of the mount,
+        and neither does an odometry that has jumped.
         """
         if se2.is_finite(T_odom_base):
             self._turns.add(scan, T_odom_base)
@@ -51,7 +52,8 @@ class ConsistencyMonitor:
 
     def _add_to_mount(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> None:
         information = estimate.scan_information
-        if information is None or estimate.correction is not None:
+        is_moved = estimate.correction is not None or estimate.odometry_discontinuity
+        if information is None or is_moved:
             self._mount_errors.reset_span()
             return
         T_base_laser = scan.T_base_laser

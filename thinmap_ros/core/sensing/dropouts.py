@@ -84,7 +84,7 @@ class DropoutDetector:
         contradicted = self._count_contradicted(scan, T_odom_base) if unreturned else 0
         self._evidence = evidence.plus(unreturned, contradicted)
         self._views.append(se2.transform_points(T_odom_base, _surfaces(scan)))
-        # With a gap, so that a laser near the limit is not judged anew again and again.
+        # With a gap, so that the verdict on a laser near the limit does not alternate.
         limit = 0.5 * _MAX_CONTRADICTED if self.drops_out else _MAX_CONTRADICTED
         self.drops_out = self._evidence.ratio > limit
         return self.drops_out
