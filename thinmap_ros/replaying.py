@@ -29,6 +29,8 @@ from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import summary_figure
 
+_REPEATED = 0.01  # m and rad: the pose of a scan that was matched twice differs by less
+
 
 @dataclass(eq=False)
 class ScanCounts:
@@ -222,9 +224,18 @@ def write_outputs(
 
 
 def _write_trajectory(path: Path, stamps_ns: list[int], poses: Array) -> None:
-    """Write poses (N, 3) in the order of their stamps, the first one of each stamp."""
-    ordered, first = np.unique(np.array(stamps_ns, dtype=np.int64), return_index=True)
-    trajectories.write_tum(path, ordered.tolist(), list(poses[first]))
+    """Write poses (N, 3) in the order of their stamps, and a scan that came twice once.
+
+    Between scans with one stamp a robot may have moved all the same: the clocks of old logs are
+    coarse.
+    """
+    stamps = np.array(stamps_ns, dtype=np.int64)
+    order = np.argsort(stamps, kind='stable')
+    stamps = stamps[order]
+    ordered = poses[order]
+    moved = np.abs(np.diff(ordered, axis=0)).max(axis=1, initial=0.0) > _REPEATED
+    is_new = np.append(True, (np.diff(stamps) > 0) | moved)
+    trajectories.write_tum(path, stamps[is_new].tolist(), list(ordered[is_new]))
 
 
 def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[str, Any]:

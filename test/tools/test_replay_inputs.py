@@ -100,6 +100,20 @@ def test_a_trajectory_has_one_pose_for_each_stamp(tmp_path: Path) -> None:
 
 
 @pytest.mark.programs
+def test_scans_of_a_coarse_clock_keep_their_poses(tmp_path: Path) -> None:
+    path = tmp_path / 'log.clf'
+    lines = carmen_lines()
+    stamp = lines[18].split()[-3]
+    lines[20] = lines[20].replace(lines[20].split()[-3], stamp)
+    path.write_text('\n'.join(lines))
+    replayed(tmp_path, path)
+    trajectory = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
+    assert len(trajectory) == 30
+    assert (np.diff(trajectory[:, 0]) == 0.0).sum() == 1
+    assert (np.diff(trajectory[:, 1]) > 0.01).all()
+
+
+@pytest.mark.programs
 @pytest.mark.parametrize('every_s', [1.0, 1.05])
 def test_odometry_once_a_second_is_enough(tmp_path: Path, every_s: float) -> None:
     path = bag(

@@ -276,6 +276,6 @@ class OdometryIncrements:
         self.rejected += 1
         jump = (
             f'odometry jumped by {math.hypot(moved[0], moved[1]):.2f} m, '
-            f'{math.degrees(float(moved[2])):.0f} deg within {seconds:.2f} s'
+            f'{math.degrees(float(moved[2])):.0f} deg within {max(seconds, 0.0):.2f} s'
         )
         return OdometryIncrement(np.zeros(3), seconds, _LIMITS.distance_m(max(seconds, 1.0)), jump)
