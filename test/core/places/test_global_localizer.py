@@ -53,6 +53,21 @@ def test_the_same_seed_gives_the_same_answers():
         assert poses[0] == poses[1]
 
 
+def test_once_a_laser_proves_to_drop_out_the_search_starts_again(finder):
+    """What its beams without return have said before does not delay it."""
+    rng = np.random.default_rng(4)
+    looks = []
+    for k, (scan, odometry, T) in enumerate(drive(OFFICE, START, WAY)):
+        lost = np.repeat(rng.random(-(-scan.ranges_m.size // 6)) < 0.6, 6)[: scan.ranges_m.size]
+        ranges = np.where(lost, np.inf, scan.ranges_m)
+        looks.append((replace(scan, ranges_m=ranges, drops_out=k > 3), odometry, T))
+    late = run(finder, looks)
+    known = run(finder, [(replace(scan, drops_out=True), *rest) for scan, *rest in looks[4:]])
+    sure = [[r.state == State.LOCALIZED for r, _ in results] for results in (late, known)]
+    assert all(is_right(r.pose, T) for r, T in late if r.state == State.LOCALIZED)
+    assert sure[0].index(True) <= sure[1].index(True) + 4 + 2
+
+
 def test_a_robot_that_stands_still_is_not_sure(finder):
     looks = list(drive(OFFICE, START, [(0.0, 0.0)] * 15))
     assert State.LOCALIZED not in [result.state for result, _ in run(finder, looks)]

@@ -142,6 +142,7 @@ class GlobalLocalization:
         self._rng = np.random.default_rng(seed)
         self._model: NodeModel | None = None
         self._judge: Judge | None = None
+        self._drops_out = False  # whether the laser does
         self._usual = 1.0  # share that the right place explains in this map
         self.restart()
 
@@ -174,6 +175,11 @@ class GlobalLocalization:
             self._T_step = T_odom_base
             return self._waiting('odometry has jumped: the search is reset')
         self._T_step = T_odom_base
+        if scan.drops_out and not self._drops_out:
+            # So far beams without return have spoken for open space.
+            self.restart()
+            self._T_step = T_odom_base
+        self._drops_out = scan.drops_out
         blind_reason = scan.blind_reason or few_beams_reason(scan)
         if blind_reason or not (scan.returned | scan.no_return).any():
             reason = blind_reason or 'no beam shows anything'
