@@ -29,7 +29,7 @@ def verdicts(spoil, scans=300, seed=7):
     return found, detector
 
 
-@pytest.mark.parametrize('share', [0.05, 0.2, 0.6, 0.85])
+@pytest.mark.parametrize('share', [0.05, 0.2, 0.6, 0.75])
 @pytest.mark.parametrize('block', [1, 6])
 def test_a_laser_that_drops_returns_is_recognized_within_metres(share, block):
     def spoil(scan, rng):
@@ -38,7 +38,7 @@ def test_a_laser_that_drops_returns_is_recognized_within_metres(share, block):
 
     found, detector = verdicts(spoil)
     assert all(found[-100:])
-    assert f'{100 * detector.contradicted_ratio:.0f} % of the beams' in detector.warning
+    assert f'{100 * detector.miss_ratio:.0f} % of the beams' in detector.warning
 
 
 def test_surfaces_that_are_hit_only_at_steep_angles_make_a_laser_that_drops_out():
@@ -60,7 +60,7 @@ def test_walls_out_of_range_are_no_dropouts(range_max_m):
     found, detector = verdicts(spoil, 600)
     assert not any(found)
     assert detector.warning == ''
-    assert detector.contradicted_ratio < 0.2
+    assert detector.miss_ratio < 0.03
 
 
 def test_a_robot_that_stands_learns_nothing_new():
