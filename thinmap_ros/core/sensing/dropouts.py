@@ -25,8 +25,8 @@ _VIEWS = 40
 _MAX_TURN_RAD = 0.5
 _SAME_SURFACE_M = 0.1
 _MIN_STEP_RAD = 1e-6
-# Measured over whole recordings: at most 0.017 with lasers of 3 to 80 m in rooms, halls and outdoors;
-# 0.05 with one that drops 5 % of its returns, 0.27 and 0.53 with cheap ones.
+# Measured over whole recordings: at most 0.017 with lasers of 3 to 80 m in rooms, halls and
+# outdoors; 0.05 with one that drops 5 % of its returns, 0.27 and 0.53 with cheap ones.
 _MAX_MISSED = 0.03
 # Measured: at most 0.06 in halls and outdoors, 0.15 and more with lasers that drop returns.
 _MAX_WRONG = 0.1
