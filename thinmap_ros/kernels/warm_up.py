@@ -72,6 +72,7 @@ def localizer() -> None:
     from thinmap_ros.core.slam.graph.pose_graph import Edge
     from thinmap_ros.core.slam.localizer import Localizer
 
+    _sense()
     rehearsed = Localizer()
     for scan, T_map_base in _drive():
         rehearsed.step(scan, T_map_base)
@@ -83,6 +84,19 @@ def localizer() -> None:
     Localizer.from_occupancy_map(_room(), OdometryAnchor(0, T_map_base, T_map_base), T_map_base)
     # A revisit needs covariances along the graph.
     covariances_from(0, np.zeros((2, 3)), [Edge(0, 1, np.zeros(3), np.eye(3), False)], np.ones(2))
+
+
+def _sense() -> None:
+    """Warm up the correction for motion within a scan, and the search for dropouts."""
+    from dataclasses import replace
+
+    from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
+
+    pairing = ScanOdometrySynchronizer()
+    beam_s = _REHEARSAL.period_s * _REHEARSAL.beam_step_rad / (2.0 * np.pi)
+    for scan, T_map_base in _drive():
+        pairing.add_odometry(scan.stamp_ns, T_map_base)
+        pairing.add_scan(replace(scan, beam_period_s=beam_s))
 
 
 def grid_mapper() -> None:
@@ -136,6 +150,7 @@ def navigator() -> None:
     from thinmap_ros.core.planning.wavefront import WavefrontConfig
     from thinmap_ros.core.topology.builder import TopologyConfig, build
 
+    _sense()
     patch = _room()
     topology = build(patch, (2.0, 2.0), TopologyConfig())
     route_band(topology, patch, (2.0, 2.0), (4.0, 3.0), WavefrontConfig())
@@ -150,6 +165,7 @@ def global_localizer() -> None:
     from thinmap_ros.core.places.global_localizer import GlobalLocalization
     from thinmap_ros.core.topology.builder import TopologyConfig, build
 
+    _sense()
     patch = _room()
     rehearsed = GlobalLocalization(patch, build(patch, (2.0, 2.0), TopologyConfig()))
     for scan, T_map_base in _drive():
