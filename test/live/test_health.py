@@ -280,7 +280,4 @@ def test_a_deactivated_navigator_takes_no_goal(graph):
     request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
     assert graph.call(ChangeState, '/navigator/change_state', request).success
     client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
-    graph.until(client.server_is_ready, 'action')
-    future = client.send_goal_async(NavigateToPose.Goal())
-    graph.until(future.done, 'an answer')
-    assert not future.result().accepted
+    assert not graph.send_goal(client, NavigateToPose.Goal()).accepted

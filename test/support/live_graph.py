@@ -148,13 +148,16 @@ class Graph:
         # A server that has just discovered its client may not respond yet: ask again.
         return self._first(lambda: client.call_async(request), f'an answer of {name}')
 
-    def send_goal(self, client: ActionClient, goal: Any) -> Any:
-        """Handle of an accepted goal.
+    def send_goal(
+        self, client: ActionClient, goal: Any, on_feedback: Callable[[Any], None] | None = None
+    ) -> Any:
+        """Handle of a goal, accepted or rejected.
 
-        A killed node still counts as a server for a while: then ask again.
+        Sends it again if there is no answer: a killed node still counts as a server for a while,
+        and a server that has just discovered its client may not respond yet.
         """
         self.until(client.server_is_ready, 'action server')
-        return self._first(lambda: client.send_goal_async(goal), 'goal taken')
+        return self._first(lambda: client.send_goal_async(goal, on_feedback), 'goal taken')
 
     def _first(self, ask: Callable[[], Any], what: str, again_s: float = _ASK_AGAIN_S) -> Any:
         """First response; asks again if there is none for a while."""

@@ -27,14 +27,20 @@ class Client:
         self._kind, action = ACTIONS[name]
         self.is_explorer = self._kind is Explore
         self._client = ActionClient(graph.node, self._kind, action)
-        graph.until(self._client.server_is_ready, 'action server')
+        # A first goal proves that the server has discovered its client: no later answer is lost.
+        first = graph.send_goal(self._client, self._goal())
+        graph.cancel(first)
+        graph.result(first, 'the first goal')
 
     def send(self):
         """Future of the handle of a new goal."""
+        return self._client.send_goal_async(self._goal())
+
+    def _goal(self):
         goal = self._kind.Goal()
         if self._kind is NavigateToPose:
             goal.pose = messages.pose_stamped_msg(np.zeros(3), 'map', 0)
-        return self._client.send_goal_async(goal)
+        return goal
 
     def accepted(self, sent):
         """Handle of a goal, and the future of its result."""

@@ -109,10 +109,7 @@ def test_an_ordinary_client_has_feedback_again_can_cancel_and_asks_again_for_the
     exploration = Exploration(graph)
     feedback = []
     client = ActionClient(graph.node, Explore, 'explore')
-    graph.until(client.server_is_ready, 'the explorer')
-    sent = client.send_goal_async(Explore.Goal(), feedback.append)
-    graph.until(sent.done, 'the goal is accepted')
-    handle = sent.result()
+    handle = graph.send_goal(client, Explore.Goal(), feedback.append)
     lost = handle.get_result_async()
     graph.until(lambda: feedback, 'feedback')
     exploration.until_elapsed(10.0)

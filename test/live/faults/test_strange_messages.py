@@ -133,13 +133,11 @@ def set_to_work(graph, name):
         (Explore, 'explore') if name == 'explorer' else (NavigateToPose, 'navigate_to_pose')
     )
     client = ActionClient(graph.node, kind, action)
-    graph.until(client.server_is_ready, action)
     goal = kind.Goal()
     if name == 'navigator':
         goal.pose.pose.position.x = 1.2
         goal.pose.pose.orientation.w = 1.0
-    sent = client.send_goal_async(goal)
-    graph.until(sent.done, 'the goal is taken')
+    graph.send_goal(client, goal)
 
 
 def say(graph, name, publishers, count):

@@ -44,11 +44,10 @@ def test_a_distant_goal_is_planned_on_the_graph(graph):
     plans = graph.heard('plan', Path, qos.LATCHED)
     commands = graph.heard('cmd_vel', Twist)
     client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
-    graph.until(client.server_is_ready, 'action server')
 
     def send():
         pose = messages.pose_stamped_msg(np.array([*GOAL, 0.0]), 'map', 0)
-        client.send_goal_async(NavigateToPose.Goal(pose=pose))
+        graph.send_goal(client, NavigateToPose.Goal(pose=pose))
 
     send()
     graph.until(lambda: plans and highest(plans[-1]) < 1.0, 'a plan without a graph')

@@ -42,12 +42,10 @@ class Client:
     def send(self, goal):
         """Future of the result of an accepted goal."""
         kind = NavigateToPose if isinstance(goal, NavigateToPose.Goal) else NavigateThroughPoses
-        client = self._clients[kind]
-        self.graph.until(client.server_is_ready, 'action server')
-        sent = client.send_goal_async(goal, lambda m: self.feedback.append(m.feedback))
-        self.graph.until(sent.done, 'goal taken')
-        assert sent.result().accepted
-        self.handle = sent.result()
+        self.handle = self.graph.send_goal(
+            self._clients[kind], goal, lambda m: self.feedback.append(m.feedback)
+        )
+        assert self.handle.accepted
         return self.handle.get_result_async()
 
     def to(self, *place, **where):

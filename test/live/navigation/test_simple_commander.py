@@ -75,10 +75,7 @@ class Commander:
         self._graph.until(answer.done, 'an answer to the cancellation')
 
     def _send(self, client, goal):
-        self._graph.until(client.server_is_ready, 'action server')
-        sent = client.send_goal_async(goal, self._on_feedback)
-        self._graph.until(sent.done, 'goal taken')
-        self._handle = sent.result()
+        self._handle = self._graph.send_goal(client, goal, self._on_feedback)
         self.result = self._handle.get_result_async() if self._handle.accepted else None
         return self._handle.accepted
 
