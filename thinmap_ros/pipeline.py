@@ -84,9 +84,7 @@ class Pipeline:
                 self.corrections += self._grid.apply_correction(
                     *self.localizer.keyframe_trajectory(), scan.stamp_ns
                 )
-            # As in grid_mapper: a lost robot is at no place of the map, a blind laser sees nothing.
-            is_mapped = not (estimate.is_lost or estimate.blind_reason or estimate.mount_fault)
-            moved = self._grid.update(scan if is_mapped else None, estimate.T_map_base)
+            moved = self._grid.update(scan, estimate.T_map_base, estimate.placement)
             self.refusals += self._grid.take_refusals()
         if moved is not None:
             self._rebuild(moved)

@@ -1,6 +1,7 @@
 """Result of one localizer step."""
 
 from dataclasses import dataclass
+from enum import Enum
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
@@ -18,6 +19,19 @@ class Correction:
         return se2.compose(self.after[k], se2.between(self.before[k], T))
 
 
+class Placement(Enum):
+    """Where a scan belongs.
+
+    MAP: in the map, at its pose. OPEN: there, if it turns out that the robot is not lost. APART: in
+    a piece of map whose place is unknown. NOWHERE: it shows nothing, or nobody knows where.
+    """
+
+    MAP = 0
+    OPEN = 1
+    APART = 2
+    NOWHERE = 3
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Estimated pose after a scan.
@@ -27,7 +41,10 @@ class Estimate:
     observed_lines, matched_lines: lines of this scan, and how many of them match features (both 0
     while the robot stands still). n_features, n_local_features: features in the map, and in the
     local area. inlier_ratio: share of the scan points in known space that fit the map.
-    is_lost: the pose is unknown; the covariance is accordingly large.
+    is_lost: the place in the map is unknown; the covariance is accordingly large.
+    is_mapping_apart: lost, and what the robot sees is mapped as a piece of its own, which a loop
+    closure joins with the map.
+    is_contradicted: scans contradict the map, and whether the robot is lost is not yet decided.
     blind_reason: why the laser does not confirm the pose, which follows the odometry; '': it does.
     odometry_discontinuity: description of an odometry jump since the previous scan; '': none.
     mount_fault: why the pose of the laser on the robot must be wrong, by so much that the robot
@@ -46,8 +63,21 @@ class Estimate:
     n_local_features: int = 0
     inlier_ratio: float = 0.0
     is_lost: bool = False
+    is_mapping_apart: bool = False
+    is_contradicted: bool = False
     blind_reason: str = ''
     odometry_discontinuity: str = ''
     mount_fault: str = ''
     correction: Correction | None = None
     scan_information: Array | None = None
+
+    @property
+    def placement(self) -> Placement:
+        """Where the scan belongs: a blind or misaligned laser shows nothing."""
+        if self.blind_reason or self.mount_fault:
+            return Placement.NOWHERE
+        if self.is_mapping_apart:
+            return Placement.APART
+        if self.is_lost:
+            return Placement.NOWHERE
+        return Placement.OPEN if self.is_contradicted else Placement.MAP

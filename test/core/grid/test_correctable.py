@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from support.slam_room import corridor_ring, scan_in
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid import rerendering
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
@@ -365,3 +366,63 @@ def test_scans_that_a_correction_moves_too_far_away_are_left_out_and_named():
         grid.update(SCANS[19], TRUE[19])
     assert grid.take_refusals(), 'those around the tenth'
     assert (grid.shown.known_area().cells != UNKNOWN).sum() > 1000
+
+
+def occupied_after(placements, correct_at=None):
+    """Occupied cells of a grid after scans with these placements, each 50 scans later."""
+    grid = CorrectableGrid(OccupancyGrid())
+    for k, placement in enumerate(placements):
+        number = 50 * k
+        if k == correct_at:
+            numbers = [50 * i for i in range(k)]
+            stamps = np.array([SCANS[i].stamp_ns for i in numbers], dtype=np.int64)
+            grid.apply_correction(stamps, TRUE[numbers], SCANS[number].stamp_ns)
+        # Where the place is unknown, so is the pose.
+        at = TRUE[number] + (100.0 if placement is Placement.APART else 0.0)
+        grid.update(SCANS[number], at, placement)
+    grid.finish()
+    return grid.shown.known_area().occupied.sum(), grid
+
+
+MAP, OPEN, APART, NOWHERE = Placement
+
+
+def test_scans_whose_placement_is_open_wait_until_it_is_decided():
+    known, _ = occupied_after([MAP])
+    assert occupied_after([MAP, OPEN, OPEN])[0] == known
+    assert occupied_after([MAP, OPEN, OPEN, MAP])[0] == occupied_after([MAP] * 4)[0] > known
+    with_gap = occupied_after([MAP, NOWHERE, NOWHERE, MAP])[0]
+    assert (
+        occupied_after([MAP, OPEN, OPEN, APART, MAP])[0]
+        == occupied_after([MAP, NOWHERE, NOWHERE, NOWHERE, MAP])[0]
+    )
+    assert with_gap < occupied_after([MAP] * 4)[0]
+
+
+def test_scans_whose_placement_is_open_move_with_a_correction():
+    grid = CorrectableGrid(OccupancyGrid())
+    shifted = np.array([1.0, 0.0, 0.0])
+    grid.update(SCANS[0], TRUE[0] + shifted)
+    grid.update(SCANS[50], TRUE[50] + shifted, OPEN)
+    grid.apply_correction(np.array([SCANS[0].stamp_ns]), TRUE[:1], SCANS[100].stamp_ns)
+    grid.update(SCANS[100], TRUE[100])
+    grid.finish()
+    assert grid.shown.known_area().occupied.sum() == occupied_after([MAP] * 3)[0]
+
+
+def test_what_was_mapped_apart_is_shown_once_a_correction_joins_it():
+    apart = [MAP, APART, APART]
+    assert occupied_after(apart)[0] == occupied_after([MAP])[0]
+    joined, grid = occupied_after([*apart, MAP], correct_at=3)
+    assert joined == occupied_after([MAP] * 4)[0]
+    assert not grid.is_rerendering
+
+
+def test_what_was_mapped_apart_is_dropped_if_the_robot_is_placed_without_it():
+    gap = occupied_after([MAP, NOWHERE, NOWHERE, MAP])[0]
+    assert occupied_after([MAP, APART, APART, MAP])[0] == gap
+    # A correction within the piece does not place it.
+    assert (
+        occupied_after([MAP, APART, APART, APART, MAP], correct_at=3)[0]
+        == occupied_after([MAP, NOWHERE, NOWHERE, NOWHERE, MAP])[0]
+    )

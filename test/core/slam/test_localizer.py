@@ -10,6 +10,7 @@ from support.slam_room import BLIND, ROOM, drive, drive_round_the_block, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
@@ -505,6 +506,71 @@ def test_kidnapping_starts_a_new_submap_and_reports_lost():
     steps = [se2.between(a[0], b[0]) for a, b in pairwise(carried[-20:])]
     found = [se2.between(a[1].T_map_base, b[1].T_map_base) for a, b in pairwise(carried[-20:])]
     np.testing.assert_allclose(found, steps, atol=0.06)
+
+
+def driven_elsewhere(localizer, start, odom_before=None):
+    """Estimates of a drive that starts at another place (3,) than the localizer believes."""
+    rng = np.random.default_rng(5)
+    before = np.zeros(3) if odom_before is None else odom_before
+    stamp_ns = localizer._prediction.stamp_ns or 0
+    for k, (truth, odom) in enumerate(drive(300, rng, np.array(start))):
+        scan = scan_in(ROOM, truth, rng, stamp_ns + (k + 1) * PERIOD_NS)
+        yield truth, localizer.step(scan, se2.compose(before, odom))
+
+
+@pytest.mark.parametrize('start', [(8.5, 5.0, -2.0), (4.1, 7.0, 1.5), (5.5, 1.5, 3.0)])
+def test_a_carried_robot_sees_through_walls_where_its_scans_fit_the_map_that_grows(start):
+    rows, localizer = driven(300)
+    carried = list(driven_elsewhere(localizer, start, rows[-1][2]))
+    apart = [estimate.is_mapping_apart for _, estimate in carried]
+    assert any(apart[:60])
+    assert all(apart[60:])
+    mapped = [row for row in carried if row[1].placement is Placement.MAP]
+    assert not any(np.hypot(*(e.T_map_base - truth)[:2]) > 0.5 for truth, e in mapped)
+
+
+def test_what_is_mapped_apart_is_not_saved_and_the_pose_of_a_user_leaves_it():
+    rng = np.random.default_rng(8)
+    rows, localizer = driven(300)
+    truth, _, odom = rows[-1]
+    carried = on(localizer, 60, np.array([1.0, 2.0, 0.5]), odom, rng, ELSEWHERE)
+    assert carried[-1][1].is_mapping_apart
+    saved = Localizer.from_state(localizer.state(), LocalizerConfig(**AT_START))
+    assert not driven(20, localizer=saved)[0][-1][1].is_lost, 'the room, and no more'
+    localizer.set_pose(truth, np.diag([0.01, 0.01, 0.01]))
+    back = on(localizer, 10, truth, carried[-1][2], rng)
+    assert not any(estimate.is_mapping_apart for _, estimate, _ in back)
+    assert worst(back) < 0.1
+    assert all(estimate.placement is Placement.MAP for _, estimate, _ in back[-5:])
+
+
+def test_a_robot_that_was_lost_in_a_crowd_joins_its_map_again():
+    rng = np.random.default_rng(2)
+    localizer = at_start()
+    apart = []
+    for k, (truth, odom) in enumerate(drive(1400, rng, START)):
+        segments = crowd(truth[:2], rng) if 300 <= k < 340 else ROOM
+        estimate = localizer.step(scan_in(segments, truth, rng, k * PERIOD_NS), odom)
+        apart.append(estimate.is_mapping_apart)
+        if apart[-1] and not estimate.is_lost:
+            pytest.fail('apart, and not lost')
+    assert not any(apart[:300])
+    assert any(apart[300:345])
+    assert not apart[-1]
+    assert np.hypot(*(estimate.T_map_base - truth)[:2]) < 0.1
+
+
+def test_a_loaded_map_in_which_the_robot_is_elsewhere_stays_as_it_is(whole_drive):
+    """No scan that fits by chance, later, places it: a pose has to be given."""
+    _, first = whole_drive
+    state = first.state()
+    second = Localizer.from_state(state, LocalizerConfig(**AT_START))
+    estimates = [estimate for _, estimate in driven_elsewhere(second, (4.1, 7.0, 1.5))]
+    assert all(estimate.is_mapping_apart for estimate in estimates[60:])
+    assert not any(estimate.placement is Placement.MAP for estimate in estimates)
+    after = second.state()
+    for name, array in state.items():
+        np.testing.assert_array_equal(after[name], array)
 
 
 @pytest.mark.parametrize('threshold', [1.0, 1000.0])

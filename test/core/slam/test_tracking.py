@@ -59,3 +59,22 @@ def test_in_a_given_map_a_pose_is_lost_until_a_scan_fits():
         assert tracking.is_lost == is_map_given
         tracking.update(match(0.7, 0.0))
         assert not tracking.is_lost
+
+
+def test_walls_that_are_seen_through_are_evidence_that_no_inlier_reduces():
+    tracking = Tracking(4.0, 0.6, np.zeros(3))
+    scans = 0
+    while not tracking.needs_submap:
+        tracking.update(match(1.0, 0.0), seen_through=0.5)
+        scans += 1
+        assert not tracking.agrees
+    assert scans == 16
+    tracking.start_submap()
+    assert tracking.agrees
+
+
+def test_glass_is_seen_through_and_no_evidence():
+    tracking = Tracking(4.0, 0.6, np.zeros(3))
+    for _ in range(1000):
+        tracking.update(match(0.9, 0.05), seen_through=0.2)
+    assert tracking.agrees

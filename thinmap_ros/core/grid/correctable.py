@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.scan_history import CorrectedPoses, PoseHistory
@@ -20,6 +22,9 @@ class CorrectableGrid:
     `shown` is the published map. It is always complete: each tile shows the old rendering until its
     new one is complete. `corrected_ns` is the stamp of the newest correction that has been
     applied to the whole map.
+    Scans whose placement is open wait: they are added once a scan belongs in the map, and dropped
+    if the robot was lost. Those of a robot that maps apart are stored and not shown. They join the
+    map if a correction comes before the robot is in the map again; otherwise they are dropped.
     The stored scans take 10 kB per metre of new ground, at most 30 kB per square metre.
     """
 
@@ -32,6 +37,9 @@ class CorrectableGrid:
         self._drops_out = False
         self._refusals: list[str] = []
         self._history: PoseHistory[StoredScan] | None = PoseHistory() if keeps_scans else None
+        self._open: list[tuple[Scan, Array]] = []  # with the poses (3,) at which they were made
+        self._apart: PoseHistory[StoredScan] | None = None
+        self._is_joined = False  # whether a correction has come since the last scan that is apart
         self._pending_ns: int | None = None
         self._rerendering: Rerendering | None = None
         self._T_map_base = np.zeros(3)  # pose of the robot
@@ -51,27 +59,47 @@ class CorrectableGrid:
         if self._history is None:
             self.corrected_ns = since_ns
             return False
+        before = self._history.last_pose()
         self._history.apply_correction(stamps_ns, poses, since_ns)
+        self._move_open(before, self._history.last_pose())
+        if self._apart is not None:
+            self._apart.apply_correction(stamps_ns, poses, since_ns)
+            self._is_joined = True
         self._pending_ns = since_ns
         self._rerendering = None
         return True
 
-    def update(self, scan: Scan | None, T_map_base: Array) -> CorrectedPoses | None:
+    def update(
+        self, scan: Scan | None, T_map_base: Array, placement: Placement = Placement.MAP
+    ) -> CorrectedPoses | None:
         """Continue the re-rendering, then add a scan made at a robot pose (3,).
 
-        scan: None if its pose is unknown. Returns the corrected poses when a re-rendering is
-        complete, without that of this scan. Scans that `OccupancyGrid.add_scan` refuses are left
-        out: `take_refusals`.
+        scan: None where there is none that belongs anywhere. Returns the corrected poses when a
+        re-rendering is complete, without that of this scan. Scans that `OccupancyGrid.add_scan`
+        refuses are left out: `take_refusals`.
         """
         self._T_map_base = T_map_base
+        if scan is None:
+            placement = Placement.NOWHERE
+        if placement is Placement.MAP:
+            self._end_apart()
         moved = self._render_slice()
         if scan is not None:
-            self._set_drops_out(scan.drops_out)
-            try:
-                self._add_scan(scan, T_map_base)
-            except InputError as error:
-                self._refusals.append(str(error))
+            self._place(scan, T_map_base, placement)
         return moved
+
+    def _place(self, scan: Scan, T_map_base: Array, placement: Placement) -> None:
+        if placement is Placement.MAP:
+            self._set_drops_out(scan.drops_out)
+            for earlier, T_earlier in self._open:
+                self._add_scan(earlier, T_earlier)
+            self._open.clear()
+            self._add_scan(scan, T_map_base)
+        elif placement is Placement.OPEN:
+            self._open.append((scan, T_map_base))
+        elif placement is Placement.APART:
+            self._open.clear()
+            self._store_apart(scan, T_map_base)
 
     def take_refusals(self) -> list[str]:
         """Why scans were left out since the last call, a reason for each."""
@@ -86,6 +114,22 @@ class CorrectableGrid:
             moved = self._render_slice()
         return moved
 
+    def _store_apart(self, scan: Scan, T_map_base: Array) -> None:
+        if self._history is None:
+            return
+        if self._apart is None:
+            self._apart = PoseHistory()
+        self._is_joined = False
+        kept = StoredScan.of(scan, self.shown.config)
+        self._apart.add_pose(scan.stamp_ns, T_map_base, kept)
+
+    def _end_apart(self) -> None:
+        """Add the scans that are apart to the map if they were joined, and drop them otherwise."""
+        if self._history is not None and self._apart is not None and self._is_joined:
+            self._history.extend(self._apart)
+            self._render_again()
+        self._apart = None
+
     def _set_drops_out(self, drops_out: bool) -> None:
         """Render the stored scans again if what their beams without return say has changed."""
         if drops_out == self._drops_out:
@@ -97,12 +141,26 @@ class CorrectableGrid:
         self._history.replace_kept(
             lambda kept: StoredScan.of(replace(kept.scan, drops_out=drops_out), config)
         )
+        self._render_again()
+
+    def _render_again(self) -> None:
+        """Begin to render all stored scans."""
         self._rerendering = None
         if self._pending_ns is None:
             self._pending_ns = self.corrected_ns
 
+    def _move_open(self, before: Array | None, after: Array | None) -> None:
+        """Move the waiting scans along with the scan before them, from one pose (3,) to another."""
+        if before is not None and after is not None:
+            T = se2.compose(after, se2.invert(before))
+            self._open = [(scan, se2.compose(T, T_scan)) for scan, T_scan in self._open]
+
     def _add_scan(self, scan: Scan, T_map_base: Array) -> None:
-        self.shown.add_scan(scan, T_map_base)
+        try:
+            self.shown.add_scan(scan, T_map_base)
+        except InputError as error:
+            self._refusals.append(str(error))
+            return
         if self._history is None:
             return
         kept = StoredScan.of(scan, self.shown.config)

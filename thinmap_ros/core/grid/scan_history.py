@@ -74,6 +74,19 @@ class PoseHistory(Generic[Kept]):
         while len(at_place) > self._config.scans_per_place:
             del self._kept[at_place.popleft()]
 
+    def last_pose(self) -> Array | None:
+        """Pose (3,) of the newest scan; None before the first."""
+        return np.array(self._poses[-3:]) if self._poses else None
+
+    def extend(self, other: 'PoseHistory[Kept]') -> None:
+        """Add the scans of another history, at their present poses."""
+        first = len(self._stamps)
+        self._stamps.extend(other._stamps)
+        self._poses.extend(other._poses)
+        self._last_apart = first + other._last_apart
+        self._kept |= {first + number: kept for number, kept in other._kept.items()}
+        self._sort_by_place()
+
     def kept(self) -> list[Kept]:
         """The stored data, in the order in which it was added."""
         return list(self._kept.values())
@@ -104,7 +117,13 @@ class PoseHistory(Generic[Kept]):
         anchors = np.maximum(np.searchsorted(numbers, np.arange(count), side='right') - 1, 0)
         after = _moved_along(before, before[numbers][anchors], poses[named][anchors])
         np.frombuffer(self._poses)[: 3 * count] = after.ravel()
-        # Places that have too many scans now lose the oldest ones when more arrive.
+        self._sort_by_place()
+
+    def _sort_by_place(self) -> None:
+        """Sort the stored scans by place.
+
+        Places that have too many scans now lose the oldest ones when more arrive.
+        """
         kept = self._kept_numbers()
         self._at_place = {}
         places = _places_of(self._all_poses()[kept], self._config)

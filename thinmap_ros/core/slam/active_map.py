@@ -1,6 +1,7 @@
 """The local map for scan matching, re-rendered from the keyframes after a loop closure."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -10,18 +11,22 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
+from thinmap_ros.core.slam.graph.pieces import Pieces
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 
 
 class ActiveMap:
-    """The current local map, its loaded cells, and the keyframes that are not yet rendered."""
+    """The local map of a piece, its loaded cells, and the keyframes that are not yet rendered.
 
-    def __init__(self, config: LocalMapConfig, render_first: int = 20) -> None:
+    Loaded cells belong to the published map.
+    """
+
+    def __init__(self, config: LocalMapConfig, pieces: Pieces, render_first: int = 20) -> None:
         """render_first: keyframes that are rendered at once after a correction."""
         self._config = config
+        self._pieces = pieces
         self._render_first = render_first
         self.map = LocalMap(config)
-        self.number = 0  # of the submap
         self.T_at_update: Array | None = None  # pose (3,) of the last scan that was added
         self.refused = 0  # scans that lie too far from the others for one map
         self._loaded: Mapping[str, NDArray[Any]] | None = None
@@ -47,23 +52,38 @@ class ActiveMap:
         """Continue in an empty map."""
         self.map = LocalMap(self._config)
         self._pending = []
-        self.number += 1
 
     def rerender(self, keyframes: Sequence[Keyframe], T_map_base: Array) -> None:
-        """Re-render the map from the keyframes, those nearest to a pose (3,) first."""
-        self.map = LocalMap(self._config)
-        if self._loaded is not None:
-            self.map.restore(self._loaded)
+        """Re-render the map from the keyframes of the piece, those nearest to a pose (3,) first."""
+        self.map = self._empty(is_published=not self._pieces.is_apart)
         places = np.array([frame.T_map_base for frame in keyframes]).reshape(-1, 3)[:, :2]
         away = np.hypot(*(places - T_map_base[:2]).T)
-        self._pending = np.argsort(-away).tolist()
+        order = np.argsort(-away).tolist()
+        self._pending = [k for k in order if self._pieces.is_here(keyframes[k].submap)]
         self.render(keyframes, self._render_first)
+
+    def published(self, keyframes: Sequence[Keyframe]) -> LocalMap:
+        """The local map of the published piece: rendered anew while the robot is in another."""
+        if not self._pieces.is_apart:
+            return self.map
+        rendered = self._empty(is_published=True)
+        for frame in keyframes:
+            if self._pieces.is_published(frame.submap):
+                with suppress(InputError):  # counted when it was added
+                    rendered.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
+        return rendered
 
     def render(self, keyframes: Sequence[Keyframe], count: int = 2) -> None:
         """Render up to `count` of the pending keyframes."""
         for _ in range(min(count, len(self._pending))):
             frame = keyframes[self._pending.pop()]
             self._add(frame.points, frame.scan.T_base_laser, frame.T_map_base)
+
+    def _empty(self, is_published: bool) -> LocalMap:
+        empty = LocalMap(self._config)
+        if is_published and self._loaded is not None:
+            empty.restore(self._loaded)
+        return empty
 
     def _add(self, points: Array, T_base_laser: Array, T_map_base: Array) -> bool:
         try:

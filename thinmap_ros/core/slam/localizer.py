@@ -45,7 +45,7 @@ from thinmap_ros.core.slam.matching.scan_matcher import (
     MatchingConfig,
 )
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.slam.matching.visibility import misses_walls
+from thinmap_ros.core.slam.matching.visibility import misses_walls, seen_through_ratio
 from thinmap_ros.core.slam.motion_model import MotionConfig
 from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction, Prediction
 from thinmap_ros.core.slam.tracking import INLIERS_PER_CONTRADICTION, Tracking
@@ -103,11 +103,11 @@ class Localizer:
         self._tracking = Tracking(
             config.lost_threshold, config.matching.min_inlier_ratio, self._pose
         )
-        self._map = ActiveMap(config.local_map)
         self._heading = HeadingCorrection(config.lines)
         self._loops = LoopClosure(
             config.loop_closure, config.keyframes, config.matching, config.local_map
         )
+        self._map = ActiveMap(config.local_map, self._loops.pieces)
         self._path = KeyframeTrajectory()
 
     def adjust(self, config: LocalizerConfig) -> None:
@@ -144,7 +144,8 @@ class Localizer:
         """Set the pose (3,) with covariance (3, 3) in the current map.
 
         The map is not updated until scans confirm the pose. In a map that does not change, the
-        robot is lost until then.
+        robot is lost until then. A piece of map that is apart is left: the pose is in the published
+        map.
         """
         if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
             self._rejected += 1
@@ -154,11 +155,12 @@ class Localizer:
         self._prediction.reset_segment()
         is_map_given = not self.config.is_mapping
         self._tracking.place(self._pose, self._uncertainty.since_match, is_map_given)
+        self._loops.pieces.return_to_published()
         self._map.rerender(self.keyframes, self._pose)
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """The local map as arrays by name, for `from_state`; without the pose."""
-        return self._map.map.state()
+        """The published local map as arrays by name, for `from_state`; without the pose."""
+        return self._map.published(self.keyframes).state()
 
     @staticmethod
     def from_state(
@@ -228,7 +230,7 @@ class Localizer:
         points = surface_points(scan)
         match = self._match(scan, points, prediction.T_map_base)
         self._tracking.dead_reckoned = self._tracking.dead_reckoned.moved(prediction)
-        self._tracking.update(match)
+        self._tracking.update(match, self._seen_through_ratio(scan, match))
         fitting = self._update(match, prediction, is_stationary)
         self._tracking.record_pose(self._pose, self._uncertainty.since_match)
         blind_reason = self._blind_reason(scan, points, match)
@@ -236,6 +238,8 @@ class Localizer:
             self._detect_loss()
         elif not self._tracking.is_delocalized:
             self._update_map(scan, points)
+        elif self._tracking.needs_submap:
+            self._start_submap()  # the robot is not where it was placed
         correction = self._loops.step()
         if correction is not None:
             self._apply(correction)
@@ -260,9 +264,16 @@ class Localizer:
         return self._loops.keyframes.path()
 
     def known_places(self) -> Array:
-        """Places (N, 2) that enclose what is known: cells of the local map, and keyframes, m."""
-        keyframes = [frame.T_map_base[:2] for frame in self.keyframes]
-        return np.vstack([self._map.map.corners(), np.array(keyframes).reshape(-1, 2)])
+        """Places (N, 2) that enclose the published map: cells, and keyframes, m."""
+        is_published = self._loops.pieces.is_published
+        keyframes = [frame.T_map_base[:2] for frame in self.keyframes if is_published(frame.submap)]
+        cells = self._map.published(self.keyframes).corners()
+        return np.vstack([cells, np.array(keyframes).reshape(-1, 2)])
+
+    @property
+    def _is_lost(self) -> bool:
+        """Whether the place of the robot in the published map is unknown."""
+        return self._loops.pieces.is_apart or self._tracking.is_lost
 
     def _start_delocalized(self, given: Mapping[str, NDArray[Any]]) -> None:
         """Start in a loaded local map: delocalized until scans fit."""
@@ -305,12 +316,22 @@ class Localizer:
         covariance = self._uncertainty.since_match
         return self._matcher.match(points, scan.T_base_laser, self._map.map, prior, covariance)
 
+    def _seen_through_ratio(self, scan: Scan, match: Match | None) -> float:
+        """Ratio of returns behind walls of the map that this localizer makes.
+
+        In a map that does not change, the inliers alone tell where the robot is; and its furniture
+        may have changed.
+        """
+        if match is None or not self.config.is_mapping:
+            return 0.0
+        return seen_through_ratio(scan, self._map.map, match.T_map_base)
+
     def _blind_reason(self, scan: Scan, points: Array, match: Match | None) -> str:
         """Why the laser does not confirm the pose; '' if it does, or if no wall is in range."""
         if match is not None or scan.is_blind:
             return scan.blind_reason
         sparse_reason = few_beams_reason(scan) or self._sparse_reason(scan, points)
-        if sparse_reason or self._tracking.is_lost:
+        if sparse_reason or self._is_lost:
             return sparse_reason
         covariance = self._uncertainty.since_match
         misses = misses_walls(scan, self._map.map, self._pose, covariance)
@@ -379,7 +400,6 @@ class Localizer:
         turn = 0.0 if moved is None else abs(float(moved[2]))
         if not first and path_m < config.update_distance_m and turn < config.update_angle_rad:
             return
-        self._tracking.add_path(path_m)
         if self._tracking.needs_submap:
             self._start_submap()
         self._correct_heading(scan)
@@ -409,10 +429,11 @@ class Localizer:
         step, jump = self._uncertainty.step_from(yaw)
         path_m = loops.path_m(self._pose)
         # In a new submap the heading is unknown, also by multiples of 90 degrees.
-        heading = None if self._tracking.is_lost else self._heading.measured
+        submap = loops.pieces.current
+        heading = None if self._is_lost else self._heading.measured
         variance = heading_variance(heading, self._pose)
         covariance = with_heading(self._covariance(), variance)
-        frame = Keyframe(scan, points, self._pose, path_m, covariance, self._map.number, heading)
+        frame = Keyframe(scan, points, self._pose, path_m, covariance, submap, heading)
         loops.add(frame, step, jump)
         self._uncertainty.start_step()
 
@@ -427,6 +448,7 @@ class Localizer:
         self._prediction.reset_segment()
         covariance = dead_reckoned.covariance + self._slip_covariance()
         self._uncertainty.start_submap(self._pose, covariance)
+        self._loops.pieces.begin()
         self._map.start_submap()
         self._tracking.start_submap()
 
@@ -437,7 +459,7 @@ class Localizer:
         self._pose = correction.applied_to(anchor, self._pose)
         self._map.T_at_update = self._pose
         self._uncertainty.move(self._pose)
-        self._tracking.join(correction.applied_to(anchor, self._tracking.dead_reckoned.T_map_base))
+        self._tracking.move(correction.applied_to(anchor, self._tracking.dead_reckoned.T_map_base))
         self._map.rerender(self.keyframes, self._pose)
 
     def _record_pose(self, scan: Scan) -> None:
@@ -458,14 +480,16 @@ class Localizer:
         self, match: Match | None, correction: Correction | None, blind_reason: str
     ) -> Estimate:
         covariance = self._covariance()
-        if self._tracking.is_lost:
+        if self._is_lost:
             covariance = covariance + UNKNOWN
         return Estimate(
             self._pose,
             covariance,
             se2.compose(self._pose, se2.invert(self._prediction.T_odom_base)),
             inlier_ratio=0.0 if match is None else match.inlier_ratio,
-            is_lost=self._tracking.is_lost,
+            is_lost=self._is_lost,
+            is_mapping_apart=self._loops.pieces.is_apart,
+            is_contradicted=self.config.is_mapping and not self._tracking.agrees,
             blind_reason=blind_reason,
             correction=correction,
         )

@@ -28,6 +28,7 @@ from thinmap_ros.core.slam.graph.keyframes import (
     rotated_covariance,
     view_difference_m,
 )
+from thinmap_ros.core.slam.graph.pieces import Pieces
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized, rounds
 from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
@@ -96,6 +97,14 @@ class _Job:
     covariance: Array
 
 
+@dataclass(eq=False)
+class _Optimization:
+    """An optimization in progress: its rounds, and the poses (N, 3) after the last one."""
+
+    rounds: Iterator[Array]
+    poses: Array
+
+
 class LoopClosure:
     """The pose graph of the keyframes, and the search for loop-closure edges."""
 
@@ -108,6 +117,7 @@ class LoopClosure:
     ) -> None:
         self.keyframes = Keyframes(keyframes)
         self.edges: list[Edge] = []
+        self.pieces = Pieces()
         self.adjust(config, matching)
         self._jobs: deque[_Job] = deque()
         self._pending: tuple[Keyframe, Array] | None = None
@@ -115,8 +125,7 @@ class LoopClosure:
         self._here: Keyframe | None = None  # the last keyframe scan, added or not
         self._is_strained = False  # whether a re-measured step contradicts the poses
         self._submaps = Submaps(local_map)
-        self._rounds: Iterator[Array] | None = None
-        self._after: Array = np.zeros((0, 3))
+        self._optimization: _Optimization | None = None
 
     def adjust(self, config: LoopClosureConfig, matching: MatchingConfig) -> None:
         """Search with other parameters from now on; keyframes and edges stay."""
@@ -225,28 +234,34 @@ class LoopClosure:
 
         Returns the correction of the keyframes when an optimization has finished.
         """
-        if self._rounds is not None:
-            return self._optimize()
+        if self._optimization is not None:
+            return self._optimize(self._optimization)
         if self._jobs:
             self._match(self._jobs.popleft())
             if not self._is_pending_matched():
                 self._add_pending()
-            consistent = self._consistent()
-            if len(consistent) >= self._config.min_consistent_matches:
+            if edges := self._closing_edges():
                 self._add_pending()
                 self._requested.clear()
-                self.edges += consistent
+                self.edges += edges
                 self._begin_rounds()
         return None
 
-    def _optimize(self) -> Correction | None:
-        assert self._rounds is not None
-        after = next(self._rounds, None)
+    def _closing_edges(self) -> list[Edge]:
+        """Loop edges that enough matches agree on, within a piece or between two."""
+        fewest = self._config.min_consistent_matches
+        consistent = self._consistent(list(self._requested))
+        if len(consistent) >= fewest:
+            return consistent
+        return self.pieces.take_edges(self.keyframes.frames, self._consistent, fewest)
+
+    def _optimize(self, optimization: _Optimization) -> Correction | None:
+        after = next(optimization.rounds, None)
         if after is not None:
-            self._after = after
+            optimization.poses = after
             return None
-        self._rounds = None
-        poses = self._after
+        self._optimization = None
+        poses = optimization.poses
         # Keyframes that were added during the optimization move with their anchors.
         for step in self.keyframes.steps[len(poses) - 1 :]:
             poses = np.vstack([poses, se2.compose(poses[step.a], step.T_a_b)])
@@ -260,6 +275,7 @@ class LoopClosure:
             last = self.keyframes.anchor
             self._pending = (_moved(frame, before[last], poses[last]), covariance)
         self._submaps.clear()
+        self.pieces.join(self.keyframes.frames, self.edges)
         self._measure_jumps()
         return Correction(before, poses)
 
@@ -283,7 +299,8 @@ class LoopClosure:
         return k < len(self.keyframes) and self.keyframes.steps[k - 1].a == j
 
     def _begin_rounds(self) -> None:
-        self._rounds = rounds(self.keyframes.poses(), self._all_edges)
+        poses = self.keyframes.poses()
+        self._optimization = _Optimization(rounds(poses, self._all_edges), poses)
 
     @property
     def _all_edges(self) -> list[Edge]:
@@ -316,7 +333,10 @@ class LoopClosure:
         covariance = rotated_covariance(covariance, float(T_j_base[2]))
         T_j_k = se2.compose(T_j_base, match.T_map_base)
         edge = Edge(j, k, T_j_k, inverse(covariance), True)
-        if is_step:
+        if not self.pieces.is_here(frames[j].submap):
+            self._add_pending()
+            self.pieces.add_match(edge)
+        elif is_step:
             self.edges.append(edge)
             self._is_strained |= self._mahalanobis(edge) > CHI2
         elif self._mahalanobis(edge) < CHI2:
@@ -361,9 +381,9 @@ class LoopClosure:
         off[2] = se2.wrap(float(off[2]))
         return float(off @ edge.information @ off)
 
-    def _consistent(self) -> list[Edge]:
-        """Largest set of recent candidates that agree on the same correction (greedy)."""
-        edges = [edge for edge in self._requested if edge.b < len(self.keyframes)]
+    def _consistent(self, candidates: list[Edge]) -> list[Edge]:
+        """Largest set of candidates that agree on the same correction (greedy)."""
+        edges = [edge for edge in candidates if edge.b < len(self.keyframes)]
         if not edges:
             return []
         n = len(edges)

@@ -1,4 +1,4 @@
-"""Walls of the local map that beams would hit."""
+"""Walls of the local map that beams would hit, or have passed through."""
 
 import math
 
@@ -21,6 +21,10 @@ from thinmap_ros.core.slam.matching.local_map import (
 _REACH = 0.9  # of range_max: a farther wall may be out of range
 _STEP_CELLS = 0.5
 _SIGMAS = 3.0
+_BEHIND_M = 0.3  # by which a beam ends behind a wall that it has passed through
+_FEWEST_HITS = 2  # of a cell that is a wall for certain
+_MOST_OBLIQUE = 0.5  # cosine; more oblique beams pass the cells of a wall beside them
+_SAME_SIDE = 0.5  # length of the mean double-angle vector of normals that agree
 
 
 def misses_walls(scan: Scan, local_map: LocalMap, T_map_base: Array, covariance: Array) -> bool:
@@ -37,6 +41,53 @@ def misses_walls(scan: Scan, local_map: LocalMap, T_map_base: Array, covariance:
     hit_ratio = local_map.config.occupied_min_hit_ratio
     missed = _count_walls(angles, T_map_laser, reach_m, local_map.lattice, hit_ratio)
     return is_most_missed(scan, missed)
+
+
+def seen_through_ratio(scan: Scan, local_map: LocalMap, T_map_base: Array) -> float:
+    """Ratio of the returns of a scan, made at a pose (3,), that lie behind a wall of the map."""
+    returned = scan.returned
+    total = int(np.count_nonzero(returned))
+    if local_map.is_empty or total == 0:
+        return 0.0
+    T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
+    angles = T_map_laser[2] + scan.angles_rad[returned]
+    reaches_m = scan.ranges_m[returned] - _BEHIND_M
+    hit_ratio = local_map.config.occupied_min_hit_ratio
+    return _count_through(angles, reaches_m, T_map_laser, local_map.lattice, hit_ratio) / total
+
+
+@kernel
+def _count_through(
+    angles: Array, reaches_m: Array, laser: Array, lattice: LocalMapView, hit_ratio: float
+) -> int:
+    """Number of beams at angles (N,), map frame, with a wall within their reaches (N,), m.
+
+    laser (3,): its pose.
+    """
+    count = 0
+    for i in range(len(angles)):
+        cos = math.cos(angles[i])
+        sin = math.sin(angles[i])
+        x = laser[0] / lattice.cell_m - lattice.first_col
+        y = laser[1] / lattice.cell_m - lattice.first_row
+        for _ in range(int(reaches_m[i] / (_STEP_CELLS * lattice.cell_m))):
+            x += _STEP_CELLS * cos
+            y += _STEP_CELLS * sin
+            row = cell_of(y)
+            col = cell_of(x)
+            slot = slot_of(lattice, row, col)
+            if slot == NO_TILE:
+                continue
+            cell = lattice.pool[slot, row & TILE_MASK, col & TILE_MASK]
+            if cell['hits'] < _FEWEST_HITS or not is_wall(cell, hit_ratio):
+                continue
+            if math.hypot(cell['cos2'], cell['sin2']) < _SAME_SIDE:
+                continue
+            normal = 0.5 * math.atan2(cell['sin2'], cell['cos2'])
+            if abs(math.cos(normal) * cos + math.sin(normal) * sin) > _MOST_OBLIQUE:
+                count += 1
+                break
+    return count
 
 
 @kernel
