@@ -45,6 +45,7 @@ Fields = Mapping[str, Field]
 
 
 STAMPED: Fields = {'latest_ns': Field(np.int64, (), 0, MAX_COUNT)}
+IDENTIFIED: Fields = {'map_id': Field(np.int64, (), 0, MAX_COUNT)}
 
 
 def validate(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:
@@ -72,6 +73,16 @@ def split_stamp(state: State) -> tuple[int, dict[str, NDArray[Any]]]:
     own = {name: array for name, array in state.items() if name in STAMPED}
     stamp_ns = int(validate(own, STAMPED, 'state')['latest_ns'])
     return stamp_ns, {name: array for name, array in state.items() if name not in STAMPED}
+
+
+def split_map_id(state: State) -> tuple[int, dict[str, NDArray[Any]]]:
+    """Split the state of a node into the id of its map and the other arrays.
+
+    Raises InputError if there is no id.
+    """
+    own = {name: array for name, array in state.items() if name in IDENTIFIED}
+    map_id = int(validate(own, IDENTIFIED, 'state')['map_id'])
+    return map_id, {name: array for name, array in state.items() if name not in IDENTIFIED}
 
 
 def require(is_so: bool, what: str, expected: str) -> None:

@@ -59,7 +59,7 @@ class ExplorerNode(ThinmapNode):
         warm_up.explorer()
         radius_m = self._strategies.config.robot_radius_m
         self._source = ObservationSource(
-            self, self._settings, frames, radius_m, self._on_observation
+            self, self._settings, frames, radius_m, self._on_observation, self._on_other_map
         )
         self._driver = self._make_driver(frames.map_frame)
         self.reset_state()
@@ -175,6 +175,10 @@ class ExplorerNode(ThinmapNode):
         if is_exploring:
             self._output.end_nodes(self._mission, observation.scan.stamp_ns)
         self._execute(action)
+
+    def _on_other_map(self) -> None:
+        self.get_logger().warning('grid is of another map: state reset')
+        self._reset()
 
     def _on_drive_ended(self, success: bool, reason: str) -> None:
         self._output.clear_target()

@@ -322,8 +322,8 @@ class GlobalLocalizerNode(ThinmapNode):
         self._topology = topology
 
     def _on_slam_status(self, message: SlamStatus) -> None:
-        """Start when the localizer reports LOST (kidnapped robot)."""
-        is_lost = message.state == SlamStatus.LOST and not self._is_requested
+        """Start when the localizer reports that it is lost (kidnapped robot)."""
+        is_lost = messages.is_lost(message) and not self._is_requested
         is_kidnapped = self._lost.update(messages.stamp_ns(message.header.stamp), is_lost)
         if is_kidnapped and self._settings.node.start_automatically:
             self.get_logger().info('the localizer is lost: searching the whole map')

@@ -33,12 +33,19 @@ from thinmap_ros.nodes.mapping.map_output import MapOutputConfig, MapPublishers
 from thinmap_ros.nodes.mapping.scan_pairs import LocatedScan, ScanPairs
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
+from thinmap_ros.ros.diagnostics import ERROR
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.session_client import SessionClient
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
+
+_OTHER_MAP = (
+    'the localizer is in another map than the one here: scans are not mapped: expected that it '
+    'finds its place in this map, or ~/reset of this node'
+)
 
 
 @dataclass(frozen=True)
@@ -99,6 +106,7 @@ class GridMapperNode(ThinmapNode):
         self.enable_checkpoint(self._state, self._restore)
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('map')
+        self.diagnostics.add_check(ERROR, lambda: self._fault)
         # First: of messages that wait together, it is processed before the poses that follow it.
         subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_status, qos.STREAM)
@@ -132,6 +140,8 @@ class GridMapperNode(ThinmapNode):
     def reset_state(self) -> None:
         """Discard the map, or return to the session that the node was started with."""
         self._pairs = ScanPairs(self)
+        self._fault = ''
+        self._output.followed = FollowedMap()
         self._output.load_ns = self.get_clock().now().nanoseconds
         has_map = self._session or self._stamp.latest_ns is not None
         self._stamp.latest_ns = None
@@ -151,11 +161,16 @@ class GridMapperNode(ThinmapNode):
     def _state(self) -> State | None:
         if self._stamp.latest_ns is None:
             return None
-        return {**self._grid.shown.state(), 'latest_ns': np.array(self._stamp.latest_ns)}
+        return {
+            **self._grid.shown.state(),
+            'latest_ns': np.array(self._stamp.latest_ns),
+            'map_id': np.array(self._output.followed.id),
+        }
 
     def _restore(self, state: State) -> None:
         """Continue with the map of a killed mapper. Raises InputError where it is no such map."""
-        latest_ns, cells = snapshot.split_stamp(state)
+        latest_ns, rest = snapshot.split_stamp(state)
+        map_id, cells = snapshot.split_map_id(rest)
         grid = OccupancyGrid.from_state(cells, self._settings.grid)
         expected_m = self._settings.grid.resolution_m
         if not self._session and grid.frame.resolution != expected_m:
@@ -164,6 +179,7 @@ class GridMapperNode(ThinmapNode):
             )
         self._stamp.restore(latest_ns)
         self._replace_grid(grid)
+        self._output.followed = FollowedMap(map_id)
 
     def _on_scan(self, message: LaserScan) -> None:
         self._add_scan(self._pairs.add_scan(message))
@@ -179,7 +195,7 @@ class GridMapperNode(ThinmapNode):
 
     def _add_scan(self, located: LocatedScan | None) -> None:
         self.diagnostics.set_drop_total('scans and poses without a partner', self._pairs.dropped)
-        if located is None:
+        if located is None or not self._is_of_this_map(located):
             return
         measured = self._laser_transform.to_scan(located.message)
         scan = replace(measured, drops_out=located.drops_out)
@@ -187,8 +203,8 @@ class GridMapperNode(ThinmapNode):
         if self._stamp.is_restarted_by(scan.stamp_ns):
             self.reset_state()
         with self.diagnostics.time_step('map update'):
-            is_mapped = self._settings.mapping and located.is_known
-            moved = self._grid.update(scan if is_mapped else None, T_map_base)
+            mapped = scan if self._settings.mapping else None
+            moved = self._grid.update(mapped, T_map_base, located.placement)
             x, y, _ = T_map_base
             window = self._grid.shown.window(x, y, self._settings.local_map_size_m)
         self._stamp.latest_ns = scan.stamp_ns
@@ -198,6 +214,20 @@ class GridMapperNode(ThinmapNode):
         for refusal in self._grid.take_refusals():
             self.diagnostics.message_rejected('scan', refusal)
             self.get_logger().warning(f'scan: {refusal}', throttle_duration_sec=WARN_PERIOD_S)
+
+    def _is_of_this_map(self, located: LocatedScan) -> bool:
+        """Whether a scan was localized in the map of this node, which follows its localizer's."""
+        followed = self._output.followed
+        origin = followed.origin(located.map_id)
+        if origin is Origin.OTHER and located.replaced_map_id == followed.id:
+            self.get_logger().warning('the localizer was reset: map reset, too')
+            self.reset_state()
+            origin = followed.origin(located.map_id)
+        is_other = origin is Origin.OTHER
+        self._fault = _OTHER_MAP if is_other and self._settings.mapping else ''
+        if self._fault:
+            self.get_logger().warning(self._fault, throttle_duration_sec=WARN_PERIOD_S)
+        return not self._fault and origin is not Origin.STALE
 
     def _publish_map(self) -> None:
         if self._stamp.latest_ns is not None:
@@ -225,6 +255,7 @@ class GridMapperNode(ThinmapNode):
     def _replace_grid(self, grid: OccupancyGrid) -> None:
         corrected_ns = self._grid.corrected_ns
         self._grid = CorrectableGrid(grid, keeps_scans=False, corrected_ns=corrected_ns)
+        self._output.followed.leave()
         self._output.load_ns = self.get_clock().now().nanoseconds
         self._stamp.latest_ns = self._stamp.latest_ns or self._output.load_ns
         self._publish_map()

@@ -3,16 +3,23 @@
 from dataclasses import dataclass, field
 from time import monotonic, perf_counter
 
+import numpy as np
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Path
+from nav_msgs.msg import Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
+from thinmap_msgs.msg import (
+    LineFeature,
+    LineFeatureArray,
+    ProbabilityGrid,
+    SlamStatus,
+    TopologicalMap,
+)
 from thinmap_msgs.srv import LoadMap, SaveMap
-from thinmap_ros.core import se2
+from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
@@ -22,7 +29,7 @@ from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.core.slam.localizer import LIVE_PARAMETERS, LocalizerConfig
+from thinmap_ros.core.slam.localizer import LIVE_PARAMETERS, Localizer, LocalizerConfig
 from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
     adjust,
@@ -44,6 +51,7 @@ from thinmap_ros.ros.decoding.topology_reader import read_topology
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.map_identity import UNKNOWN, new_map_id
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
@@ -55,6 +63,11 @@ _HEALTH = {
     SlamStatus.TRACKING: (OK, 'tracking'),
     SlamStatus.LOST: (ERROR, 'lost: scans contradict the map'),
     SlamStatus.NO_MAP: (ERROR, 'no map: waits for topic map; dead reckoning'),
+    SlamStatus.MAPPING_APART: (
+        ERROR,
+        'lost: maps a piece apart until its place in the map is known: expected a pose on '
+        'initialpose, or a way through known places',
+    ),
 }
 
 
@@ -119,10 +132,41 @@ class _Input:
         return self.pairing.warnings | self.consistency.warnings
 
 
+@dataclass(eq=False)
+class _MapIds:
+    """Id of the map that the localizer makes, and of the one that a reset has replaced by it.
+
+    is_given: whether the map was loaded, or begun by a reset, and not by the start of the node.
+    """
+
+    id: int = field(default_factory=new_map_id)
+    replaced: int = UNKNOWN
+    is_given: bool = False
+    _published: int = UNKNOWN
+
+    def begin(self) -> None:
+        """A reset begins another map."""
+        self.replaced = self._published
+        self.id = new_map_id()
+        self.is_given = True
+
+    def load(self) -> None:
+        """Another map was loaded."""
+        self.replaced = UNKNOWN
+        self.id = new_map_id()
+        self.is_given = True
+
+    def fill_in(self, status: SlamStatus) -> None:
+        """Fill in the ids of a status that is published."""
+        status.map_id = self.id
+        status.replaced_map_id = self.replaced
+        self._published = self.id
+
+
 class _Relocation:
     """What a localizer that was killed and restarted waits for: a scan, and the map of before.
 
-    last: the pose in its checkpoint. map: None until it is received by `subscription`.
+    last: the pose in its checkpoint. map: None until it is received.
     """
 
     def __init__(self, last: OdometryAnchor) -> None:
@@ -130,7 +174,6 @@ class _Relocation:
         self.map: GridPatch | None = None
         self._pending: tuple[Scan, Array] | None = None
         self._waiting_since_s = monotonic()
-        self.subscription: Subscription | None = None
 
     @property
     def waited_s(self) -> float:
@@ -183,8 +226,10 @@ class LocalizerNode(ThinmapNode):
         self._save_directory = SaveDirectory(self)
         parameters.reject_unknown(self)
         warm_up.localizer()
-        self.reset_state()
+        self._map_ids: _MapIds | None = _MapIds() if self._config.is_mapping else None
+        self._begin()
         self.enable_checkpoint(self._state, self._restore)
+        self._living_map = self._subscribe_living_map()
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('pose')
         self.diagnostics.add_check(WARN, lambda: '; '.join(self._input.warnings.values()))
@@ -215,6 +260,11 @@ class LocalizerNode(ThinmapNode):
 
         The robot is at the start pose.
         """
+        if self._map_ids is not None:
+            self._map_ids.begin()
+        self._begin()
+
+    def _begin(self) -> None:
         self._localizer = self._given.create_localizer()
         self._broadcaster.reset()
         self._odometry.reset()
@@ -224,13 +274,21 @@ class LocalizerNode(ThinmapNode):
         self._relocation: _Relocation | None = None
 
     def _state(self) -> State | None:
-        return None if self._last is None else self._last.state()
+        if self._last is None:
+            return None
+        map_id = UNKNOWN if self._map_ids is None else self._map_ids.id
+        return {**self._last.state(), 'map_id': np.array(map_id)}
 
     def _restore(self, state: State) -> None:
         """Continue at the last pose of a killed localizer. Raises InputError where it is none."""
-        self._relocation = _Relocation(OdometryAnchor.from_state(state))
+        map_id, anchor = snapshot.split_map_id(state)
+        self._relocation = _Relocation(OdometryAnchor.from_state(anchor))
         self._relocation.map = self._given.source.patch
-        self._subscribe_map_once(self._relocation)
+        if self._map_ids is not None:
+            self._map_ids = _MapIds(map_id)
+        self.create_active_timer(
+            _MAP_WAIT_S, lambda: self._process([]), Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         self._process(self._input.pairing.add_odometry(stamp_ns, T_odom_base))
@@ -249,6 +307,8 @@ class LocalizerNode(ThinmapNode):
         """Localize in the map that topic map has brought."""
         if self._relocation is None:
             self._localizer = self._given.with_new_map(self._localizer)
+        elif (patch := self._given.source.patch) is not None:
+            self._relocate_in(self._relocation, patch)
 
     def _on_topology(self, topology: Graph) -> None:
         self._topology = topology
@@ -286,25 +346,47 @@ class LocalizerNode(ThinmapNode):
                 self.get_logger().warning(f'scan: {text}')
                 self._input.reported.add(kind)
 
-    def _subscribe_map_once(self, relocation: _Relocation) -> None:
-        """Subscribe once to the map that was built before the crash."""
+    def _subscribe_living_map(self) -> Subscription | None:
+        """Subscribe to the map of a mapper that has outlived this node."""
+        if self._map_ids is None:
+            return None
 
-        def on_map(message: OccupancyGrid) -> None:
-            if self._relocation is not relocation or self._given.source.is_from_file:
+        def on_grid(message: ProbabilityGrid) -> None:
+            if message.map_id == UNKNOWN:
                 return
             try:
-                relocation.map = messages.grid_from_msg(message)
+                self._on_living_map(message.map_id, messages.grid_from_msg(message))
             except InputError as error:
-                self.get_logger().warning(f'map: {error}')
-            if self.is_active:
-                self._process([])
+                self.get_logger().warning(f'grid: {error}')
 
-        relocation.subscription = self.create_subscription(
-            OccupancyGrid, 'map', on_map, qos.LATCHED
-        )
-        self.create_active_timer(
-            _MAP_WAIT_S, lambda: self._process([]), Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        return self.create_subscription(ProbabilityGrid, 'grid', on_grid, qos.LATCHED)
+
+    def _on_living_map(self, map_id: int, patch: GridPatch) -> None:
+        """Continue in a map that was there before this node, rather than begin a second one."""
+        ids = self._map_ids
+        assert ids is not None
+        if self._relocation is not None:
+            self._relocate_in(self._relocation, patch)
+        elif map_id != ids.id and not ids.is_given:
+            kind = localizer_class(self._config)
+            if kind is not Localizer:
+                return  # a map of line features cannot be made of a grid
+            self.get_logger().warning(
+                'grid is of a map that another localizer has begun: lost in that map until scans '
+                'match at the start pose, or a pose is given'
+            )
+            self._localizer = Localizer.in_occupancy_map(patch, self._config)
+            ids.id = map_id
+        if self._living_map is not None:
+            self.destroy_subscription(self._living_map)
+            self._living_map = None
+
+    def _relocate_in(self, relocation: _Relocation, patch: GridPatch) -> None:
+        """Use a map that has come for the relocation, unless that has one."""
+        if relocation.map is None:
+            relocation.map = patch
+        if self.is_active:
+            self._process([])
 
     def _relocate(
         self, relocation: _Relocation, ready: list[tuple[Scan, Array]]
@@ -321,6 +403,8 @@ class LocalizerNode(ThinmapNode):
         _, T_odom_base = pending
         if not relocation.is_continuous_with(*pending):
             self.get_logger().warning('odometry was reset: starting at the initial pose')
+            if relocation.map is not None and isinstance(self._localizer, Localizer):
+                self._localizer = Localizer.in_occupancy_map(relocation.map, self._config)
         elif relocation.map is None:
             self.get_logger().warning(
                 f'no map received for {relocation.waited_s:.0f} s: '
@@ -335,7 +419,6 @@ class LocalizerNode(ThinmapNode):
             )
         if self._topology is not None:
             set_topology(self._localizer, self._topology)
-        self.destroy_subscription(relocation.subscription)
         self._relocation = None
         return [pending]
 
@@ -370,6 +453,8 @@ class LocalizerNode(ThinmapNode):
             return 'the session has no map of the localizer: it keeps its own'
         self._localizer = loaded
         self._given.source.replaced()
+        if self._map_ids is not None:
+            self._map_ids.load()
         if self._topology is not None:
             set_topology(loaded, self._topology)
         features = line_features(loaded)
@@ -387,7 +472,14 @@ class LocalizerNode(ThinmapNode):
         if state != SlamStatus.NO_MAP:
             self._broadcaster.update(estimate.T_map_odom)
         self._given.publish(scan.stamp_ns, estimate, state)
-        status = SlamStatus(state=state, step_time_ms=step_ms, no_return_is_unknown=scan.drops_out)
+        status = SlamStatus(
+            state=state,
+            step_time_ms=step_ms,
+            no_return_is_unknown=scan.drops_out,
+            is_contradicted=estimate.is_contradicted,
+        )
+        if self._map_ids is not None:
+            self._map_ids.fill_in(status)
         self._output.publish_scan(self._laser_transform.to_message(scan))
         self._output.publish_estimate(scan.stamp_ns, estimate, self._localizer, status)
 
@@ -398,6 +490,8 @@ def _state_of(estimate: Estimate) -> int:
         return int(SlamStatus.BLIND)
     if estimate.mount_fault:
         return int(SlamStatus.MISALIGNED)
+    if estimate.is_mapping_apart:
+        return int(SlamStatus.MAPPING_APART)
     return int(SlamStatus.LOST if estimate.is_lost else SlamStatus.TRACKING)
 
 

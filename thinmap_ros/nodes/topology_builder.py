@@ -25,6 +25,7 @@ from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
@@ -41,9 +42,9 @@ class _TopologyPublishers:
         self._global = node.create_publisher(TopologicalMapMsg, 'topology', qos.LATCHED)
         self.has_published = False
 
-    def publish_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
+    def publish_map(self, topology: TopologicalMap, stamp_ns: int, map_id: int) -> None:
         self.has_published = True
-        self._global.publish(messages.topology_msg(topology, self.frame_id, stamp_ns))
+        self._global.publish(messages.topology_msg(topology, self.frame_id, stamp_ns, map_id))
 
     def publish_local_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
         self._local.publish(messages.topology_msg(topology, self.frame_id, stamp_ns))
@@ -109,6 +110,7 @@ class TopologyBuilderNode(ThinmapNode):
 
     def reset_state(self) -> None:
         """Discard the graph, or return to the session that the node was started with."""
+        self._followed = FollowedMap()
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._newest_saved_id = 0
         self._T_map_base: Array | None = None
@@ -122,7 +124,18 @@ class TopologyBuilderNode(ThinmapNode):
         if self._session or self._output.has_published:
             self._publish(self.get_clock().now().nanoseconds)
 
+    def _is_of_this_map(self, message: ProbabilityGrid) -> bool:
+        """Whether a grid is of the map of this graph; a graph of another map is discarded."""
+        origin = self._followed.origin(message.map_id)
+        if origin is Origin.OTHER:
+            self.get_logger().warning('grid is of another map: graph reset')
+            self.reset_state()
+            self._followed.origin(message.map_id)
+        return origin is not Origin.STALE
+
     def _on_local_grid(self, message: ProbabilityGrid) -> None:
+        if not self._is_of_this_map(message):
+            return
         stamp_ns = messages.stamp_ns(message.header.stamp)
         patch = messages.grid_from_msg(message)
         self._rebuilding.window(patch, messages.stamp_ns(message.correction_stamp))
@@ -157,6 +170,8 @@ class TopologyBuilderNode(ThinmapNode):
             self._rebuilding.correct(corrected_ns, *messages.trajectory_from_msg(message))
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
+        if not self._is_of_this_map(message):
+            return
         corrected_ns = messages.stamp_ns(message.correction_stamp)
         patch = messages.grid_from_msg(message)
         self._regions.add_grid(messages.stamp_ns(message.header.stamp), patch)
@@ -174,7 +189,7 @@ class TopologyBuilderNode(ThinmapNode):
 
     def _publish(self, stamp_ns: int) -> None:
         self._checkpoint_new_ids()
-        self._output.publish_map(self._builder.map, stamp_ns)
+        self._output.publish_map(self._builder.map, stamp_ns, self._followed.id)
         self._route_graph.graph_changed()
 
     def _checkpoint_new_ids(self) -> None:
@@ -214,6 +229,7 @@ class TopologyBuilderNode(ThinmapNode):
         """Replace the graph by a saved one; windows that were made before are discarded."""
         loaded, regions = self._read(path)
         self._builder = loaded
+        self._followed.leave()
         self._regions.reset(regions)
         self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Header
 
-from thinmap_msgs.msg import ProbabilityGrid, TopologicalEdge, TopologicalNode
+from thinmap_msgs.msg import ProbabilityGrid, SlamStatus, TopologicalEdge, TopologicalNode
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
@@ -217,15 +217,21 @@ def grid_msg(patch: GridPatch, frame_id: str, ns: int, load_ns: int = 0) -> Occu
 
 
 def probability_grid_msg(
-    patch: GridPatch, frame_id: str, ns: int, load_ns: int = 0, corrected_ns: int = 0
+    patch: GridPatch,
+    frame_id: str,
+    ns: int,
+    load_ns: int = 0,
+    corrected_ns: int = 0,
+    map_id: int = 0,
 ) -> ProbabilityGrid:
     """Message of occupancy probabilities.
 
     load_ns: time at which the map was loaded or begun; corrected_ns: stamp of the newest trajectory
-    that all cells follow.
+    that all cells follow; map_id: as in SlamStatus.
     """
     message = ProbabilityGrid(header=header(frame_id, ns), info=_map_info(patch, load_ns))
     message.correction_stamp = time_msg(corrected_ns)
+    message.map_id = map_id
     message.data = _int8_array(patch.cells)
     return message
 
@@ -264,12 +270,20 @@ def grid_from_msg(message: OccupancyGrid | ProbabilityGrid) -> GridPatch:
     return aligned_patch(origin, resolution, cells)
 
 
-def topology_msg(topology: TopologicalMap, frame_id: str, ns: int) -> TopologicalMapMsg:
-    """Message of a topological map."""
+def is_lost(status: SlamStatus) -> bool:
+    """Whether the place of the robot in the map is unknown."""
+    return status.state in (SlamStatus.LOST, SlamStatus.MAPPING_APART)
+
+
+def topology_msg(
+    topology: TopologicalMap, frame_id: str, ns: int, map_id: int = 0
+) -> TopologicalMapMsg:
+    """Message of a topological map; map_id: of its grid."""
     return TopologicalMapMsg(
         header=header(frame_id, ns),
         nodes=[_node_msg(node) for node in topology.nodes.values()],
         edges=[_edge_msg(edge) for edge in topology.edges.values()],
+        map_id=map_id,
     )
 
 

@@ -22,6 +22,7 @@ from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.topology_reader import read_topology
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 _LOOK_PERIOD_S = 0.5
@@ -52,11 +53,16 @@ class ObservationSource:
         frames: RobotFrames,
         robot_radius_m: float,
         on_observation: Callable[[Observation], None],
+        on_other_map: Callable[[], None],
     ) -> None:
-        """on_observation: receives each observation; its graph is complete after `with_graph`."""
+        """on_observation: receives each observation; its graph is complete after `with_graph`.
+
+        on_other_map: is called when the grid is of another map than before, to reset this.
+        """
         self._node = node
         self._laser_transform = frames.laser_transform
         self._on_observation = on_observation
+        self._on_other_map = on_other_map
         self._graph_config = TopologyConfig(robot_radius_m=robot_radius_m)
         self._grids = PublisherCheck(node, 'grid', 'local_grid')
         self._topologies = PublisherCheck(node, 'topology')
@@ -75,6 +81,7 @@ class ObservationSource:
 
     def reset(self) -> None:
         """Discard map, graph and scans."""
+        self._followed = FollowedMap()
         self.watchdog = InputWatchdog()
         self._buffer = ObservationBuffer(Topology())
         self._graph = MapGraph(self._graph_config)
@@ -101,10 +108,12 @@ class ObservationSource:
         self._buffer.topology = topology
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
+        self._follow(message.map_id)
         self._grids.message_received()
         self._buffer.replace_map(messages.grid_from_msg(message))
 
     def _on_local_grid(self, message: ProbabilityGrid) -> None:
+        self._follow(message.map_id)
         self._grids.message_received()
         stamp_ns = messages.stamp_ns(message.header.stamp)
         self._process(self._buffer.add_local_map(stamp_ns, messages.grid_from_msg(message)))
@@ -128,8 +137,12 @@ class ObservationSource:
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         self._buffer.is_blind = message.state in (SlamStatus.BLIND, SlamStatus.MISALIGNED)
-        is_lost = message.state == SlamStatus.LOST
-        self.watchdog.add_tracking(is_lost, self._now_ns() / SECOND_NS)
+        self.watchdog.add_tracking(messages.is_lost(message), self._now_ns() / SECOND_NS)
+
+    def _follow(self, map_id: int) -> None:
+        if self._followed.origin(map_id) is Origin.OTHER:
+            self._on_other_map()
+            self._followed.origin(map_id)
 
     # Outputs.
 

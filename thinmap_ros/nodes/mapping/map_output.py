@@ -11,6 +11,7 @@ from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros.map_identity import FollowedMap
 
 TRINARY = 'trinary'
 PROBABILITY = 'probability'
@@ -67,13 +68,14 @@ class MapOutputConfig(Config):
 class MapPublishers:
     """Publishes the map for others, and the exact grid for thinmap's own nodes.
 
-    load_ns: time at which the map was begun or loaded.
+    load_ns: time at which the map was begun or loaded; followed: knows its id.
     """
 
     def __init__(self, node: Node, config: MapOutputConfig) -> None:
         self.config = config
         self._frame = parameters.declare_map_frame(node)
         self.load_ns = 0
+        self.followed = FollowedMap()
         self._map = node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
         self._metadata = node.create_publisher(MapMetaData, 'map_metadata', qos.LATCHED)
         self._grid = node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
@@ -86,7 +88,7 @@ class MapPublishers:
         self._map.publish(message)
         self._metadata.publish(message.info)
         exact = messages.probability_grid_msg(
-            patch, self._frame, stamp_ns, self.load_ns, grid.corrected_ns
+            patch, self._frame, stamp_ns, self.load_ns, grid.corrected_ns, self.followed.id
         )
         self._grid.publish(exact)
 
@@ -98,6 +100,6 @@ class MapPublishers:
     def publish_local_grid(self, window: GridPatch, stamp_ns: int, corrected_ns: int) -> None:
         """Publish the part of the grid that a scan has changed."""
         message = messages.probability_grid_msg(
-            window, self._frame, stamp_ns, self.load_ns, corrected_ns
+            window, self._frame, stamp_ns, self.load_ns, corrected_ns, self.followed.id
         )
         self._local_grid.publish(message)

@@ -7,22 +7,26 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import SlamStatus
+from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.ros import messages
+from thinmap_ros.ros.map_identity import UNKNOWN
 
 
 class LocatedScan(NamedTuple):
     """A scan and the pose T_map_base (3,) at which it was made.
 
-    is_known: whether the pose belongs to a place in the map; drops_out: whether its beams without
-    return show no free space.
+    drops_out: whether its beams without return show no free space; map_id, replaced_map_id: of the
+    map that the pose is in, and of the one before it.
     """
 
     message: LaserScan
     T_map_base: Array
-    is_known: bool = True
+    placement: Placement = Placement.MAP
     drops_out: bool = False
+    map_id: int = UNKNOWN
+    replaced_map_id: int = UNKNOWN
 
 
 class ScanPairs:
@@ -30,7 +34,7 @@ class ScanPairs:
 
     A localizer that publishes the scans that it has localized, corrected for motion, is preferred
     to the laser. A pose of a lost robot, or of one without a map, belongs to no place in the map,
-    and a blind scan observes nothing.
+    that of one that maps apart to a piece beside it, and a blind scan observes nothing.
     """
 
     def __init__(self, node: Node) -> None:
@@ -79,5 +83,16 @@ def _complete(found: tuple[LocatedScan, SlamStatus] | None) -> LocatedScan | Non
         return None
     located, status = found
     return located._replace(
-        is_known=status.state == SlamStatus.TRACKING, drops_out=status.no_return_is_unknown
+        placement=_placement(status),
+        drops_out=status.no_return_is_unknown,
+        map_id=status.map_id,
+        replaced_map_id=status.replaced_map_id,
     )
+
+
+def _placement(status: SlamStatus) -> Placement:
+    if status.state == SlamStatus.MAPPING_APART:
+        return Placement.APART
+    if status.state != SlamStatus.TRACKING:
+        return Placement.NOWHERE
+    return Placement.OPEN if status.is_contradicted else Placement.MAP

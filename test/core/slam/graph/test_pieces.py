@@ -11,8 +11,8 @@ from thinmap_ros.core.slam.graph.pose_graph import Edge
 SCAN = Scan.create(1, np.ones(3), 0.0, 0.1, 0.05, 8.0, np.zeros(3))
 
 
-def frame(submap, path_m):
-    return Keyframe(SCAN, np.zeros((0, 5)), np.zeros(3), path_m, np.eye(3), submap)
+def frame(submap, x):
+    return Keyframe(SCAN, np.zeros((0, 5)), np.array([x, 0.0, 0.0]), 0.0, np.eye(3), submap)
 
 
 def edge(a, b):

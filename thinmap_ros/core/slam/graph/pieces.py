@@ -4,13 +4,14 @@ import math
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 
+from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 
 _PUBLISHED = 0
-# Path length between two views of which each says something new. Of eight robots that were carried
-# off and drove for 440 s, some joined their piece at a wrong place where matches of one view were
-# counted each; with 3 m none did.
+# Distance between two views of which each says something new. Of eight robots that were carried off
+# and drove for 440 s, two joined their piece at a wrong place where all matches were counted, one
+# where those 3 m of path apart were, and none with this.
 _VIEW_M = 3.0
 _RECENT = 24  # matches among which consistent ones are searched
 
@@ -80,18 +81,16 @@ class Pieces:
                 of_piece[self._piece_of[frames[edge.a].submap]].append(edge)
         for edges in of_piece.values():
             agreeing = largest_consistent(edges)
-            if _count_views([frames[edge.b].path_m for edge in agreeing]) >= fewest:
+            if _count_views([frames[edge.b].T_map_base for edge in agreeing]) >= fewest:
                 self._matches.clear()
                 return agreeing
         return []
 
 
-def _count_views(paths_m: list[float]) -> int:
-    """Number of path lengths that are a view apart."""
-    count = 0
-    last_m = -math.inf
-    for path_m in sorted(paths_m):
-        if path_m - last_m >= _VIEW_M:
-            count += 1
-            last_m = path_m
-    return count
+def _count_views(poses: list[Array]) -> int:
+    """Number of poses (3,) that are a view apart from each other (greedy)."""
+    views: list[Array] = []
+    for T in poses:
+        if all(math.dist(T[:2], view[:2]) >= _VIEW_M for view in views):
+            views.append(T)
+    return len(views)
