@@ -66,7 +66,7 @@ def test_what_cannot_be_explored_is_not_resolved():
     """Between twelve beams no place is free enough to drive to."""
     outcome, path_m = explored(12, 100.0)
     assert outcome.finished and path_m == 0.0
-    assert '1 end nodes left, of which visits showed no more' in outcome.reason
+    assert '1 end node left, which the robot cannot reach or see into' in outcome.reason
 
 
 def test_a_robot_stands_still_once_its_laser_has_slipped():

@@ -192,9 +192,35 @@ def test_a_target_that_cannot_be_reached_is_put_aside_tried_again_and_named_at_t
     run = Run(two_rooms(), fails=refuse).go(60.0)
     assert run.last.finished
     assert run.last.code == FinishCode.UNREACHABLE
-    assert run.last.unreachable
+    left = len(run.last.unreachable)
+    assert left == run.last.remaining > 0
+    assert run.last.reason == (
+        f'{left} end node{"s" * (left > 1)} left, which the robot cannot reach or see into'
+    )
     assert max(refused.count(node_id) for node_id in run.last.unreachable) >= 2
     assert not np.hypot(*(np.array(run.poses)[:, :2] - START[:2]).T).any()
+
+
+def ajar():
+    """A door of 0.3 m, too narrow for the robot, to a second room."""
+    return world_of([(slice(0, 28), 30), (slice(31, 60), 30)])
+
+
+@pytest.mark.parametrize('strategy', [Explorer, PaperExplorer])
+def test_what_was_visited_in_vain_is_left_and_named(strategy):
+    run = Run(ajar(), strategy()).go()
+    assert run.last.finished
+    given_up = [
+        node
+        for node in run.last.end_nodes
+        if node.probability < ExplorerConfig().probability_threshold
+    ]
+    assert len(given_up) == run.last.remaining == len(run.last.unreachable)
+    is_left = run.last.code == FinishCode.UNREACHABLE
+    assert is_left == bool(given_up)
+    assert ('which the robot cannot reach or see into' in run.last.reason) == is_left
+    if strategy is Explorer:
+        assert given_up
 
 
 def test_a_navigator_that_refuses_all_goals_at_first_does_not_end_the_exploration():

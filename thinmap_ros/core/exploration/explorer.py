@@ -285,7 +285,7 @@ class Explorer:
 
     def _choose(self, topology: TopologicalMap, T_map_base: Array) -> None:
         """Choose the target among the candidates."""
-        worth = [c for c in self.candidates if self._is_worth_a_visit(c)]
+        worth = [c for c in self._doubtful if not _is_given_up(c)]
         waits = not topology.nodes and self._clock.now_ns - self._clock.began_ns < (
             _START_S * SECOND_NS
         )
@@ -317,10 +317,11 @@ class Explorer:
         """
         return self.config.switch_margin_m * self._left.factor(candidate.evidence.id)
 
-    def _is_worth_a_visit(self, candidate: Candidate) -> bool:
-        attempts = max(candidate.evidence.visits, candidate.evidence.failures)
-        is_doubtful = candidate.probability < self.config.probability_threshold
-        return is_doubtful and candidate.goal is not None and attempts < _MAX_ATTEMPTS
+    @property
+    def _doubtful(self) -> list[Candidate]:
+        """Candidates that are not resolved: worth a visit, or given up."""
+        threshold = self.config.probability_threshold
+        return [candidate for candidate in self.candidates if candidate.probability < threshold]
 
     def _ready(self, worth: list[Candidate]) -> list[Candidate]:
         """Candidates that did not fail lately; if there are none, those after a shorter pause."""
@@ -400,21 +401,27 @@ class Explorer:
             end_node = candidate.as_end_node(target.goal if is_target else None)
             chosen = end_node if is_target else chosen
             end_nodes.append(end_node)
-        doubtful = [c for c in self.candidates if c.probability < self.config.probability_threshold]
-        unreachable = sorted(c.node_id for c in doubtful if c.evidence.failures or c.goal is None)
+        doubtful = self._doubtful
+        aside = sorted(c.node_id for c in doubtful if c.evidence.failures or _is_given_up(c))
         finished = self._scans_without_target >= _SCANS
-        code, reason = finish_reason(finished, unreachable, len(doubtful))
+        code, reason = finish_reason(finished, len(doubtful))
         return Decision(
             chosen,
             finished,
             reason,
             code,
             end_nodes,
-            unreachable,
+            aside,
             self.frontier_map.known_area_m2,
             len(doubtful),
             self._missing,
         )
+
+
+def _is_given_up(candidate: Candidate) -> bool:
+    """Whether there is no way to a candidate, or as many tries in vain as it is worth."""
+    attempts = max(candidate.evidence.visits, candidate.evidence.failures)
+    return candidate.goal is None or attempts >= _MAX_ATTEMPTS
 
 
 def _turns(T_map_base: Array, goals: Array) -> Array:
