@@ -7,6 +7,7 @@
 - The target is kept unless another one saves a clear margin, so that the robot does not oscillate.
 - A target that stays as it is although the robot observes it is evidence that nothing is hidden.
 - One that cannot be reached is tried again after a while and before the end, some times at most.
+- Before the explorer gives up, the robot turns once in place if it stands beside unknown space.
 
 Source: exploration paper sections 3.2 and 4.
 """
@@ -25,6 +26,7 @@ from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.belief import evidence
 from thinmap_ros.core.exploration.belief.fitted import FITTED
 from thinmap_ros.core.exploration.belief.model import (
+    HIDDEN_REACH_M,
     WORTH_SEEING_M2,
     BeliefModel,
     MissingArea,
@@ -32,6 +34,7 @@ from thinmap_ros.core.exploration.belief.model import (
 )
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.frontiers import FrontierMap, Place
+from thinmap_ros.core.exploration.look_around import LookAround, turn_target
 from thinmap_ros.core.exploration.reachable import ReachableSpace
 from thinmap_ros.core.exploration.strategy import Decision, finish_reason
 from thinmap_ros.core.exploration.tour import tours_by_first
@@ -110,12 +113,16 @@ class ExplorerConfig(CandidateConfig):
 
 @dataclass
 class _Target:
-    """Where the robot drives: the candidate, the goal (3,), and scans made at the goal."""
+    """Where the robot drives: the candidate, the goal (3,), and scans made at the goal.
+
+    is_turn: whether the goal is a part of a turn in place.
+    """
 
     candidate: Candidate | None = None
     middle: Place = (math.inf, math.inf)
     goal: Array | None = None
     scans_at_goal: int = 0
+    is_turn: bool = False
 
 
 @dataclass
@@ -162,6 +169,7 @@ class Explorer:
         self._space = ReachableSpace(self.config.robot_radius_m)
         self._target = _Target()
         self._left = _LeftTargets()
+        self._look = LookAround()
         self._clock = _Clock()
         self._frame = self.frontier_map.frame
         self._scans_without_target = 0
@@ -225,9 +233,12 @@ class Explorer:
     def target_failed(self, reason: str) -> None:
         """Process that the present target could not be reached."""
         candidate = self._target.candidate
-        if candidate is not None:
+        if self._target.is_turn:
+            self._look.stop()
+        elif candidate is not None:
             candidate.evidence.failures += 1
             candidate.evidence.failed_ns = self._clock.now_ns
+        if candidate is not None:
             self._drop_target()
             self._target.goal = None
 
@@ -256,7 +267,7 @@ class Explorer:
         It is observed from somewhere else the next time, and is reachable, whatever failed before.
         """
         target = self._target
-        if target.candidate is None or target.goal is None:
+        if target.candidate is None or target.goal is None or target.is_turn:
             return
         is_there = _is_at(T_map_base, target.goal)
         target.scans_at_goal = target.scans_at_goal + 1 if is_there else 0
@@ -292,9 +303,11 @@ class Explorer:
         if not worth:
             self._drop_target()
             is_over = self.frontier_map.free_cells > 0 and not waits
-            self._scans_without_target += is_over
+            if not (is_over and self._turns_in_place(T_map_base)):
+                self._scans_without_target += is_over
             return
         self._scans_without_target = 0
+        self._look.stop()
         ready = self._ready(worth)
         if not ready:
             self._drop_target()
@@ -309,6 +322,18 @@ class Explorer:
             else:
                 self._left.add(kept.evidence.id)
         self._drive_to(best, T_map_base)
+
+    def _turns_in_place(self, T_map_base: Array) -> bool:
+        """Begin to turn, or turn on, if that can show anything; returns whether it can."""
+        frontiers = self.frontier_map
+        xy = (float(T_map_base[0]), float(T_map_base[1]))
+        hidden_m2 = frontiers.hidden_area_m2(xy, HIDDEN_REACH_M)
+        is_left = bool(self._doubtful)
+        goal = self._look.next_goal(T_map_base, hidden_m2, frontiers.known_area_m2, is_left)
+        if goal is None:
+            return False
+        self._target = _Target(turn_target(goal), goal=goal, is_turn=True)
+        return True
 
     def _switch_margin_m(self, candidate: Candidate) -> float:
         """Saving for which the target is changed, larger for one that was left.
@@ -352,6 +377,7 @@ class Explorer:
             target.goal = goal
         target.candidate = candidate
         target.middle = candidate.middle
+        target.is_turn = False
 
     def _goal_stays(self, candidate: Candidate, goal: Array, T_map_base: Array) -> bool:
         """Whether the goal stays although another viewpoint of the same frontier is nearer now.
@@ -370,6 +396,7 @@ class Explorer:
     def _drop_target(self) -> None:
         self._target.candidate = None
         self._target.scans_at_goal = 0
+        self._target.is_turn = False
 
     def _costs(self, candidates: list[Candidate], T_map_base: Array) -> dict[Candidate, float]:
         """Cost, m, of the cheapest tour that begins with each of the nearest candidates."""
@@ -396,7 +423,10 @@ class Explorer:
         target = self._target
         chosen = None
         end_nodes = []
-        for candidate in self.candidates:
+        places = self.candidates
+        if target.is_turn and target.candidate is not None:
+            places = [*places, target.candidate]
+        for candidate in places:
             is_target = candidate is target.candidate
             end_node = candidate.as_end_node(target.goal if is_target else None)
             chosen = end_node if is_target else chosen
@@ -404,7 +434,8 @@ class Explorer:
         doubtful = self._doubtful
         aside = sorted(c.node_id for c in doubtful if c.evidence.failures or _is_given_up(c))
         finished = self._scans_without_target >= _SCANS
-        code, reason = finish_reason(finished, len(doubtful))
+        left = len(doubtful) or int(self._look.is_in_the_dark)
+        code, reason = finish_reason(finished, left)
         return Decision(
             chosen,
             finished,
@@ -413,7 +444,7 @@ class Explorer:
             end_nodes,
             aside,
             self.frontier_map.known_area_m2,
-            len(doubtful),
+            left,
             self._missing,
         )
 
