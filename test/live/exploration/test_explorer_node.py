@@ -163,7 +163,7 @@ def test_it_reports_why_it_ended(robot):
     assert robot.explores() == (ExplorationStatus.SENSOR_TIMEOUT, GoalStatus.STATUS_ABORTED)
     robot.hears_scans = True
     robot.refuses_to_drive()
-    assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_SUCCEEDED)
+    assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_ABORTED)
     robot.knows(60)
     assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
 
@@ -218,9 +218,10 @@ def test_a_users_own_strategy_explores(graph):
         strategy='own_strategy:TwoAttempts',
     )
     ended = graph.act(Explore, 'explore', Explore.Goal())
-    assert ended.status == GoalStatus.STATUS_SUCCEEDED
+    assert ended.status == GoalStatus.STATUS_ABORTED
     assert ended.result.status.reason_code == ExplorationStatus.UNREACHABLE
-    assert ended.result.status.reason == 'two attempts failed'
+    failure = 'no target was reached: the wheels are chained'
+    assert ended.result.status.reason == f'two attempts failed; {failure}'
     assert list(robot.evidence()) == [7]
     saved = graph.call(SaveMap, 'save_exploration', SaveMap.Request(path='room'))
     assert saved.success
@@ -232,7 +233,7 @@ def test_a_baseline_explores(graph):
     robot = Robot(graph)
     robot.refuses_to_drive()
     graph.start('explorer', laser_pose='0,0,0', use_sim_time=True, strategy='nearest_frontier')
-    assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_SUCCEEDED)
+    assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_ABORTED)
     robot.knows(60)
     assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
     assert graph.stop('explorer') == 0, graph.log('explorer')
@@ -261,5 +262,6 @@ def test_a_return_begins_when_there_is_a_navigator_at_last(graph, robot):
     robot.refuses_to_drive()
     ended = accepted.get_result_async()
     graph.until(ended.done, 'the end')
+    assert ended.result().status == GoalStatus.STATUS_ABORTED
     assert ended.result().result.status.reason_code == ExplorationStatus.BUDGET_EXHAUSTED
     assert ended.result().result.status.reason.endswith('; not home: the wheels are chained')
