@@ -16,6 +16,7 @@ from nav2_msgs.action import NavigateToPose
 from rclpy.action import ActionClient, ActionServer
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import (
@@ -256,6 +257,7 @@ def test_a_return_begins_when_there_is_a_navigator_at_last(graph, robot):
     client = ActionClient(graph.node, Explore, 'explore')
     accepted = graph.send_goal(client, Explore.Goal(area_limit_m2=1.0, return_home=True))
     status = graph.heard('exploration_status', ExplorationStatus, qos.LATCHED)
+    words = graph.heard('explore/status', String, qos.LATCHED)
     graph.until(
         lambda: status and status[-1].state == ExplorationStatus.RETURNING, 'the robot returns'
     )
@@ -265,3 +267,5 @@ def test_a_return_begins_when_there_is_a_navigator_at_last(graph, robot):
     assert ended.result().status == GoalStatus.STATUS_ABORTED
     assert ended.result().result.status.reason_code == ExplorationStatus.BUDGET_EXHAUSTED
     assert ended.result().result.status.reason.endswith('; not home: the wheels are chained')
+    graph.until(lambda: words[-1].data == 'exploration_complete', 'its last status')
+    assert 'exploration_paused' not in [message.data for message in words]
