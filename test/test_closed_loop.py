@@ -62,11 +62,21 @@ def test_with_too_few_beams_the_robot_stands_still_and_nothing_is_explored():
     assert '8 valid beams of 8: expected at least 10' in outcome.reason
 
 
-def test_what_cannot_be_explored_is_not_resolved():
-    """Between twelve beams no place is free enough to drive to."""
-    outcome, path_m = explored(12, 100.0)
-    assert outcome.finished and path_m == 0.0
-    assert '1 end nodes left, of which visits showed no more' in outcome.reason
+def test_between_a_few_beams_the_robot_looks_by_turning():
+    """At the start, no place between twelve beams is free enough to drive to."""
+    _, path_m = explored(12, 100.0)
+    assert path_m > 0.5
+
+
+def test_an_exploration_that_reaches_nothing_is_not_finished():
+    world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
+    start = np.asarray(world.start)
+    strategy = Repeats(start + (100.0, 0.0, 0.0))
+    loop = make_loop(world, start, Options())
+    loop.strategy = strategy
+    outcome = loop.run(observable_cells(world, start, 0.25, 8.0), 60.0, lambda *shown: None)
+    assert strategy.failures and not outcome.finished
+    assert outcome.reason == f'no target was reached: {strategy.failures[-1]}'
 
 
 def test_a_robot_stands_still_once_its_laser_has_slipped():

@@ -10,6 +10,8 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.live.drive_progress import Arrivals
+from thinmap_ros.core.exploration.live.drives import Drives
+from thinmap_ros.core.exploration.mission import Odometer
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, Strategy
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
@@ -46,7 +48,7 @@ class RunLog:
 
 @dataclass(frozen=True)
 class ExplorationOutcome:
-    """How an exploration ended; finished: whether the strategy ended it."""
+    """How an exploration ended; finished: whether the strategy ended it, and has explored."""
 
     finished: bool
     reason: str
@@ -71,11 +73,13 @@ class Mishap(Protocol):
 class _Drive:
     """The goal (3,) that the navigator has, arrivals, and the last command (v, w).
 
-    Speeds in m/s and rad/s.
+    Speeds in m/s and rad/s. drives: what came of all of them; odometer: of the estimated poses.
     """
 
     goal: Array | None = None
     arrivals: Arrivals = field(default_factory=Arrivals)
+    drives: Drives = field(default_factory=Drives)
+    odometer: Odometer = field(default_factory=Odometer)
     command: tuple[float, float] = (0.0, 0.0)
 
 
@@ -130,15 +134,19 @@ class ClosedLoop:
             steps = steps + 1
         self.pipeline.finish()
         show(*self._measure(goal))
-        finished = self.decision is not None and self.is_finished
-        reason = (
-            self.decision.reason
-            if self.decision is not None and finished
-            else f'time limit of {limit_s:.0f} s'
-        )
-        if self._stop_reason:
-            reason = f'{reason}; {self._stop_reason}'
+        finished, reason = self._ending(limit_s)
         return ExplorationOutcome(finished, reason, self.simulation.robot.collisions)
+
+    def _ending(self, limit_s: float) -> tuple[bool, str]:
+        """Whether the strategy ended the exploration, which came to something, and why it ended."""
+        words = [f'time limit of {limit_s:.0f} s']
+        shortcoming = ''
+        if self.decision is not None and self.is_finished:
+            drive = self._drive
+            shortcoming = drive.drives.shortcoming(self.decision, drive.odometer.distance_m)
+            words = [self.decision.reason, shortcoming]
+        reason = '; '.join(word for word in [*words, self._stop_reason] if word)
+        return self.is_finished and not shortcoming, reason
 
     @property
     def is_finished(self) -> bool:
@@ -182,7 +190,9 @@ class ClosedLoop:
         self.log.decision_s.append(time.thread_time() - began)
         if self._watch is not None:
             self._watch(self.decision, estimate.T_map_base)
+        self._drive.odometer.add_pose(estimate.T_map_base)
         target = self.decision.target
+        self._drive.drives.follow(target)
         if target is None:
             self.navigator.cancel()
             self._drive.goal = None
@@ -195,10 +205,14 @@ class ClosedLoop:
             self._drive.arrivals.clear()
             self._drive.goal = None
             self.navigator.cancel()
-            self.strategy.target_failed('reached, but the target stays')
+            self._target_failed('reached, but the target stays')
             return
         self._drive.goal = goal
         self.navigator.set_goal(*(float(number) for number in goal))
+
+    def _target_failed(self, reason: str) -> None:
+        self._drive.drives.add_result(False, reason)
+        self.strategy.target_failed(reason)
 
     def replace_strategy(
         self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator
@@ -222,8 +236,9 @@ class ClosedLoop:
         )
         self._drive.command = (command.v, command.w)
         if command.state == 'failed':
-            self.strategy.target_failed(command.reason)
+            self._target_failed(command.reason)
         if command.state == 'reached' and self._drive.goal is not None:
+            self._drive.drives.add_result(True, '')
             self._drive.arrivals.add(self._drive.goal)
         if command.state in ('failed', 'reached'):
             self._drive.goal = None

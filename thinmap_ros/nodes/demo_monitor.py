@@ -113,8 +113,8 @@ class DemoMonitorNode(Node):
         if self._config.result:
             end_ns = messages.stamp_ns(status.header.stamp)
             content = {
-                'finished': status.reason_code
-                in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.UNREACHABLE),
+                'finished': ended.status == GoalStatus.STATUS_SUCCEEDED
+                and status.reason_code != ExplorationStatus.BUDGET_EXHAUSTED,
                 'reason': status.reason,
                 'start_ns': end_ns - round(1e9 * messages.seconds(status.elapsed)),
                 'end_ns': end_ns,

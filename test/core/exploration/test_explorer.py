@@ -12,6 +12,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.belief.evidence import Evidence
 from thinmap_ros.core.exploration.candidates import Candidate
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.look_around import TURN_ID
 from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision, FinishCode
 from thinmap_ros.core.grid.frame import GridFrame
@@ -49,10 +50,12 @@ def two_rooms():
 class Run:
     """An exploration with known poses; fails(decision): whether navigation to a target fails."""
 
-    def __init__(self, world, strategy=None, seed=1, fails=None, start=START):
+    def __init__(self, world, strategy=None, seed=1, fails=None, start=START, laser=None):
         self.world = world
         self.fails = fails or (lambda decision: False)
-        self.simulation = Simulation(world, start, PRESETS['2dx'], LaserScannerConfig(), seed)
+        self.simulation = Simulation(
+            world, start, PRESETS['2dx'], laser or LaserScannerConfig(), seed
+        )
         self.grid = OccupancyGrid()
         self.topology = TopologyBuilder()
         self.explorer = strategy or Explorer()
@@ -192,9 +195,59 @@ def test_a_target_that_cannot_be_reached_is_put_aside_tried_again_and_named_at_t
     run = Run(two_rooms(), fails=refuse).go(60.0)
     assert run.last.finished
     assert run.last.code == FinishCode.UNREACHABLE
-    assert run.last.unreachable
+    left = len(run.last.unreachable)
+    assert left == run.last.remaining > 0
+    assert run.last.reason == (
+        f'{left} end node{"s" * (left > 1)} left, which the robot cannot reach or see into'
+    )
     assert max(refused.count(node_id) for node_id in run.last.unreachable) >= 2
     assert not np.hypot(*(np.array(run.poses)[:, :2] - START[:2]).T).any()
+
+
+def ajar():
+    """A door of 0.3 m, too narrow for the robot, to a second room."""
+    return world_of([(slice(0, 28), 30), (slice(31, 60), 30)])
+
+
+@pytest.mark.parametrize('strategy', [Explorer, PaperExplorer])
+def test_what_was_visited_in_vain_is_left_and_named(strategy):
+    run = Run(ajar(), strategy()).go()
+    assert run.last.finished
+    given_up = [
+        node
+        for node in run.last.end_nodes
+        if node.probability < ExplorerConfig().probability_threshold
+    ]
+    assert len(given_up) == run.last.remaining == len(run.last.unreachable)
+    is_left = run.last.code == FinishCode.UNREACHABLE
+    assert is_left == bool(given_up)
+    assert ('which the robot cannot reach or see into' in run.last.reason) == is_left
+    if strategy is Explorer:
+        assert given_up
+
+
+@pytest.mark.parametrize(
+    ('field_of_view_deg', 'gap_m'), [(180.0, 0.24), (180.0, 0.3), (60.0, 0.24)]
+)
+def test_a_robot_in_front_of_a_wall_turns_and_explores(field_of_view_deg, gap_m):
+    start = np.array([0.1 + gap_m, 1.0, math.pi])
+    laser = LaserScannerConfig(beams=91, field_of_view_deg=field_of_view_deg)
+    run = Run(two_rooms(), start=start, laser=laser).go()
+    first = next(decision for decision in run.decisions if decision.target is not None)
+    assert first.target.node_id == TURN_ID
+    assert first.target in first.end_nodes
+    assert run.last.code == FinishCode.ALL_RESOLVED
+    assert run.coverage() > 0.98
+
+
+def test_a_robot_that_cannot_turn_gives_up_with_what_it_does_not_see():
+    laser = LaserScannerConfig(beams=91, field_of_view_deg=60.0)
+    start = np.array([0.34, 1.0, math.pi])
+    run = Run(two_rooms(), start=start, laser=laser, fails=lambda decision: True).go(60.0)
+    assert run.last.finished and run.last.code == FinishCode.UNREACHABLE
+    assert run.last.reason == '1 end node left, which the robot cannot reach or see into'
+    turns = [d for d in run.decisions if d.target is not None and d.target.node_id == TURN_ID]
+    assert len(turns) == 1
 
 
 def test_a_navigator_that_refuses_all_goals_at_first_does_not_end_the_exploration():

@@ -1,7 +1,6 @@
 """Missions: budgets, distance, area, return to the start, timeouts of inputs."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -104,16 +103,17 @@ class Scripted:
         self.area_m2 = area_m2
         self.patch = None
         self.failures = []
-        self.left = {}  # fields of the decision: end nodes that remain
+        self.target_id = 1
 
     def step(self, topology, patch, scan, T_map_base):
         self.patch = patch
         target = None
         if self.goal is not None:
-            target = EndNode(1, 0.0, 0.0, 0.5, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, True, self.goal)
+            target = EndNode(
+                self.target_id, 0.0, 0.0, 0.5, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, True, self.goal
+            )
         finished = self.code != FinishCode.NONE
-        decision = Decision(target, finished, 'words', self.code, [], [], self.area_m2)
-        return replace(decision, **self.left)
+        return Decision(target, finished, 'words', self.code, [], [], self.area_m2)
 
     def target_failed(self, reason):
         self.failures.append(reason)
@@ -149,21 +149,47 @@ def test_a_mission_drives_where_the_strategy_decides_and_ends_with_it():
 
 
 def test_nothing_left_to_do_is_not_nothing_could_be_done():
-    for remaining, unreachable, places, succeeds in (
-        (0, [], [0.0], True),  # a closet that is seen from the start
-        (1, [], [0.0, 0.005], False),
-        (1, [], [0.0, 0.5, 0.0], True),
-        (1, [7], [0.0], True),  # a closed door
+    for code, places, succeeds in (
+        (FinishCode.ALL_RESOLVED, [0.0], True),  # a closet that is seen from the start
+        (FinishCode.UNREACHABLE, [0.0], False),
+        (FinishCode.UNREACHABLE, [0.0, 0.1, 0.0], False),  # turns in place, not quite
+        (FinishCode.UNREACHABLE, [0.0, 0.5, 0.0], True),
     ):
         strategy = Scripted()
-        strategy.left = {'remaining': remaining, 'unreachable': unreachable}
         mission = mission_of(strategy)
         for x in places:
             assert mission.step(at(x)) is None
-        strategy.code = FinishCode.UNREACHABLE
+        strategy.code = code
         end = mission.step(at(0.0))
-        assert (end.code, end.is_success) == (FinishCode.UNREACHABLE, succeeds)
-        assert ('has not driven' in end.reason) is not succeeds
+        assert (end.code, end.is_success) == (code, succeeds)
+        assert end.reason == ('words' if succeeds else 'words; the robot has not driven')
+
+
+@pytest.mark.parametrize(
+    ('results', 'succeeds'),
+    [
+        ([False], False),
+        ([False, False], False),
+        ([True], True),
+        ([True, False], True),  # a closed door, after a room
+        ([None, False], True),  # the first target was seen on the way
+    ],
+)
+def test_a_navigator_that_reaches_no_target_has_explored_nothing(results, succeeds):
+    strategy = Scripted(GOAL)
+    mission = mission_of(strategy)
+    for number, result in enumerate(results):
+        strategy.target_id = number
+        mission.step(at(float(number)))
+        if result is not None:
+            mission.drive_ended(result, '' if result else 'the wheels are chained')
+    strategy.goal = None
+    strategy.code = FinishCode.UNREACHABLE
+    end = mission.step(at(3.0))
+    assert (end.code, end.is_success) == (FinishCode.UNREACHABLE, succeeds)
+    failure = 'words; no target was reached: the wheels are chained'
+    assert end.reason == ('words' if succeeds else failure)
+    assert mission.is_resumed_by(MissionGoal()) is False, 'the next one tries all again'
 
 
 @pytest.mark.parametrize(
@@ -215,7 +241,9 @@ def test_the_return_is_tried_three_times():
     assert isinstance(mission.drive_ended(False, 'no path'), DriveTo)
     assert isinstance(mission.drive_ended(False, 'no path'), DriveTo)
     end = mission.drive_ended(False, 'a closed door')
-    assert end == Finish(FinishCode.UNREACHABLE, 'words; not home: a closed door')
+    words = 'words; not home: a closed door'
+    assert end == Finish(FinishCode.UNREACHABLE, words, is_home=False)
+    assert end.is_explored and not end.is_success
     assert not mission.strategy.failures
 
 

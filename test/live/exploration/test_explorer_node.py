@@ -16,6 +16,7 @@ from nav2_msgs.action import NavigateToPose
 from rclpy.action import ActionClient, ActionServer
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import (
@@ -163,7 +164,7 @@ def test_it_reports_why_it_ended(robot):
     assert robot.explores() == (ExplorationStatus.SENSOR_TIMEOUT, GoalStatus.STATUS_ABORTED)
     robot.hears_scans = True
     robot.refuses_to_drive()
-    assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_SUCCEEDED)
+    assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_ABORTED)
     robot.knows(60)
     assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
 
@@ -218,9 +219,10 @@ def test_a_users_own_strategy_explores(graph):
         strategy='own_strategy:TwoAttempts',
     )
     ended = graph.act(Explore, 'explore', Explore.Goal())
-    assert ended.status == GoalStatus.STATUS_SUCCEEDED
+    assert ended.status == GoalStatus.STATUS_ABORTED
     assert ended.result.status.reason_code == ExplorationStatus.UNREACHABLE
-    assert ended.result.status.reason == 'two attempts failed'
+    failure = 'no target was reached: the wheels are chained'
+    assert ended.result.status.reason == f'two attempts failed; {failure}'
     assert list(robot.evidence()) == [7]
     saved = graph.call(SaveMap, 'save_exploration', SaveMap.Request(path='room'))
     assert saved.success
@@ -232,7 +234,7 @@ def test_a_baseline_explores(graph):
     robot = Robot(graph)
     robot.refuses_to_drive()
     graph.start('explorer', laser_pose='0,0,0', use_sim_time=True, strategy='nearest_frontier')
-    assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_SUCCEEDED)
+    assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_ABORTED)
     robot.knows(60)
     assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
     assert graph.stop('explorer') == 0, graph.log('explorer')
@@ -255,11 +257,15 @@ def test_a_return_begins_when_there_is_a_navigator_at_last(graph, robot):
     client = ActionClient(graph.node, Explore, 'explore')
     accepted = graph.send_goal(client, Explore.Goal(area_limit_m2=1.0, return_home=True))
     status = graph.heard('exploration_status', ExplorationStatus, qos.LATCHED)
+    words = graph.heard('explore/status', String, qos.LATCHED)
     graph.until(
         lambda: status and status[-1].state == ExplorationStatus.RETURNING, 'the robot returns'
     )
     robot.refuses_to_drive()
     ended = accepted.get_result_async()
     graph.until(ended.done, 'the end')
+    assert ended.result().status == GoalStatus.STATUS_ABORTED
     assert ended.result().result.status.reason_code == ExplorationStatus.BUDGET_EXHAUSTED
     assert ended.result().result.status.reason.endswith('; not home: the wheels are chained')
+    graph.until(lambda: words[-1].data == 'exploration_complete', 'its last status')
+    assert 'exploration_paused' not in [message.data for message in words]

@@ -16,7 +16,7 @@ from thinmap_msgs.msg import ExplorationStatus
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
-UNREACHABLE = (GoalStatus.STATUS_SUCCEEDED, ExplorationStatus.UNREACHABLE)
+UNREACHABLE = (GoalStatus.STATUS_ABORTED, ExplorationStatus.UNREACHABLE)
 
 
 class Scene:

@@ -1,5 +1,7 @@
 """The explorer with the navigation and the SLAM of others, on a live graph."""
 
+import math
+
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
@@ -22,6 +24,7 @@ from thinmap_ros.sim.world import World
 pytestmark = pytest.mark.live
 PEERS = 'support.peers'
 OFFICE = '1.3,1.2,0.0'
+AT_A_WALL = '0.35,4.0,3.14'
 DUNGEON = '42.05,21.05,-1.238'
 RANGE_M = 8.0
 
@@ -183,6 +186,20 @@ def test_nav2_drives_through_an_office_that_our_nodes_map(graph, office):
     ended = graph.result(handle, 'the exploration')
     assert ended.status == GoalStatus.STATUS_SUCCEEDED
     office.is_complete(ended.result.status, None, 0.97)
+
+
+def test_a_robot_that_starts_in_front_of_a_wall_turns_and_explores(graph):
+    room = Exploration(graph, 'room_10x10', AT_A_WALL)
+    room.start_our_slam()
+    room.start_nav2(paced_by='local_topology')
+    room.start_explorer()
+    status, end = room.ended(area_limit_m2=40.0)
+    assert status == GoalStatus.STATUS_SUCCEEDED
+    assert end.reason_code == ExplorationStatus.BUDGET_EXHAUSTED
+    assert math.dist(
+        messages.pose_from_msg(room.targets[0].pose)[:2], pose_of(AT_A_WALL)[:2]
+    ) == pytest.approx(0.0, abs=0.1)
+    assert room.collisions[-1].data == 0
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@
 - The target is kept unless another one saves a clear margin, so that the robot does not oscillate.
 - A target that stays as it is although the robot observes it is evidence that nothing is hidden.
 - One that cannot be reached is tried again after a while and before the end, some times at most.
+- Before the explorer gives up, the robot turns once in place if it stands beside unknown space.
 
 Source: exploration paper sections 3.2 and 4.
 """
@@ -25,6 +26,7 @@ from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.belief import evidence
 from thinmap_ros.core.exploration.belief.fitted import FITTED
 from thinmap_ros.core.exploration.belief.model import (
+    HIDDEN_REACH_M,
     WORTH_SEEING_M2,
     BeliefModel,
     MissingArea,
@@ -32,6 +34,7 @@ from thinmap_ros.core.exploration.belief.model import (
 )
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.frontiers import FrontierMap, Place
+from thinmap_ros.core.exploration.look_around import LookAround, turn_target
 from thinmap_ros.core.exploration.reachable import ReachableSpace
 from thinmap_ros.core.exploration.strategy import Decision, finish_reason
 from thinmap_ros.core.exploration.tour import tours_by_first
@@ -110,12 +113,16 @@ class ExplorerConfig(CandidateConfig):
 
 @dataclass
 class _Target:
-    """Where the robot drives: the candidate, the goal (3,), and scans made at the goal."""
+    """Where the robot drives: the candidate, the goal (3,), and scans made at the goal.
+
+    is_turn: whether the goal is a part of a turn in place.
+    """
 
     candidate: Candidate | None = None
     middle: Place = (math.inf, math.inf)
     goal: Array | None = None
     scans_at_goal: int = 0
+    is_turn: bool = False
 
 
 @dataclass
@@ -162,6 +169,7 @@ class Explorer:
         self._space = ReachableSpace(self.config.robot_radius_m)
         self._target = _Target()
         self._left = _LeftTargets()
+        self._look = LookAround()
         self._clock = _Clock()
         self._frame = self.frontier_map.frame
         self._scans_without_target = 0
@@ -225,9 +233,12 @@ class Explorer:
     def target_failed(self, reason: str) -> None:
         """Process that the present target could not be reached."""
         candidate = self._target.candidate
-        if candidate is not None:
+        if self._target.is_turn:
+            self._look.stop()
+        elif candidate is not None:
             candidate.evidence.failures += 1
             candidate.evidence.failed_ns = self._clock.now_ns
+        if candidate is not None:
             self._drop_target()
             self._target.goal = None
 
@@ -256,7 +267,7 @@ class Explorer:
         It is observed from somewhere else the next time, and is reachable, whatever failed before.
         """
         target = self._target
-        if target.candidate is None or target.goal is None:
+        if target.candidate is None or target.goal is None or target.is_turn:
             return
         is_there = _is_at(T_map_base, target.goal)
         target.scans_at_goal = target.scans_at_goal + 1 if is_there else 0
@@ -285,16 +296,18 @@ class Explorer:
 
     def _choose(self, topology: TopologicalMap, T_map_base: Array) -> None:
         """Choose the target among the candidates."""
-        worth = [c for c in self.candidates if self._is_worth_a_visit(c)]
+        worth = [c for c in self._doubtful if not _is_given_up(c)]
         waits = not topology.nodes and self._clock.now_ns - self._clock.began_ns < (
             _START_S * SECOND_NS
         )
         if not worth:
             self._drop_target()
             is_over = self.frontier_map.free_cells > 0 and not waits
-            self._scans_without_target += is_over
+            if not (is_over and self._turns_in_place(T_map_base)):
+                self._scans_without_target += is_over
             return
         self._scans_without_target = 0
+        self._look.stop()
         ready = self._ready(worth)
         if not ready:
             self._drop_target()
@@ -310,6 +323,18 @@ class Explorer:
                 self._left.add(kept.evidence.id)
         self._drive_to(best, T_map_base)
 
+    def _turns_in_place(self, T_map_base: Array) -> bool:
+        """Begin to turn, or turn on, if that can show anything; returns whether it can."""
+        frontiers = self.frontier_map
+        xy = (float(T_map_base[0]), float(T_map_base[1]))
+        hidden_m2 = frontiers.hidden_area_m2(xy, HIDDEN_REACH_M)
+        is_left = bool(self._doubtful)
+        goal = self._look.next_goal(T_map_base, hidden_m2, frontiers.known_area_m2, is_left)
+        if goal is None:
+            return False
+        self._target = _Target(turn_target(goal), goal=goal, is_turn=True)
+        return True
+
     def _switch_margin_m(self, candidate: Candidate) -> float:
         """Saving for which the target is changed, larger for one that was left.
 
@@ -317,10 +342,11 @@ class Explorer:
         """
         return self.config.switch_margin_m * self._left.factor(candidate.evidence.id)
 
-    def _is_worth_a_visit(self, candidate: Candidate) -> bool:
-        attempts = max(candidate.evidence.visits, candidate.evidence.failures)
-        is_doubtful = candidate.probability < self.config.probability_threshold
-        return is_doubtful and candidate.goal is not None and attempts < _MAX_ATTEMPTS
+    @property
+    def _doubtful(self) -> list[Candidate]:
+        """Candidates that are not resolved: worth a visit, or given up."""
+        threshold = self.config.probability_threshold
+        return [candidate for candidate in self.candidates if candidate.probability < threshold]
 
     def _ready(self, worth: list[Candidate]) -> list[Candidate]:
         """Candidates that did not fail lately; if there are none, those after a shorter pause."""
@@ -351,6 +377,7 @@ class Explorer:
             target.goal = goal
         target.candidate = candidate
         target.middle = candidate.middle
+        target.is_turn = False
 
     def _goal_stays(self, candidate: Candidate, goal: Array, T_map_base: Array) -> bool:
         """Whether the goal stays although another viewpoint of the same frontier is nearer now.
@@ -369,6 +396,7 @@ class Explorer:
     def _drop_target(self) -> None:
         self._target.candidate = None
         self._target.scans_at_goal = 0
+        self._target.is_turn = False
 
     def _costs(self, candidates: list[Candidate], T_map_base: Array) -> dict[Candidate, float]:
         """Cost, m, of the cheapest tour that begins with each of the nearest candidates."""
@@ -395,26 +423,36 @@ class Explorer:
         target = self._target
         chosen = None
         end_nodes = []
-        for candidate in self.candidates:
+        places = self.candidates
+        if target.is_turn and target.candidate is not None:
+            places = [*places, target.candidate]
+        for candidate in places:
             is_target = candidate is target.candidate
             end_node = candidate.as_end_node(target.goal if is_target else None)
             chosen = end_node if is_target else chosen
             end_nodes.append(end_node)
-        doubtful = [c for c in self.candidates if c.probability < self.config.probability_threshold]
-        unreachable = sorted(c.node_id for c in doubtful if c.evidence.failures or c.goal is None)
+        doubtful = self._doubtful
+        aside = sorted(c.node_id for c in doubtful if c.evidence.failures or _is_given_up(c))
         finished = self._scans_without_target >= _SCANS
-        code, reason = finish_reason(finished, unreachable, len(doubtful))
+        left = len(doubtful) or int(self._look.is_in_the_dark)
+        code, reason = finish_reason(finished, left)
         return Decision(
             chosen,
             finished,
             reason,
             code,
             end_nodes,
-            unreachable,
+            aside,
             self.frontier_map.known_area_m2,
-            len(doubtful),
+            left,
             self._missing,
         )
+
+
+def _is_given_up(candidate: Candidate) -> bool:
+    """Whether there is no way to a candidate, or as many tries in vain as it is worth."""
+    attempts = max(candidate.evidence.visits, candidate.evidence.failures)
+    return candidate.goal is None or attempts >= _MAX_ATTEMPTS
 
 
 def _turns(T_map_base: Array, goals: Array) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import validation
+from thinmap_ros.core.exploration.live.drives import Drives
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, FinishCode, Strategy
 from thinmap_ros.core.grid.patch import GridPatch
@@ -107,18 +108,24 @@ class DriveTo(NamedTuple):
 class Finish(NamedTuple):
     """Order to stop, with the reason why the mission ended.
 
-    has_explored: False where end nodes are left that no drive has failed to reach, and the robot
-    never drove: the laser shows too little.
+    has_explored: False where something is left and no drive came to anything; is_home: False where
+    the robot could not return to the start as it was asked to.
     """
 
     code: FinishCode
     reason: str
     has_explored: bool = True
+    is_home: bool = True
+
+    @property
+    def is_explored(self) -> bool:
+        """Whether exploring ended as planned, wherever the robot is now."""
+        return self.has_explored and self.code in (*_EXPLORED, FinishCode.BUDGET_EXHAUSTED)
 
     @property
     def is_success(self) -> bool:
         """Whether the mission ended as planned."""
-        return self.has_explored and self.code in (*_EXPLORED, FinishCode.BUDGET_EXHAUSTED)
+        return self.is_explored and self.is_home
 
 
 Action = DriveTo | Finish | None
@@ -192,9 +199,9 @@ class _MissionClock:
 class Mission:
     """One exploration from its start to its end.
 
-    decision: the strategy's last one; end: why exploring ended, code NONE before; is_paused: while
-    it is, nothing is decided and no timeout runs; has_returned: whether the robot is back at its
-    start.
+    drives: what came of them; decision: the strategy's last one; end: why exploring ended, code
+    NONE before; is_paused: while it is, nothing is decided and no timeout runs; has_returned:
+    whether the robot is back at its start.
     """
 
     def __init__(
@@ -211,6 +218,7 @@ class Mission:
         self.strategy = strategy
         self.state = state
         self.odometer = Odometer()
+        self.drives = Drives()
         self.decision: Decision | None = None
         self.end = Finish(FinishCode.NONE, '')
         self.is_paused = False
@@ -248,6 +256,7 @@ class Mission:
         if self.decision.finished:
             return self._finish_exploring(self._end_of(self.decision))
         target = self.decision.target
+        self.drives.follow(target)
         return None if target is None else DriveTo(target.goal)
 
     def check(self, now_s: float, is_driving: bool) -> Action:
@@ -276,8 +285,10 @@ class Mission:
     def drive_ended(self, success: bool, reason: str) -> Action:
         """Process the navigator's result for the goal that it was given last."""
         if self.state != MissionState.RETURNING:
-            if not success and self.state == MissionState.EXPLORING:
-                self.strategy.target_failed(reason)
+            if self.state == MissionState.EXPLORING:
+                self.drives.add_result(success, reason)
+                if not success:
+                    self.strategy.target_failed(reason)
             return None
         if success:
             self.has_returned = True
@@ -285,16 +296,17 @@ class Mission:
         self._return_failures += 1
         if self._return_failures < self.goal.return_attempts:
             return self._drive_to_start()
-        return self._finish(self.end._replace(reason=f'{self.end.reason}; not home: {reason}'))
+        words = f'{self.end.reason}; not home: {reason}'
+        return self._finish(self.end._replace(reason=words, is_home=False))
 
     def cancel(self, reason: str) -> Finish:
         """End the mission before it is done."""
         return self._finish(Finish(FinishCode.CANCELLED, reason))
 
     def _end_of(self, decision: Decision) -> Finish:
-        is_left = decision.remaining > 0 and not decision.unreachable
-        if is_left and self.odometer.distance_m == 0.0:
-            return Finish(decision.code, f'{decision.reason}; the robot has not driven', False)
+        shortcoming = self.drives.shortcoming(decision, self.odometer.distance_m)
+        if shortcoming:
+            return Finish(decision.code, f'{decision.reason}; {shortcoming}', False)
         return Finish(decision.code, decision.reason)
 
     def _finish_exploring(self, end: Finish) -> Action:

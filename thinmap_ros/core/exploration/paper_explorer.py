@@ -72,10 +72,10 @@ class PaperExplorer:
         self._add_views(scan, T_map_base)
         self._add_visit(T_map_base)
         waits = not topology.nodes and scan.stamp_ns - self._began_ns < _START_S * SECOND_NS
-        left = [node for node in self._end_nodes if self._is_worth_a_visit(node)]
+        left = [node for node in self._doubtful if not _attempts(node)]
         self._scans_without_target = 0 if left or waits else self._scans_without_target + 1
         self._choose(left, topology, T_map_base)
-        return self._decision(len(left))
+        return self._decision()
 
     def target_failed(self, reason: str) -> None:
         """Process that the present target could not be reached."""
@@ -121,9 +121,11 @@ class PaperExplorer:
             target.evidence.visits += 1
             self._scans_at_goal = 0
 
-    def _is_worth_a_visit(self, node: _EndNode) -> bool:
-        attempts = node.evidence.visits + node.evidence.failures
-        return node.probability < self.config.probability_threshold and attempts == 0
+    @property
+    def _doubtful(self) -> list[_EndNode]:
+        """End nodes that are not resolved: worth a visit, or given up after one."""
+        threshold = self.config.probability_threshold
+        return [node for node in self._end_nodes if node.probability < threshold]
 
     def _choose(self, left: list[_EndNode], topology: TopologicalMap, T_map_base: Array) -> None:
         if self._target not in left:
@@ -143,7 +145,7 @@ class PaperExplorer:
         lengths = path_lengths_to_nodes(topology, float(T_map_base[0]), float(T_map_base[1]))
         return min(left, key=lambda node: lengths.get(node.node_id, math.inf))
 
-    def _decision(self, left: int) -> Decision:
+    def _decision(self) -> Decision:
         chosen = None
         end_nodes = []
         for node in self._end_nodes:
@@ -151,11 +153,18 @@ class PaperExplorer:
             if node is self._target:
                 end_node = chosen = end_node._replace(is_target=True, goal=self._goal)
             end_nodes.append(end_node)
-        unreachable = sorted(n.node_id for n in self._end_nodes if n.evidence.failures)
+        doubtful = self._doubtful
+        given_up = sorted(node.node_id for node in doubtful if _attempts(node))
         finished = self._scans_without_target >= _SCANS
-        code, reason = finish_reason(finished, unreachable, left)
+        left = len(doubtful)
+        code, reason = finish_reason(finished, left)
         area_m2 = self._frontier_map.known_area_m2
-        return Decision(chosen, finished, reason, code, end_nodes, unreachable, area_m2, left)
+        return Decision(chosen, finished, reason, code, end_nodes, given_up, area_m2, left)
+
+
+def _attempts(node: _EndNode) -> int:
+    """How often the robot was there, or could not get there."""
+    return node.evidence.visits + node.evidence.failures
 
 
 def _turn(T_map_base: Array, place: tuple[float, float]) -> float:

@@ -55,9 +55,9 @@ class EndNode(NamedTuple):
 class Decision:
     """What to do next: drive to target.goal, stay, or finish.
 
-    reason: words for the end, or for the progress; unreachable: ids of end nodes that are ignored
-    for now because they could not be reached; remaining: how many are worth a visit; missing: area
-    that is not seen, None where the strategy does not estimate it.
+    reason: words for the end, or for the progress; unreachable: ids of end nodes that are put aside
+    or given up: without a way to them, or visited in vain; remaining: how many are not resolved,
+    these included; missing: area that is not seen, None where the strategy does not estimate it.
     """
 
     target: EndNode | None
@@ -99,13 +99,14 @@ class ShowsFrontiers(Protocol):
         """Cells of each frontier, (N, 2), m, map frame."""
 
 
-def finish_reason(finished: bool, unreachable: list[int], left: int) -> tuple[FinishCode, str]:
-    """Code and words for the state of an exploration with a number of end nodes left."""
+def finish_reason(finished: bool, left: int) -> tuple[FinishCode, str]:
+    """Code and words for the state of an exploration with a number of unresolved end nodes.
+
+    When it is finished, each of these is given up.
+    """
+    words = f'{left} end node{"" if left == 1 else "s"} left'
     if not finished:
-        return FinishCode.NONE, f'{left} end nodes left'
-    if unreachable:
-        reason = f'{len(unreachable)} end nodes left, none of them reachable'
-        return FinishCode.UNREACHABLE, reason
+        return FinishCode.NONE, words
     if left:
-        return FinishCode.UNREACHABLE, f'{left} end nodes left, of which visits showed no more'
+        return FinishCode.UNREACHABLE, f'{words}, which the robot cannot reach or see into'
     return FinishCode.ALL_RESOLVED, 'all end nodes resolved'

@@ -44,7 +44,7 @@ def status_of(mission: Mission, is_yielding: bool) -> str:
         if mission.has_returned:
             return RETURNED
         # An exploration that was cancelled or failed continues at the next start.
-        return COMPLETE if mission.end.is_success else PAUSED
+        return COMPLETE if mission.end.is_explored else PAUSED
     return ''
 
 

@@ -51,6 +51,15 @@ def test_goal_budget_and_progress_are_those_of_before():
     np.testing.assert_array_equal(again.odometer.start, START)
 
 
+def test_what_the_drives_came_to_is_kept():
+    mission = mission_of(state=MissionState.RETURNING)
+    mission.end = Finish(FinishCode.UNREACHABLE, 'the robot has not driven', has_explored=False)
+    again = resumed(mission, now_s=120.0)
+    assert again.end == mission.end and not again.drives.has_settled
+    mission.drives.add_result(True, '')
+    assert resumed(mission, now_s=120.0).drives.has_settled
+
+
 def test_the_budget_of_time_counts_what_was_used_before():
     watchdog = InputWatchdog(scan_timeout_s=1000.0)
     state = mission_state(mission_of(), 112.0)

@@ -30,6 +30,8 @@ FIELDS = {
     'distance_m': Field(np.float64, (), 0.0, MAX_COUNT),
     'is_paused': Field(np.bool_),
     'has_returned': Field(np.bool_),
+    'has_explored': Field(np.bool_),
+    'has_settled': Field(np.bool_),
 }
 
 
@@ -49,6 +51,8 @@ def mission_state(mission: Mission, now_s: float) -> dict[str, NDArray[Any]]:
         'distance_m': np.array(mission.odometer.distance_m),
         'is_paused': np.array(mission.is_paused),
         'has_returned': np.array(mission.has_returned),
+        'has_explored': np.array(mission.end.has_explored),
+        'has_settled': np.array(mission.drives.has_settled),
     }
 
 
@@ -64,7 +68,9 @@ def resumed_mission(
     phase = MissionState(int(own['phase']))
     mission = Mission(goal, strategy, watchdog, now_s, phase, float(own['elapsed_s']))
     reason = own['end_reason'].tobytes().decode(errors='replace')
-    mission.end = Finish(FinishCode(int(own['end_code'])), reason)
+    has_explored = bool(own['has_explored'])
+    mission.end = Finish(FinishCode(int(own['end_code'])), reason, has_explored)
+    mission.drives.has_settled = bool(own['has_settled'])
     mission.odometer.start = own['start'][0] if len(own['start']) else None
     mission.odometer.distance_m = float(own['distance_m'])
     mission.is_paused = bool(own['is_paused'])
