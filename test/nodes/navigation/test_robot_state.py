@@ -155,6 +155,19 @@ def test_poses_of_another_clock_are_named():
     assert reasons[-1].startswith('pose stamps are 7.0 s ahead of')
 
 
+def test_the_first_poses_are_named_at_once_if_they_are_of_another_clock():
+    robot = Robot()
+    robot.silent = {'localizer'}
+    robot.run(4)
+    assert robot.state.pose() is None
+    robot.state.add_pose(robot.stamp() + 7 * S, np.zeros(3))
+    assert robot.run(1)[-1].startswith('pose stamps are 7.0 s ahead of')
+    robot.silent = set()
+    assert robot.run(2)[-1] == ''
+    robot.state.add_pose(robot.stamp() + 7 * S, np.zeros(3))
+    assert robot.state.stop_reason() == '', 'the last good one holds'
+
+
 def test_a_laser_at_one_hertz_is_told_its_rate():
     robot = Robot(scan_steps=S // STEP_NS)
     assert robot.run(30)[-1] == 'laser at 1.0 Hz: expected at least 2.5 Hz'
