@@ -6,7 +6,12 @@ import sys
 import pytest
 from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
 
 from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
 from thinmap_ros.ros import qos
@@ -15,6 +20,8 @@ pytestmark = pytest.mark.live
 
 
 def value(number):
+    if isinstance(number, bool):
+        return ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=number)
     if isinstance(number, str):
         return ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=number)
     return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=number)
@@ -117,6 +124,14 @@ def test_what_cannot_change_is_marked_and_refused(graph):
     assert descriptor.floating_point_range[0].to_value == 1.0
     result = change(graph, 'grid_mapper', resolution_m=0.2)
     assert not result.successful and 'read-only' in result.reason
+    # A node with a clock that nobody publishes would do nothing any more, not even stop.
+    result = change(graph, 'grid_mapper', use_sim_time=True)
+    assert not result.successful and 'read-only' in result.reason
+    simulated = Parameter(name='use_sim_time', value=value(True))
+    request = SetParameters.Request(parameters=[simulated])
+    answer = graph.call(SetParameters, '/grid_mapper/set_parameters', request)
+    assert [result.successful for result in answer.results] == [False]
+    assert 'use_sim_time' in answer.results[0].reason
     assert graph.stop('grid_mapper') == 0
 
 

@@ -230,7 +230,7 @@ class ExplorerNode(ThinmapNode):
         self._output.progress(self._mission, self._driver.is_yielding)
 
     def _now_s(self) -> float:
-        return float(self.get_clock().now().nanoseconds) / 1e9
+        return self.elapsed_time.now_s()
 
 
 def main() -> None:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
-from rclpy.clock import Clock
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
@@ -23,6 +22,7 @@ from thinmap_ros.core.places.global_localizer import (
 )
 from thinmap_ros.core.planning.navigator import (
     CONTROL_PERIOD_S,
+    SENSOR_DELAY_NS,
     SENSOR_TIMEOUT_NS,
     NavigatorConfig,
 )
@@ -30,12 +30,14 @@ from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.sensing.input_stream import InputStream
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.files import occupancy_maps
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
 from thinmap_ros.ros.decoding.topology_reader import read_topology
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -141,10 +143,10 @@ class _SearchDriver:
     search: None while there is nothing to search.
     """
 
-    def __init__(self, clock: Clock, velocity: VelocityPublisher | None) -> None:
+    def __init__(self, time: ElapsedTime, velocity: VelocityPublisher | None) -> None:
         """velocity: None for a node that does not drive."""
         self.search: ActiveSearch | None = None
-        self._clock = clock
+        self._time = time
         self._velocity = velocity
         self._is_driving = False
         self.reset()
@@ -155,10 +157,20 @@ class _SearchDriver:
         self._scan: Scan | None = None
         self._T_odom_base: Array | None = None
         self._odometry_ns = 0
+        self._streams = {
+            name: InputStream(name, SENSOR_TIMEOUT_NS, SENSOR_DELAY_NS)
+            for name in ('laser', 'odometry')
+        }
+
+    def record(self, source: str, stamp_ns: int) -> None:
+        """A measurement of a source, 'laser' or 'odometry', was received."""
+        time = self._time
+        self._streams[source].add(stamp_ns, time.now_ns(), time.age_ns(stamp_ns))
 
     def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         self._T_odom_base = T_odom_base
         self._odometry_ns = stamp_ns
+        self.record('odometry', stamp_ns)
 
     def add_scan(self, scan: Scan) -> None:
         """Add a scan; while the laser is blind, the robot does not drive."""
@@ -197,8 +209,10 @@ class _SearchDriver:
             self._velocity.stop()
 
     def _is_recent(self, scan_ns: int) -> bool:
-        odometry_age_ns = int(self._clock.now().nanoseconds) - self._odometry_ns
-        return max(abs(self._odometry_ns - scan_ns), odometry_age_ns) <= SENSOR_TIMEOUT_NS
+        now_ns = self._time.now_ns()
+        if any(stream.fault(now_ns) for stream in self._streams.values()):
+            return False
+        return abs(self._odometry_ns - scan_ns) <= SENSOR_TIMEOUT_NS
 
 
 class _LocalizationPublishers:
@@ -290,11 +304,11 @@ class GlobalLocalizerNode(ThinmapNode):
 
     def _create_driver(self) -> _SearchDriver:
         if not self._settings.node.drive:
-            return _SearchDriver(self.get_clock(), None)
+            return _SearchDriver(self.elapsed_time, None)
         base_frame = self._laser_transform.base_frame
         velocity = VelocityPublisher(self, base_frame, self._settings.stamped_commands)
         self.create_active_timer(CONTROL_PERIOD_S, lambda: self._driver.step())
-        return _SearchDriver(self.get_clock(), velocity)
+        return _SearchDriver(self.elapsed_time, velocity)
 
     def reset_state(self) -> None:
         """Discard the search and all inputs but the map."""
@@ -356,6 +370,7 @@ class GlobalLocalizerNode(ThinmapNode):
     def _on_scan(self, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(message)
         self._received.add('scan')
+        self._driver.record('laser', scan.stamp_ns)
         self._odometry.add_scan_stamp(scan.stamp_ns)
         self._process(self._pairing.add_scan(scan))
 

@@ -54,6 +54,10 @@ class _NavigatorPublishers:
         self._plan = node.create_publisher(Path, 'plan', qos.LATCHED)
         self._published_path: Array | None = None
 
+    @property
+    def is_interrupted(self) -> bool:
+        return self._velocity.is_interrupted
+
     def command(self, v: float, w: float) -> None:
         self._velocity.publish(v, w)
 
@@ -120,7 +124,7 @@ class NavigatorNode(ThinmapNode):
         self._tasks.reset()
         self._navigator = Navigator(self._config)
         self._map.reset()
-        self._robot = RobotState(self.get_clock(), self._odometry.source != NONE)
+        self._robot = RobotState(self.elapsed_time, self._odometry.source != NONE)
         self._task = NavigationTask(NavigateToPose, (), 0)
 
     def _on_config(self, config: NavigatorConfig) -> None:
@@ -189,6 +193,8 @@ class NavigatorNode(ThinmapNode):
         if self._goals.is_cancel_requested:
             self._end(Outcome.CANCELED, ErrorCode.NONE, 'cancelled')
             return
+        if self._output.is_interrupted:
+            self._navigator.reset_velocity()
         command = self._command()
         if command is None:
             self._publish_feedback(0.0)
@@ -231,8 +237,9 @@ class NavigatorNode(ThinmapNode):
         """Publish feedback; current_pose has no frame while the pose is unknown."""
         now_ns = int(self.get_clock().now().nanoseconds)
         remaining_m = self._navigator.distance_remaining_m
+        elapsed_ns = self.elapsed_time.now_ns() - self._task.start_ns
         feedback = self._task.action.Feedback(
-            navigation_time=messages.duration_msg((now_ns - self._task.start_ns) / SECOND_NS),
+            navigation_time=messages.duration_msg(elapsed_ns / SECOND_NS),
             number_of_recoveries=min(self._navigator.recoveries, _MAX_INT16),
             distance_remaining=remaining_m,
         )

@@ -3,8 +3,7 @@
 from collections.abc import Callable
 
 from lifecycle_msgs.srv import ChangeState
-from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
-from rclpy.duration import Duration
+from rclpy.clock import Clock, ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.timer import Timer
@@ -12,50 +11,15 @@ from std_srvs.srv import SetBool, Trigger
 
 from thinmap_ros.core.errors import ThinmapError, one_line_reason
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.stamps import CLOCK_JUMP_NS
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint
+from thinmap_ros.ros.clocks.time_jumps import ElapsedTime, TimeJumps
 from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
 from thinmap_ros.ros.foreign.translation import translate
 from thinmap_ros.ros.services import fill_response
 
 _CHECKPOINT_PERIOD_S = 0.5
 RCLError = rclpy_implementation.RCLError
-_BACKWARD = JumpThreshold(
-    min_forward=None, min_backward=Duration(nanoseconds=-CLOCK_JUMP_NS), on_clock_change=False
-)
-
-
-class TimeJumps:
-    """Backward jumps of a clock: a bag or a simulation was started again.
-
-    count: of the jumps that were handled.
-    """
-
-    def __init__(self, clock: Clock) -> None:
-        self.count = 0
-        self._clock = clock
-        self._is_pending = False
-        self._before_ns = 0
-        self._jump_ns = 0
-        self._handle = clock.create_jump_callback(_BACKWARD, post_callback=self._on_jump)
-
-    def pop(self) -> bool:
-        """Whether the clock has jumped since the last call."""
-        is_pending = self._is_pending
-        self._is_pending = False
-        self.count += is_pending
-        return is_pending
-
-    def is_before(self, stamp_ns: int) -> bool:
-        """Whether a stamp belongs to the time just before the last jump."""
-        return abs(self._before_ns - stamp_ns) < self._jump_ns // 4
-
-    def _on_jump(self, jump: TimeJump) -> None:
-        # Only recorded: the caller, which sets the clock, must not be blocked.
-        self._is_pending = True
-        self._jump_ns = -jump.delta.nanoseconds
-        self._before_ns = self._clock.now().nanoseconds + self._jump_ns
 
 
 class ThinmapNode(LifecycleNode):
@@ -82,6 +46,7 @@ class ThinmapNode(LifecycleNode):
         self.is_active = False
         self.is_paused = False
         self.time_jumps = TimeJumps(self.get_clock())
+        self.elapsed_time = ElapsedTime(self.get_clock())
         self._checkpoint: PeriodicCheckpoint | None = None
         self._activation_callbacks: list[Callable[[], None]] = []
         self.diagnostics.add_update_callback(self.handle_time_jump)
@@ -109,14 +74,17 @@ class ThinmapNode(LifecycleNode):
     def create_active_timer(
         self, period_s: float, work: Callable[[], None], clock: Clock | None = None
     ) -> Timer:
-        """Create a timer that calls `work` while the node is active."""
+        """Create a timer that calls `work` while the node is active.
+
+        clock: that of `elapsed_time`, if none is given.
+        """
 
         def guarded() -> None:
             self.handle_time_jump()
             if self.is_active:
                 work()
 
-        return self.create_timer(period_s, guarded, clock=clock)
+        return self.create_timer(period_s, guarded, clock=clock or self.elapsed_time.timer_clock)
 
     def enable_checkpoint(
         self, state: Callable[[], State | None], restore: Callable[[State], None]

@@ -72,6 +72,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
         with parameters.shared_process(len(make_nodes)):
             nodes.extend(make() for make in make_nodes)
         for node in nodes:
+            parameters.freeze_clock(node)
             getattr(node, 'start', lambda: None)()
         compilation.end()
         release_compiler_pages()

@@ -153,6 +153,19 @@ def _accept_integer(node: Node, name: str, default: Any) -> None:
         node._parameter_overrides[name] = Parameter(name, value=float(given.value))
 
 
+def freeze_clock(node: Node) -> None:
+    """Make `use_sim_time` of a node read-only.
+
+    A node that is given another clock while it runs waits for times that do not come.
+    """
+    descriptor = ParameterDescriptor(
+        type=Parameter.Type.BOOL.value,
+        description='Use the time of /clock, of a simulation or a bag. Set it at the start.',
+        read_only=True,
+    )
+    node.set_descriptor('use_sim_time', descriptor)
+
+
 def declare_strict(node: Node) -> bool:
     """Declare the parameter `strict_parameters` and return its value."""
     return bool(

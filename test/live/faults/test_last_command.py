@@ -1,10 +1,13 @@
-"""A navigator that is stopped: its last command is zero, and arrives before the node is gone."""
+"""The last command of a navigator is zero: it is stopped, or its clock stands."""
 
 import signal
 
 import pytest
 from geometry_msgs.msg import Twist
+from rosgraph_msgs.msg import Clock
 from support.peers.standing_robot import StandingRobot
+
+from thinmap_ros.ros import qos
 
 pytestmark = pytest.mark.live
 
@@ -38,3 +41,21 @@ def test_the_last_command_of_a_navigator_is_zero(graph, number):
         graph.until(lambda r=robot: r.stand() or is_driven(r), f'{name} is driven')
         assert graph.stop(name, number) == 0
         graph.until(lambda r=robot: not is_driven(r), f'{name} stands', seconds=20.0)
+
+
+def test_a_robot_stands_while_the_clock_of_its_navigator_stands_and_goes_on_with_it(graph):
+    graph.start('navigator', laser_pose='0,0,0', use_sim_time=True)
+    robot = StandingRobot(graph)
+    clock = graph.node.create_publisher(Clock, '/clock', qos.STREAM)
+
+    def run():
+        clock.publish(Clock(clock=graph.node.get_clock().now().to_msg()))
+        robot.stand()
+
+    goal = robot.drive_to(4.0)
+    graph.until(lambda: run() or is_driven(robot), 'it is driven')
+    graph.until(lambda: not is_driven(robot), 'it stands')
+    graph.until(lambda: 'the simulation is paused' in graph.log('navigator'), 'a report')
+    graph.until(lambda: run() or is_driven(robot), 'it is driven again')
+    assert not goal.get_result_async().done()
+    assert graph.stop('navigator') == 0

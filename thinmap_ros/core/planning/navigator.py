@@ -5,6 +5,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import SAFE_HIGHER, Config, parameter, part
 from thinmap_ros.core.grid.patch import GridPatch
@@ -18,6 +20,7 @@ from thinmap_ros.core.planning.path_follower import (
 )
 from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.short_path import plan_short_path
+from thinmap_ros.core.planning.stuck import StuckDetector, StuckPlaces
 from thinmap_ros.core.planning.traversability import path_collides
 from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path
 from thinmap_ros.core.scan import Scan
@@ -27,11 +30,17 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 # Of the nodes that drive the robot: a stop within half a second after the last scan or odometry.
 CONTROL_PERIOD_S = 0.1
 SENSOR_TIMEOUT_NS = 400_000_000
+# Later data are of another place: 0.25 m away at the usual 0.5 m/s.
+SENSOR_DELAY_NS = 500_000_000
 _ROUNDING_M_S = 1e-9
 # A waypoint counts as passed on this last part of the path to it at most.
 _MAX_WAYPOINT_PASS_M = 0.7
 _OBSTACLE = 'an obstacle blocks the path'
 _HIDDEN = 'the laser does not see the path: sector of invalid beams'
+_STUCK = (
+    'the robot does not move as commanded: wheels blocked or off, or an obstacle that the laser '
+    'does not see'
+)
 
 
 @dataclass(frozen=True)
@@ -124,6 +133,15 @@ class _Progress:
     is_near: bool = False
 
 
+class _Motion:
+    """Motion of the robot so far: its recent path, and where it did not obey its commands."""
+
+    def __init__(self, robot_radius_m: float) -> None:
+        self.recent_path = RecentPath()
+        self.detector = StuckDetector()
+        self.stuck_places = StuckPlaces(robot_radius_m)
+
+
 class Navigator:
     """Drives to one goal at a time; a new goal replaces the old one without a stop."""
 
@@ -133,13 +151,13 @@ class Navigator:
         # Of the map: long paths are planned on it. None: all paths by wavefront alone.
         self.topology: TopologicalMap | None = None
         self._follower = PathFollower(self.config.controller)
-        self._recent_path = RecentPath()
         self._obstacles = ObstaclePoints()
         self._goal: tuple[float, float] | None = None
         self._waypoints: list[tuple[float, float]] = []
         self._heading_rad: float | None = None
         self._progress = _Progress()
         self._patch: GridPatch | None = None
+        self._motion = _Motion(self.config.planner.robot_radius_m)
 
     @property
     def distance_remaining_m(self) -> float:
@@ -180,6 +198,7 @@ class Navigator:
         self._heading_rad = theta
         self.path = None
         self._progress = _Progress()
+        self._motion.stuck_places.goal_set()
 
     def reset_velocity(self) -> None:
         """Reset the commanded velocity: the robot was stopped from outside."""
@@ -198,9 +217,13 @@ class Navigator:
         The same scan may be given again while the robot moves.
         """
         self._obstacles.add_scan(T_map_base, scan)
-        self._recent_path.add_pose(T_map_base)
+        self._motion.recent_path.add_pose(T_map_base)
+        self._motion.stuck_places.add_pose(T_map_base)
+        is_stuck = self._motion.detector.add(T_map_base, self._follower.v, self._follower.w, dt_s)
         if self._goal is None:
             return Command(*self._follower.stop(dt_s), 'idle')
+        if is_stuck:
+            return self._stop_stuck(T_map_base, dt_s)
         while self._waypoints and self._passes_waypoint(T_map_base):
             self._waypoints.pop(0)
             self.path = None
@@ -286,10 +309,7 @@ class Navigator:
     def _find_path(self, T_map_base: Array, patch: GridPatch) -> Array | None:
         """Path to the target, along a route on the graph if it is far; None: no path."""
         start = float(T_map_base[0]), float(T_map_base[1])
-        obstacles = None
-        if self._progress.blocked_s > 0.0:
-            points = self._obstacles.query_radius(T_map_base, self.config.scan_obstacle_range_m)
-            obstacles = Obstacles(points, self.config.stop_radius_m)
+        obstacles = self._extra_obstacles(T_map_base)
         # Not along a route again after the target was near: two paths could alternate.
         self._progress.is_near |= math.dist(start, self._target) < LONG_PATH_M
         if self.topology is not None and not self._progress.is_near:
@@ -298,14 +318,27 @@ class Navigator:
             path = None if band is None else self._plan_in_band(start, band, obstacles)
             if path is not None:
                 return path
-        trail = self._recent_path.cells(patch.frame, patch.shape)
+        trail = self._motion.recent_path.cells(patch.frame, patch.shape)
         return plan_short_path(patch, start, self._target, self.config.planner, obstacles, trail)
+
+    def _extra_obstacles(self, T_map_base: Array) -> Obstacles | None:
+        """What the map need not contain: places where the robot was stuck, and points of scans.
+
+        These while it is blocked. None for nothing.
+        """
+        points = self._motion.stuck_places.points()
+        if self._progress.blocked_s > 0.0:
+            reach_m = self.config.scan_obstacle_range_m
+            points = np.concatenate([points, self._obstacles.query_radius(T_map_base, reach_m)])
+        elif not len(points):
+            return None
+        return Obstacles(points, self.config.stop_radius_m)
 
     def _plan_in_band(
         self, start: tuple[float, float], band: Band, obstacles: Obstacles | None
     ) -> Array | None:
         """Path to the target by wavefront, over the cells of a band only."""
-        trail = self._recent_path.cells(band.patch.frame, band.patch.shape)
+        trail = self._motion.recent_path.cells(band.patch.frame, band.patch.shape)
         config = self.config.planner
         found = find_path(band.patch, start, self._target, config, obstacles, trail, band.cells)
         return None if found is None else found.points
@@ -356,6 +389,20 @@ class Navigator:
         if self._safe_speed(T_map_base, before, w * before / v, self.config.stop_radius_m) < v:
             v, w = self._follower.override_speed(0.0, 0.0)
         return Command(v, w, 'driving')
+
+    def _stop_stuck(self, T_map_base: Array, dt_s: float) -> Command:
+        """Stop a robot that does not move, and plan around the place; again: abort."""
+        is_turning = self._motion.detector.is_turning
+        is_repeated = self._motion.stuck_places.add_stuck(T_map_base, is_turning)
+        still = self._follower.override_speed(0.0, 0.0)
+        self.path = None
+        self._progress.standstills += 1
+        self._progress.recoveries += 1
+        self._progress.blocked_s += dt_s
+        if is_repeated or self._progress.standstills > self.config.max_standstills:
+            self.cancel()
+            return Command(*still, 'failed', _STUCK)
+        return Command(*still, 'blocked', _STUCK)
 
     def _face_obstacle(self, T_map_base: Array, dt_s: float) -> Command:
         """Act in front of an obstacle: rotate towards the path, else replan, else abort."""

@@ -244,4 +244,4 @@ class NavigationClient:
         self._on_result(is_success, reason)
 
     def _now_s(self) -> float:
-        return float(self._node.get_clock().now().nanoseconds) / 1e9
+        return self._node.elapsed_time.now_s()

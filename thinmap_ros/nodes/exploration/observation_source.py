@@ -11,7 +11,6 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.live.map_graph import MapGraph
 from thinmap_ros.core.exploration.mission import InputWatchdog
 from thinmap_ros.core.exploration.observations import Observation, ObservationBuffer
-from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.nodes.exploration.foreign_map import ForeignMap
@@ -27,7 +26,7 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 
 _LOOK_PERIOD_S = 0.5
 # A publisher that is silent because its map does not change: the old one holds.
-_UNCHANGED_NS = 10 * SECOND_NS
+_UNCHANGED_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ class ObservationSource:
         self._graph = MapGraph(self._graph_config)
         self._view.reset()
         self._map.reset()
-        self._looked_ns = 0
+        self._looked_s = -_UNCHANGED_S
 
     def with_graph(self, observation: Observation) -> Observation:
         """Observation with the graph of its map, if nobody publishes a topological map."""
@@ -132,12 +131,12 @@ class ObservationSource:
         if scan.is_blind or self._buffer.is_blind:
             return  # ignored: a blind scan observes nothing
         self.watchdog.awaited = InputWatchdog.awaited
-        self.watchdog.add_scan(self._now_ns() / SECOND_NS)
+        self.watchdog.add_scan(self._node.elapsed_time.now_s())
         self._process(self._buffer.add_scan(scan))
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         self._buffer.is_blind = message.state in (SlamStatus.BLIND, SlamStatus.MISALIGNED)
-        self.watchdog.add_tracking(messages.is_lost(message), self._now_ns() / SECOND_NS)
+        self.watchdog.add_tracking(messages.is_lost(message), self._node.elapsed_time.now_s())
 
     def _follow(self, map_id: int) -> None:
         if self._followed.origin(map_id) is Origin.OTHER:
@@ -154,30 +153,28 @@ class ObservationSource:
         """Make an observation of a new map; of an old one if there is none for a long time."""
         if not self._uses_foreign_map():
             return
-        now_ns = self._now_ns()
-        is_due = not 0 <= now_ns - self._looked_ns < _UNCHANGED_NS
+        now_s = self._node.elapsed_time.now_s()
+        is_due = not 0.0 <= now_s - self._looked_s < _UNCHANGED_S
         if not (self._map.is_changed or is_due):
             return
         try:
-            observation = self._observe(now_ns)
+            observation = self._observe()
         except InputError as error:
             self.watchdog.awaited = f'pose of the robot in the map ({error})'
             return
         if observation is None:
             self.watchdog.awaited = f'map on {self._map.topic}'
             return
-        self._looked_ns = now_ns
+        self._looked_s = now_s
         self._map.is_changed = False
         self.watchdog.awaited = f'new map on {self._map.topic}'
-        self.watchdog.add_scan(now_ns / SECOND_NS)
+        self.watchdog.add_scan(now_s)
         self._process(observation)
 
-    def _observe(self, now_ns: int) -> Observation | None:
+    def _observe(self) -> Observation | None:
         patch = self._map.patch()
         if patch is None:
             return None
+        now_ns = int(self._node.get_clock().now().nanoseconds)
         scan, T_map_base = self._view.look(patch, now_ns)
         return Observation(self._buffer.topology, patch, scan, T_map_base)
-
-    def _now_ns(self) -> int:
-        return int(self._node.get_clock().now().nanoseconds)

@@ -7,7 +7,6 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
-from rclpy.node import Node
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
@@ -15,6 +14,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.ros import messages, parameters
 from thinmap_ros.ros.action_server import InvalidGoalError
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.tf.transform_listener import TransformListener
 
 _MAX_POSES = 10_000
@@ -35,7 +35,7 @@ class NavigationTask:
     """Poses (3,) in the map frame: all but the last one are passed on the way.
 
     action: the one that the goal came by, with the types of its feedback and result; start_ns: time
-    at which the goal was accepted.
+    at which the goal was accepted, by the node's `elapsed_time`.
     """
 
     action: Any
@@ -54,7 +54,7 @@ class _TransformError(InputError):
 class TaskReader:
     """Reads goals in any frame that is connected to the map by transforms."""
 
-    def __init__(self, node: Node, map_frame: str) -> None:
+    def __init__(self, node: ThinmapNode, map_frame: str) -> None:
         """Declare the parameter `transform_tolerance`."""
         self._node = node
         self._map_frame = map_frame
@@ -119,7 +119,7 @@ class TaskReader:
         logger = self._node.get_logger()
         if request.behavior_tree:
             logger.warning(f'behavior_tree {quoted(request.behavior_tree)} ignored: there is none')
-        start_ns = int(self._node.get_clock().now().nanoseconds)
+        start_ns = self._node.elapsed_time.now_ns()
         try:
             return NavigationTask(action, poses(), start_ns)
         except InputError as error:

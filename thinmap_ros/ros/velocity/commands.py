@@ -10,6 +10,7 @@ from rclpy.node import Node
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.diagnostics import WARN, NodeDiagnostics
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.velocity.watchdog import CommandTimeout, CommandWatchdog
 
 TOPIC = 'cmd_vel'
 _KINDS: dict[str, type] = {
@@ -35,31 +36,59 @@ def declare_stamped(node: Node) -> bool:
 
 
 class VelocityPublisher:
-    """Publishes velocity commands on cmd_vel, and reports other publishers of it."""
+    """Publishes velocity commands on cmd_vel, and reports other publishers of it.
+
+    A motion that no other command follows in time is ended with a stop: see `CommandWatchdog`.
+    """
 
     def __init__(self, node: ThinmapNode, base_frame: str, is_stamped: bool) -> None:
         """base_frame: frame of stamped commands."""
-        self._clock = node.get_clock()
+        self._node = node
         self._frame = base_frame
         self._is_stamped = is_stamped
         kind = TwistStamped if is_stamped else Twist
         self._publisher = node.create_publisher(kind, TOPIC, qos.STREAM)
+        self._interruption = ''
+        self._watchdog = CommandWatchdog(
+            self._send, self._on_interruption, CommandTimeout(node.elapsed_time.is_simulated)
+        )
         # A joystick or Nav2's behaviors may share the topic on purpose.
         node.diagnostics.check_sole_publisher(TOPIC, WARN)
+        node.diagnostics.add_check(WARN, lambda: self._interruption)
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether the watchdog has stopped the robot since the last command."""
+        return bool(self._interruption)
 
     def stop(self) -> None:
-        """Publish a stop, and wait until it is received: a publisher that is gone sends nothing."""
+        """Publish a stop, the last command, and wait until it is received.
+
+        A publisher that is gone sends nothing.
+        """
+        self._watchdog.close()
         self.publish(0.0, 0.0)
         self._publisher.wait_for_all_acked(_ACKNOWLEDGEMENT)
 
     def publish(self, v: float, w: float) -> None:
         """Publish a command: v m/s ahead, w rad/s to the left."""
+        self._interruption = ''
+        self._watchdog.send(v, w)
+
+    def _send(self, v: float, w: float) -> None:
         twist = messages.twist_msg(v, w)
         if not self._is_stamped:
             self._publisher.publish(twist)
             return
-        header = messages.header(self._frame, self._clock.now().nanoseconds)
+        header = messages.header(self._frame, self._node.get_clock().now().nanoseconds)
         self._publisher.publish(TwistStamped(header=header, twist=twist))
+
+    def _on_interruption(self, seconds: float) -> None:
+        paused = 'the simulation is paused, or ' if self._node.elapsed_time.is_simulated else ''
+        self._interruption = (
+            f'no command for {seconds:.1f} s: stopped: {paused}a step takes too long'
+        )
+        self._node.get_logger().warning(self._interruption)
 
 
 class VelocitySubscription:

@@ -1,0 +1,107 @@
+"""What a navigator commands while it knows everything, and while it must not drive."""
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.time import Time
+from support.halls import empty_hall
+
+from thinmap_msgs.msg import SlamStatus
+from thinmap_ros.core.planning.navigator import CONTROL_PERIOD_S
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import pose
+from thinmap_ros.nodes.navigator import NavigatorNode
+from thinmap_ros.ros import messages
+from thinmap_ros.sim.robot import after_arc
+
+pytestmark = pytest.mark.live
+STEP_NS = round(1e9 * CONTROL_PERIOD_S)
+
+
+class Driven:
+    """A navigator in the middle of a hall, with a goal, and the messages that it receives."""
+
+    def __init__(self, node):
+        self.node = node
+        self.now_ns = 10**9
+        self.silent = set()
+        self.T = np.zeros(3)
+        node._map._on_map(empty_hall())
+        node._drive_to((pose(4.0, 0.0, 0.0),))
+
+    def step(self, count=1):
+        """Commands of the next control periods, of which the robot obeys each."""
+        for _ in range(count):
+            self.now_ns += STEP_NS
+            clock = self.node.get_clock()
+            clock.set_ros_time_override(Time(nanoseconds=self.now_ns, clock_type=clock.clock_type))
+            self._publish()
+            command = self.node._command()
+            if command is not None:
+                moved = (command.v * CONTROL_PERIOD_S, command.w * CONTROL_PERIOD_S)
+                self.T = after_arc(self.T, *moved)
+        return command
+
+    def _publish(self):
+        T = self.T
+        if 'odometry' not in self.silent:
+            frames = ('odom', 'base_link')
+            odometry = messages.odometry_msg(T, (0.0, 0.0), frames, self.now_ns)
+            self.node._odometry._on_odometry(odometry)
+        if 'laser' not in self.silent:
+            noise = 0.01 * np.random.default_rng(self.now_ns).standard_normal(61)
+            scan = Scan.create(self.now_ns, 6.0 + noise, -1.5, 0.05, 0.05, 8.0)
+            self.node._on_scan(messages.scan_msg(scan, 'laser', CONTROL_PERIOD_S))
+        if 'localizer' not in self.silent:
+            message = messages.pose_with_covariance_msg(T, np.eye(3), 'map', self.now_ns)
+            self.node._on_pose(message)
+
+
+@pytest.fixture
+def driven(ros_domain):
+    arguments = ['use_sim_time:=true', 'laser_pose:=0,0,0']
+    values = [word for argument in arguments for word in ('-p', argument)]
+    rclpy.init(args=['--ros-args', *values], domain_id=ros_domain)
+    node = NavigatorNode()
+    node.start()
+    yield Driven(node)
+    node.close()
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def test_it_drives_with_all_inputs_and_waits_without_one(driven):
+    driven.silent = {'localizer'}
+    assert driven.step() is None
+    driven.silent = set()
+    command = driven.step(20)
+    assert command.state == 'driving'
+    assert command.v == pytest.approx(driven.node._config.controller.max_speed_m_s)
+
+
+@pytest.mark.parametrize(('source', 'steps'), [('laser', 6), ('odometry', 6), ('localizer', 32)])
+def test_a_silent_input_stops_it_at_once_and_it_starts_anew(driven, source, steps):
+    driven.step(20)
+    driven.silent = {source}
+    command = driven.step(steps)
+    assert (command.v, command.w, command.state) == (0.0, 0.0, 'blocked')
+    assert command.reason.startswith(f'{source} silent for ')
+    assert command.reason.endswith(': standing still')
+    driven.silent = set()
+    command = driven.step()
+    assert command.state == 'driving'
+    assert 0.0 < command.v < 0.1
+
+
+def test_the_state_of_the_localizer_stops_it(driven):
+    driven.step(20)
+    for state, reason in (
+        (SlamStatus.BLIND, 'laser blind (it does not confirm the pose)'),
+        (SlamStatus.MISALIGNED, 'laser misaligned (turned on the robot)'),
+    ):
+        driven.node._on_slam_status(SlamStatus(state=state))
+        command = driven.step()
+        assert (command.v, command.w, command.state) == (0.0, 0.0, 'blocked')
+        assert command.reason == f'{reason}: standing still'
+    driven.node._on_slam_status(SlamStatus(state=SlamStatus.TRACKING))
+    assert driven.step().state == 'driving'

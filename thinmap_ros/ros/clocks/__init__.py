@@ -1,0 +1,1 @@
+"""Clocks of a node: jumps of its time, and time that does not jump."""
