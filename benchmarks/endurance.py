@@ -6,9 +6,11 @@ each node, its step time, CPU time of all nodes, scans without a pose. Ends with
 from the second quarter of the drive to the last one, and lost scans.
 
 With --faults one fault after the other strikes the graph: nodes are killed or stopped, messages
-dropped or repeated, the laser is blind or frozen, odometry and clock jump. Each is judged by the
-true pose of the simulator. Writes DIR/faults.json and the logs of the nodes, and prints a table and
-each violation; the exit code is 1 if there are any.
+dropped, repeated or late, the laser is blind or frozen, odometry and clock jump, the wheels are
+blocked, the robot is carried off, the localizer loses its state, a peer changes use_sim_time. Each
+is judged by the true pose of the simulator, and the map by the walls of its world. Writes
+DIR/faults.json and the logs of the nodes, and prints a table and each violation; the exit code is 1
+if there are any.
 """
 
 import argparse

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from benchmarks.faults.kinds import Fault
+from benchmarks.faults.map_watch import Drawn
 from benchmarks.faults.track import Located
 
 ERROR_M = 0.1
@@ -55,6 +56,7 @@ class Record:
     collisions: int = 0
     recovered_s: float | None = None
     pose: PoseWatch = field(default_factory=PoseWatch)
+    drawn: Drawn = field(default_factory=Drawn)
     others: list[str] = field(default_factory=list)
 
     @property
@@ -76,7 +78,7 @@ class Record:
             found.append(f'drove {self.driven_m:.2f} m, expected {self.fault.kind.stop_m} m')
         if self.commands:
             found.append(f'{self.commands} commands not zero while it should stand')
-        return found + self.others
+        return found + self.drawn.violations() + self.others
 
     def as_json(self) -> dict[str, Any]:
         """Values for a JSON file."""
@@ -88,6 +90,8 @@ class Record:
             'seed': self.fault.seed if self.fault else 0,
             'driven_m': round(self.driven_m, 3),
             'worst_error_m': round(self.pose.worst_m, 3),
+            'wrong_cells_before': self.drawn.wrong_before,
+            'wrong_cells': self.drawn.wrong,
             'recovered_s': None if self.recovered_s is None else round(self.recovered_s, 2),
             'violations': self.violations(),
         }

@@ -21,7 +21,8 @@ class Kind:
 
     seconds: shortest and longest duration (simulated). stop_m: how far the robot may drive while it
     lasts. stand_s: after this time, all commands must be zero. resets: nodes discard their state,
-    as documented, so that all of them are started again afterwards.
+    as documented, so that all of them are started again afterwards. may_end_lost: the robot need
+    not drive again, as long as it says that its pose is unknown.
     """
 
     name: str
@@ -29,12 +30,14 @@ class Kind:
     stop_m: float = math.inf
     stand_s: float = math.inf
     resets: bool = False
+    may_end_lost: bool = False
     node: str = ''
 
     @property
     def signal(self) -> str:
-        """KILL or STOP for a fault of a process, '' for one of messages."""
-        return self.name.partition('_')[0] if self.node else ''
+        """KILL or STOP for a process that is killed or stopped, else ''."""
+        word = self.name.partition('_')[0]
+        return word if word in (KILL, STOP) else ''
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,15 @@ KINDS = {
         Kind('odom_stamps', (2.0, 6.0)),
         Kind('odom_one_stamp', (1.0, 1.0)),
         Kind('clock_ahead', (1.0, 1.0)),
+        Kind('clock_minute', (1.0, 1.0)),
         Kind('clock_back', (1.0, 1.0), resets=True),
+        # Late by more than the age from which a sensor counts as silent.
+        Kind('late_data', (5.0, 10.0), _SILENT_M, 2.0),
+        Kind('wheels_blocked', (3.0, 20.0)),
+        Kind('use_sim_time', (1.0, 1.0)),
+        Kind('carried_off', (1.0, 1.0), may_end_lost=True),
+        Kind('reset_localizer', (1.0, 1.0), resets=True),
+        Kind('forget_localizer', (0.5, 3.0), _POSE_M, resets=True, node='localizer'),
     )
 }
 

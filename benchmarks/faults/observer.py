@@ -8,18 +8,25 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String, UInt32
 
 from benchmarks.faults.judge import Counts, Passed
+from benchmarks.faults.map_watch import MapWatch
 from benchmarks.faults.track import Track
 from benchmarks.interruption import Interruption
 from thinmap_msgs.msg import SlamStatus
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages, qos
+from thinmap_ros.sim.world import World
 
 _DEEP = QoSProfile(depth=1000)
+# States in which no scan may be drawn into the map.
+_NOTHING_DRAWN = {
+    getattr(SlamStatus, name) for name in ('LOST', 'MAPPING_APART') if hasattr(SlamStatus, name)
+}
 _LOST = 'lost in transport or in a full queue'
 _GAPS = 'gaps between the stamps'
 
@@ -53,11 +60,12 @@ class _RelayState:
 class Observer:
     """A node that listens. Others may use it as their node, too."""
 
-    def __init__(self) -> None:
+    def __init__(self, world: World) -> None:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._interruption = Interruption()
         self.node = rclpy.create_node('endurance')
         self.track = Track()
+        self.map = MapWatch(world, self.track)
         self.health: dict[str, Health] = {}
         self.collisions = 0
         self.moving_commands = 0
@@ -75,6 +83,7 @@ class Observer:
             (String, 'relay_scan', self._on_relay_scan),
         ):
             self.node.create_subscription(kind, topic, hear, _DEEP)
+        self.node.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
         self.node.create_subscription(UInt32, 'collisions', self._on_collisions, qos.LATCHED)
 
     @property
@@ -108,6 +117,7 @@ class Observer:
         if self._last_pose is not None:
             stamp_ns, pose = self._last_pose
             self.track.align(pose, stamp_ns)
+            self.map.restart()
 
     def spin(self) -> None:
         """Process what was received. Raises KeyboardInterrupt after Ctrl-C."""
@@ -132,6 +142,11 @@ class Observer:
     def _on_status(self, message: SlamStatus) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
         self.track.add_state(stamp_ns, message.state == SlamStatus.TRACKING)
+        self.map.add_state(stamp_ns, message.state in _NOTHING_DRAWN)
+
+    def _on_map(self, message: OccupancyGrid) -> None:
+        stamp_ns = messages.stamp_ns(message.header.stamp)
+        self.map.add_map(stamp_ns, messages.grid_from_msg(message))
 
     def _on_command(self, message: Twist) -> None:
         self.moving_commands += message.linear.x != 0.0 or message.angular.z != 0.0

@@ -44,7 +44,7 @@ class Processes:
             'wait_for_subscribers': 1,
         }
         renamed = {'local_topology': 'paced', '/clock': '/raw_clock', '/tf': '/raw_tf'}
-        renamed |= {'scan': 'raw_scan', 'odom': 'raw_odom'}
+        renamed |= {'scan': 'raw_scan', 'odom': 'raw_odom', 'cmd_vel': 'wheels'}
         self._start('sim', 'thinmap_ros.nodes.sim', parameters, renamed)
 
     def start_nodes(self, T_map_base: Array) -> None:
@@ -80,6 +80,11 @@ class Processes:
             with suppress(psutil.NoSuchProcess):
                 process.kill()
             process.wait()
+
+    def forget(self, name: str) -> None:
+        """Remove the checkpoint of a node that was killed."""
+        for path in (self._folder / 'state').glob(f'*.{name}.npz'):
+            path.unlink()
 
     def ended(self) -> dict[str, str]:
         """Processes that ended by themselves, with exit code and last line; they are forgotten."""

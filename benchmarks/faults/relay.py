@@ -1,8 +1,8 @@
-"""A node between simulator and robot: faults of laser, odometry and clock, and the pace of time.
+"""A node between simulator and robot: faults of what they exchange, and the pace of time.
 
-raw_scan, raw_odom, raw_clock in; scan, odom, /tf, /clock out. The simulator is in lockstep with
-`paced`: it continues when the graph has processed a scan, or with the wall clock while a fault
-prevents that, and pauses on request.
+raw_scan, raw_odom, raw_clock, cmd_vel in; scan, odom, /tf, /clock, wheels out. The simulator is
+in lockstep with `paced`: it continues when the graph has processed a scan, or with the wall clock
+while a fault prevents that, and pauses on request.
 
 Topics `relay_order` and `relay_state` (JSON) connect it with benchmarks/faults/observer.py;
 `relay_scan` tells the stamp and the true time of each scan.
@@ -12,6 +12,7 @@ import json
 from dataclasses import dataclass
 from time import monotonic
 
+from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -81,6 +82,7 @@ class FaultRelay(Node):
             'odom': self.create_publisher(Odometry, 'odom', qos.STREAM),
             'tf': self.create_publisher(TFMessage, '/tf', qos.STREAM),
             'clock': self.create_publisher(ClockMsg, '/clock', qos.STREAM),
+            'wheels': self.create_publisher(Twist, 'wheels', qos.STREAM),
             'paced': self.create_publisher(TopologicalMap, 'paced', qos.STREAM),
             'state': self.create_publisher(String, 'relay_state', qos.STREAM),
             'stamp': self.create_publisher(String, 'relay_scan', qos.STREAM),
@@ -88,6 +90,7 @@ class FaultRelay(Node):
         self.create_subscription(LaserScan, 'raw_scan', self._on_scan, _DEEP)
         self.create_subscription(Odometry, 'raw_odom', self._on_odometry, _DEEP)
         self.create_subscription(ClockMsg, '/raw_clock', self._on_clock, _DEEP)
+        self.create_subscription(Twist, 'cmd_vel', self._on_command, _DEEP)
         self.create_subscription(TopologicalMap, 'local_topology', self._on_result, qos.STREAM)
         self.create_subscription(String, 'relay_order', self._on_order, _DEEP)
         wall = Clock(clock_type=ClockType.STEADY_TIME)
@@ -118,6 +121,9 @@ class FaultRelay(Node):
             stamp_ns = messages.stamp_ns(each.header.stamp)
             transform = messages.transform_msg(T_odom_base, 'odom', 'base_link', stamp_ns)
             self._out['tf'].publish(TFMessage(transforms=[transform]))
+
+    def _on_command(self, message: Twist) -> None:
+        self._out['wheels'].publish(Twist() if self._faults.blocks_wheels else message)
 
     def _on_result(self, message: TopologicalMap) -> None:
         self._pace.result(messages.stamp_ns(message.header.stamp))

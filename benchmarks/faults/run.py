@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.faults.causes import Killed, cause_of
 from benchmarks.faults.judge import Counts, Passed, PoseWatch, Record, uncounted
-from benchmarks.faults.kinds import KILL, NODES, STOP, Fault
+from benchmarks.faults.kinds import NODES, Fault
 from benchmarks.faults.observer import Observer
 from benchmarks.faults.processes import Processes
 from benchmarks.goal_client import GoalClient
@@ -31,6 +32,7 @@ _MOVING_S = 60.0
 _CENSUS_S = 60.0
 _REALIGN_S = 2.0
 _STOP_S = 2.5
+_ANSWER_S = 30.0
 _SETTLED = 2  # diagnostics of each node with the same counts
 _TOPICS = ('scan', 'odom')
 
@@ -64,7 +66,7 @@ class FaultRun:
 
     def __init__(self, setting: Setting) -> None:
         self._setting = setting
-        self._observer = Observer()
+        self._observer = Observer(setting.world)
         self._processes = Processes(setting.out, SPEED_M_S)
         self._goals = GoalClient(self._observer.node, setting.world, setting.seed, _EXPLORATIONS)
         self._rng = np.random.default_rng([setting.seed, 1])
@@ -92,7 +94,8 @@ class FaultRun:
             self._recover(fault)
             self._take_census()
             self._end_record(report)
-            if self._record.violations() or fault.kind.resets:
+            is_lost = self._record.recovered_s is None
+            if self._record.violations() or fault.kind.resets or is_lost:
                 self._restart_all()
 
     def close(self) -> None:
@@ -128,27 +131,21 @@ class FaultRun:
         track = self._observer.track
         self._observer.order(is_free=True)
         end_s = track.time_s + fault.duration_s
-        if fault.kind.signal == KILL:
-            self._processes.kill(fault.kind.node)
-            self._spin_until(lambda: track.time_s > end_s)
-            self._start_again(fault.kind.node)
-        elif fault.kind.signal == STOP:
-            self._processes.send(fault.kind.node, signal.SIGSTOP)
-            self._spin_until(lambda: track.time_s > end_s)
-            self._processes.send(fault.kind.node, signal.SIGCONT)
-        else:
-            self._observer.order(begin=fault.kind.name, seed=fault.seed)
-            stand_s = track.time_s + fault.kind.stand_s
-            self._spin_until(lambda: track.time_s > min(end_s, stand_s))
-            before = self._observer.moving_commands
-            self._spin_until(lambda: track.time_s > end_s)
-            self._record.commands = self._observer.moving_commands - before
-            self._observer.order(end=True)
+        cause = cause_of(fault, self._setting.world, self._processes, self._observer)
+        cause.begin()
+        stand_s = track.time_s + fault.kind.stand_s
+        self._spin_until(lambda: track.time_s > min(end_s, stand_s))
+        before = self._observer.moving_commands
+        self._spin_until(lambda: track.time_s > end_s)
+        self._record.commands = self._observer.moving_commands - before
+        self._spin_until(lambda: cause.is_done() or track.time_s > end_s + _ANSWER_S)
+        self._record.others += cause.end()
+        if isinstance(cause, Killed):
+            self._await_start(fault.kind.node)
         self._record.driven_m = track.travelled_m - self._begun_m
 
-    def _start_again(self, name: str) -> None:
+    def _await_start(self, name: str) -> None:
         self._observer.health.pop(name, None)
-        self._processes.start_node(name)
         self._spin_until(lambda: name in self._observer.health or not self._processes.pid(name))
         self._goals.ask_again()
 
@@ -175,7 +172,7 @@ class FaultRun:
         self._spin_until(ended)
         if recovered():
             self._record.recovered_s = track.time_s - begun_s
-        elif not watch.is_violated:
+        elif not watch.is_violated and not self._is_lost_as_it_may(fault):
             faults = [f'{n}: {h.message}' for n, h in self._observer.health.items() if not h.is_ok]
             state = 'the pose is wrong' if drives else 'the robot does not drive'
             self._record.others.append(
@@ -183,9 +180,13 @@ class FaultRun:
             )
         self._observer.order(is_free=False)
 
+    def _is_lost_as_it_may(self, fault: Fault) -> bool:
+        localizer = self._observer.health.get('localizer')
+        return fault.kind.may_end_lost and localizer is not None and not localizer.is_ok
+
     def _begin_record(self, fault: Fault | None) -> None:
         track = self._observer.track
-        self._record = Record(fault, track.time_s)
+        self._record = Record(fault, track.time_s, drawn=self._observer.map.begin())
         self._begun_m = track.travelled_m
 
     def _end_record(self, report: Callable[[Record], None]) -> None:
@@ -242,6 +243,7 @@ class FaultRun:
         self._wait_for(observer.is_connected, 'simulator and relay do not start')
         observer.health.clear()
         observer.track.T_world_map = np.zeros(3)
+        observer.map.discard()
         self._processes.start_nodes(at)
         self._wait_for(lambda: observer.health.keys() >= set(NODES), 'nodes do not start')
         self._census = self._counts()
@@ -299,6 +301,7 @@ class FaultRun:
         for scan in observer.track.located():
             localizer = observer.health.get('localizer')
             self._record.pose.add(scan, localizer is not None and not localizer.is_ok)
+            observer.map.add_error(scan.stamp_ns, scan.error_m)
         if observer.collisions != self._collisions:
             self._record.collisions += observer.collisions - self._collisions
             self._collisions = observer.collisions

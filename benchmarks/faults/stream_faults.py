@@ -1,4 +1,4 @@
-"""Faults of the messages of laser, odometry and clock."""
+"""Faults of the messages of laser, odometry, clock and wheels."""
 
 from array import array
 from collections import deque
@@ -17,6 +17,34 @@ _COPIES = 4
 _MEMORY = 10
 _STAMPS_S = 5.0
 _ONE_STAMP_S = 9.0
+_LATE_S = (1.0, 5.0)
+_MINUTE_S = 61.0
+
+
+class LateMessages:
+    """Holds messages back by stream, which keep their stamps.
+
+    delay_ns: 0 once the fault is over; what was held back then comes at once.
+    """
+
+    def __init__(self) -> None:
+        self.delay_ns = 0
+        self._held: dict[str, deque[Any]] = {}
+
+    @property
+    def is_used(self) -> bool:
+        """Whether messages are held back, or some still are."""
+        return self.delay_ns > 0 or any(self._held.values())
+
+    def passed(self, stream: str, message: Any) -> list[Any]:
+        """Messages of a stream that are due when another arrives."""
+        held = self._held.setdefault(stream, deque())
+        held.append(message)
+        now_ns = messages.stamp_ns(message.header.stamp)
+        due = []
+        while held and messages.stamp_ns(held[0].header.stamp) <= now_ns - self.delay_ns:
+            due.append(held.popleft())
+        return due
 
 
 class StreamFaults:
@@ -33,6 +61,7 @@ class StreamFaults:
         self._T_new_odom: Array = np.zeros(3)
         self._frozen: array[float] | None = None
         self._shift_ns = 0
+        self._late = LateMessages()
         self._is_due = False
         self._recent: dict[str, deque[Any]] = {
             'scan': deque(maxlen=_MEMORY),
@@ -53,6 +82,10 @@ class StreamFaults:
             self._T_new_odom = se2.compose(jump, self._T_new_odom)
         elif kind == 'clock_ahead':
             self.offset_ns += int(self._rng.uniform(1.0, 20.0) * SECOND_NS)
+        elif kind == 'clock_minute':
+            self.offset_ns += int(_MINUTE_S * SECOND_NS)
+        elif kind == 'late_data':
+            self._late.delay_ns = int(self._rng.uniform(*_LATE_S) * SECOND_NS)
         elif kind == 'clock_back':
             self.offset_ns -= int(self._rng.uniform(2.0, 20.0) * SECOND_NS)
         elif kind == 'odom_stamps':
@@ -62,11 +95,17 @@ class StreamFaults:
     def end(self) -> None:
         """End the fault."""
         self._kind = ''
+        self._late.delay_ns = 0
 
     @property
     def is_silent(self) -> bool:
-        """Whether a sensor is silent, which is no loss of single messages."""
-        return self._kind.startswith('silent')
+        """Whether a sensor is silent or late, which is no loss of single messages."""
+        return self._kind.startswith(('silent', 'late'))
+
+    @property
+    def blocks_wheels(self) -> bool:
+        """Whether commands have no effect."""
+        return self._kind == 'wheels_blocked'
 
     def clock(self, stamp_ns: int) -> int:
         """Time of /clock."""
@@ -106,6 +145,8 @@ class StreamFaults:
         """The message, or none, or several copies, some of earlier messages."""
         recent = self._recent[stream]
         recent.append(message)
+        if self._late.is_used:
+            return self._late.passed(stream, message)
         if self._kind == f'silent_{stream}':
             return []
         if self._kind == f'drop_{stream}' and self._rng.random() < _DROP:

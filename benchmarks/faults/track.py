@@ -16,11 +16,15 @@ _SPEED_NS = SECOND_NS // 2
 
 @dataclass(frozen=True)
 class Located:
-    """A scan that has a pose: time, s; error of the pose, m; whether the state is TRACKING."""
+    """A scan that has a pose: time, s; error of the pose, m; whether the state is TRACKING.
+
+    stamp_ns: its stamp, which may be wrong.
+    """
 
     time_s: float
     error_m: float
     is_tracking: bool
+    stamp_ns: int
 
 
 class _Recent(dict[int, Array]):
@@ -111,7 +115,8 @@ class Track:
                 continue
             believed = se2.compose(self.T_world_map, pose)
             error_m = math.dist(believed[:2], self._truth[true_ns][:2])
-            found.append(Located(true_ns / SECOND_NS, error_m, self._states.pop(stamp_ns)))
+            is_tracking = self._states.pop(stamp_ns)
+            found.append(Located(true_ns / SECOND_NS, error_m, is_tracking, stamp_ns))
         return found
 
     def align(self, T_map_base: Array, stamp_ns: int) -> None:

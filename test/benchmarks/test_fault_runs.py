@@ -7,16 +7,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters
+from std_srvs.srv import Trigger
 
 from benchmarks.faults import report
+from benchmarks.faults.causes import place_apart, reset_faults, sim_time_faults
 from benchmarks.faults.judge import Counts, Passed, PoseWatch, Record, uncounted
 from benchmarks.faults.kinds import KINDS, Fault, random_faults
+from benchmarks.faults.map_watch import Drawn, MapWatch
+from benchmarks.faults.processes import Processes
 from benchmarks.faults.stream_faults import StreamFaults
 from benchmarks.faults.track import Located, Track
 from thinmap_ros.core import se2
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.ros import messages
+from thinmap_ros.sim.world import World
 
 SCAN_NS = SECOND_NS // 5
 
@@ -137,7 +146,7 @@ def test_errors_are_those_at_the_true_time_of_a_scan() -> None:
     track.add_pose(10**12, np.array([0.5, 0.3, 0.0]))
     assert track.located() == []
     track.add_state(10**12, True)
-    assert track.located() == [Located(1.0, pytest.approx(0.3), True)]
+    assert track.located() == [Located(1.0, pytest.approx(0.3), True, 10**12)]
     track.align(np.array([1.0, 1.0, 1.0]), 10**12)
     assert se2.compose(track.T_world_map, np.array([1.0, 1.0, 1.0])) == pytest.approx([0.5, 0, 0])
 
@@ -157,8 +166,147 @@ def test_an_error_that_lasts_and_is_not_reported_is_a_violation(
 ) -> None:
     watch = PoseWatch()
     for k in range(round(5.0 * seconds)):
-        watch.add(Located(0.2 * k, error_m, is_tracking), is_reported)
+        watch.add(Located(0.2 * k, error_m, is_tracking, k), is_reported)
     assert watch.is_violated == violated
+
+
+def test_late_data_keep_their_stamps_and_order_and_come_at_once_in_the_end() -> None:
+    faults = StreamFaults(100 * SECOND_NS)
+    faults.begin('late_data', 1)
+    delays = []
+    for k in range(1, 51):
+        delays += [100.0 + 0.2 * k - stamp_s(scan) for scan in faults.scan(scan_msg(k))]
+        faults.odometry(odometry_msg(k))
+    assert len(set(np.round(delays, 6))) == 1
+    assert 1.0 <= delays[0] <= 5.2
+    assert faults.is_silent
+    faults.end()
+    for change, make in ((faults.scan, scan_msg), (faults.odometry, odometry_msg)):
+        flood = [stamp_s(message) for message in change(make(51))]
+        assert flood[-1] == pytest.approx(110.2)
+        assert np.diff(flood) == pytest.approx(0.2)
+        assert 110.2 - flood[0] == pytest.approx(delays[0], abs=0.21)
+        assert len(change(make(52))) == 1
+
+
+def test_the_clock_goes_ahead_by_more_than_a_minute() -> None:
+    faults = StreamFaults(100 * SECOND_NS)
+    faults.begin('clock_minute', 1)
+    faults.end()
+    assert faults.clock(0) == 161 * SECOND_NS
+
+
+def test_wheels_are_blocked_until_the_end_of_the_fault() -> None:
+    faults = StreamFaults(0)
+    assert not faults.blocks_wheels
+    faults.begin('wheels_blocked', 1)
+    assert faults.blocks_wheels
+    assert faults.odometry(odometry_msg(1)) == [odometry_msg(1)]
+    faults.end()
+    assert not faults.blocks_wheels
+
+
+def test_a_change_of_use_sim_time_must_be_answered_and_refused() -> None:
+    def response(successful: bool) -> SetParameters.Response:
+        return SetParameters.Response(results=[SetParametersResult(successful=successful)])
+
+    assert sim_time_faults('navigator', response(False)) == []
+    assert sim_time_faults('navigator', response(True)) == ['navigator: accepted use_sim_time']
+    assert sim_time_faults('navigator', None) == ['navigator: no answer to use_sim_time']
+
+
+def test_a_reset_must_be_answered_and_done() -> None:
+    assert reset_faults(Trigger.Response(success=True)) == []
+    refused = reset_faults(Trigger.Response(success=False, message='busy'))
+    assert refused == ['localizer: not reset: busy']
+    assert reset_faults(None) == ['localizer: no answer to a reset']
+
+
+def room(size_m: float = 6.0) -> World:
+    """An empty room with walls of 0.1 m."""
+    cells = np.full((round(10 * size_m),) * 2, 0, dtype=np.int8)
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
+    return World.from_patch('room', patch, np.array([3.0, 3.0, 0.0]))
+
+
+def test_a_robot_is_carried_to_a_clear_place_some_metres_away() -> None:
+    world = room()
+    place = np.array([1.0, 1.0, 0.0])
+    for seed in range(10):
+        x, y, _ = place_apart(world, place, np.random.default_rng(seed))
+        assert math.hypot(x - 1.0, y - 1.0) >= 1.5
+        assert world.is_clear(x, y, 0.2)
+
+
+def test_a_checkpoint_is_forgotten(tmp_path: Path) -> None:
+    (tmp_path / 'state').mkdir()
+    for name in ('63.localizer.npz', '63.grid_mapper.npz'):
+        (tmp_path / 'state' / name).touch()
+    Processes(tmp_path, 0.5).forget('localizer')
+    assert [path.name for path in (tmp_path / 'state').iterdir()] == ['63.grid_mapper.npz']
+
+
+def drawn_map(*points: tuple[float, float]) -> GridPatch:
+    """A map of the room with free space, and an occupied row of three cells at each point."""
+    cells = np.zeros((60, 60), dtype=np.int8)
+    for x, y in points:
+        cells[int(10 * y), int(10 * x) : int(10 * x) + 3] = 100
+    return GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
+
+
+WALL = (2.0, 0.05)
+WRONG = (3.0, 3.05)
+
+
+@pytest.mark.parametrize(
+    ('error_m', 'is_lost', 'expected'),
+    [
+        (0.0, False, Drawn(0, 3)),
+        (0.6, False, Drawn(0, 3, while_wrong=3)),
+        (0.0, True, Drawn(0, 3, while_lost=3)),
+    ],
+)
+def test_walls_drawn_in_the_open_are_judged_by_the_pose_and_state(
+    error_m: float, is_lost: bool, expected: Drawn
+) -> None:
+    watch = MapWatch(room(), Track())
+    drawn = watch.begin()
+    watch.add_map(SCAN_NS, drawn_map(WALL))
+    for k in (2, 3):
+        watch.add_error(k * SCAN_NS, error_m)
+        watch.add_state(k * SCAN_NS, is_lost)
+    for k in (3, 4):
+        watch.add_map(k * SCAN_NS, drawn_map(WALL, WRONG))
+    assert drawn == expected
+    assert len(drawn.violations()) == 1 + bool(error_m or is_lost)
+    assert watch.begin() == Drawn(3, 3)
+
+
+def test_cells_by_themselves_and_walls_at_their_place_are_right() -> None:
+    track = Track()
+    watch = MapWatch(room(), track)
+    drawn = watch.begin()
+    patch = drawn_map(WALL)
+    patch.cells[30, 30] = 100
+    watch.add_map(0, patch)
+    assert drawn.wrong == 0
+    # The same map, elsewhere in the world: outside of it, too, walls are wrong.
+    for shift_m in (1.0, -9.0):
+        track.T_world_map = np.array([0.0, shift_m, 0.0])
+        watch.add_map(0, patch)
+        assert drawn.wrong == 3
+
+
+def test_a_map_that_was_begun_anew_is_not_compared_with_the_one_before() -> None:
+    watch = MapWatch(room(), Track())
+    drawn = watch.begin()
+    watch.add_map(9 * SCAN_NS, drawn_map(WALL))
+    for k in range(1, 4):
+        watch.add_state(k * SCAN_NS, True)
+        watch.add_map(k * SCAN_NS, drawn_map(WALL, WRONG))
+    assert drawn == Drawn(0, 3)
 
 
 def test_messages_that_a_node_neither_received_nor_counted_are_found() -> None:

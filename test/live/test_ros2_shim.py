@@ -354,6 +354,7 @@ AT_ONCE = ('--spin-time', '0.5')
     ('words', 'code', 'said'),
     [
         (['bag', 'record'], 2, 'no command bag: this is'),
+        (['security', 'create_keystore', 'x'], 2, 'needs a ROS 2 Jazzy with the package'),
         (['topic', 'bw', '/scan'], 2, 'no verb bw: this is'),
         (['topic', 'echo'], 2, 'topic_name'),
         (['topic', 'hz', '/scan', '/odom'], 2, '/odom'),

@@ -1,5 +1,7 @@
 """Mutation testing: change the code in one place at a time, and run its tests.
 
+A mutant that computes several times as long as its tests do without it loops: its CPU limit kills
+it. One that times out is not counted as killed: the machine may be busy, or something waits.
 Survivors, which no test has found, are listed with file, line, and both texts. Mutants that change
 no result are listed in test/mutants/equivalent.tsv with their reasons, and are not counted.
 """
@@ -10,6 +12,8 @@ import hashlib
 import shutil
 import sys
 import time
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 from mutants.mutations import Mutation, mutations
@@ -21,6 +25,7 @@ FOLDERS = ('thinmap_ros/core', 'thinmap_ros/files')
 SEED = 39
 COUNT = 200
 LEAST_SHARE = 0.85
+LIMIT_S = 900.0  # as that of a single test in pyproject.toml
 
 # File, its line without and its line with the mutation.
 Change = tuple[str, str, str]
@@ -36,7 +41,10 @@ def parsed(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--only', default='', help='only paths that begin with this')
     parser.add_argument('--skip', nargs='*', default=[], help='no paths that begin with these')
     parser.add_argument(
-        '--limit-s', type=float, default=300.0, help='time for the tests of a mutant (default 300)'
+        '--limit-s',
+        type=float,
+        default=LIMIT_S,
+        help=f'time for the tests of a mutant, also where they wait (default {LIMIT_S:g})',
     )
     parser.add_argument('--root', type=Path, default=ROOT, help=argparse.SUPPRESS)
     parser.add_argument('--folders', nargs='+', default=FOLDERS, help=argparse.SUPPRESS)
@@ -104,15 +112,27 @@ def run(arguments: argparse.Namespace, folder: Path) -> list[Result]:
         place = f'{mutation.path.as_posix()}:{line}'
         seconds = time.monotonic() - began
         print(f'{number}: {result.fate.value} {seconds:.1f} s {place} {result.test}', flush=True)
-    killers = sorted({result.test for result in results if result.test})
-    broken = workshop.failures_without_mutant(killers, arguments.limit_s * len(killers))
-    if broken:
-        raise SystemExit(f'mutants: these tests fail without a mutant: {", ".join(broken)}')
     return results
 
 
+def report(root: Path, results: list[Result]) -> Iterator[str]:
+    """Lines: the mutants that were not killed, how many there are of each fate, and in all."""
+    for fate in (Fate.TIMED_OUT, Fate.SURVIVED):
+        for result in results:
+            if result.fate is fate:
+                yield f'{fate.value}: {described(root, result)}'
+    counts = Counter(result.fate for result in results)
+    for fate in Fate:
+        yield f'{counts[fate]:5d} {fate.value}'
+
+
+def share_killed(results: list[Result]) -> float:
+    """Share of the mutants that were killed, of all."""
+    return sum(result.fate.is_killed for result in results) / max(len(results), 1)
+
+
 def main(words: list[str] | None = None) -> int:
-    """Run; the exit code is 1 if too many survive."""
+    """Run; the exit code is 1 if too few are killed."""
     arguments = parsed(words)
     folder = arguments.root / 'out' / 'mutants'
     shutil.rmtree(folder, ignore_errors=True)
@@ -121,10 +141,9 @@ def main(words: list[str] | None = None) -> int:
         results = run(arguments, folder)
     finally:
         shutil.rmtree(folder)
-    survivors = [result for result in results if result.fate is Fate.SURVIVED]
-    for result in survivors:
-        print(f'survived: {described(arguments.root, result)}')
-    share = 1.0 - len(survivors) / max(len(results), 1)
+    for line in report(arguments.root, results):
+        print(line)
+    share = share_killed(results)
     print(f'seed {arguments.seed}: {share:.1%} of {len(results)} mutants killed')
     return int(share < LEAST_SHARE)
 

@@ -1,12 +1,24 @@
 """scripts/mutants reports the killed and the surviving mutants of a small package."""
 
+import signal
 import subprocess
 from pathlib import Path
 
 import pytest
+from support.timeouts import PATIENCE_S
 
-from mutants.__main__ import EQUIVALENT, ROOT, chosen, equivalent_changes, main, parsed
+from mutants.__main__ import (
+    EQUIVALENT,
+    ROOT,
+    chosen,
+    equivalent_changes,
+    main,
+    parsed,
+    report,
+    share_killed,
+)
 from mutants.mutations import mutations
+from mutants.runner import Fate, Result, Workshop, fate_of
 from mutants.selection import Selection
 
 MODULE = """
@@ -66,6 +78,12 @@ def test_killed_and_surviving_mutants_are_told_apart(project, capsys) -> None:
     assert 'package/core/bounds.py:2 test/core/test_bounds.py::test_values' in killed[0]
     at = lines.index('survived: package/core/bounds.py:6')
     assert lines[at + 1 : at + 3] == ['    - if value > LIMIT:', '    + if value >= LIMIT:']
+    assert lines[-5:-1] == [
+        '    1 killed',
+        '    0 killed by its CPU limit',
+        '    0 timed out',
+        '    5 survived',
+    ]
     assert lines[-1] == 'seed 39: 16.7% of 6 mutants killed'
     assert not (project / 'out' / 'mutants').exists()
     assert (project / 'package' / 'core' / 'bounds.py').read_text() == MODULE
@@ -90,6 +108,51 @@ def test_a_test_that_fails_without_a_mutant_ends_it(project) -> None:
     (project / 'test' / 'core' / 'test_bounds.py').write_text(TEST + '    assert bounded(1) == 2\n')
     with pytest.raises(SystemExit, match=r'fail without a mutant: test/core/test_bounds\.py::test'):
         main(words(project, '--last', '1'))
+
+
+@pytest.mark.programs
+def test_a_mutant_that_loops_is_killed_by_a_limit_from_the_time_of_the_tests(project) -> None:
+    source = 'def counted(value):\n    while value > 0:\n        value -= 1\n    return value'
+    test = 'from package.core.loop import counted\n\n\ndef test_it():\n    assert counted(3) == 0\n'
+    added(project, 'package/core/loop.py', source + '\n')
+    added(project, 'test/core/test_loop.py', test)
+    (project / 'out').mkdir()
+    workshop = Workshop(project, 'package', project / 'out')
+    loop = Path('package/core/loop.py')
+    found = {m.before_and_after(source.encode())[1]: m for m in mutations(loop, source.encode())}
+    result = workshop.run(found['value += 1'], limit_s=PATIENCE_S)
+    assert (result.fate, result.test) == (Fate.KILLED_BY_LIMIT, '')
+    assert workshop.run(found['value -= 2'], limit_s=PATIENCE_S).fate is Fate.KILLED
+
+
+@pytest.mark.parametrize(
+    ('code', 'has_failed', 'fate', 'is_killed'),
+    [
+        (1, True, Fate.KILLED, True),
+        (-signal.SIGSEGV, False, Fate.KILLED, True),
+        (-signal.SIGXCPU, False, Fate.KILLED_BY_LIMIT, True),
+        (None, False, Fate.TIMED_OUT, False),
+        (0, False, Fate.SURVIVED, False),
+    ],
+)
+def test_fate_of_a_mutant(code, has_failed, fate, is_killed) -> None:
+    assert fate_of(code, has_failed) is fate
+    assert fate.is_killed == is_killed
+
+
+def test_mutants_that_time_out_have_lines_of_their_own_and_do_not_count_as_killed(tmp_path) -> None:
+    (tmp_path / 'a.py').write_text('a = 1\n')
+    (mutation,) = mutations(Path('a.py'), b'a = 1\n')
+    results = [Result(mutation, fate) for fate in (*Fate, Fate.KILLED)]
+    assert list(report(tmp_path, results)) == [
+        'timed out: a.py:1\n    - a = 1\n    + a = 2',
+        'survived: a.py:1\n    - a = 1\n    + a = 2',
+        '    2 killed',
+        '    1 killed by its CPU limit',
+        '    1 timed out',
+        '    1 survived',
+    ]
+    assert share_killed(results) == pytest.approx(3 / 5)
 
 
 @pytest.mark.programs

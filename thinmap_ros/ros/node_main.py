@@ -5,9 +5,10 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NoReturn
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -15,11 +16,15 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from thinmap_ros.core.errors import ThinmapError, one_line_reason
+from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.ros import parameters
 
+_SECURITY = 'ROS_SECURITY_ENABLE'
+_KEYSTORE = 'ROS_SECURITY_KEYSTORE'
+_STRATEGY = 'ROS_SECURITY_STRATEGY'
+_PERMISSIVE = 'Permissive'
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -70,7 +75,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
     running = _Running(nodes)
     try:
         with parameters.shared_process(len(make_nodes)):
-            nodes.extend(make() for make in make_nodes)
+            nodes.extend(_made(make) for make in make_nodes)
         for node in nodes:
             parameters.freeze_clock(node)
             getattr(node, 'start', lambda: None)()
@@ -82,8 +87,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
     except ExternalShutdownException:
         pass
     except ThinmapError as error:
-        print(f'error: {error}', file=sys.stderr)
-        sys.exit(2)
+        _fail(str(error))
     finally:
         _on_signals(signal.SIG_IGN)  # a second signal must not interrupt the end, which is short
         for node in reversed(nodes):
@@ -95,10 +99,54 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
 def _init() -> None:
     """Parse the arguments after --ros-args; ends with 2 and an error line where they are wrong."""
     try:
+        enforce_security(os.environ)
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except InputError as error:
+        _fail(str(error))
     except rclpy_implementation.RCLError as error:
-        print(f'error: arguments after --ros-args: {one_line_reason(error)}', file=sys.stderr)
-        sys.exit(2)
+        _fail(f'arguments after --ros-args: {one_line_reason(error)}')
+
+
+def enforce_security(environment: MutableMapping[str, str]) -> None:
+    """Set the strategy of SROS 2 to Enforce where it is on, unless it is Permissive by that word.
+
+    ROS takes any other word, or none, for Permissive, and then starts nodes without keys, without a
+    message: who misspells it would believe the graph to be protected.
+
+    Raises InputError where no keystore is named.
+    """
+    if environment.get(_SECURITY) != 'true' or environment.get(_STRATEGY) == _PERMISSIVE:
+        return
+    if not environment.get(_KEYSTORE):
+        raise InputError(
+            f'{_SECURITY}=true, and {_KEYSTORE} is not set: expected the folder of the keys '
+            f'(ros2 security create_keystore), or {_STRATEGY}={_PERMISSIVE} to start unprotected'
+        )
+    environment[_STRATEGY] = 'Enforce'
+
+
+def _security_advice(reason: str) -> str:
+    """What to do about an RMW without security, after its error; '' for any other."""
+    if 'security libraries' not in reason:
+        return ''
+    return f': the Python wheels of ROS have no SROS 2: source a ROS 2 Jazzy, or unset {_SECURITY}'
+
+
+def _fail(text: str) -> NoReturn:
+    print(f'error: {text}', file=sys.stderr)
+    sys.exit(2)
+
+
+def _made(make_node: Callable[[], Node]) -> Node:
+    """A node. Raises InputError where ROS creates none, as without security for its keys."""
+    try:
+        with warnings.catch_warnings():
+            # Of a node that was not created: it says no more than the error.
+            warnings.filterwarnings('ignore', message='Failed to fini', category=RuntimeWarning)
+            return make_node()
+    except rclpy_implementation.RCLError as error:
+        reason = one_line_reason(error)
+        raise InputError(f'{reason}{_security_advice(reason)}') from error
 
 
 def _spin(running: _Running) -> None:

@@ -19,6 +19,11 @@ COMMANDS = {
     'service': 'list and call services',
     'topic': 'list topics, show and publish messages',
 }
+# Of the real one: what they need, that the Python wheels of ROS do not have.
+ELSEWHERE = {
+    'security': 'SROS 2 needs a ROS 2 Jazzy with the package ros-jazzy-sros2; '
+    'the Fast DDS of the Python wheels is built without security',
+}
 SMALL = "thinmap's small ros2 for machines without ROS"
 
 
@@ -50,6 +55,9 @@ def _command(words: list[str]) -> int:
         _table(COMMANDS)
         print('\nros2 COMMAND -h: its verbs')
         return 0
+    if words[0] in ELSEWHERE:
+        print(f'ros2: no command {words[0]}: {ELSEWHERE[words[0]]}', file=sys.stderr)
+        return 2
     if words[0] not in COMMANDS:
         return _unknown('ros2', 'command', words[0], COMMANDS)
     if words[0] == 'run':

@@ -11,7 +11,7 @@ from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros.map_identity import FollowedMap
+from thinmap_ros.ros.decoding.map_identity import FollowedMap
 
 TRINARY = 'trinary'
 PROBABILITY = 'probability'

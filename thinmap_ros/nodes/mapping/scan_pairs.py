@@ -11,7 +11,7 @@ from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.ros import messages
-from thinmap_ros.ros.map_identity import UNKNOWN
+from thinmap_ros.ros.decoding.map_identity import UNKNOWN
 
 
 class LocatedScan(NamedTuple):
