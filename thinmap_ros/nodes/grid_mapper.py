@@ -33,10 +33,10 @@ from thinmap_ros.nodes.mapping.map_output import MapOutputConfig, MapPublishers
 from thinmap_ros.nodes.mapping.scan_pairs import LocatedScan, ScanPairs
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
+from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.diagnostics import ERROR
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.session_client import SessionClient

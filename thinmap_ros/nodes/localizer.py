@@ -47,11 +47,11 @@ from thinmap_ros.nodes.localization.initial_poses import InitialPoses
 from thinmap_ros.nodes.localization.known_area import require_near_map
 from thinmap_ros.nodes.localization.map_source import load_localizer
 from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.decoding.map_identity import UNKNOWN, new_map_id
 from thinmap_ros.ros.decoding.topology_reader import read_topology
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.decoding.map_identity import UNKNOWN, new_map_id
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
@@ -192,7 +192,7 @@ class _Relocation:
             self._waiting_since_s = monotonic()
             return None
         is_early = self.map is None and self.waited_s < _MAP_WAIT_S
-        return None if is_early and self.is_continuous_with(*self._pending) else self._pending
+        return None if is_early else self._pending
 
 
 class LocalizerNode(ThinmapNode):
@@ -375,7 +375,7 @@ class LocalizerNode(ThinmapNode):
                 'grid is of a map that another localizer has begun: lost in that map until scans '
                 'match at the start pose, or a pose is given'
             )
-            self._localizer = Localizer.in_occupancy_map(patch, self._config)
+            self._start_again_in(patch)
             ids.id = map_id
         if self._living_map is not None:
             self.destroy_subscription(self._living_map)
@@ -403,8 +403,7 @@ class LocalizerNode(ThinmapNode):
         _, T_odom_base = pending
         if not relocation.is_continuous_with(*pending):
             self.get_logger().warning('odometry was reset: starting at the initial pose')
-            if relocation.map is not None and isinstance(self._localizer, Localizer):
-                self._localizer = Localizer.in_occupancy_map(relocation.map, self._config)
+            self._start_again_in(relocation.map)
         elif relocation.map is None:
             self.get_logger().warning(
                 f'no map received for {relocation.waited_s:.0f} s: '
@@ -421,6 +420,13 @@ class LocalizerNode(ThinmapNode):
             set_topology(self._localizer, self._topology)
         self._relocation = None
         return [pending]
+
+    def _start_again_in(self, patch: GridPatch | None) -> None:
+        """Start at the initial pose in the map that is there, or else in a new one."""
+        if patch is not None and isinstance(self._localizer, Localizer):
+            self._localizer = Localizer.in_occupancy_map(patch, self._config)
+        elif self._map_ids is not None:
+            self._map_ids.load()
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:

@@ -157,6 +157,7 @@ class NavigatorNode(ThinmapNode):
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         self._robot.pose_fault = _POSE_FAULTS.get(message.state, '')
+        self._map.pose_map_id = message.map_id
 
     def _on_topology(self, data: bytes) -> None:
         if len(data) > _MAX_TOPOLOGY_BYTES:
@@ -214,7 +215,7 @@ class NavigatorNode(ThinmapNode):
 
         None before all inputs are received.
         """
-        if fault := self._robot.stop_reason():
+        if fault := self._robot.stop_reason() or self._map.fault:
             reason = f'{fault}: standing still'
             self.get_logger().warning(reason, throttle_duration_sec=WARN_PERIOD_S)
             self.diagnostics.set_state(WARN, reason)

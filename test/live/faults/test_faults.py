@@ -225,6 +225,7 @@ def test_a_killed_node_with_other_parameters_is_reset_and_reports_why(graph):
     kill(graph, 'localizer')
     (kept,) = state.glob('*.localizer.npz')
     wrong = {'stamp_ns': np.array(1), 'T_map_odom': np.zeros(4), 'T_odom_base': np.zeros(3)}
+    wrong['map_id'] = np.array(1)
     with kept.open('wb') as stream:
         write_snapshot(stream, 'checkpoint', wrong)
     start_one(graph, 'localizer')

@@ -6,16 +6,19 @@ from thinmap_msgs.msg import ProbabilityGrid
 from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.decoding.map_identity import UNKNOWN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 
 class MapInput:
-    """The newest map: grid and local_grid of grid_mapper, or else map, of whatever SLAM."""
+    """The newest map: grid and local_grid of grid_mapper, or else map, of whatever SLAM.
+
+    pose_map_id: id of the map that the pose of the robot is in.
+    """
 
     def __init__(self) -> None:
-        self._map = MapMirror()
-        self._has_grid = False
+        self.reset()
 
     @property
     def patch(self) -> GridPatch | None:
@@ -32,12 +35,25 @@ class MapInput:
         """Discard the map."""
         self._map = MapMirror()
         self._has_grid = False
+        self._map_id = UNKNOWN
+        self.pose_map_id = UNKNOWN
+
+    @property
+    def fault(self) -> str:
+        """Why the robot must not drive on this map; '' for no reason."""
+        if UNKNOWN in (self._map_id, self.pose_map_id) or self._map_id == self.pose_map_id:
+            return ''
+        return 'the pose is in another map than the one on grid (was the localizer restarted?)'
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
         self._has_grid = True
+        self._map_id = message.map_id
         self._map.replace(messages.grid_from_msg(message))
 
     def _on_local_grid(self, message: ProbabilityGrid) -> None:
+        if UNKNOWN not in (message.map_id, self._map_id) and message.map_id != self._map_id:
+            self._map = MapMirror()
+        self._map_id = message.map_id
         self._map.paste(messages.grid_from_msg(message))
 
     def _on_map(self, message: OccupancyGrid) -> None:

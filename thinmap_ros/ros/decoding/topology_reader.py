@@ -23,6 +23,7 @@ _COUNT = struct.Struct('<I')
 _ID_KIND = struct.Struct('<IB')
 _PLACE = struct.Struct('<dddfI')  # x, y, z, clearance_m, number of feature_ids
 _EDGE = struct.Struct('<IIIffI')  # id, ends, length_m, clearance_m, number of points
+_MAP_ID = struct.Struct('<Q')
 _POINT = np.dtype('<f4')
 
 
@@ -39,6 +40,7 @@ def read_topology(data: bytes) -> TopologicalMap:
         reader.skip_header()
         nodes = list(reader.nodes())
         edges = list(reader.edges())
+        reader.skip_map_id()
     except (struct.error, ValueError) as error:
         raise InputError(f'topology of {len(data)} bytes: {error}: expected a whole one') from error
     _check(nodes, edges)
@@ -94,6 +96,11 @@ class _Reader:
             path = np.frombuffer(self._data, _POINT, 3 * points, self._at).reshape(-1, 3)
             self._at += path.nbytes
             yield Edge(number, a, b, path[:, :2].astype(np.float64), length_m, clearance_m)
+
+    def skip_map_id(self) -> None:
+        """Skip the id of the map. Raises struct.error where it is missing."""
+        self._align(8)
+        _MAP_ID.unpack_from(self._data, self._at)
 
     def _count(self) -> int:
         self._align(4)

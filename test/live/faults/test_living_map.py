@@ -1,0 +1,115 @@
+"""A localizer that starts anew while the other nodes keep their map: never two maps in one."""
+
+import signal
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from std_srvs.srv import Trigger
+from support.halls import AT_START, START
+
+from thinmap_msgs.msg import ProbabilityGrid, SlamStatus, TopologicalMap
+from thinmap_ros.ros import messages, qos
+
+pytestmark = pytest.mark.live
+NODES = ('grid_mapper', 'topology_builder', 'localizer')
+RECOVER_S = 1000.0
+
+
+class Robot:
+    """A robot that drives in a curve, and what is published of it."""
+
+    def __init__(self, graph):
+        self.graph = graph
+        self.truth = graph.heard('ground_truth', PoseStamped)
+        self.status = graph.heard('slam_status', SlamStatus)
+        self.poses = graph.heard('pose', PoseWithCovarianceStamped)
+        self.grids = graph.heard('grid', ProbabilityGrid, qos.LATCHED)
+        self.graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
+        self.commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
+        for name in NODES:
+            self.start(name)
+        graph.start(
+            'sim',
+            remap=graph.paced(),
+            start=START,
+            wait_for_subscribers=2,
+            real_time_factor=4.0,
+            lockstep='local_topology',
+            lockstep_timeout_s=2.0,
+        )
+
+    def start(self, name):
+        values = AT_START if name == 'localizer' else {}
+        self.graph.start(name, use_sim_time=True, recovery_timeout_s=RECOVER_S, **values)
+
+    def drive_until(self, condition, what):
+        ahead = Twist()
+        ahead.linear.x = 0.25
+        ahead.angular.z = 0.25
+
+        def met():
+            self.commands.publish(ahead)
+            return self.status and self.grids and self.truth and condition()
+
+        self.graph.until(met, what)
+
+    def drive_for(self, seconds):
+        end_s = self.seconds() + seconds
+        self.drive_until(lambda: self.seconds() > end_s, f'{seconds} s')
+
+    def seconds(self):
+        return messages.stamp_ns(self.truth[-1].header.stamp) / 1e9
+
+    def known(self):
+        return int((np.array(self.grids[-1].data) >= 0).sum())
+
+
+def test_a_localizer_that_is_reset_takes_mapper_and_graph_along(graph):
+    robot = Robot(graph)
+    robot.drive_until(lambda: robot.truth and robot.seconds() > 12.0, 'a map')
+    before = robot.status[-1].map_id
+    assert before == robot.grids[-1].map_id != 0
+    robot.grids.clear(), robot.graphs.clear()
+    assert graph.call(Trigger, '/localizer/reset', Trigger.Request()).success
+    robot.drive_until(lambda: robot.status[-1].map_id != before, 'another map')
+    after = robot.status[-1].map_id
+    assert robot.status[-1].replaced_map_id == before
+    robot.drive_until(lambda: robot.grids[-1].map_id == after, 'the mapper follows')
+    robot.drive_until(lambda: robot.graphs and robot.graphs[-1].map_id == after, 'the graph, too')
+    assert 'the localizer was reset: map reset, too' in graph.log('grid_mapper')
+    assert 'graph reset' in graph.log('topology_builder')
+    # The map begins at the start pose again: what it shows is what the robot has seen from there.
+    first = next(grid for grid in robot.grids if grid.map_id == after)
+    x, y = AT_START['initial_x_m'], AT_START['initial_y_m']
+    cell = messages.grid_from_msg(first).frame.cells_of(np.array([[x, y]]))[0]
+    assert messages.grid_from_msg(first).cells[tuple(cell)] == 0
+    assert [graph.stop(name) for name in NODES] == [0] * 3
+
+
+def test_a_localizer_without_memory_stays_lost_in_the_living_map_until_a_pose_is_given(graph):
+    robot = Robot(graph)
+    robot.drive_until(lambda: robot.truth and robot.seconds() > 12.0, 'a map')
+    graph.stop('localizer', signal.SIGKILL)
+    for kept in (graph.folder / 'state').glob('*.localizer.npz'):
+        kept.unlink()
+    count = len(robot.grids)
+    graph.until(lambda: len(robot.grids) > count + 1, 'the last map before that')
+    before = robot.grids[-1].map_id
+    known = robot.known()
+    robot.status.clear()
+    robot.start('localizer')
+    robot.drive_until(lambda: robot.status[-1].map_id == before, 'it finds the map')
+    robot.drive_for(4.0)
+    lost = (SlamStatus.LOST, SlamStatus.MAPPING_APART)
+    assert {status.state for status in robot.status[-10:]} <= set(lost)
+    assert robot.known() == known, 'nothing is drawn meanwhile'
+    given = graph.node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 10)
+    graph.until(given.get_subscription_count, 'the localizer')
+    # In the frame of the map, in which the robot has started at its true pose.
+    place = messages.pose_from_msg(robot.truth[-1].pose)
+    given.publish(messages.pose_with_covariance_msg(place, np.diag([0.05, 0.05, 0.02]), 'map', 0))
+    robot.drive_until(lambda: robot.status[-1].state == SlamStatus.TRACKING, 'it is found')
+    assert robot.status[-1].map_id == before
+    robot.drive_until(lambda: robot.known() != known, 'mapping goes on')
+    assert [graph.stop(name) for name in NODES] == [0] * 3
