@@ -59,7 +59,7 @@ class ExplorerNode(ThinmapNode):
         warm_up.explorer()
         radius_m = self._strategies.config.robot_radius_m
         self._source = ObservationSource(
-            self, self._settings, frames, radius_m, self._on_observation, self._on_other_map
+            self, self._settings, frames, radius_m, self._on_observation
         )
         self._driver = self._make_driver(frames.map_frame)
         self.reset_state()
@@ -158,8 +158,7 @@ class ExplorerNode(ThinmapNode):
         """Have the mission process a scan that is in the map."""
         stamp_ns = observation.scan.stamp_ns
         if self._stamp.is_restarted_by(stamp_ns):
-            self.get_logger().warning('the robot was started again, too: state reset')
-            self._reset()
+            self.reset('the robot was started again, too')
         self._stamp.latest_ns = stamp_ns
         if self._starts_itself:
             self._start(MissionGoal())
@@ -175,10 +174,6 @@ class ExplorerNode(ThinmapNode):
         if is_exploring:
             self._output.end_nodes(self._mission, observation.scan.stamp_ns)
         self._execute(action)
-
-    def _on_other_map(self) -> None:
-        self.get_logger().warning('grid is of another map: state reset')
-        self._reset()
 
     def _on_drive_ended(self, success: bool, reason: str) -> None:
         self._output.clear_target()

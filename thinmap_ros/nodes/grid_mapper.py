@@ -220,8 +220,7 @@ class GridMapperNode(ThinmapNode):
         followed = self._output.followed
         origin = followed.origin(located.map_id)
         if origin is Origin.OTHER and located.replaced_map_id == followed.id:
-            self.get_logger().warning('the localizer was reset: map reset, too')
-            self.reset_state()
+            self.reset('the localizer was reset')
             origin = followed.origin(located.map_id)
         is_other = origin is Origin.OTHER
         self._fault = _OTHER_MAP if is_other and self._settings.mapping else ''

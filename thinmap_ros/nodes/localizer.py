@@ -119,11 +119,13 @@ class _PosePublishers:
 class _Input:
     """Scans with the odometry at their stamps, and the check of both.
 
-    reported: kinds of warnings that are in the log.
+    last: the anchor of the last scan at a known place; reported: kinds of warnings that are in the
+    log.
     """
 
     pairing: ScanOdometrySynchronizer = field(default_factory=ScanOdometrySynchronizer)
     consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
+    last: OdometryAnchor | None = None
     reported: set[str] = field(default_factory=set)
 
     @property
@@ -137,11 +139,13 @@ class _MapIds:
     """Id of the map that the localizer makes, and of the one that a reset has replaced by it.
 
     is_given: whether the map was loaded, or begun by a reset, and not by the start of the node.
+    living: the subscription to the map of a mapper that has outlived the localizer.
     """
 
     id: int = field(default_factory=new_map_id)
     replaced: int = UNKNOWN
     is_given: bool = False
+    living: Subscription | None = None
     _published: int = UNKNOWN
 
     def begin(self) -> None:
@@ -229,7 +233,8 @@ class LocalizerNode(ThinmapNode):
         self._map_ids: _MapIds | None = _MapIds() if self._config.is_mapping else None
         self._begin()
         self.enable_checkpoint(self._state, self._restore)
-        self._living_map = self._subscribe_living_map()
+        if self._map_ids is not None:
+            self._map_ids.living = self._subscribe_living_map(self._map_ids)
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('pose')
         self.diagnostics.add_check(WARN, lambda: '; '.join(self._input.warnings.values()))
@@ -269,15 +274,15 @@ class LocalizerNode(ThinmapNode):
         self._broadcaster.reset()
         self._odometry.reset()
         self._input = _Input()
-        self._last: OdometryAnchor | None = None
         self._topology: Graph | None = None
         self._relocation: _Relocation | None = None
 
     def _state(self) -> State | None:
-        if self._last is None:
+        last = self._input.last
+        if last is None:
             return None
         map_id = UNKNOWN if self._map_ids is None else self._map_ids.id
-        return {**self._last.state(), 'map_id': np.array(map_id)}
+        return {**last.state(), 'map_id': np.array(map_id)}
 
     def _restore(self, state: State) -> None:
         """Continue at the last pose of a killed localizer. Raises InputError where it is none."""
@@ -285,7 +290,7 @@ class LocalizerNode(ThinmapNode):
         self._relocation = _Relocation(OdometryAnchor.from_state(anchor))
         self._relocation.map = self._given.source.patch
         if self._map_ids is not None:
-            self._map_ids = _MapIds(map_id)
+            self._map_ids.id = map_id
         self.create_active_timer(
             _MAP_WAIT_S, lambda: self._process([]), Clock(clock_type=ClockType.STEADY_TIME)
         )
@@ -329,7 +334,7 @@ class LocalizerNode(ThinmapNode):
                     'its pose follows from the scan alone'
                 )
             if not estimate.is_lost:
-                self._last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
+                self._input.last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         self._report_warnings()
         diagnostics = self.diagnostics
         diagnostics.set_drop_total(
@@ -346,25 +351,21 @@ class LocalizerNode(ThinmapNode):
                 self.get_logger().warning(f'scan: {text}')
                 self._input.reported.add(kind)
 
-    def _subscribe_living_map(self) -> Subscription | None:
+    def _subscribe_living_map(self, ids: _MapIds) -> Subscription:
         """Subscribe to the map of a mapper that has outlived this node."""
-        if self._map_ids is None:
-            return None
 
         def on_grid(message: ProbabilityGrid) -> None:
             if message.map_id == UNKNOWN:
                 return
             try:
-                self._on_living_map(message.map_id, messages.grid_from_msg(message))
+                self._on_living_map(ids, message.map_id, messages.grid_from_msg(message))
             except InputError as error:
                 self.get_logger().warning(f'grid: {error}')
 
         return self.create_subscription(ProbabilityGrid, 'grid', on_grid, qos.LATCHED)
 
-    def _on_living_map(self, map_id: int, patch: GridPatch) -> None:
+    def _on_living_map(self, ids: _MapIds, map_id: int, patch: GridPatch) -> None:
         """Continue in a map that was there before this node, rather than begin a second one."""
-        ids = self._map_ids
-        assert ids is not None
         if self._relocation is not None:
             self._relocate_in(self._relocation, patch)
         elif map_id != ids.id and not ids.is_given:
@@ -377,9 +378,9 @@ class LocalizerNode(ThinmapNode):
             )
             self._start_again_in(patch)
             ids.id = map_id
-        if self._living_map is not None:
-            self.destroy_subscription(self._living_map)
-            self._living_map = None
+        if ids.living is not None:
+            self.destroy_subscription(ids.living)
+            ids.living = None
 
     def _relocate_in(self, relocation: _Relocation, patch: GridPatch) -> None:
         """Use a map that has come for the relocation, unless that has one."""

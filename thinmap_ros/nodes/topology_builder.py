@@ -34,16 +34,21 @@ _ID_RESERVE = 1000  # ids that a builder may have assigned after its last checkp
 
 
 class _TopologyPublishers:
-    """Publishes the topological map, and the part of it near the robot."""
+    """Publishes the topological map, and the part of it near the robot.
+
+    followed: knows the id of the map.
+    """
 
     def __init__(self, node: Node) -> None:
         self.frame_id = parameters.declare_map_frame(node)
         self._local = node.create_publisher(TopologicalMapMsg, 'local_topology', qos.LATCHED)
         self._global = node.create_publisher(TopologicalMapMsg, 'topology', qos.LATCHED)
         self.has_published = False
+        self.followed = FollowedMap()
 
-    def publish_map(self, topology: TopologicalMap, stamp_ns: int, map_id: int) -> None:
+    def publish_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
         self.has_published = True
+        map_id = self.followed.id
         self._global.publish(messages.topology_msg(topology, self.frame_id, stamp_ns, map_id))
 
     def publish_local_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
@@ -110,7 +115,7 @@ class TopologyBuilderNode(ThinmapNode):
 
     def reset_state(self) -> None:
         """Discard the graph, or return to the session that the node was started with."""
-        self._followed = FollowedMap()
+        self._output.followed = FollowedMap()
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._newest_saved_id = 0
         self._T_map_base: Array | None = None
@@ -126,11 +131,10 @@ class TopologyBuilderNode(ThinmapNode):
 
     def _is_of_this_map(self, message: ProbabilityGrid) -> bool:
         """Whether a grid is of the map of this graph; a graph of another map is discarded."""
-        origin = self._followed.origin(message.map_id)
+        origin = self._output.followed.origin(message.map_id)
         if origin is Origin.OTHER:
-            self.get_logger().warning('grid is of another map: graph reset')
-            self.reset_state()
-            self._followed.origin(message.map_id)
+            self.reset('grid is of another map')
+            self._output.followed.origin(message.map_id)
         return origin is not Origin.STALE
 
     def _on_local_grid(self, message: ProbabilityGrid) -> None:
@@ -189,7 +193,7 @@ class TopologyBuilderNode(ThinmapNode):
 
     def _publish(self, stamp_ns: int) -> None:
         self._checkpoint_new_ids()
-        self._output.publish_map(self._builder.map, stamp_ns, self._followed.id)
+        self._output.publish_map(self._builder.map, stamp_ns)
         self._route_graph.graph_changed()
 
     def _checkpoint_new_ids(self) -> None:
@@ -229,7 +233,7 @@ class TopologyBuilderNode(ThinmapNode):
         """Replace the graph by a saved one; windows that were made before are discarded."""
         loaded, regions = self._read(path)
         self._builder = loaded
-        self._followed.leave()
+        self._output.followed.leave()
         self._regions.reset(regions)
         self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)

@@ -131,9 +131,13 @@ class ThinmapNode(LifecycleNode):
     def handle_time_jump(self) -> None:
         """Reset the state if the clock has jumped back: before messages of the new time."""
         if self.time_jumps.pop():
-            self.get_logger().warning('clock jumped back: state reset')
             self.diagnostics.count_drops('state reset: clock jumped back', 1)
-            self._reset()
+            self.reset('clock jumped back')
+
+    def reset(self, reason: str) -> None:
+        """Reset the state as ~/reset does, and say why."""
+        self.get_logger().warning(f'{reason}: state reset')
+        self._reset()
 
     def _reset(self) -> None:
         self.stop()

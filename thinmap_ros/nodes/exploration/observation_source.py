@@ -37,6 +37,26 @@ class RobotFrames:
     laser_transform: LaserTransform
 
 
+class _GridPublisher:
+    """The mapper: whether there is one, and which map it publishes."""
+
+    def __init__(self, node: ThinmapNode) -> None:
+        self.followed = FollowedMap()
+        self._node = node
+        self._check = PublisherCheck(node, 'grid', 'local_grid')
+
+    def is_found(self) -> bool:
+        """Whether somebody publishes grids."""
+        return self._check.is_found()
+
+    def received(self, message: ProbabilityGrid) -> None:
+        """Reset the node where a grid is of another map than those before."""
+        self._check.message_received()
+        if self.followed.origin(message.map_id) is Origin.OTHER:
+            self._node.reset('grid is of another map')
+            self.followed.origin(message.map_id)
+
+
 class ObservationSource:
     """Makes observations of what is published.
 
@@ -52,18 +72,13 @@ class ObservationSource:
         frames: RobotFrames,
         robot_radius_m: float,
         on_observation: Callable[[Observation], None],
-        on_other_map: Callable[[], None],
     ) -> None:
-        """on_observation: receives each observation; its graph is complete after `with_graph`.
-
-        on_other_map: is called when the grid is of another map than before, to reset this.
-        """
+        """on_observation: receives each observation; its graph is complete after `with_graph`."""
         self._node = node
         self._laser_transform = frames.laser_transform
         self._on_observation = on_observation
-        self._on_other_map = on_other_map
         self._graph_config = TopologyConfig(robot_radius_m=robot_radius_m)
-        self._grids = PublisherCheck(node, 'grid', 'local_grid')
+        self._grids = _GridPublisher(node)
         self._topologies = PublisherCheck(node, 'topology')
         self._view = RobotView(node, settings, frames.map_frame, frames.laser_transform)
         self._map = ForeignMap(node, settings, frames.map_frame, self._uses_foreign_map)
@@ -80,7 +95,7 @@ class ObservationSource:
 
     def reset(self) -> None:
         """Discard map, graph and scans."""
-        self._followed = FollowedMap()
+        self._grids.followed = FollowedMap()
         self.watchdog = InputWatchdog()
         self._buffer = ObservationBuffer(Topology())
         self._graph = MapGraph(self._graph_config)
@@ -107,13 +122,11 @@ class ObservationSource:
         self._buffer.topology = topology
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
-        self._follow(message.map_id)
-        self._grids.message_received()
+        self._grids.received(message)
         self._buffer.replace_map(messages.grid_from_msg(message))
 
     def _on_local_grid(self, message: ProbabilityGrid) -> None:
-        self._follow(message.map_id)
-        self._grids.message_received()
+        self._grids.received(message)
         stamp_ns = messages.stamp_ns(message.header.stamp)
         self._process(self._buffer.add_local_map(stamp_ns, messages.grid_from_msg(message)))
 
@@ -137,11 +150,6 @@ class ObservationSource:
     def _on_slam_status(self, message: SlamStatus) -> None:
         self._buffer.is_blind = message.state in (SlamStatus.BLIND, SlamStatus.MISALIGNED)
         self.watchdog.add_tracking(messages.is_lost(message), self._node.elapsed_time.now_s())
-
-    def _follow(self, map_id: int) -> None:
-        if self._followed.origin(map_id) is Origin.OTHER:
-            self._on_other_map()
-            self._followed.origin(map_id)
 
     # Outputs.
 
