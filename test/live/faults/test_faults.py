@@ -21,6 +21,7 @@ from thinmap_msgs.msg import ExplorationStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.files.snapshots import write_snapshot
 from thinmap_ros.ros import messages, qos
+from thinmap_ros.sim.robot import after_arc
 
 pytestmark = pytest.mark.live
 # While a node is dead, no scan has a result.
@@ -346,7 +347,8 @@ def test_what_waited_while_the_clock_was_set_back_does_not_begin_the_new_map(gra
 def scan_of_nothing_near(ns):
     message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
     message.header = messages.header('laser', ns)
-    message.ranges = 61 * [5.0]
+    # No laser measures the same twice.
+    message.ranges = 61 * [5.0 + 0.01 * (ns // TICK_NS % 2)]
     return message
 
 
@@ -361,6 +363,7 @@ def test_a_silent_laser_stops_the_robot_until_scans_return(graph):
     clock = graph.node.create_publisher(Clock, '/clock', qos.STREAM)
     silent = set()
     now_ns = [10**12]
+    here = [np.zeros(3)]
     answered = [-1]
     said_at = [0.0]
 
@@ -376,15 +379,16 @@ def test_a_silent_laser_stops_the_robot_until_scans_return(graph):
         said_at[0] = time.monotonic()
         now_ns[0] += TICK_NS
         ns = now_ns[0]
+        if commands:
+            here[0] = after_arc(here[0], 0.1 * commands[-1].linear.x, 0.1 * commands[-1].angular.z)
         clock.publish(Clock(clock=messages.time_msg(ns)))
         if 'odometry' not in silent:
-            odometry.publish(
-                messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), ns)
-            )
+            frames = ('odom', 'base_link')
+            odometry.publish(messages.odometry_msg(here[0], (0.0, 0.0), frames, ns))
         if 'laser' not in silent:
             scan.publish(scan_of_nothing_near(ns))
         if 'localizer' not in silent:
-            pose.publish(messages.pose_with_covariance_msg(np.zeros(3), np.eye(3), 'map', ns))
+            pose.publish(messages.pose_with_covariance_msg(here[0], np.eye(3), 'map', ns))
 
     free.publish(empty_hall())
     client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
