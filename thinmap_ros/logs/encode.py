@@ -139,6 +139,7 @@ class BagObjects:
             header=self.header('map', ns),
             nodes=nodes,
             edges=edges,
+            map_id=0,
         )
 
     def _node(self, node: Node) -> Any:
