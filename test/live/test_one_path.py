@@ -49,7 +49,7 @@ CONNECTIONS = {
         'slam_status: publishers': 1,
         'trajectory: publishers': 1,
         'local_grid: subscribers': 1,
-        'grid: subscribers': 1,
+        'grid: subscribers': 2,
     },
     'topology_builder': {
         'local_grid: publishers': 1,
