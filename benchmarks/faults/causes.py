@@ -148,7 +148,7 @@ class Asked:
 
 
 class Carried:
-    """The robot is carried off; its wheels do not turn."""
+    """The robot is kidnapped; its wheels do not turn."""
 
     def __init__(self, seed: int, world: World, observer: Observer) -> None:
         self._seed = seed

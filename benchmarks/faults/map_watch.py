@@ -92,7 +92,7 @@ class _Recent:
 
 
 class MapWatch:
-    """Judges each map by the poses of the scans between it and the one before.
+    """Judges each map by the poses of the scans between it and the previous map.
 
     A map is judged when the next one arrives: by then, poses and states of its scans are known.
     Scans before and after a change of pose or state may be in one map, which is not judged.
@@ -113,7 +113,7 @@ class MapWatch:
         return self._drawn
 
     def discard(self) -> None:
-        """The map was begun anew, or lies elsewhere: nothing is compared with it."""
+        """The map was reset, or lies elsewhere: nothing is compared with it."""
         self._maps = []
         self._recent = _Recent()
 
@@ -125,7 +125,7 @@ class MapWatch:
         self._drawn.while_lost = 0
 
     def add_state(self, stamp_ns: int, is_lost: bool) -> None:
-        """Add whether the localizer says at a scan that nothing may be drawn."""
+        """Add whether the status of a scan says that nothing may be drawn."""
         self._recent.is_lost[stamp_ns] = is_lost
 
     def add_error(self, stamp_ns: int, error_m: float) -> None:

@@ -39,6 +39,7 @@ _MAX_INT16 = 2**15 - 1
 # Of a serialized graph, which is read within one control period: about 50,000 m2 of a building.
 _MAX_TOPOLOGY_BYTES = 2_000_000
 _POSE_FAULTS = {
+    SlamStatus.LOST: 'lost (the place of the robot in the map is unknown)',
     SlamStatus.BLIND: 'laser blind (it does not confirm the pose)',
     SlamStatus.MISALIGNED: 'laser misaligned (turned on the robot)',
 }

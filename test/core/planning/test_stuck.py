@@ -109,7 +109,7 @@ class Room:
     """A free room of 8 x 8 m, with a robot in it that cannot pass some places."""
 
     def __init__(self, passes=lambda T: True, top_m=4.0):
-        """top_m: upper border of what is free."""
+        """top_m: upper edge of what is free."""
         cells = np.zeros((80, 80), dtype=np.int8)
         cells[round((top_m + 4.0) / 0.1) :] = 100
         self.patch = GridPatch(GridFrame(-4.0, -4.0, 0.1), cells)

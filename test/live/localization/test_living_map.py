@@ -1,4 +1,4 @@
-"""A localizer that starts anew while the other nodes keep their map: never two maps in one."""
+"""A localizer that begins again while the other nodes keep their map: never two maps in one."""
 
 import signal
 

@@ -96,6 +96,7 @@ def test_a_silent_input_stops_it_at_once_and_it_starts_anew(driven, source, step
 def test_the_state_of_the_localizer_stops_it(driven):
     driven.step(20)
     for state, reason in (
+        (SlamStatus.LOST, 'lost (the place of the robot in the map is unknown)'),
         (SlamStatus.BLIND, 'laser blind (it does not confirm the pose)'),
         (SlamStatus.MISALIGNED, 'laser misaligned (turned on the robot)'),
     ):
@@ -103,5 +104,17 @@ def test_the_state_of_the_localizer_stops_it(driven):
         command = driven.step()
         assert (command.v, command.w, command.state) == (0.0, 0.0, 'blocked')
         assert command.reason == f'{reason}: standing still'
-    driven.node._on_slam_status(SlamStatus(state=SlamStatus.TRACKING))
+    # A robot that maps apart has to drive to find its place.
+    for state in (SlamStatus.TRACKING, SlamStatus.MAPPING_APART):
+        driven.node._on_slam_status(SlamStatus(state=state))
+        assert driven.step().state == 'driving'
+
+
+def test_a_pose_in_another_map_than_the_grid_stops_it(driven):
+    driven.step(20)
+    grid = messages.probability_grid_msg(messages.grid_from_msg(empty_hall()), 'map', 0, map_id=7)
+    driven.node._map._on_grid(grid)
+    driven.node._on_slam_status(SlamStatus(state=SlamStatus.TRACKING, map_id=8))
+    assert driven.step().reason.startswith('the pose is in another map than the one on grid')
+    driven.node._on_slam_status(SlamStatus(state=SlamStatus.TRACKING, map_id=7))
     assert driven.step().state == 'driving'

@@ -450,7 +450,7 @@ class Explorer:
 
 
 def _is_given_up(candidate: Candidate) -> bool:
-    """Whether there is no way to a candidate, or as many tries in vain as it is worth."""
+    """Whether there is no way to a candidate, or it was tried as often as it is worth."""
     attempts = max(candidate.evidence.visits, candidate.evidence.failures)
     return candidate.goal is None or attempts >= _MAX_ATTEMPTS
 

@@ -32,7 +32,7 @@ class LookAround:
     def next_goal(
         self, T_map_base: Array, hidden_m2: float, known_m2: float, is_left: bool
     ) -> Array | None:
-        """Where to turn from a pose (3,), as a pose (3,); None: no more, or in vain.
+        """Where to turn from a pose (3,), as a pose (3,); None: no more, or no use.
 
         hidden_m2: unknown area in line of sight of the robot, were it to look there; known_m2: of
         the map; is_left: whether end nodes are left.

@@ -11,7 +11,7 @@ from thinmap_ros.core.se2 import Array
 
 # A robot is stuck if it has moved by less than this share of what it was commanded for a while, and
 # of so much that the noise of its pose does not matter. The least share of a simulated exploration
-# (dungeon/d1573, 543 s) is 0.88; a slow base, and wheels that slip while the localizer takes back
+# (dungeon/d1573, 543 s) is 0.88; a slow base, and wheels that slip while the localizer corrects
 # their odometry, lie between.
 _SHARE = 0.1
 _WINDOW_S = 1.5
@@ -46,7 +46,7 @@ class StuckDetector:
     def add(self, T_map_base: Array, v: float, w: float, dt_s: float) -> bool:
         """Add a pose (3,), after a command v (m/s), w (rad/s) of dt_s.
 
-        Returns whether the robot is stuck. A stop starts the comparison anew.
+        Returns whether the robot is stuck. A stop restarts the comparison.
         """
         if (v == 0.0 and w == 0.0) or not self._samples:
             self._samples = deque([_Sample(T_map_base, 0.0, 0.0, 0.0, 0.0)])

@@ -63,7 +63,7 @@ class ActiveMap:
         self.render(keyframes, self._render_first)
 
     def published(self, keyframes: Sequence[Keyframe]) -> LocalMap:
-        """The local map of the published piece: rendered anew while the robot is in another."""
+        """The local map of the published piece: rendered again while the robot is in another."""
         if not self._pieces.is_apart:
             return self.map
         rendered = self._empty(is_published=True)

@@ -13,7 +13,7 @@ from thinmap_ros.core.slam.odometry_prediction import Prediction
 # Inliers for each contradicting point with which a match overrides the odometry.
 INLIERS_PER_CONTRADICTION = 3.0
 # Ratio of returns behind walls, between that of the worst real log (mean 0.11, of an office with
-# much glass) and that of robots that were carried off (mean 0.4 in the first seconds).
+# much glass) and that of robots that were kidnapped (mean 0.4 in the first seconds).
 _SEEN_THROUGH = 0.25
 # Of a pose that no scan has confirmed: less than a scan with 30 % inliers removes.
 _UNCONFIRMED_EVIDENCE = 0.3 / INLIERS_PER_CONTRADICTION

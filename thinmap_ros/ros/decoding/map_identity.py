@@ -16,7 +16,7 @@ def new_map_id() -> int:
 
 
 class Origin(Enum):
-    """Which map a message is of: the one that is followed, the one before it, or another."""
+    """Which map a message is of: the one that is followed, the previous one, or another."""
 
     SAME = 0
     STALE = 1
