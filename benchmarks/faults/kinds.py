@@ -85,7 +85,7 @@ KINDS = {
         Kind('use_sim_time', (1.0, 1.0)),
         Kind('carried_off', (1.0, 1.0), may_end_lost=True),
         Kind('reset_localizer', (1.0, 1.0), resets=True),
-        Kind('forget_localizer', (0.5, 3.0), _POSE_M, resets=True, node='localizer'),
+        Kind('forget_localizer', (0.5, 3.0), _POSE_M, node='localizer', may_end_lost=True),
     )
 }
 
