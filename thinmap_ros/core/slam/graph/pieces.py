@@ -9,9 +9,9 @@ from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 
 _PUBLISHED = 0
-# Distance between two views of which each says something new. Of eight robots that were kidnapped
-# and drove for 440 s, two joined their piece at a wrong place where all matches were counted, one
-# where those 3 m of path apart were, and none with this.
+# Distance between two views of which each says something new. Of eight kidnapped robots that drove
+# for 440 s, one joined its piece at a wrong place where those 3 m of path apart were counted, and
+# none with this.
 _VIEW_M = 3.0
 _RECENT = 24  # matches among which consistent ones are searched
 
