@@ -113,5 +113,5 @@ def test_a_localizer_without_memory_stays_lost_in_the_living_map_until_a_pose_is
     given.publish(messages.pose_with_covariance_msg(place, np.diag([0.05, 0.05, 0.02]), 'map', 0))
     robot.drive_until(lambda: robot.status[-1].state == SlamStatus.TRACKING, 'it is found')
     assert robot.status[-1].map_id == before
-    robot.drive_until(lambda: robot.known() != map_before, 'mapping goes on')
+    robot.drive_until(lambda: robot.known() != map_before, 'mapping continues')
     assert [graph.stop(name) for name in NODES] == [0] * 3

@@ -100,7 +100,8 @@ def test_its_sequence_of_calls_drives_the_simulated_robot(graph):
         'sim',
         remap=graph.paced(),
         start=START,
-        real_time_factor=8.0,
+        # Commands that arrive late on a busy machine turn the robot too far: half as far as at 8.
+        real_time_factor=4.0,
         lockstep='local_topology',
         wait_for_subscribers=3,
     )
@@ -126,8 +127,7 @@ def test_its_sequence_of_calls_drives_the_simulated_robot(graph):
     assert max(remaining) == pytest.approx(math.sqrt(2.0), abs=0.3)
     assert math.dist(position(), (3.0, 3.0)) < 0.3
     yaw = decode.yaw(truth[-1].pose.orientation)
-    # The robot has come at 45 degrees, and turns until the last command arrives.
-    assert abs(yaw - math.pi / 2) < 0.5, 'the heading of the goal counts'
+    assert abs(yaw - math.pi / 2) < 0.3, 'the heading of the goal counts'
 
     assert commander.go_to_pose(pose_at(2.0, 2.0))
     start = position()
