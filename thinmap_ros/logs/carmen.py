@@ -3,6 +3,10 @@
 Lines are played in the order of the file; their stamps are those of the robot and step back now and
 then. Invalid lines are skipped and counted, because some logs are truncated or concatenated. A file
 without scans is an error.
+
+An interlaced laser writes partial scans that are shifted by fractions of the angle between beams:
+181 beams from -90 degrees, and 180 from -89.75, -89.5 or -89.25. A line does not say which; so in a
+log with both counts, the smaller one is centred between the ends of the greater one.
 """
 
 import gzip
@@ -80,6 +84,7 @@ class CarmenLog:
     skipped: SkippedRecords = field(default_factory=SkippedRecords)
     is_sorted: bool = field(default=True, init=False)
     _measured: Array | None = field(default=None, init=False)  # T_base_laser of the lines
+    _counts: set[bytes] = field(default_factory=set, init=False)  # of beams, of FLASER lines
 
     def events(self) -> Iterator[Event]:
         """Odometry and scans in file order; the odometry of a scan line precedes its scan.
@@ -89,6 +94,7 @@ class CarmenLog:
         """
         self.skipped = SkippedRecords()
         self._measured = None
+        self._counts = _beam_counts(self._beginning()[0])
         scans = 0
         for number, line in self._lines():
             try:
@@ -110,19 +116,27 @@ class CarmenLog:
     @property
     def expected_scans(self) -> int | None:
         """Number of scan lines, estimated from the beginning of the file; None without any."""
-        scans = 0
+        lines, read = self._beginning()
+        if not read:
+            return None
+        return round(len(lines) * self.path.stat().st_size / read) or None
+
+    def _beginning(self) -> tuple[list[bytes], int]:
+        """Scan lines at the beginning of the file, and the bytes of the file that were read.
+
+        Of a compressed file, the compressed bytes. 0 if the file cannot be read so far.
+        """
+        lines = []
         left = _SAMPLE_BYTES
         try:
-            size = self.path.stat().st_size
             with open_regular_file(self.path) as file, _unpacked(file) as stream:
                 while left > 0 and (line := stream.readline(LOGS.line_bytes)):
                     left -= len(line)
-                    scans += line.lstrip().startswith(_SCAN_KEYWORDS)
-                # Of a compressed file, the compressed bytes.
-                read = file.tell()
+                    if line.lstrip().startswith(_SCAN_KEYWORDS):
+                        lines.append(line)
+                return lines, file.tell()
         except (OSError, EOFError, zlib.error, InputError):
-            return None
-        return round(scans * size / max(read, 1)) or None
+            return lines, 0
 
     def _lines(self) -> Iterator[tuple[int, str]]:
         refuse_foreign(self.path, 'a CARMEN log')
@@ -185,8 +199,11 @@ class CarmenLog:
         count = int(words[1])
         rest = words[2 + count :]
         _check_length(rest, 7, f'{count} ranges, two poses and a stamp')
-        step = self.options.step_deg or (1.0 if count == 180 else 180.0 / max(count - 1, 1))
-        fan = (math.radians(self.options.start_angle_deg), math.radians(step))
+        is_partial = b'%d' % (count + 1) in self._counts
+        whole = count + is_partial
+        step = self.options.step_deg or (1.0 if whole == 180 else 180.0 / max(whole - 1, 1))
+        start = self.options.start_angle_deg + 0.5 * step * is_partial
+        fan = (math.radians(start), math.radians(step))
         scan = self._scan(
             _stamp(rest[6]), words[2 : 2 + count], fan, self.options.range_max_m, self._offset()
         )
@@ -250,6 +267,12 @@ class CarmenLog:
                 T_base_laser,
                 self.laser,
             )
+
+
+def _beam_counts(lines: list[bytes]) -> set[bytes]:
+    """Numbers of beams, as written, of the FLASER lines among scan lines."""
+    beginnings = [line.split(maxsplit=2) for line in lines]
+    return {words[1] for words in beginnings if words[0] == b'FLASER' and len(words) > 1}
 
 
 def _check_length(words: list[str], count: int, expected: str) -> None:

@@ -42,6 +42,18 @@ def test_a_robot_switched_on_anywhere_is_found_and_never_wrongly_sure(finder, st
         assert np.sqrt(pose.covariance[:2, :2].trace()) < 0.3
 
 
+def test_scans_may_have_different_numbers_of_beams(finder):
+    """As those of an interlaced laser."""
+    looks = []
+    for k, (scan, odometry, T) in enumerate(drive(OFFICE, START, WAY)):
+        first = scan.angle_min_rad + (k % 4) * scan.angle_increment_rad
+        fewer = replace(scan, ranges_m=scan.ranges_m[k % 4 :], angle_min_rad=first)
+        looks.append((fewer, odometry, T))
+    results = run(finder, looks)
+    sure = [(result.pose, T) for result, T in results if result.state == State.LOCALIZED]
+    assert sure and all(is_right(pose, T) for pose, T in sure)
+
+
 def test_the_same_seed_gives_the_same_answers():
     first, second = (
         run(GlobalLocalization(*map_of(OFFICE), seed=5), drive(OFFICE, START, WAY[:6]))
