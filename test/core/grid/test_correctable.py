@@ -231,6 +231,14 @@ def test_a_scan_touches_no_tile_beyond_those_that_it_is_thought_to(seed):
     assert (high - low <= 1.5 * longest + 3).all()
 
 
+def test_the_extent_of_a_scan_holds_whatever_its_beams_without_return_show():
+    """Else a verdict on the laser would have to change all stored scans in one step."""
+    scan = dropped(SCANS[0], np.random.default_rng(7))
+    config = OccupancyConfig()
+    extents = [StoredScan.of(replace(scan, drops_out=d), config).extent for d in (False, True)]
+    np.testing.assert_array_equal(*extents)
+
+
 def test_what_is_rendered_again_at_the_same_poses_is_what_was_there():
     """All scans touch the tile of the robot: they are rendered in their original order."""
     grid = CorrectableGrid(OccupancyGrid())

@@ -1,7 +1,5 @@
 """Occupancy grid that is corrected after loop closures, and once a laser proves to drop out."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -135,13 +133,8 @@ class CorrectableGrid:
         if drops_out == self._drops_out:
             return
         self._drops_out = drops_out
-        if self._history is None:
-            return
-        config = self.shown.config
-        self._history.replace_kept(
-            lambda kept: StoredScan.of(replace(kept.scan, drops_out=drops_out), config)
-        )
-        self._render_again()
+        if self._history is not None:
+            self._render_again()
 
     def _render_again(self) -> None:
         """Begin to render all stored scans."""
@@ -174,7 +167,9 @@ class CorrectableGrid:
         if self._rerendering is None:
             kept = self._history.kept()
             poses = self._history.kept_poses()
-            self._rerendering = Rerendering(self.shown, kept, poses, self._T_map_base)
+            self._rerendering = Rerendering(
+                self.shown, kept, poses, self._T_map_base, self._drops_out
+            )
             # The step that closes a loop is already long: rendering starts with the next one.
             return None
         self._refusals += self._rerendering.render_slice(self.shown)

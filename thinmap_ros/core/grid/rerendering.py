@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,12 +36,15 @@ class StoredScan(NamedTuple):
 
     @staticmethod
     def of(scan: Scan, config: OccupancyConfig) -> 'StoredScan':
-        """Store a scan, with the extent that a grid of this configuration renders."""
+        """Store a scan, with the extent that a grid of this configuration renders.
+
+        Or would render if beams without return showed free space.
+        """
         usable = scan.max_range_m
         ranges = np.where(scan.returned, scan.ranges_m, 0.0)
         reach = np.minimum(ranges + config.surface_thickness_m, usable)
         without_return = min(config.no_return_clear_range_m, scan.range_max_m, usable)
-        reach = np.where(scan.no_return, without_return, reach)
+        reach = np.where(scan.without_return, without_return, reach)
         bearings = scan.angles_rad + scan.T_base_laser[2]
         x = np.append(reach * np.cos(bearings), 0.0) + scan.T_base_laser[0]
         y = np.append(reach * np.sin(bearings), 0.0) + scan.T_base_laser[1]
@@ -113,12 +117,19 @@ class Rerendering:
     """
 
     def __init__(
-        self, like: OccupancyGrid, kept: Sequence[StoredScan], poses: Array, T_map_base: Array
+        self,
+        like: OccupancyGrid,
+        kept: Sequence[StoredScan],
+        poses: Array,
+        T_map_base: Array,
+        drops_out: bool = False,
     ) -> None:
         """Start with the stored scans at their poses (N, 3).
 
-        like: a grid with the same cells and configuration; T_map_base (3,): pose of the robot.
+        like: a grid with the same cells and configuration; T_map_base (3,): pose of the robot;
+        drops_out: of the laser, as is known now, for all scans.
         """
+        self._drops_out = drops_out
         self.grid = OccupancyGrid(like.config, like.frame)
         self._added = OccupancyGrid(like.config, like.frame)  # scans that arrived meanwhile
         self._robot_tile = like.frame.cells_of(T_map_base[None, :2])[0] // TILE
@@ -155,7 +166,8 @@ class Rerendering:
                 break
             task = self._queue.pop()
             try:
-                self.grid.add_scan(task.scan, task.T_map_base)
+                scan = replace(task.scan, drops_out=self._drops_out)
+                self.grid.add_scan(scan, task.T_map_base)
             except InputError as error:
                 refusals.append(str(error))
             scans += 1

@@ -3,7 +3,6 @@
 import math
 from array import array
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
@@ -90,10 +89,6 @@ class PoseHistory(Generic[Kept]):
     def kept(self) -> list[Kept]:
         """The stored data, in the order in which it was added."""
         return list(self._kept.values())
-
-    def replace_kept(self, changed: Callable[[Kept], Kept]) -> None:
-        """Replace the stored data of each scan."""
-        self._kept = {number: changed(kept) for number, kept in self._kept.items()}
 
     def kept_poses(self) -> Array:
         """Current poses (N, 3) of the stored scans."""
