@@ -26,6 +26,7 @@ from thinmap_ros.core.slam.wall_compass import Heading
 _BUCKET_M = 4.0
 # Variance of the main wall direction relative to the first keyframe.
 _MAP_VARIANCE = 0.005**2
+_UNMEASURED = Heading(0.0, math.inf)
 _RADIAN_M = 1.0  # distance that changes the view of a scan as much as a rotation by a radian
 
 
@@ -120,12 +121,10 @@ class Keyframes:
 
         edges: edges of the graph besides the steps.
         """
-        variances = np.array(
-            [
-                heading_variance(frame.heading, T)
-                for frame, T in zip(self.frames, poses, strict=False)
-            ]
-        )
+        frames = self.frames[: len(poses)]
+        measured = np.array([frame.heading or _UNMEASURED for frame in frames])
+        off = se2.wrap(measured[:, 0] - poses[:, 2])
+        variances = _MAP_VARIANCE + measured[:, 1] + off**2
         variances[0] = 0.0
         return covariances_from(root, poses, self.steps + edges, variances[root] + variances)
 
@@ -245,8 +244,12 @@ def covariances_from(root: int, poses: Array, edges: list[Edge], heading_varianc
 @inlined
 def _carry(covariance: Array, x: float, y: float) -> Array:
     """`propagated_covariance` with a lever (x, y)."""
-    F = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-    carried_there: Array = F @ covariance @ F.T
+    # Without products of matrices: for these small ones their calls take most of the time.
+    carried_there: Array = covariance.copy()
+    carried_there[0] -= y * covariance[2]
+    carried_there[1] += x * covariance[2]
+    carried_there[:, 0] -= y * carried_there[:, 2]
+    carried_there[:, 1] += x * carried_there[:, 2]
     return carried_there
 
 
