@@ -13,7 +13,17 @@ REACH = round(LocalMapConfig().max_wall_distance_m / CELL_M)
 def cells_of(local_map):
     """All cells (R, C) of the rectangle of tiles, and the first row and column."""
     top, left, end_row, end_col = local_map.tiles.bounds()
-    return local_map.tiles.read(top, left, end_row - top, end_col - left), top, left
+    return read_cells(local_map, top, left, end_row - top, end_col - left), top, left
+
+
+def read_cells(local_map, *rectangle):
+    """Cells (R, C) of a rectangle (first row, first column, rows, columns), with their surfaces."""
+    stores = [store.read(*rectangle) for store in (local_map.tiles, local_map.surfaces)]
+    cells = np.empty(rectangle[2:], [field for store in stores for field in store.dtype.descr])
+    for store in stores:
+        for name in store.dtype.names:
+            cells[name] = store[name]
+    return cells
 
 
 def walls_of(cells):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.local_map_cells import CELL_M, REACH, cells_of, nearest, walls_of
+from support.local_map_cells import CELL_M, REACH, cells_of, nearest, read_cells, walls_of
 from support.slam_room import ROOM, map_of, on_wall, seen_in
 
 from thinmap_ros.core import se2, snapshot
@@ -37,7 +37,7 @@ def add(local_map, points, laser=(0.0, 0.0), angle_rad=math.pi / 2.0):
 def cell_at(local_map, x, y):
     row = math.floor(y / CELL_M)
     col = math.floor(x / CELL_M)
-    return local_map.tiles.read(row, col, 1, 1)[0, 0]
+    return read_cells(local_map, row, col, 1, 1)[0, 0]
 
 
 def random_pose(rng):

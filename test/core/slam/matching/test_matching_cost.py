@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from support.local_map_cells import read_cells
 from support.slam_room import ROOM, around, map_of, on_wall, seen_in
 
 from thinmap_ros.core import se2
@@ -53,7 +54,7 @@ def cauchy(squared, width):
 
 
 def cell_at(local_map, row, col):
-    return local_map.tiles.read(row, col, 1, 1)[0, 0]
+    return read_cells(local_map, row, col, 1, 1)[0, 0]
 
 
 def assigned(local_map, scan, pose):

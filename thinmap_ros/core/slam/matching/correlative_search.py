@@ -14,8 +14,14 @@ import numpy as np
 from thinmap_ros.core.grid.tiles import NO_TILE, TILE
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.matching.local_map import HERE, LocalMapView, cell_of, slot_of
-from thinmap_ros.core.slam.matching.matching_cost import UNSEEN_COST, by_prior, far_cost, loss
+from thinmap_ros.core.slam.matching.local_map import LocalMapView, cell_of, cells_to_wall, slot_of
+from thinmap_ros.core.slam.matching.matching_cost import (
+    SLIP_SIGMAS,
+    UNSEEN_COST,
+    by_prior,
+    far_cost,
+    loss,
+)
 
 _ROOT = 4.0  # half the size of a root node, in cells
 _LEVELS = 2  # levels of nodes below the root
@@ -26,14 +32,14 @@ _MASK = TILE - 1
 @inlined
 def _cost(
     scan: Array,
-    pose: Array,
+    pose: Array | tuple[float, float, float],
     lattice: LocalMapView,
     sigma: float,
     width: float,
     slack: float,
     most: float,
 ) -> float:
-    """Cost of a scan at a pose (3,), with wall distances reduced by a slack, in cells.
+    """Cost of a scan at a pose, with wall distances reduced by a slack, in cells.
 
     scan (N, 4): x, y, weight, and the factor of the slack. Returns early when the cost exceeds
     `most`.
@@ -50,18 +56,15 @@ def _cost(
         col = cell_of(x / lattice.cell_m) - lattice.first_col
         slot = slot_of(lattice, row, col)
         share = UNSEEN_COST
-        away = -1.0
+        away = np.inf
         if slot != NO_TILE:
             cell = lattice.pool[slot, row & _MASK, col & _MASK]
             share = 1.0 if cell['seen'] > 0 else UNSEEN_COST
-            if cell['to_row'] != 0:
-                down = int(cell['to_row']) - HERE
-                right = int(cell['to_col']) - HERE
-                away = math.sqrt(down * down + right * right)
-        if away < 0.0:
+            away = cells_to_wall(cell)
+        nearest = (away - slack * scan[i, 3]) * scale
+        if away == np.inf:
             cost += scan[i, 2] * share * far
-        else:
-            nearest = max(away - slack * scan[i, 3], 0.0) * scale
+        elif nearest > 0.0:
             cost += scan[i, 2] * loss(nearest * nearest, width)
         if cost >= most:
             break
@@ -69,14 +72,21 @@ def _cost(
 
 
 @inlined
-def _least_by_prior(middle: Array, half: Array, prior: Array, information: Array) -> float:
+def _least_by_prior(
+    middle: tuple[float, float, float], half: tuple[float, float, float], information: Array
+) -> float:
     """Lower bound of the prior's cost in a node: at the point nearest to the prior on each axis.
 
-    middle, half (3,): centre of the node relative to the prior, and half of its size.
+    middle: centre of the node relative to the prior; half: of its size. Numbers, not arrays: there
+    are thousands of nodes, and an array would take longer than all that is done with it.
     """
-    nearest = np.sign(middle) * np.maximum(np.abs(middle) - half, 0.0)
-    _, _, cost = by_prior(prior + nearest, prior, information)
-    return cost
+    x = math.copysign(max(abs(middle[0]) - half[0], 0.0), middle[0])
+    y = math.copysign(max(abs(middle[1]) - half[1], 0.0), middle[1])
+    turn = math.copysign(max(abs(middle[2]) - half[2], 0.0), middle[2])
+    squared = information[0, 0] * x * x + information[1, 1] * y * y
+    squared += information[2, 2] * turn * turn + 2.0 * information[0, 1] * x * y
+    squared += 2.0 * (information[0, 2] * x + information[1, 2] * y) * turn
+    return loss(squared, SLIP_SIGMAS)
 
 
 @kernel
@@ -118,21 +128,18 @@ def search(
     while True:
         spent += len(children)
         for level, dx, dy, turn in children:
-            away_from_prior = np.array([dx, dy, turn])
-            pose = prior + away_from_prior
-            slack = 0.0
-            if level < _LEVELS:
-                slack = _ROOT * 0.5**level
-                cost = _least_by_prior(away_from_prior, 0.5**level * size, prior, information)
-            else:
-                _, _, cost = by_prior(pose, prior, information)
+            share = 0.5**level if level < _LEVELS else 0.0  # a leaf is a single pose
+            half_size = (share * size[0], share * size[1], share * size[2])
+            pose = (prior[0] + dx, prior[1] + dy, prior[2] + turn)
+            cost = _least_by_prior((dx, dy, turn), half_size, information)
             if cost < lowest:
+                slack = _ROOT * share
                 cost += _cost(moving, pose, lattice, sigma, width, slack, lowest - cost)
             if cost < lowest and level < _LEVELS:
                 heapq.heappush(heap, (cost, level, dx, dy, turn))
             elif cost < lowest:
                 lowest = cost
-                best = pose
+                best = np.array(pose)
         if len(heap) == 0 or spent > most_nodes:
             break
         bound, level, dx, dy, turn = heapq.heappop(heap)

@@ -25,12 +25,18 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.surface import COLUMNS
 from thinmap_ros.core.snapshot import Field
 
+# Apart from the surfaces, which walls alone have: kernels pass through many cells for each hit, and
+# most of their time is that of the memory.
 CELL = np.dtype(
     [
         ('hits', np.uint8),
         ('seen', np.uint8),
         ('to_row', np.uint8),  # offset to the nearest wall, cells, + HERE; 0: none within reach
         ('to_col', np.uint8),
+    ]
+)
+SURFACE = np.dtype(
+    [
         ('x', np.float32),  # mean of the hits, in cells from the corner of this cell
         ('y', np.float32),
         ('cos2', np.float32),  # mean of the double angle of the surface normal
@@ -90,11 +96,13 @@ class LocalMapConfig(Config):
 class LocalMapView(NamedTuple):
     """View of the cells for kernels, valid until the map grows.
 
-    pool: tiles of cells, dtype CELL; directory: the slot of each tile, or NO_TILE; first_row,
-    first_col: first cell of the directory; reach: largest distance to a wall, in cells.
+    pool: tiles of cells, dtype CELL; surfaces: of those in them, dtype SURFACE; directory: the slot
+    of each tile, or NO_TILE; first_row, first_col: first cell of the directory; reach: largest
+    distance to a wall, in cells.
     """
 
     pool: NDArray[Any]
+    surfaces: NDArray[Any]
     directory: NDArray[np.int32]
     first_row: int
     first_col: int
@@ -107,7 +115,10 @@ class LocalMap:
 
     def __init__(self, config: LocalMapConfig | None = None) -> None:
         self.config = config or LocalMapConfig()
-        self.tiles = TileStore(CELL, max_extent_tiles=_MAX_EXTENT_TILES, begins_at_origin=False)
+        self.tiles, self.surfaces = (
+            TileStore(dtype, max_extent_tiles=_MAX_EXTENT_TILES, begins_at_origin=False)
+            for dtype in (CELL, SURFACE)
+        )
 
     @property
     def is_empty(self) -> bool:
@@ -120,6 +131,7 @@ class LocalMap:
         tiles = self.tiles
         return LocalMapView(
             tiles.pool,
+            self.surfaces.pool,
             tiles.directory,
             tiles.first_row * TILE,
             tiles.first_col * TILE,
@@ -176,6 +188,7 @@ class LocalMap:
         blocks = padded.reshape(rows, TILE, cols, TILE).swapaxes(1, 2)
         used = np.argwhere(blocks.any(axis=(2, 3)))
         places = used + (row // TILE, col // TILE)
+        self._allocate(places)
         cells = self.tiles.read_tiles(places)
         cells['seen'] = np.maximum(cells['seen'], blocks[tuple(used.T)])
         self.tiles.write_tiles(places, cells)
@@ -192,14 +205,15 @@ class LocalMap:
         """All cells as arrays by name, for `restore`."""
         tiles = self.tiles
         cells = tiles.pool[: tiles.used]
+        means, normals, faces = np.split(self._surface_values, 3, axis=-1)
         return {
             'cell_m': np.array(self.config.resolution_m),
             'tiles': tiles.tile_coordinates(),
             'hits': cells['hits'],
             'seen': cells['seen'],
-            'means': np.stack([cells['x'], cells['y']], axis=-1),
-            'normals': np.stack([cells['cos2'], cells['sin2']], axis=-1),
-            'faces': np.stack([cells['face_x'], cells['face_y']], axis=-1),
+            'means': means,
+            'normals': normals,
+            'faces': faces,
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -215,19 +229,12 @@ class LocalMap:
             return
         once = len(np.unique(places, axis=0)) == len(places)
         snapshot.require(once, 'local map: tiles: one occurs twice', 'each tile once')
-        low = places.min(axis=0)
-        high = places.max(axis=0)
-        self.tiles.grow_to(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-        self.tiles.allocate(places)
+        self._allocate(places)
         cells = self.tiles.pool[: len(places)]
         cells['hits'] = np.minimum(state['hits'], state['seen'])
         cells['seen'] = state['seen']
-        cells['x'] = state['means'][..., 0]
-        cells['y'] = state['means'][..., 1]
-        cells['cos2'] = state['normals'][..., 0]
-        cells['sin2'] = state['normals'][..., 1]
-        cells['face_x'] = state['faces'][..., 0]
-        cells['face_y'] = state['faces'][..., 1]
+        values = [state[name] for name in ('means', 'normals', 'faces')]
+        self._surface_values[:] = np.concatenate(values, axis=-1)
         _lead(places * TILE, self.lattice, self.config.occupied_min_hit_ratio)
 
     def _reach(self, points_map: Array, laser_map: Array) -> None:
@@ -237,15 +244,22 @@ class LocalMap:
         both = np.vstack([points_map, laser_map])
         low = np.floor((both.min(axis=0) - reach) / edge_m).astype(np.int64)[::-1]
         high = np.floor((both.max(axis=0) + reach) / edge_m).astype(np.int64)[::-1]
-        self.tiles.grow_to(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         touched = _touched(points_map, laser_map, low, high, edge_m, reach)
-        first = (low[0] - self.tiles.first_row, low[1] - self.tiles.first_col)
-        rows, cols = touched.shape
-        missing = touched & (
-            self.tiles.directory[first[0] : first[0] + rows, first[1] : first[1] + cols] == NO_TILE
-        )
-        if missing.any():
-            self.tiles.allocate(np.argwhere(missing) + low)
+        self._allocate(np.argwhere(touched) + low)
+
+    @property
+    def _surface_values(self) -> NDArray[np.float32]:
+        """View (T, TILE, TILE, 6) of the surfaces of all tiles."""
+        surfaces = self.surfaces.pool[: self.surfaces.used]
+        return surfaces.view(np.float32).reshape(*surfaces.shape, len(SURFACE.names or ()))
+
+    def _allocate(self, places: NDArray[np.int64]) -> None:
+        """Allocate tiles (N, 2) of cells, and of their surfaces in the same slots."""
+        low = places.min(axis=0).tolist()
+        high = places.max(axis=0).tolist()
+        for store in (self.tiles, self.surfaces):
+            store.grow_to(*low, *high)
+            store.allocate(places)
 
 
 FIELDS = {
@@ -278,25 +292,39 @@ def slot_of(lattice: LocalMapView, row: int, col: int) -> int:
 
 
 @inlined
-def off_wall(lattice: LocalMapView, x: float, y: float) -> tuple[bool, bool, float, float, Any]:
+def cells_to_wall(cell: Any) -> float:
+    """Length of the offset of a cell to its nearest wall, in cells; inf beyond the reach."""
+    if cell['to_row'] == 0:
+        return np.inf
+    down = int(cell['to_row']) - HERE
+    right = int(cell['to_col']) - HERE
+    return math.sqrt(down * down + right * right)
+
+
+@inlined
+def off_wall(
+    lattice: LocalMapView, x: float, y: float
+) -> tuple[bool, bool, float, float, int, Any]:
     """Offset of a point (x, y), in cells, from its nearest wall.
 
     Returns whether the point's cell was observed, whether a wall is within reach, the offset (2)
-    from the mean of the wall's hits, in cells, and the cell of the wall.
+    from the mean of the wall's hits, in cells, their number, and the surface of the wall.
     """
     row = cell_of(y)
     col = cell_of(x)
     slot = slot_of(lattice, row, col)
     if slot == NO_TILE:
-        return False, False, 0.0, 0.0, lattice.pool[0, 0, 0]
+        return False, False, 0.0, 0.0, 0, lattice.surfaces[0, 0, 0]
     cell = lattice.pool[slot, row & TILE_MASK, col & TILE_MASK]
     is_seen = bool(cell['seen'] > 0)
     if cell['to_row'] == 0:
-        return is_seen, False, 0.0, 0.0, cell
+        return is_seen, False, 0.0, 0.0, 0, lattice.surfaces[0, 0, 0]
     row += int(cell['to_row']) - HERE
     col += int(cell['to_col']) - HERE
-    wall = lattice.pool[slot_of(lattice, row, col), row & TILE_MASK, col & TILE_MASK]
-    return is_seen, True, x - col - wall['x'], y - row - wall['y'], wall
+    slot = slot_of(lattice, row, col)
+    hits = int(lattice.pool[slot, row & TILE_MASK, col & TILE_MASK]['hits'])
+    wall = lattice.surfaces[slot, row & TILE_MASK, col & TILE_MASK]
+    return is_seen, True, x - col - wall['x'], y - row - wall['y'], hits, wall
 
 
 @kernel
@@ -306,7 +334,7 @@ def _distances(points: Array, lattice: LocalMapView) -> Array:
     for i in range(len(points)):
         x = points[i, 0] / lattice.cell_m - lattice.first_col
         y = points[i, 1] / lattice.cell_m - lattice.first_row
-        _, is_near, dx, dy, _ = off_wall(lattice, x, y)
+        _, is_near, dx, dy, _, _ = off_wall(lattice, x, y)
         if is_near:
             found[i] = min(found[i], lattice.cell_m * math.hypot(dx, dy))
     return found
@@ -399,22 +427,24 @@ def _add(
 
 
 @inlined
-def _learn_surface(cell: Any, x: float, y: float, normal: tuple[float, float, float]) -> None:
-    """Update the means of a cell by a hit at (x, y), in cells from its corner.
+def _learn_surface(
+    surface: Any, hits: int, x: float, y: float, normal: tuple[float, float, float]
+) -> None:
+    """Update the means of a surface by the last of its hits, at (x, y), in cells from its corner.
 
     normal: cosine and sine of the double angle of the surface normal, and the signed distance of
     the laser along the normal at half of this angle.
     """
-    gain = np.float32(1.0 / cell['hits'])
+    gain = np.float32(1.0 / hits)
     cos2, sin2, side = normal
     half = 0.5 * math.atan2(sin2, cos2)
     sign = math.copysign(1.0, side)
-    cell['x'] += gain * np.float32(x - cell['x'])
-    cell['y'] += gain * np.float32(y - cell['y'])
-    cell['cos2'] += gain * np.float32(cos2 - cell['cos2'])
-    cell['sin2'] += gain * np.float32(sin2 - cell['sin2'])
-    cell['face_x'] += gain * np.float32(sign * math.cos(half) - cell['face_x'])
-    cell['face_y'] += gain * np.float32(sign * math.sin(half) - cell['face_y'])
+    surface['x'] += gain * np.float32(x - surface['x'])
+    surface['y'] += gain * np.float32(y - surface['y'])
+    surface['cos2'] += gain * np.float32(cos2 - surface['cos2'])
+    surface['sin2'] += gain * np.float32(sin2 - surface['sin2'])
+    surface['face_x'] += gain * np.float32(sign * math.cos(half) - surface['face_x'])
+    surface['face_y'] += gain * np.float32(sign * math.sin(half) - surface['face_y'])
 
 
 @kernel
@@ -446,7 +476,9 @@ def _hit(
         turned = (cos2 * c2 - sin2 * s2, sin2 * c2 + cos2 * s2)
         own = 0.5 * math.atan2(turned[1], turned[0])
         side = math.cos(own) * back_x + math.sin(own) * back_y
-        _learn_surface(cell, x - col, y - row, (turned[0], turned[1], side))
+        surface = lattice.surfaces[slot, row & TILE_MASK, col & TILE_MASK]
+        normal = (turned[0], turned[1], side)
+        _learn_surface(surface, cell['hits'], x - col, y - row, normal)
         if not was_wall and is_wall(cell, share):
             _appear(lattice, row, col)
 
@@ -472,10 +504,11 @@ def _lead(
 def _appear(lattice: LocalMapView, row: int, col: int) -> None:
     """Add a wall: cells to which it is the nearest one refer to it."""
     for down in range(-lattice.reach, lattice.reach + 1):
-        for right in range(-lattice.reach, lattice.reach + 1):
+        side = int(math.sqrt(lattice.reach * lattice.reach - down * down))
+        for right in range(-side, side + 1):
             squared = down * down + right * right
             slot = slot_of(lattice, row + down, col + right)
-            if slot == NO_TILE or squared > lattice.reach * lattice.reach:
+            if slot == NO_TILE:
                 continue
             cell = lattice.pool[slot, (row + down) & TILE_MASK, (col + right) & TILE_MASK]
             to_row = int(cell['to_row']) - HERE

@@ -87,7 +87,7 @@ def evaluate(
         sums[1] += weight
         x = (pose[0] + px) / cell_m - lattice.first_col
         y = (pose[1] + py) / cell_m - lattice.first_row
-        is_seen, is_near, dx, dy, wall = off_wall(lattice, x, y)
+        is_seen, is_near, dx, dy, hits, wall = off_wall(lattice, x, y)
         if not is_near:
             sums[0] += weight * far * (1.0 if is_seen else UNSEEN_COST)
             sums[3] += weight * is_seen
@@ -97,7 +97,7 @@ def evaluate(
         if wall['face_x'] * to_x + wall['face_y'] * to_y < _BEHIND:
             sums[0] += weight * far * UNSEEN_COST  # the other face is a separate wall
             continue
-        w = weight * wall['hits'] / (wall['hits'] + _YOUNG_HITS)
+        w = weight * hits / (hits + _YOUNG_HITS)
         xx, xy, yy = _normal_matrix(wall['cos2'], wall['sin2'])
         ex = xx * dx + xy * dy
         ey = xy * dx + yy * dy

@@ -14,12 +14,14 @@ from thinmap_ros.core.slam.matching.local_map import (
     LocalMap,
     LocalMapView,
     cell_of,
+    cells_to_wall,
     is_wall,
     slot_of,
 )
 
 _REACH = 0.9  # of range_max: a farther wall may be out of range
 _STEP_CELLS = 0.5
+_BETWEEN_CELLS = 2.0  # a way may end in a cell whose offset is longer by less than this
 _SIGMAS = 3.0
 _BEHIND_M = 0.3  # by which a beam ends behind a wall that it has passed through
 _FEWEST_HITS = 2  # of a cell that is a wall for certain
@@ -65,25 +67,31 @@ def _count_through(
     laser (3,): its pose.
     """
     count = 0
+    x0 = laser[0] / lattice.cell_m - lattice.first_col
+    y0 = laser[1] / lattice.cell_m - lattice.first_row
     for i in range(len(angles)):
         cos = math.cos(angles[i])
         sin = math.sin(angles[i])
-        x = laser[0] / lattice.cell_m - lattice.first_col
-        y = laser[1] / lattice.cell_m - lattice.first_row
-        for _ in range(int(reaches_m[i] / (_STEP_CELLS * lattice.cell_m))):
-            x += _STEP_CELLS * cos
-            y += _STEP_CELLS * sin
-            row = cell_of(y)
-            col = cell_of(x)
+        steps = int(reaches_m[i] / (_STEP_CELLS * lattice.cell_m))
+        step = 0
+        while step < steps:
+            step += 1
+            row = cell_of(y0 + step * _STEP_CELLS * sin)
+            col = cell_of(x0 + step * _STEP_CELLS * cos)
             slot = slot_of(lattice, row, col)
             if slot == NO_TILE:
                 continue
             cell = lattice.pool[slot, row & TILE_MASK, col & TILE_MASK]
+            free = min(cells_to_wall(cell), lattice.reach) - _BETWEEN_CELLS
+            if free > 0.0:
+                step += int(free / _STEP_CELLS)
+                continue
             if cell['hits'] < _FEWEST_HITS or not is_wall(cell, hit_ratio):
                 continue
-            if math.hypot(cell['cos2'], cell['sin2']) < _SAME_SIDE:
+            wall = lattice.surfaces[slot, row & TILE_MASK, col & TILE_MASK]
+            if math.hypot(wall['cos2'], wall['sin2']) < _SAME_SIDE:
                 continue
-            normal = 0.5 * math.atan2(cell['sin2'], cell['cos2'])
+            normal = 0.5 * math.atan2(wall['sin2'], wall['cos2'])
             if abs(math.cos(normal) * cos + math.sin(normal) * sin) > _MOST_OBLIQUE:
                 count += 1
                 break
