@@ -835,6 +835,18 @@ def test_a_loop_is_closed_while_the_robot_drives(round_the_block):
     assert corrected.mean() < 0.8 * off.mean()
 
 
+def test_the_path_at_the_end_holds_the_loop_that_is_being_closed_and_the_pose_follows():
+    localizer = at_start(initial_x_m=3.15, initial_y_m=1.2)
+    for scan, odom, _ in drive_round_the_block():
+        localizer.step(scan, odom)
+        if localizer._loops._optimization is not None:
+            break
+    before = localizer.pose
+    path = localizer.optimized_trajectory()
+    assert np.hypot(*(localizer.pose - before)[:2]) > 0.1, 'nothing was closed'
+    np.testing.assert_allclose(path[-1], localizer.pose, atol=0.01)
+
+
 def test_the_map_is_rendered_again_the_nearest_part_first(round_the_block):
     """As after a loop closure: the map near the robot is rendered at once, the rest later."""
     rows, localizer = round_the_block

@@ -240,9 +240,7 @@ class Localizer:
             self._update_map(scan, points)
         elif self._tracking.needs_submap:
             self._start_submap()  # the robot is not where it was placed
-        correction = self._loops.step()
-        if correction is not None:
-            self._apply(correction)
+        correction = self._close_loops()
         self._map.render(self.keyframes)
         self._record_pose(scan)
         estimate = self._estimate(match, correction, blind_reason)
@@ -253,7 +251,12 @@ class Localizer:
         )
 
     def optimized_trajectory(self) -> Array:
-        """Poses (N, 3) of all steps since the start, after all corrections."""
+        """Poses (N, 3) of all steps since the start, after all corrections.
+
+        Pending matches are done, and the pose is corrected by them.
+        """
+        while self._loops.is_busy:
+            self._close_loops()
         return self._path.poses(self._loops.finish())
 
     def keyframe_trajectory(self) -> tuple[NDArray[np.int64], Array]:
@@ -451,6 +454,13 @@ class Localizer:
         self._loops.pieces.begin()
         self._map.start_submap()
         self._tracking.start_submap()
+
+    def _close_loops(self) -> Correction | None:
+        """Do one step of loop closure, and apply its correction."""
+        correction = self._loops.step()
+        if correction is not None:
+            self._apply(correction)
+        return correction
 
     def _apply(self, correction: Correction) -> None:
         """Apply a loop closure to the pose, and re-render the local map."""

@@ -149,6 +149,14 @@ def test_a_closed_ring_reuses_its_keyframes(ring):
     assert np.hypot(*(poses - truths)[-5:, :2].T).max() < 0.4
 
 
+def test_a_drive_that_ends_before_its_matches_are_done_is_closed_all_the_same():
+    driver = Driver(bias=DRIFT)
+    for truth in round_the_block():
+        driver.go(truth, works=0)
+    assert driver.errors(driver.loops.finish()).max() < 0.6 * driver.largest
+    assert not driver.loops.is_busy
+
+
 def test_a_little_drift_is_not_made_worse():
     driver = Driver()
     for truth in round_the_block():

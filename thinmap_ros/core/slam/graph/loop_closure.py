@@ -229,6 +229,11 @@ class LoopClosure:
             for there, own in zip(back, drift, strict=True)
         ]
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether there are pending matches, or an optimization is in progress."""
+        return bool(self._jobs) or self._optimization is not None
+
     def step(self) -> Correction | None:
         """Do one pending match, or one iteration of the optimization; called once per scan.
 
@@ -440,9 +445,9 @@ class LoopClosure:
         self.keyframes.reuse(j, frame)
 
     def finish(self) -> Array:
-        """Do all pending matches; returns the optimized poses (N, 3) of the keyframes."""
-        while self._jobs:
-            self._match(self._jobs.popleft())
+        """Do all pending work; returns the optimized poses (N, 3) of the keyframes."""
+        while self.is_busy:
+            self.step()
         self._add_pending()
         return optimized(self.keyframes.poses(), self._all_edges)
 
