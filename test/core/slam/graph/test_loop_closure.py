@@ -37,15 +37,15 @@ def loop_closure(**config):
     )
 
 
-def round_the_block():
-    """True poses of a path of more than a lap of the corridor, every 0.75 m or 0.5 rad."""
+def round_the_block(step_m=0.75, laps=1):
+    """True poses of a path of more than a lap of the corridor, at each step or 0.5 rad."""
     pose = np.array([3.0, 1.2, 0.0])
     yield pose
-    for goal in CORNERS:
+    for goal in CORNERS[:4] * laps + CORNERS[4:]:
         while np.hypot(*(goal - pose[:2])) > 0.5:
             off = goal - pose[:2]
             turn = np.clip(se2.wrap(np.arctan2(off[1], off[0]) - pose[2]), -0.5, 0.5)
-            ahead = 0.75 if abs(turn) < 0.3 else 0.2
+            ahead = step_m if abs(turn) < 0.3 else 0.2
             pose = se2.compose(pose, np.array([0.0, 0.0, turn]))
             pose = se2.compose(pose, np.array([ahead, 0.0, 0.0]))
             yield pose
@@ -275,6 +275,25 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
     assert counts == before
 
 
+def test_a_keyframe_is_matched_soon_though_each_scan_is_one(monkeypatch):
+    """One scan a metre: a match a scan, and up to three to be done."""
+    driver = Driver(bias=DRIFT)
+    ages = []
+    match = LoopClosure._match
+
+    def timed_match(self, job):
+        ages.append(len(driver.truths) - 1 - self._frame(job.k).scan.stamp_ns)
+        match(self, job)
+
+    monkeypatch.setattr(LoopClosure, '_match', timed_match)
+    for truth in round_the_block(step_m=1.0, laps=3):
+        driver.go(truth)
+    assert len(ages) > 100
+    assert max(ages) <= 20
+    assert driver.corrections
+    assert driver.errors().max() < 0.6 * driver.largest
+
+
 def test_a_robot_that_stands_about_keeps_one_scan(rng):
     loops = loop_closure()
     kept = 0
@@ -316,16 +335,20 @@ def test_a_step_with_a_jump_is_measured_again(rng):
     assert np.hypot(*(loops.finish()[2] - truths[2])[:2]) < 0.1
 
 
-def test_what_has_jumped_is_as_uncertain_as_step_and_jump_together():
+@pytest.mark.parametrize(('off', 'measured'), [((0.6, 0.0), True), ((0.0, 0.6), False)])
+def test_what_has_jumped_is_as_uncertain_as_step_and_jump_together(off, measured):
     loops = loop_closure()
-    for k, jump in enumerate([NONE, np.diag([0.09, 0.01, 0.02])]):
-        pose = se2.pose(2.0, 2.0 + k, 0.5 * np.pi)
-        scan = scan_in(ROOM, pose, stamp_ns=k)
+    jump = np.diag([0.09, 0.01, 0.02])
+    for k, uncertain in enumerate([NONE, jump]):
+        truth = se2.pose(2.0, 2.0 + k, 0.5 * np.pi)
+        told = se2.compose(truth, k * np.array([*off, 0.0]))
+        scan = scan_in(ROOM, truth, stamp_ns=k)
         points = surface_points(scan)
-        loops.add(Keyframe(scan, points, pose, float(k), NONE, 0), STEP, jump)
-    (job,) = loops._jobs
-    # In the map frame: along the robot's way is y.
-    np.testing.assert_allclose(job.covariance, STEP + np.diag([0.01, 0.09, 0.02]), atol=1e-12)
+        loops.add(Keyframe(scan, points, told, float(k), NONE, 0), STEP, uncertain)
+    loops.finish()
+    # In the frame of the anchor: along the robot's way is x.
+    np.testing.assert_allclose(inverse(loops.keyframes.steps[0].information), STEP + jump)
+    assert bool(loops.edges) == measured
 
 
 def test_the_step_covariance_is_that_of_the_step(rng):

@@ -35,6 +35,9 @@ from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 
 _RECENT = 8  # recent candidates among which consistent ones are searched
+# Scans within which a keyframe is matched. With three matches for each of the scans of a sparse
+# log, and one done at a time, a loop was closed up to 344 scans after its keyframes.
+_LATEST = 20
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,7 @@ class LoopClosure:
         self.edges: list[Edge] = []
         self.pieces = Pieces()
         self.adjust(config, matching)
-        self._jobs: deque[_Job] = deque()
+        self._jobs: deque[list[_Job]] = deque([[]], maxlen=_LATEST)  # by the scan that began them
         self._pending: tuple[Keyframe, Array] | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
         self._here: Keyframe | None = None  # the last keyframe scan, added or not
@@ -155,21 +158,19 @@ class LoopClosure:
         self._pending = (frame, step_covariance + jump)
         self._here = frame
         jumped = bool(jump.any()) and len(self.keyframes) > 0
-        if jumped:
-            anchor = self.keyframes.anchor
-            theta = float(self.keyframes.frames[anchor].T_map_base[2])
-            self._jobs.append(
-                _Job(anchor, len(self.keyframes), rotated_covariance(step_covariance + jump, theta))
-            )
         recent = None if jumped else self._recent_alike(frame)
         if recent is not None:
             self._reuse_keyframe(recent)
             return
-        self._jobs.extend(self._earlier_visits(frame))
+        anchor = self.keyframes.anchor
+        jobs = self._earlier_visits(frame)
+        self._jobs[-1] += jobs
+        if jumped or not jobs:
+            self._add_pending()
         if jumped:
-            self._add_pending()
-        if not self._is_pending_matched():
-            self._add_pending()
+            theta = float(self.keyframes.frames[anchor].T_map_base[2])
+            covariance = rotated_covariance(step_covariance + jump, theta)
+            self._match(_Job(anchor, self.keyframes.anchor, covariance))
 
     def _recent_alike(self, frame: Keyframe) -> int | None:
         """Keyframe of the current visit with nearly the same view, or None."""
@@ -183,8 +184,7 @@ class LoopClosure:
         frames = self.keyframes.frames
         spread = math.sqrt(float(np.linalg.eigvalsh(here.covariance[:2, :2])[-1]))
         near = self.keyframes.near(here.T_map_base, self._reach_m(spread))
-        due = {job.j for job in self._jobs if job.k == len(frames)}  # the step to be re-measured
-        near = [j for j in near if self._is_earlier(j, here) and j not in due]
+        near = [j for j in near if self._is_earlier(j, here)]
         if not near:
             return []
         covariances = self._as_seen_from(near, here)
@@ -207,6 +207,8 @@ class LoopClosure:
         return config.search_radius_m + min(config.search_sigmas * sigma, config.max_uncertainty_m)
 
     def _is_earlier(self, j: int, here: Keyframe) -> bool:
+        if j == self.keyframes.anchor:  # of another submap: the step is measured again
+            return False
         frame = self.keyframes.frames[j]
         return frame.path_m <= here.path_m - AGAIN_M or frame.submap != here.submap
 
@@ -232,25 +234,32 @@ class LoopClosure:
     @property
     def is_busy(self) -> bool:
         """Whether there are pending matches, or an optimization is in progress."""
-        return bool(self._jobs) or self._optimization is not None
+        return any(self._jobs) or self._optimization is not None
 
     def step(self) -> Correction | None:
         """Do one pending match, or one iteration of the optimization; called once per scan.
 
-        Returns the correction of the keyframes when an optimization has finished.
+        The newest keyframe is matched first. Returns the correction of the keyframes when an
+        optimization has finished.
         """
+        correction = None
         if self._optimization is not None:
-            return self._optimize(self._optimization)
-        if self._jobs:
-            self._match(self._jobs.popleft())
-            if not self._is_pending_matched():
-                self._add_pending()
-            if edges := self._closing_edges():
-                self._add_pending()
-                self._requested.clear()
-                self.edges += edges
-                self._begin_rounds()
-        return None
+            correction = self._optimize(self._optimization)
+        elif any(self._jobs):
+            self._match(next(jobs for jobs in reversed(self._jobs) if jobs).pop(0))
+            self._close()
+        self._jobs.append([])
+        return correction
+
+    def _close(self) -> None:
+        """Begin an optimization if enough matches agree on a loop."""
+        if not self._is_pending_matched():
+            self._add_pending()
+        if edges := self._closing_edges():
+            self._add_pending()
+            self._requested.clear()
+            self.edges += edges
+            self._begin_rounds()
 
     def _closing_edges(self) -> list[Edge]:
         """Loop edges that enough matches agree on, within a piece or between two."""
@@ -281,23 +290,7 @@ class LoopClosure:
             self._pending = (_moved(frame, before[last], poses[last]), covariance)
         self._submaps.clear()
         self.pieces.join(self.keyframes.frames, self.edges)
-        self._measure_jumps()
         return Correction(before, poses)
-
-    def _measure_jumps(self) -> None:
-        """Re-measure steps with a jump, and optimize again if one contradicts the poses.
-
-        After such a step, scans are matched with the old map of the place. The scans that closed
-        the loop are part of the new map.
-        """
-        last = len(self.keyframes)
-        jumps = [job for job in self._jobs if job.k < last and self._is_step(job.j, job.k)]
-        for job in jumps:
-            self._jobs.remove(job)
-            known = len(self.edges)
-            self._match(job)
-            if any(self._mahalanobis(edge) > CHI2 for edge in self.edges[known:]):
-                self._begin_rounds()
 
     def _is_step(self, j: int, k: int) -> bool:
         """Whether keyframe j was the anchor of keyframe k."""
@@ -426,7 +419,8 @@ class LoopClosure:
 
     def _is_pending_matched(self) -> bool:
         """Whether there are pending matches of the pending keyframe."""
-        return bool(self._jobs) and self._jobs[-1].k == len(self.keyframes)
+        number = len(self.keyframes)
+        return any(job.k == number for jobs in self._jobs for job in jobs)
 
     def _add_pending(self) -> None:
         """Add the pending keyframe to the graph, if there is one."""
@@ -441,7 +435,8 @@ class LoopClosure:
         frame, _ = self._pending
         self._pending = None
         number = len(self.keyframes)
-        self._jobs = deque(job for job in self._jobs if job.k != number)
+        for jobs in self._jobs:
+            jobs[:] = [job for job in jobs if job.k != number]
         self.keyframes.reuse(j, frame)
 
     def finish(self) -> Array:
