@@ -529,6 +529,19 @@ def test_a_carried_robot_sees_through_walls_where_its_scans_fit_the_map_that_gro
     assert not any(np.hypot(*(e.T_map_base - truth)[:2]) > 0.5 for truth, e in mapped)
 
 
+def test_a_robot_that_stands_is_not_lost_by_one_view_through_walls():
+    """Scans through walls from one place are one look, however many they are."""
+    rows, localizer = driven(300)
+    truth, _, odom = rows[-1]
+    rng = np.random.default_rng(8)
+    for k in range(300, 400):
+        scan = scan_in(ROOM, np.array([8.5, 5.0, -2.0]), rng, k * PERIOD_NS)
+        localizer.step(scan, odom)
+    rows = on(localizer, 40, truth, odom, rng)
+    assert not any(estimate.is_lost for _, estimate, _ in rows)
+    assert worst(rows) < 0.1
+
+
 def test_what_is_mapped_apart_is_not_saved_and_the_pose_of_a_user_leaves_it():
     rng = np.random.default_rng(8)
     rows, localizer = driven(300)

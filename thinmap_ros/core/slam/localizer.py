@@ -230,7 +230,7 @@ class Localizer:
         points = surface_points(scan)
         match = self._match(scan, points, prediction.T_map_base)
         self._tracking.dead_reckoned = self._tracking.dead_reckoned.moved(prediction)
-        self._tracking.update(match, self._seen_through_ratio(scan, match))
+        self._tracking.update(match, self._seen_through_ratio(scan, match), is_stationary)
         fitting = self._update(match, prediction, is_stationary)
         self._tracking.record_pose(self._pose, self._uncertainty.since_match)
         blind_reason = self._blind_reason(scan, points, match)

@@ -55,6 +55,7 @@ class Tracking:
         self._loaded_evidence = loaded_evidence
         self.evidence = 0.0
         self._seen_through = 0.0
+        self._before_look = 0.0  # the same before the present look
         self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
         self.is_unconfirmed = False  # after a scan without a match, until one fits
         self.dead_reckoned = DeadReckoning(T_map_base, np.zeros((3, 3)))
@@ -80,10 +81,13 @@ class Tracking:
         """Whether the evidence against the map, or against a given pose, reaches the threshold."""
         return max(self.evidence, self._seen_through) >= self._lost_evidence
 
-    def update(self, match: Match | None, seen_through: float = 0.0) -> None:
+    def update(
+        self, match: Match | None, seen_through: float = 0.0, is_stationary: bool = False
+    ) -> None:
         """Update the evidence by a match; None (no match was possible) leaves it unchanged.
 
-        seen_through: ratio of returns behind walls of the map.
+        seen_through: ratio of returns behind walls of the map; is_stationary: whether the scan is
+        of the same look as the last one, and no evidence of its own.
         """
         if match is None:
             self.is_unconfirmed = True
@@ -92,10 +96,17 @@ class Tracking:
             self.is_unconfirmed = False
         more = match.contradiction_ratio - match.inlier_ratio / INLIERS_PER_CONTRADICTION
         self.evidence = max(self.evidence + more, 0.0)
-        self._seen_through = max(self._seen_through + seen_through - _SEEN_THROUGH, 0.0)
+        if not is_stationary:
+            self._end_look(self._seen_through)
+        self._seen_through = max(self._before_look + seen_through - _SEEN_THROUGH, 0.0)
         if self.is_delocalized:
             self.evidence = min(self.evidence, self._lost_evidence)
             self.is_delocalized = not self.agrees or match.inlier_ratio < self._least_fit
+
+    def _end_look(self, seen_through: float) -> None:
+        """Set the evidence of walls that were seen through before the present look."""
+        self._before_look = seen_through
+        self._seen_through = seen_through
 
     def record_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Restart dead reckoning at the pose (3,) of this scan if the scan agrees with the map."""
@@ -111,7 +122,7 @@ class Tracking:
         self.is_delocalized = True
         self.is_unconfirmed = False
         self.evidence = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
-        self._seen_through = 0.0
+        self._end_look(0.0)
         self.dead_reckoned = DeadReckoning(T_map_base, covariance)
 
     def start_delocalized(self) -> None:
@@ -123,12 +134,12 @@ class Tracking:
         """The robot is delocalized in the map as it is, until scans fit."""
         self.is_delocalized = True
         self.evidence = min(self.evidence, self._lost_evidence)
-        self._seen_through = 0.0
+        self._end_look(0.0)
 
     def start_submap(self) -> None:
         """Start a new local map, which no scan contradicts."""
         self.evidence = 0.0
-        self._seen_through = 0.0
+        self._end_look(0.0)
         self.is_delocalized = False
 
     def move(self, T_map_base: Array) -> None:
