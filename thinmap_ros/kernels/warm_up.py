@@ -83,7 +83,8 @@ def localizer() -> None:
     Localizer.from_state(rehearsed.state())
     Localizer.from_occupancy_map(_room(), OdometryAnchor(0, T_map_base, T_map_base), T_map_base)
     # A revisit needs covariances along the graph.
-    covariances_from(0, np.zeros((2, 3)), [Edge(0, 1, np.zeros(3), np.eye(3), False)], np.ones(2))
+    step = Edge(0, 1, np.zeros(3), np.eye(3), False)
+    covariances_from(0, np.zeros((2, 3)), [step], np.ones((2, 6)))
 
 
 def _sense() -> None:

@@ -810,6 +810,11 @@ def test_a_state_with_more_hits_than_observations_in_one_cell_is_refused(whole_d
         Localizer.from_state({**state, 'hits': hits})
 
 
+def is_loop_found(localizer):
+    """Whether the last keyframes are tied to the first ones round the block."""
+    return any(edge.b - edge.a > 50 for edge in localizer._loops.edges)
+
+
 def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed_well():
     """At the start the pose slides onto the old walls before the loop is closed."""
     localizer = at_start(initial_x_m=3.0, initial_y_m=1.2)
@@ -833,7 +838,6 @@ def round_the_block():
     return rows, localizer
 
 
-@pytest.mark.xfail(strict=True, reason='the far side of the ring keeps most of its error')
 def test_a_loop_is_closed_while_the_robot_drives(round_the_block):
     """The map drifts round the block by systematic errors; the loop closure corrects it."""
     rows, localizer = round_the_block
@@ -852,7 +856,7 @@ def test_the_path_at_the_end_holds_the_loop_that_is_being_closed_and_the_pose_fo
     localizer = at_start(initial_x_m=3.15, initial_y_m=1.2)
     for scan, odom, _ in drive_round_the_block():
         localizer.step(scan, odom)
-        if localizer._loops._optimization is not None:
+        if is_loop_found(localizer) and localizer._loops._optimization is not None:
             break
     before = localizer.pose
     path = localizer.optimized_trajectory()
@@ -886,7 +890,7 @@ def test_the_heading_is_held_along_corridors():
     off = []
     for scan, odom, truth in drive_round_the_block():
         estimate = localizer.step(scan, odom)
-        if estimate.correction is not None:
+        if is_loop_found(localizer) and estimate.correction is not None:
             break
         off.append(se2.pose_difference(estimate.T_map_base, truth)[2])
     assert len(off) > 600

@@ -56,6 +56,9 @@ def hall():
     return Hall()
 
 
+SURE = np.zeros((3, 3))
+
+
 def test_a_hall_without_walls_in_range_is_no_fault(hall):
     estimates = hall.drive(30, se2.pose(-0.02, 0.0, 0.0))
     assert estimates[-1].inlier_ratio == 0.0
@@ -85,12 +88,14 @@ def test_returns_behind_walls_are_counted_and_those_on_them_and_beside_them_not(
     side = np.array([[-1.0, 1.0, 6.0, 1.0]])
     here = np.zeros(3)
     seen = map_of(np.vstack([wall, side]), [here] * 3)
-    assert seen_through_ratio(scan_in(np.vstack([wall, side]), here), seen, here) == 0.0
+    assert seen_through_ratio(scan_in(np.vstack([wall, side]), here), seen, here, SURE) == 0.0
     through = scan_in(np.vstack([behind, side]), here)
     x = through.ranges_m * np.cos(through.angles_rad)
     expected = np.mean(np.isclose(x[through.returned], 6.0))
-    assert seen_through_ratio(through, seen, here) == pytest.approx(expected, abs=0.05)
+    assert seen_through_ratio(through, seen, here, SURE) == pytest.approx(expected, abs=0.05)
     assert expected > 0.2
+    unsure = np.diag([1.5, 0.1, 0.01])
+    assert seen_through_ratio(through, seen, here, unsure) < 0.02, 'drift of 3 m explains them'
     closer = scan_in(np.array([[2.0, -4.0, 2.0, 0.9]]), here)
-    assert seen_through_ratio(closer, seen, here) == 0.0
-    assert seen_through_ratio(through, LocalMap(), here) == 0.0
+    assert seen_through_ratio(closer, seen, here, SURE) == 0.0
+    assert seen_through_ratio(through, LocalMap(), here, SURE) == 0.0

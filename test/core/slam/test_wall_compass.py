@@ -6,13 +6,15 @@ from support.slam_room import ROOM, corridor, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines, no_lines
+from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.wall_compass import WallCompass
+from thinmap_ros.core.slam.wall_compass import Reference, WallCompass
 
 PLACES = np.array(
     [[2.0, 2.0, 0.0], [5.5, 4.0, 1.0], [4.1, 7.0, 2.0], [8.5, 8.0, -2.0], [1.0, 8.0, -0.5]]
 )
 TURNED = 0.3
+SURE = Reference(1e-6, NO_SHARE)
 
 
 def lines_at(place, rng, walls=ROOM):
@@ -24,7 +26,7 @@ def learned(rng, walls=ROOM, turned=TURNED, looks=20):
     compass = WallCompass()
     for k in range(looks):
         place = PLACES[k % len(PLACES)] + [0.0, 0.0, 0.2 * k]
-        compass.add_lines(lines_at(place, rng, walls), place[2] + turned, 0.3 * k)
+        compass.add_lines(lines_at(place, rng, walls), place[2] + turned, 0.3 * k, SURE)
     return compass
 
 
@@ -65,7 +67,7 @@ def test_what_was_seen_where_the_map_began_counts_most(rng):
     compass = learned(rng)
     for k in range(60):
         place = PLACES[k % len(PLACES)]
-        compass.add_lines(lines_at(place, rng), place[2] + TURNED + 0.02, 100.0 + k)
+        compass.add_lines(lines_at(place, rng), place[2] + TURNED + 0.02, 100.0 + k, SURE)
     assert abs(compass.direction - TURNED) < 0.006
 
 

@@ -2,17 +2,28 @@
 
 A match measures the pose relative to the local map. A scan that is added to the map adds its own
 pose error to it. These errors accumulate along the path until a loop closure corrects them.
+
+The systematic error of the odometry is one error in all steps. Where the scans do not measure the
+pose, it adds up along the path: the covariance is P + S C S', with P of independent errors, C of
+the calibration, and S the derivative of the pose by it.
 """
 
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.ekf_slam.models import rotation
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.keyframes import inverse, propagated_covariance, rotated_covariance
+from thinmap_ros.core.slam.graph.keyframes import (
+    carried,
+    inverse,
+    propagated_covariance,
+    rotated_covariance,
+)
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 
 CHI2 = 11.34  # 99 % of three degrees of freedom
 UNKNOWN = np.diag(np.square([300.0, 300.0, np.pi]))  # covariance of an unknown pose
+NO_DERIVATIVE = np.zeros((3, 4))
 _LEAST_STEP = np.diag(np.square([2e-3, 2e-3, 5e-4]))  # smallest covariance between keyframes
 
 
@@ -55,6 +66,9 @@ class PoseUncertainty:
         self.motion_part: Array = np.zeros((3, 3))  # share of since_map_update from the motion
         self._since_keyframe = np.zeros((3, 3))
         self._map_update_covariance = np.zeros((3, 3))  # last update, not in _since_keyframe
+        # Since the walls in view were drawn, which matches measure; and besides, from the anchor.
+        self._systematic_in_view = NO_DERIVATIVE
+        self._systematic_of_step = NO_DERIVATIVE
         self._contradiction = Contradiction()
         self._T_moved = T_map_base  # pose after the last motion
 
@@ -66,15 +80,24 @@ class PoseUncertainty:
         self.since_map_update = own
         self._since_keyframe = np.zeros((3, 3))
         self._map_update_covariance = np.zeros((3, 3))
+        self._systematic_in_view = NO_DERIVATIVE
+        self._systematic_of_step = NO_DERIVATIVE
         self._contradiction.add_jump(own + UNKNOWN)
 
-    def predict(self, before: Array, prior: Array, Q: Array, is_stationary: bool) -> None:
-        """Propagate by a motion from a pose (3,) to the prior (3,), with covariance Q (3, 3)."""
+    def predict(
+        self, before: Array, prior: Array, Q: Array, is_stationary: bool, by_calibration: Array
+    ) -> None:
+        """Propagate by a motion from a pose (3,) to the prior (3,), with covariance Q (3, 3).
+
+        by_calibration (3, 4): derivative of the motion by the calibration, map frame.
+        """
         self.since_match = propagated_covariance(self.since_match, prior[:2] - before[:2]) + Q
         if not is_stationary:
             lever = prior[:2] - self._T_moved[:2]
             self._since_keyframe = propagated_covariance(self._since_keyframe, lever)
             self.since_map_update = propagated_covariance(self.since_map_update, lever)
+            self._systematic_of_step = carried(self._systematic_of_step, lever)
+            self._systematic_in_view = carried(self._systematic_in_view, lever) + by_calibration
 
     def is_stationary(self, T_map_base: Array, slip: Array) -> bool:
         """Whether a pose (3,) differs from the last moved one by at most the slip (3,)."""
@@ -95,7 +118,9 @@ class PoseUncertainty:
             return
         motion_part = inverse(self.since_map_update + Q)
         self.since_map_update = inverse(motion_part + match.scan_information)
-        self.motion_part = self.since_map_update @ motion_part @ self.since_map_update
+        unmeasured = self.since_map_update @ motion_part  # share of the prior: I - K
+        self.motion_part = unmeasured @ self.since_map_update
+        self._systematic_in_view = unmeasured @ self._systematic_in_view
         self._T_moved = match.T_map_base
 
     def is_unexpected(self, match: Match, prior: Array) -> bool:
@@ -104,12 +129,18 @@ class PoseUncertainty:
         return float(off @ np.linalg.solve(self.since_match, off)) > CHI2
 
     def map_updated(self, share: float) -> None:
-        """Account for a map update; share: of the scan's error that is independent of the last."""
+        """Account for a map update; share: of the scan's error that is independent of the last.
+
+        It is the share of the walls in view that are drawn anew, at this pose.
+        """
         scan_part = self.scan_part
         self._since_keyframe = self._since_keyframe + self.motion_part + share * scan_part
         self._map_update_covariance = (1.0 - share) * scan_part
         self.since_map_update = np.zeros((3, 3))
         self.motion_part = np.zeros((3, 3))
+        drawn = share * self._systematic_in_view
+        self._systematic_of_step = self._systematic_of_step + drawn
+        self._systematic_in_view = self._systematic_in_view - drawn
 
     @property
     def scan_part(self) -> Array:
@@ -123,27 +154,44 @@ class PoseUncertainty:
         self.since_match = np.zeros((3, 3))
         self._T_moved = T_map_base
 
-    def step_from(self, yaw: float) -> tuple[Array, Array]:
-        """Covariance (3, 3) of the step from an anchor with heading yaw, and of its jumps (3, 3).
+    def step_from(self, yaw: float) -> tuple[Array, Array, Array]:
+        """The step from an anchor with heading yaw, in its frame.
 
-        Both in the frame of the anchor.
+        Returns its derivative (3, 4) by the calibration, its covariance (3, 3), and that of its
+        jumps (3, 3).
         """
-        jump = self._contradiction.covariance
-        step = rotated_covariance(self._since_keyframe, -yaw) + _LEAST_STEP
-        return step, rotated_covariance(jump, -yaw)
+        by_calibration = rotation(-yaw) @ self._systematic_since_anchor
+        covariance = rotated_covariance(self._since_keyframe, -yaw) + _LEAST_STEP
+        return by_calibration, covariance, rotated_covariance(self._contradiction.covariance, -yaw)
 
     def start_step(self) -> None:
         """Make the current pose the anchor: its step covariance restarts at 0."""
         self._since_keyframe = np.zeros((3, 3))
         self._map_update_covariance = np.zeros((3, 3))
+        # What a match takes off the part in view is then taken off the new step.
+        self._systematic_of_step = -self._systematic_in_view
         self._contradiction = Contradiction()
+
+    @property
+    def _systematic_since_anchor(self) -> Array:
+        return self._systematic_of_step + self._systematic_in_view
+
+    def systematic(self, T_anchor: Array | None, anchor_systematic: Array) -> Array:
+        """Derivative (3, 4) of the pose by the calibration, map frame, given that of the anchor."""
+        own = self._systematic_since_anchor
+        if T_anchor is None:
+            return own
+        return own + carried(anchor_systematic, self._T_moved[:2] - T_anchor[:2])
 
     def move(self, T_map_base: Array) -> None:
         """Set the corrected pose (3,); covariances relative to earlier poses do not change."""
         self._T_moved = T_map_base
 
     def covariance(self, T_anchor: Array | None, anchor_covariance: Array | None) -> Array:
-        """Covariance (3, 3) of the pose, map frame, given the anchor's pose (3,) and covariance."""
+        """Covariance (3, 3) of the independent errors of the pose, map frame.
+
+        Given the pose (3,) of the anchor, and its covariance (3, 3).
+        """
         # A match cannot be more accurate than the scan that was last added to the map.
         own = self._since_keyframe + max(
             self._map_update_covariance, self.since_map_update, key=np.trace

@@ -5,7 +5,7 @@ from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import PoseUncertainty
-from thinmap_ros.core.slam.wall_compass import Heading, WallCompass
+from thinmap_ros.core.slam.wall_compass import Heading, Reference, WallCompass
 
 
 class HeadingCorrection:
@@ -22,12 +22,19 @@ class HeadingCorrection:
         self.measured: Heading | None = None  # measured heading of the last scan
 
     def correct(
-        self, scan: Scan, T_map_base: Array, pose: PoseUncertainty, path_m: float, fits: bool
+        self,
+        scan: Scan,
+        T_map_base: Array,
+        pose: PoseUncertainty,
+        path_m: float,
+        fits: bool,
+        own: Reference,
     ) -> Array:
         """Pose (3,) with the heading corrected by the wall directions, if they give one.
 
         path_m: length of the path so far (m); walls near the start of the path weigh most.
-        fits: whether scans agree with the map; otherwise the pose is unchanged.
+        fits: whether scans agree with the map; otherwise the pose is unchanged; own: error of the
+        heading, relative to where the map began.
         """
         # The gate is narrower than the variance of the pose: a larger heading error is also in the
         # local map, and a scan that is corrected alone would no longer fit this map.
@@ -42,5 +49,9 @@ class HeadingCorrection:
             gain = self._variance / (self._variance + self.measured.variance)
             heading = float(se2.wrap(heading + gain * (self.measured.yaw - heading)))
             self._variance *= 1.0 - gain
-        self._compass.add_lines(lines, heading, path_m)
+        self._compass.add_lines(lines, heading, path_m, own)
         return se2.pose(x, y, heading)
+
+    def calibrate(self, parameters: Array) -> None:
+        """Turn the main wall direction as parameters (N, 4) of the calibration have it."""
+        self._compass.calibrate(parameters)

@@ -17,22 +17,24 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter, parameters_of, part
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
-from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances
+from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances, rotation
 from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.active_map import ActiveMap
-from thinmap_ros.core.slam.covariance import UNKNOWN, PoseUncertainty
+from thinmap_ros.core.slam.covariance import NO_DERIVATIVE, UNKNOWN, PoseUncertainty
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
-    heading_variance,
+    Step,
+    heading_errors,
     rotated_covariance,
     with_heading,
 )
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
+from thinmap_ros.core.slam.graph.pose_graph import Systematic
 from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
 from thinmap_ros.core.slam.heading import HeadingCorrection
 from thinmap_ros.core.slam.matching import local_map
@@ -49,6 +51,7 @@ from thinmap_ros.core.slam.matching.visibility import misses_walls, seen_through
 from thinmap_ros.core.slam.motion_model import MotionConfig
 from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction, Prediction
 from thinmap_ros.core.slam.tracking import INLIERS_PER_CONTRADICTION, Tracking
+from thinmap_ros.core.slam.wall_compass import Reference
 
 _SIGMAS = 3.0
 _NO_RETURNS = 'no returns from walls of the map'
@@ -105,7 +108,11 @@ class Localizer:
         )
         self._heading = HeadingCorrection(config.lines)
         self._loops = LoopClosure(
-            config.loop_closure, config.keyframes, config.matching, config.local_map
+            config.loop_closure,
+            config.keyframes,
+            config.matching,
+            config.local_map,
+            self._prediction.calibration,
         )
         self._map = ActiveMap(config.local_map, self._loops.pieces)
         self._path = KeyframeTrajectory()
@@ -224,8 +231,9 @@ class Localizer:
         """
         prediction = self._prediction.predict(scan, T_odom_base, self._pose)
         is_stationary = self._is_stationary(prediction)
+        by_calibration = rotation(float(self._pose[2])) @ prediction.motion.by_calibration
         self._uncertainty.predict(
-            self._pose, prediction.T_map_base, prediction.covariance, is_stationary
+            self._pose, prediction.T_map_base, prediction.covariance, is_stationary, by_calibration
         )
         points = surface_points(scan)
         match = self._match(scan, points, prediction.T_map_base)
@@ -327,7 +335,7 @@ class Localizer:
         """
         if match is None or not self.config.is_mapping:
             return 0.0
-        return seen_through_ratio(scan, self._map.map, match.T_map_base)
+        return seen_through_ratio(scan, self._map.map, match.T_map_base, self._covariance())
 
     def _blind_reason(self, scan: Scan, points: Array, match: Match | None) -> str:
         """Why the laser does not confirm the pose; '' if it does, or if no wall is in range."""
@@ -374,9 +382,9 @@ class Localizer:
             return None
         self._pose = match.T_map_base
         fits = match.inlier_ratio >= self.config.matching.min_inlier_ratio
-        if fits:
-            self._prediction.update(prediction, match)
         self._uncertainty.update(match, prior, prediction.covariance, fits, is_stationary)
+        if fits:
+            self._prediction.update(prediction, match, self._systematic())
         return match if fits else None
 
     def _is_rejected(self, match: Match, is_unexpected: bool) -> bool:
@@ -420,7 +428,9 @@ class Localizer:
         """Correct the heading by the wall directions if scans agree with the map."""
         path_m = self._loops.path_m(self._pose)
         agrees = self._tracking.agrees
-        self._pose = self._heading.correct(scan, self._pose, self._uncertainty, path_m, agrees)
+        derivative = np.vstack([np.zeros((2, 4)), self._systematic()[2]])
+        own = Reference(float(self._random_covariance()[2, 2]), self._share(derivative))
+        self._pose = self._heading.correct(scan, self._pose, self._uncertainty, path_m, agrees, own)
         self._uncertainty.move(self._pose)
         self._tracking.record_pose(self._pose, self._uncertainty.since_match)
 
@@ -429,14 +439,15 @@ class Localizer:
         loops = self._loops
         anchor = loops.keyframes.anchor
         yaw = 0.0 if anchor < 0 else float(self.keyframes[anchor].T_map_base[2])
-        step, jump = self._uncertainty.step_from(yaw)
+        by_calibration, covariance, jump = self._uncertainty.step_from(yaw)
+        step = Step(covariance, self._share(by_calibration))
         path_m = loops.path_m(self._pose)
         # In a new submap the heading is unknown, also by multiples of 90 degrees.
         submap = loops.pieces.current
         heading = None if self._is_lost else self._heading.measured
-        variance = heading_variance(heading, self._pose)
-        covariance = with_heading(self._covariance(), variance)
-        frame = Keyframe(scan, points, self._pose, path_m, covariance, submap, heading)
+        (error,) = heading_errors([heading], self._pose[None])
+        covariance, systematic = with_heading(self._random_covariance(), self._systematic(), error)
+        frame = Keyframe(scan, points, self._pose, path_m, covariance, submap, heading, systematic)
         loops.add(frame, step, jump)
         self._uncertainty.start_step()
 
@@ -466,6 +477,7 @@ class Localizer:
         """Apply a loop closure to the pose, and re-render the local map."""
         anchor = self._loops.keyframes.anchor
         self._prediction.reset_segment()
+        self._heading.calibrate(self._prediction.calibration.smoothed())
         self._pose = correction.applied_to(anchor, self._pose)
         self._map.T_at_update = self._pose
         self._uncertainty.move(self._pose)
@@ -478,13 +490,35 @@ class Localizer:
         T_anchor = np.zeros(3) if anchor < 0 else self.keyframes[anchor].T_map_base
         self._path.add(scan.stamp_ns, anchor, se2.between(T_anchor, self._pose))
 
+    def _share(self, derivative: Array) -> Systematic:
+        """Share of the odometry in a relative pose of this step, by its derivative (3, 4)."""
+        calibration = self._prediction.calibration
+        return Systematic(derivative, calibration.parameters, calibration.spans)
+
+    @property
+    def _anchor(self) -> Keyframe | None:
+        anchor = self._loops.keyframes.anchor
+        return None if anchor < 0 else self.keyframes[anchor]
+
+    def _random_covariance(self) -> Array:
+        """Covariance (3, 3) of the independent errors of the pose, map frame."""
+        anchor = self._anchor
+        if anchor is None:
+            return self._uncertainty.covariance(None, None)
+        return self._uncertainty.covariance(anchor.T_map_base, anchor.covariance)
+
+    def _systematic(self) -> Array:
+        """Derivative (3, 4) of the pose by the calibration of the odometry, map frame."""
+        anchor = self._anchor
+        if anchor is None:
+            return self._uncertainty.systematic(None, NO_DERIVATIVE)
+        return self._uncertainty.systematic(anchor.T_map_base, anchor.systematic)
+
     def _covariance(self) -> Array:
         """Covariance (3, 3) of the pose, map frame."""
-        anchor = self._loops.keyframes.anchor
-        if anchor < 0:
-            return self._uncertainty.covariance(None, None)
-        frame = self.keyframes[anchor]
-        return self._uncertainty.covariance(frame.T_map_base, frame.covariance)
+        by = self._systematic()
+        total = self._random_covariance() + by @ self._prediction.calibration.covariance @ by.T
+        return np.asarray(0.5 * (total + total.T))
 
     def _estimate(
         self, match: Match | None, correction: Correction | None, blind_reason: str

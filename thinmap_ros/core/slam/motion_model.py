@@ -6,7 +6,7 @@ Source: Mehra, "On the identification of variances and adaptive Kalman filtering
 Siegwart and Nourbakhsh, "Introduction to autonomous mobile robots", for the odometry's noise.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -41,12 +41,14 @@ class MotionConfig(OdometryConfig):
 class MotionPrediction:
     """Increment (3,) and its covariance (3, 3), in the robot frame before it.
 
-    is_stationary: whether the increment is within the noise floor of the odometry.
+    is_stationary: whether the increment is within the noise floor of the odometry; by_calibration
+    (3, 4): derivative of the increment by the parameters of the calibration.
     """
 
     increment: Array
     covariance: Array
     is_stationary: bool
+    by_calibration: Array = field(default_factory=lambda: np.zeros((3, 4)))
 
 
 def _distinctness(information: Array, corridor_ratio: float) -> Array:

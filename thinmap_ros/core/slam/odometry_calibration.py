@@ -18,6 +18,9 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.models import rotation
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph.keyframes import carried
+
+_OUTLIER_SIGMAS = 3.0  # beyond which all innovations teach the same
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class CalibrationConfig:
     so long that the covariance of its two ends is small beside it; noise_m, noise_rad: of a span,
     besides that of its ends and of the odometry, as errors of matches are correlated;
     min_information: for directions without information, as in a corridor; gate_sigmas: a larger
-    innovation is wheel slip.
+    innovation is wheel slip. The noise is scaled by the innovations of noise_window spans.
     """
 
     prior_sigmas: tuple[float, ...] = (0.02, 0.02, 0.05, 0.02)
@@ -40,6 +43,19 @@ class CalibrationConfig:
     noise_rad: float = 0.02
     min_information: float = 1e-2
     gate_sigmas: float = 4.0
+    noise_window: float = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class _MatchedPose:
+    """Pose (3,), its covariance (3, 3) by the scan, and derivative (3, 4) by the parameters.
+
+    All in the map frame.
+    """
+
+    T_map_base: Array
+    covariance: Array
+    systematic: Array
 
 
 class OdometryCalibration:
@@ -49,22 +65,35 @@ class OdometryCalibration:
         self._config = config or CalibrationConfig()
         # Estimated parameters: scale, drift in rad/m, turn_scale, askew in rad.
         self.parameters = np.array([1.0, 0.0, 1.0, 0.0])
-        self._covariance = np.diag(np.square(self._config.prior_sigmas))
-        self._begin: Array | None = None
-        self._begin_covariance: Array = np.zeros((3, 3))  # of the pose _begin, map frame
+        self.covariance: Array = np.diag(np.square(self._config.prior_sigmas))  # (4, 4)
+        self._spans = _Spans(self.parameters, self.covariance)
+        # Of turn, length and lateral offset of a span.
+        self._noises = [_Noise(self._config.noise_window) for _ in range(3)]
+        self.applied = self.parameters  # as the map contains them
+        self._begin: _MatchedPose | None = None
         self.reset_segment()
 
     def reset_segment(self) -> None:
         """Discard the current span, after a pose that is not due to matching: set or lost."""
         self._begin = None
         self._expected = np.zeros(3)
+        self._by_parameters = np.zeros((3, 4))  # derivative of _expected
         self._travelled_m = self._turned_rad = 0.0
         self._random = np.zeros(2)
+
+    @property
+    def spans(self) -> int:
+        """Number of spans that the parameters were estimated from."""
+        return len(self._spans)
+
+    def smoothed(self) -> Array:
+        """Parameters (N, 4) after each number of spans, as all spans together have them."""
+        return self._spans.smoothed()
 
     def corrected(self, increment: Array, variances: Array) -> tuple[Array, Array]:
         """Odometry increment (3,), robot frame, without its systematic error.
 
-        Also returns the covariance (3, 3) of the residual systematic error.
+        Also returns its derivative (3, 4) by the parameters.
 
         variances (2,): random errors of the chord, m^2, and of the turn, rad^2.
         """
@@ -81,7 +110,6 @@ class OdometryCalibration:
         self._turned_rad += turned
         self._random = self._random + variances
         found = np.array([x, y, turn])
-        self._expected = se2.compose(self._expected, found)
         G = np.array(
             [
                 [x / scale, -0.5 * y * length, -0.5 * y * turned, -y],
@@ -89,13 +117,19 @@ class OdometryCalibration:
                 [0.0, length, turned, 0.0],
             ]
         )
-        return found, G @ self._covariance @ G.T
+        before = self._expected
+        self._expected = se2.compose(before, found)
+        moved = carried(self._by_parameters, self._expected[:2] - before[:2])
+        self._by_parameters = moved + rotation(float(before[2])) @ G
+        return found, G
 
-    def update(self, T_map_base: Array, by_map: Array) -> None:
+    def update(self, T_map_base: Array, by_map: Array, systematic: Array) -> None:
         """Update the calibration by a matched pose (3,), map frame, after the increments so far.
 
         by_map (3, 3): information of the scan alone. The odometry prior must not be part of it,
-        because it is not independent of the increments.
+        because it is not independent of the increments. systematic (3, 4): derivative of the pose
+        by the parameters, map frame: a match with a map that was drawn at a pose of the odometry
+        does not measure the odometry, but confirms it.
         """
         if (
             self._begin is not None
@@ -106,24 +140,28 @@ class OdometryCalibration:
         covariance: Array = np.linalg.inv(by_map + self._config.min_information * np.eye(3)).astype(
             np.float64
         )
-        if self._begin is not None:
-            R = rotation(float(self._begin[2]))
-            found = se2.between(self._begin, T_map_base)
-            self._update_span(found, R.T @ (covariance + self._begin_covariance) @ R)
+        begin = self._begin
+        if begin is not None:
+            R = rotation(float(begin.T_map_base[2]))
+            found = se2.between(begin.T_map_base, T_map_base)
+            begun = carried(begin.systematic, T_map_base[:2] - begin.T_map_base[:2])
+            H = self._by_parameters - R.T @ (systematic - begun)
+            self._update_span(found, R.T @ (covariance + begin.covariance) @ R, H)
         self.reset_segment()
-        self._begin = T_map_base
-        self._begin_covariance = covariance
+        self._begin = _MatchedPose(T_map_base, covariance, systematic)
 
-    def _update_span(self, found: Array, covariance: Array) -> None:
+    def _update_span(self, found: Array, covariance: Array, H: Array) -> None:
         """Kalman updates by the turn of a span, its length, and its lateral offset.
 
-        found (3,), covariance (3, 3): measured end of the span, in the frame of its start.
+        found (3,), covariance (3, 3): measured end of the span, in the frame of its start; H
+        (3, 4): what it measures of the parameters.
         """
         moved = abs(self._travelled_m) + abs(self._turned_rad)
-        self._covariance += np.diag(np.square(self._config.walk_sigmas)) * moved
+        self.covariance = self.covariance + np.diag(np.square(self._config.walk_sigmas)) * moved
+        predicted = self.covariance
         off_turn = float(se2.wrap(float(found[2] - self._expected[2])))
         variance = self._config.noise_rad**2 + self._random[1] + float(covariance[2, 2])
-        self._update(off_turn, np.array([0.0, self._travelled_m, self._turned_rad, 0.0]), variance)
+        self._update(off_turn, H[2], variance, self._noises[0])
         length = math.hypot(self._expected[0], self._expected[1])
         if length > 0.5 * self._config.span_m:
             x, y = self._expected[:2] / length
@@ -135,9 +173,7 @@ class OdometryCalibration:
                 + self._random[0]
                 + float(along @ covariance[:2, :2] @ along)
             )
-            self._update(
-                x * dx + y * dy, np.array([length / self.parameters[0], 0.0, 0.0, 0.0]), variance
-            )
+            self._update(x * dx + y * dy, along @ H[:2], variance, self._noises[1])
             # The lateral offset contains half of the turn error.
             aside = x * dy - y * dx - 0.5 * length * off_turn
             variance = (
@@ -145,20 +181,78 @@ class OdometryCalibration:
                 + 0.25 * length**2 * self._random[1]
                 + float(across @ covariance[:2, :2] @ across)
             )
-            self._update(aside, np.array([0.0, 0.0, 0.0, length]), variance)
+            H_aside = across @ H[:2] - 0.5 * length * H[2]
+            self._update(aside, H_aside, variance, self._noises[2])
+        self._spans.add(self.parameters, predicted, self.covariance)
 
-    def _update(self, off: float, H: Array, noise: float) -> None:
+    def _update(self, off: float, H: Array, modelled: float, noise: '_Noise') -> None:
         """Scalar Kalman update by an innovation `off`; an innovation outside the gate is ignored.
 
-        noise: variance of the measurement.
+        modelled: variance of the measurement, which `noise` scales.
         """
-        along = self._covariance @ H
-        variance = float(H @ along) + noise
+        along = self.covariance @ H
+        known = float(H @ along)
+        variance = known + noise.scale * modelled
+        noise.learn(off, known, modelled)
         if off * off > self._config.gate_sigmas**2 * variance:
             return
         gain = along / variance
         self.parameters = self.parameters + gain * off
-        self._covariance -= np.outer(gain, along)
+        self.covariance = self.covariance - np.outer(gain, along)
+
+
+class _Noise:
+    """Scale, at least 1, of the modelled variance of a measurement, by its innovations.
+
+    An odometry that slips at single steps, as the motion model has long learned, does so in spans.
+    Source: Mehra, "On the identification of variances and adaptive Kalman filtering", 1970.
+    """
+
+    def __init__(self, window: float) -> None:
+        """window: number of innovations that count."""
+        self.scale = 1.0
+        self._window = window
+        self._learned = 0.0  # innovations so far, by weight
+
+    def learn(self, off: float, known: float, modelled: float) -> None:
+        """Adapt to an innovation; variances: known, by the parameters; modelled, by the noise."""
+        noise = self.scale * modelled
+        beyond = max(off * off - known, 0.0) / modelled
+        outlier = _OUTLIER_SIGMAS**2 * self.scale
+        weight = noise / (noise + known)  # what the innovation says about the noise
+        self._learned += weight
+        rate = max(1.0 / self._window, 1.0 / (1.0 + self._learned))
+        self.scale = max(self.scale + rate * weight * (min(beyond, outlier) - self.scale), 1.0)
+
+
+class _Spans:
+    """The parameters after each span, and their smoother.
+
+    Source: Rauch, Tung and Striebel, "Maximum likelihood estimates of linear dynamic systems",
+    1965.
+    """
+
+    def __init__(self, parameters: Array, covariance: Array) -> None:
+        self._parameters = [parameters]
+        self._before = [covariance]  # prediction of each span
+        self._after = [covariance]
+
+    def __len__(self) -> int:
+        return len(self._parameters) - 1
+
+    def add(self, parameters: Array, before: Array, after: Array) -> None:
+        """Add a span: parameters (4,), covariances (4, 4) before and after its measurement."""
+        self._parameters.append(parameters)
+        self._before.append(before)
+        self._after.append(after)
+
+    def smoothed(self) -> Array:
+        """Parameters (N, 4) of each number of spans, given all of them."""
+        found = np.array(self._parameters)
+        gains = np.array(self._after)[:-1] @ np.linalg.inv(np.array(self._before)[1:])
+        for k in range(len(found) - 2, -1, -1):
+            found[k] += gains[k] @ (found[k + 1] - self._parameters[k])
+        return found
 
 
 def _signed_length(increment: Array) -> float:

@@ -1,6 +1,6 @@
 """Pose prediction by calibrated odometry from scan to scan, with its covariance."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -48,7 +48,7 @@ class OdometryPrediction:
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
         self._increments = OdometryIncrements()
-        self._calibration = OdometryCalibration()
+        self.calibration = OdometryCalibration()
         self._model = MotionModel(config)
         self._reversal = Reversal()
         self._begins_known = False  # whether the next motion starts at a matched pose
@@ -85,28 +85,31 @@ class OdometryPrediction:
         mean = -0.5 * off if accepted else np.zeros(3)
         self._reversal = Reversal(mean, 0.25 * np.outer(off, off))
 
-    def update(self, prediction: Prediction, match: Match) -> None:
-        """Update the odometry noise and calibration by a match with enough inliers."""
+    def update(self, prediction: Prediction, match: Match, systematic: Array) -> None:
+        """Update the odometry noise and calibration by a match with enough inliers.
+
+        systematic (3, 4): derivative of the matched pose by the calibration, map frame.
+        """
         if self._begins_known:
             scan_information = rotated_covariance(
                 match.scan_information, -float(prediction.T_before[2])
             )
             self._model.update(se2.between(prediction.T_before, match.T_map_base), scan_information)
         self._begins_known = True
-        self._calibration.update(match.T_map_base, match.scan_information)
+        self.calibration.update(match.T_map_base, match.scan_information, systematic)
 
     def reset_segment(self) -> None:
         """Stop comparing odometry with matches across a pose that was set, corrected or lost."""
         self._begins_known = False
-        self._calibration.reset_segment()
+        self.calibration.reset_segment()
 
     def _motion(self, increment: OdometryIncrement) -> MotionPrediction:
         """Motion since the last scan, robot frame; wide after an odometry discontinuity."""
         variances = odometry_variances(increment.T_before_base, self._config)[[0, 2]]
-        moved, systematic = self._calibration.corrected(increment.T_before_base, variances)
-        motion = self._model.predict(moved, systematic)
+        moved, G = self.calibration.corrected(increment.T_before_base, variances)
+        motion = self._model.predict(moved, G @ self.calibration.covariance @ G.T)
         if increment.discontinuity_m == 0.0:
-            return motion
-        self._calibration.reset_segment()
+            return replace(motion, by_calibration=G)
+        self.calibration.reset_segment()
         unknown = np.diag(np.square([increment.discontinuity_m, increment.discontinuity_m, 1.0]))
         return MotionPrediction(motion.increment, motion.covariance + unknown, False)

@@ -16,6 +16,7 @@ import numpy as np
 
 from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph.pose_graph import Systematic
 
 _QUARTER = 0.5 * math.pi
 _BINS = 180  # of half a degree
@@ -45,11 +46,56 @@ class WallCompassConfig:
     max_offset_rad: float = 0.35
 
 
+class Reference(NamedTuple):
+    """Error of the main wall direction, which all headings that are measured by it share.
+
+    It is that of the headings of the scans whose walls made it. variance: of independent errors,
+    rad^2; systematic: share of the odometry, of which only the last row is not zero.
+    """
+
+    variance: float
+    systematic: Systematic
+
+    def turn(self, parameters: Array) -> float:
+        """Turn (rad) of the direction with parameters (N, 4), by the number of spans."""
+        return float(self.systematic.change(parameters)[2])
+
+    def calibrated(self, parameters: Array) -> 'Reference':
+        """The reference of the direction after that turn."""
+        return self._replace(systematic=self.systematic.calibrated(parameters))
+
+    def mean(self, other: 'Reference', weight: float) -> 'Reference':
+        """Weighted mean with another one; weight: of the other, 0 to 1."""
+        a = self.systematic
+        b = other.systematic
+        return Reference(
+            self.variance + weight * (other.variance - self.variance),
+            Systematic(
+                a.derivative + weight * (b.derivative - a.derivative),
+                a.parameters + weight * (b.parameters - a.parameters),
+                round(a.spans + weight * (b.spans - a.spans)),
+            ),
+        )
+
+
 class Heading(NamedTuple):
-    """Heading in the map, rad, and its variance."""
+    """Heading in the map, rad, and the variance of its measurement by the main wall direction."""
 
     yaw: float
     variance: float
+    reference: Reference
+
+    @property
+    def row(self) -> tuple[float, ...]:
+        """Yaw, variance, and variance and derivative (4,) of the main direction."""
+        by_calibration = self.reference.systematic.derivative[2].tolist()
+        return (self.yaw, self.variance, self.reference.variance, *by_calibration)
+
+    def calibrated(self, parameters: Array) -> 'Heading':
+        """The heading with parameters (N, 4) of the calibration, by the number of spans."""
+        reference = self.reference
+        yaw = self.yaw + reference.turn(parameters)
+        return Heading(yaw, self.variance, reference.calibrated(parameters))
 
 
 class WallCompass:
@@ -61,13 +107,20 @@ class WallCompass:
         # their directions in the bin (0 to 1).
         self._metres = np.zeros(_BINS)
         self._places = np.zeros(_BINS)
+        self._turned = 0.0  # rotation of the histogram, rad
+        self._reference: Reference | None = None
 
-    def add_lines(self, lines: Lines, yaw: float, path_m: float) -> None:
-        """Add the walls of a scan with heading yaw (rad), after a path of a length (m)."""
-        at = (lines.z[:, 1] + yaw) % _QUARTER / _QUARTER * _BINS
+    def add_lines(self, lines: Lines, yaw: float, path_m: float, own: Reference) -> None:
+        """Add the walls of a scan with heading yaw (rad), after a path of a length (m).
+
+        own: error of this heading.
+        """
+        at = (lines.z[:, 1] + yaw - self._turned) % _QUARTER / _QUARTER * _BINS
         bins = at.astype(np.int64)
         fading = 1.0 / (1.0 + (path_m / self._config.fade_m) ** 2)
         weights = _lengths(lines) * max(fading, self._config.min_weight)
+        share = float(weights.sum()) / max(float(self._metres.sum() + weights.sum()), 1e-9)
+        self._reference = own if self._reference is None else self._reference.mean(own, share)
         np.add.at(self._metres, bins % _BINS, weights)
         np.add.at(self._places, bins % _BINS, weights * (at - bins))
 
@@ -83,7 +136,13 @@ class WallCompass:
         if metres < self._config.min_ratio * total:
             return None
         mean = (self._places[near].sum() + self._metres[near] @ _AROUND) / metres
-        return float((fullest + mean) * _QUARTER / _BINS) % _QUARTER
+        return (float((fullest + mean) * _QUARTER / _BINS) + self._turned) % _QUARTER
+
+    def calibrate(self, parameters: Array) -> None:
+        """Turn the main direction as parameters (N, 4) of the calibration have it."""
+        if self._reference is not None:
+            self._turned += self._reference.turn(parameters)
+            self._reference = self._reference.calibrated(parameters)
 
     def read(self, lines: Lines, yaw: float, variance: float) -> Heading | None:
         """Measure the heading of a scan by its lines, given a prior yaw (rad) and its variance.
@@ -93,7 +152,7 @@ class WallCompass:
         config = self._config
         direction = self.direction
         lengths = _lengths(lines)
-        if direction is None:
+        if direction is None or self._reference is None:
             return None
         off = (lines.z[:, 1] + yaw - direction + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER
         sigmas = np.sqrt(variance + config.wall_sigma_rad**2 + lines.covariances[:, 1, 1])
@@ -102,7 +161,8 @@ class WallCompass:
             return None
         weights = lengths[near] / lengths[near].sum()
         seen = float(np.square(weights) @ lines.covariances[near, 1, 1])
-        return Heading(yaw - float(weights @ off[near]), config.wall_sigma_rad**2 + seen)
+        measured = yaw - float(weights @ off[near])
+        return Heading(measured, config.wall_sigma_rad**2 + seen, self._reference)
 
 
 def _lengths(lines: Lines) -> Array:

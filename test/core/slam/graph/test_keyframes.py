@@ -13,20 +13,22 @@ from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
     Keyframes,
+    Step,
     covariances_from,
-    heading_variance,
+    heading_errors,
     inverse,
     propagated_covariance,
     rotated_covariance,
     view_difference_m,
     with_heading,
 )
-from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, Systematic
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.slam.wall_compass import Heading
+from thinmap_ros.core.slam.wall_compass import Heading, Reference
 
 STEP = np.diag(np.square([0.02, 0.01, 0.01]))
 MAP = 0.005**2  # variance of the main wall direction of the map
+REFERENCE = Reference(MAP, NO_SHARE)
 
 
 def frame(pose, path_m=0.0, stamp_ns=0, covariance=None):
@@ -39,8 +41,13 @@ def frame(pose, path_m=0.0, stamp_ns=0, covariance=None):
 def along(poses, steps=STEP):
     keyframes = Keyframes(KeyframeConfig())
     for k, pose in enumerate(poses):
-        keyframes.add(frame(pose, float(k), k), steps)
+        keyframes.add(frame(pose, float(k), k), Step(steps))
     return keyframes
+
+
+def independent(variance):
+    """Error (6,) of a heading that is measured by a direction without error."""
+    return np.array([variance, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def random_covariance(rng, size=0.02):
@@ -83,7 +90,7 @@ def test_an_earlier_keyframe_stands_for_one_that_sees_the_same():
     assert stamps.tolist() == [0, 1, 2, 3, 77]
     np.testing.assert_allclose(poses[-1], back.T_map_base)
     # The next edge starts at the reused keyframe.
-    number = keyframes.add(frame([1.0, 2.0, 0.0], 10.0), STEP)
+    number = keyframes.add(frame([1.0, 2.0, 0.0], 10.0), Step(STEP))
     assert (keyframes.steps[-1].a, keyframes.steps[-1].b) == (1, number)
 
 
@@ -152,10 +159,10 @@ def test_covariances_along_a_chain_are_those_of_sampling(rng):
     covariances = [random_covariance(rng) for _ in chain]
     poses = [np.zeros(3)]
     keyframes = Keyframes(KeyframeConfig())
-    keyframes.add(frame(poses[0]), STEP)
+    keyframes.add(frame(poses[0]), Step(STEP))
     for k, (T, covariance) in enumerate(zip(chain, covariances, strict=True)):
         poses.append(se2.compose(poses[-1], T))
-        keyframes.add(frame(poses[-1], float(k)), covariance)
+        keyframes.add(frame(poses[-1], float(k)), Step(covariance))
     keyframes.move(np.array(poses), [])
     truth = sampled(chain, covariances, rng)
     found = keyframes.frames[-1].covariance
@@ -235,55 +242,78 @@ def test_covariances_along_the_graph_are_the_same_in_plain_python(rng, monkeypat
     for a, b in pairs:
         A = rng.normal(0.0, 1.0, (3, 3))
         information = inverse(A @ A.T * 1e-3 + 1e-4 * np.eye(3))
-        edges.append(Edge(a, b, se2.between(poses[a], poses[b]), information, False))
+        share = Systematic(rng.normal(0.0, 1.0, (3, 4)), np.zeros(4), 0)
+        edges.append(Edge(a, b, se2.between(poses[a], poses[b]), information, False, share))
     headings = np.where(rng.random(12) < 0.5, rng.uniform(1e-5, 1e-2, 12), np.inf)
-    compiled = covariances_from(3, poses, edges, headings)
+    errors = np.column_stack([headings, np.zeros((12, 5))])
+    compiled, derivatives = covariances_from(3, poses, edges, errors)
     assert np.isinf(compiled[11]).all(), 'no chain leads there'
     assert (compiled[3] == 0.0).all()
     np.testing.assert_allclose(compiled, np.swapaxes(compiled, 1, 2), atol=1e-12)
     assert (compiled[:11, 2, 2] <= headings[:11] + 1e-12).all()
     monkeypatch.setattr(module, '_covariances', module._covariances.py_func)
-    np.testing.assert_allclose(covariances_from(3, poses, edges, headings), compiled, rtol=1e-12)
+    covariances, by = covariances_from(3, poses, edges, errors)
+    np.testing.assert_allclose(covariances, compiled, rtol=1e-12)
+    np.testing.assert_allclose(by, derivatives, rtol=1e-9, atol=1e-12)
 
 
 def test_a_measured_heading_makes_the_covariance_that_of_a_bayes_update(rng):
     covariance = random_covariance(rng)
     variance = 1e-4
     information = inverse(covariance) + np.diag([0.0, 0.0, 1.0 / variance])
-    np.testing.assert_allclose(with_heading(covariance, variance), inverse(information), atol=1e-12)
-    np.testing.assert_array_equal(with_heading(covariance, np.inf), covariance)
+    derivative = rng.normal(0.0, 1.0, (3, 4))
+    found, by = with_heading(covariance, derivative, independent(variance))
+    np.testing.assert_allclose(found, inverse(information), atol=1e-12)
+    np.testing.assert_allclose(by, found @ inverse(covariance) @ derivative, atol=1e-9)
+    unmeasured, _ = with_heading(covariance, derivative, independent(np.inf))
+    np.testing.assert_array_equal(unmeasured, covariance)
+
+
+def test_measured_headings_are_no_better_than_the_walls_they_are_measured_by(rng):
+    """However often they are measured: their main direction has the heading of early scans."""
+    covariance = random_covariance(rng) + np.diag([0.0, 0.0, 0.1])
+    derivative = rng.normal(0.0, 1.0, (3, 4))
+    direction = np.array([0.0, 0.5, 2.4, 0.0])
+    for _ in range(50):
+        covariance, derivative = with_heading(
+            covariance, derivative, np.array([1e-4, 0.05, *direction])
+        )
+    assert covariance[2, 2] == pytest.approx(0.05, rel=1e-3)
+    np.testing.assert_allclose(derivative[2], direction, atol=1e-3)
 
 
 def test_a_pose_off_its_measured_heading_is_as_uncertain_as_that():
-    heading = Heading(3.1, 1e-4)
-    assert heading_variance(heading, se2.pose(1.0, 2.0, 3.1)) == pytest.approx(1e-4 + MAP)
-    assert heading_variance(heading, se2.pose(1.0, 2.0, -3.1)) == pytest.approx(
-        1e-4 + MAP + (2.0 * np.pi - 6.2) ** 2
-    )
-    assert heading_variance(None, np.zeros(3)) == np.inf
+    heading = Heading(3.1, 1e-4, REFERENCE)
+    poses = np.array([[1.0, 2.0, 3.1], [1.0, 2.0, -3.1], [0.0, 0.0, 0.0]])
+    near, off, unmeasured = heading_errors([heading, heading, None], poses)
+    assert near[:2].tolist() == [pytest.approx(1e-4), MAP]
+    assert off[0] == pytest.approx(1e-4 + (2.0 * np.pi - 6.2) ** 2)
+    assert unmeasured[0] == np.inf
 
 
 def test_measured_headings_bound_the_covariance_along_the_path():
     """Without them the lateral error of a straight path grows with its length to the power 3/2."""
     poses = np.array([se2.pose(k, 0.0, 0.0) for k in range(40)])
-    blind = along(poses).covariances_from(0, poses, [])[-1]
+    blind = along(poses).covariances_from(0, poses, [])[0][-1]
     keyframes = Keyframes(KeyframeConfig())
     for k, pose in enumerate(poses):
-        kept = replace(frame(pose, float(k), k), heading=Heading(0.0, 0.005**2))
-        keyframes.add(kept, STEP)
-    guided = keyframes.covariances_from(0, poses, [])[-1]
+        kept = replace(frame(pose, float(k), k), heading=Heading(0.0, 0.005**2, REFERENCE))
+        keyframes.add(kept, Step(STEP))
+    guided = keyframes.covariances_from(0, poses, [])[0][-1]
     assert np.sqrt(blind[1, 1]) > 1.0
     assert np.sqrt(guided[1, 1]) < 0.2
     assert np.sqrt(guided[2, 2]) <= 0.0071
-    seen_from_there = keyframes.covariances_from(39, poses, [])[0]
+    seen_from_there = keyframes.covariances_from(39, poses, [])[0][0]
     np.testing.assert_allclose(seen_from_there[0, 0], guided[0, 0], rtol=0.05)
     assert seen_from_there[2, 2] <= 4.0 * 0.005**2
 
 
 def test_measured_headings_are_edges_from_the_first_keyframe():
     keyframes = Keyframes(KeyframeConfig())
-    for k, heading in enumerate([None, Heading(0.45, 1e-4), None]):
-        keyframes.add(replace(frame(se2.pose(k, 0.0, 0.4), float(k), k), heading=heading), STEP)
+    for k, heading in enumerate([None, Heading(0.45, 1e-4, REFERENCE), None]):
+        keyframes.add(
+            replace(frame(se2.pose(k, 0.0, 0.4), float(k), k), heading=heading), Step(STEP)
+        )
     (edge,) = keyframes.headings
     assert (edge.a, edge.b, edge.robust) == (0, 1, True)
     np.testing.assert_allclose(edge.T_a_b[2], 0.05)
@@ -298,5 +328,5 @@ def test_covariances_reach_what_lies_behind_a_pose_with_two_chains():
         Edge(a, b, se2.between(poses[a], poses[b]), np.diag([1.0, 1.0, 1e6]) / variance, False)
         for (a, b), variance in variances.items()
     ]
-    found = covariances_from(0, poses, edges, np.full(5, np.inf))
+    found, _ = covariances_from(0, poses, edges, np.full((5, 6), np.inf))
     np.testing.assert_allclose(found[:, 0, 0], [0.0, 0.2, 0.1, 9.2, 9.3], atol=1e-6)

@@ -11,6 +11,7 @@ from thinmap_ros.core.slam.graph import loop_closure as module
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
+    Step,
     inverse,
     propagated_covariance,
     rotated_covariance,
@@ -20,6 +21,7 @@ from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import FEWEST_POINTS, MatchingConfig
 from thinmap_ros.core.slam.matching.surface import surface_points
+from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
 SIGMAS = np.array([0.02, 0.02, 0.003])
 STEP = np.diag(np.square(SIGMAS))
@@ -33,7 +35,11 @@ OTHER_ROOMS = [(-4.0, 16.0), (-4.0, 6.0), (-4.0, -4.0), (6.0, -4.0), (16.0, -4.0
 
 def loop_closure(**config):
     return LoopClosure(
-        LoopClosureConfig(**config), KeyframeConfig(), MatchingConfig(), LocalMapConfig()
+        LoopClosureConfig(**config),
+        KeyframeConfig(),
+        MatchingConfig(),
+        LocalMapConfig(),
+        OdometryCalibration(),
     )
 
 
@@ -84,7 +90,7 @@ class Driver:
         points = surface_points(scan)
         frame = Keyframe(scan, points, self.pose, self.path_m(), self.covariance, 0)
         if len(points) >= FEWEST_POINTS and self.loops.needs_keyframe(self.pose):
-            self.loops.add(frame, STEP, NONE)
+            self.loops.add(frame, Step(STEP), NONE)
         for _ in range(works):
             correction = self.loops.step()
             if correction is not None:
@@ -192,7 +198,7 @@ def straight():
     for k, pose in enumerate(poses):
         scan = scan_in(ROOM, pose, stamp_ns=k)
         frame = Keyframe(scan, surface_points(scan), pose, float(k), NONE, 0)
-        loops.keyframes.add(frame, STEP)
+        loops.keyframes.add(frame, Step(STEP))
     return loops
 
 
@@ -220,6 +226,30 @@ def test_a_false_match_is_left_out_of_consistent_ones(straight):
     false = edge_to(straight, 3, 16, [3.0, -1.0, 0.4])
     straight._requested.extend([edges[0], false, *edges[1:]])
     assert set(map(id, straight._consistent(list(straight._requested)))) == set(map(id, edges))
+
+
+@pytest.mark.parametrize(('matches', 'inlier_ratio', 'closes'), [(4, 0.95, True), (4, 0.9, False)])
+def test_matches_that_fit_better_close_a_loop_in_smaller_number(
+    straight, matches, inlier_ratio, closes
+):
+    edges = same_correction(straight, matches)
+    straight._requested.extend(replace(edge, inlier_ratio=inlier_ratio) for edge in edges)
+    assert len(straight._closing_edges()) == matches * closes
+
+
+def test_a_single_match_begins_no_optimization_after_a_contradicted_step(rng):
+    """The step is measured again at once, off the pose; one match that agrees is no loop."""
+    loops = loop_closure()
+    truths = np.array([[1.2, 2.0, 0.3], [2.0, 2.0, 0.3], [2.8, 2.0, 0.3]])
+    told = truths + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.2, 0.4]]
+    for k, jump in enumerate([NONE, NONE, np.diag([0.1, 0.1, 0.05])]):
+        scan = scan_in(ROOM[:4] / 2.0, truths[k], rng, k, beams=361)
+        frame = Keyframe(scan, surface_points(scan), told[k], float(k), STEP + jump, 0)
+        loops.add(frame, Step(STEP), jump)
+    (edge,) = loops.edges
+    assert loops._mahalanobis(edge) > module.CHI2
+    loops._confirm(edge_to(loops, 0, 2, np.zeros(3)))
+    assert loops._optimization is None
 
 
 def test_matches_that_contradict_each_other_close_nothing(straight, rng):
@@ -301,7 +331,7 @@ def test_a_robot_that_stands_about_keeps_one_scan(rng):
         pose = np.array([2.0, 2.0, 0.0]) + rng.normal(0.0, 0.1, 3)
         if loops.needs_keyframe(pose):
             scan = scan_in(ROOM, pose, rng, k)
-            loops.add(Keyframe(scan, surface_points(scan), pose, 0.0, NONE, 0), STEP, NONE)
+            loops.add(Keyframe(scan, surface_points(scan), pose, 0.0, NONE, 0), Step(STEP), NONE)
             kept += 1
         loops.step()
     assert kept == 1
@@ -315,7 +345,7 @@ def test_the_path_is_measured_in_straight_lines():
         pose = se2.pose(2.0 + x, 2.0, 0.0)
         scan = scan_in(ROOM, pose, stamp_ns=k)
         frame = Keyframe(scan, surface_points(scan), pose, loops.path_m(pose), NONE, 0)
-        loops.add(frame, STEP, NONE)
+        loops.add(frame, Step(STEP), NONE)
     assert loops.path_m(np.array([4.0, 5.0, 0.0])) == pytest.approx(5.0)
 
 
@@ -327,7 +357,7 @@ def test_a_step_with_a_jump_is_measured_again(rng):
     for k, jump in enumerate([NONE, NONE, np.diag([0.1, 0.1, 0.01])]):
         scan = scan_in(ROOM[:4] / 2.0, truths[k], rng, k, beams=361)
         points = surface_points(scan)
-        loops.add(Keyframe(scan, points, told[k], float(k), STEP + jump, 0), STEP, jump)
+        loops.add(Keyframe(scan, points, told[k], float(k), STEP + jump, 0), Step(STEP), jump)
         loops.step()
     assert [(edge.a, edge.b) for edge in loops.edges] == [(1, 2)]
     T = se2.between(truths[1], truths[2])
@@ -344,7 +374,7 @@ def test_what_has_jumped_is_as_uncertain_as_step_and_jump_together(off, measured
         told = se2.compose(truth, k * np.array([*off, 0.0]))
         scan = scan_in(ROOM, truth, stamp_ns=k)
         points = surface_points(scan)
-        loops.add(Keyframe(scan, points, told, float(k), NONE, 0), STEP, uncertain)
+        loops.add(Keyframe(scan, points, told, float(k), NONE, 0), Step(STEP), uncertain)
     loops.finish()
     # In the frame of the anchor: along the robot's way is x.
     np.testing.assert_allclose(inverse(loops.keyframes.steps[0].information), STEP + jump)
@@ -355,7 +385,7 @@ def test_the_step_covariance_is_that_of_the_step(rng):
     loops = loop_closure()
     for k, pose in enumerate([np.zeros(3), np.array([1.0, 0.0, 0.2])]):
         scan = scan_in(ROOM, pose + [2.0, 2.0, 0.0], rng, k)
-        loops.add(Keyframe(scan, surface_points(scan), pose, float(k), NONE, 0), STEP, NONE)
+        loops.add(Keyframe(scan, surface_points(scan), pose, float(k), NONE, 0), Step(STEP), NONE)
     loops.finish()
     np.testing.assert_allclose(inverse(loops.keyframes.steps[0].information), STEP)
 
@@ -369,10 +399,10 @@ def test_an_edge_to_what_is_seen_again_holds_the_errors_of_step_and_match(rng):
         scan = scan_in(ROOM, pose, stamp_ns=k)
         frames.append(Keyframe(scan, surface_points(scan), pose, 10.0 * k, NONE, 0))
     for frame in frames[:2]:
-        loops.keyframes.add(frame, STEP)
+        loops.keyframes.add(frame, Step(STEP))
     by_match = np.diag(np.square([0.02, 0.01, 0.05]))
     by_step = np.diag([4e-4, 1e-4, 4e-4])
-    loops._pending = (frames[2], by_step)
+    loops._pending = (frames[2], Step(by_step))
     T_j_here = se2.between(poses[0], poses[2])
     T_a_here = se2.between(poses[1], poses[2])
     loops._confirm(Edge(0, 2, T_j_here, inverse(by_match), True))

@@ -8,7 +8,8 @@ graph", 2013.
 
 import heapq
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +20,14 @@ from thinmap_ros.core.grid.spatial_hash import SpatialHash
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, Systematic
 from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
 from thinmap_ros.core.slam.wall_compass import Heading
 
 _BUCKET_M = 4.0
-# Variance of the main wall direction relative to the first keyframe.
-_MAP_VARIANCE = 0.005**2
-_UNMEASURED = Heading(0.0, math.inf)
+_NO_COVARIANCE = np.zeros((3, 3))
+_NO_DERIVATIVE = np.zeros((3, 4))
+_UNMEASURED = (0.0, math.inf, 0.0, 0.0, 0.0, 0.0, 0.0)  # row of a heading
 _RADIAN_M = 1.0  # distance that changes the view of a scan as much as a rotation by a radian
 
 
@@ -55,7 +56,8 @@ class Keyframe:
     """A stored scan, its surface points (N, 5), robot frame, and its pose T_map_base (3,).
 
     path_m: length of the path at the last visit; covariance (3, 3): of the pose, map frame;
-    submap: number of its local map; heading: measured by wall directions, map frame, or None.
+    submap: number of its local map; heading: measured by wall directions, map frame, or None;
+    systematic (3, 4): derivative of the pose by the calibration of the odometry.
     """
 
     scan: Scan
@@ -65,6 +67,18 @@ class Keyframe:
     covariance: Array
     submap: int
     heading: Heading | None = None
+    systematic: Array = field(default_factory=lambda: np.zeros((3, 4)))
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Relative pose of a keyframe and its anchor, in the frame of the anchor.
+
+    covariance (3, 3): of independent errors; systematic: share of the odometry.
+    """
+
+    covariance: Array
+    systematic: Systematic = NO_SHARE
 
 
 class Keyframes:
@@ -85,16 +99,15 @@ class Keyframes:
         """Number of the last added or reused keyframe; -1 before the first."""
         return self._path.last
 
-    def add(self, frame: Keyframe, step_covariance: Array) -> int:
-        """Add a keyframe with an edge from the anchor; returns its number.
-
-        step_covariance (3, 3): of its pose relative to the anchor, in the frame of the anchor.
-        """
+    def add(self, frame: Keyframe, step: Step) -> int:
+        """Add a keyframe with an edge from the anchor, by its step; returns its number."""
         number = len(self.frames)
         if number:
             anchor = self.anchor
             T = se2.between(self.frames[anchor].T_map_base, frame.T_map_base)
-            self.steps.append(Edge(anchor, number, T, inverse(step_covariance), False))
+            self.steps.append(
+                Edge(anchor, number, T, inverse(step.covariance), False, step.systematic)
+            )
         self.frames.append(frame)
         self._buckets.insert(number, float(frame.T_map_base[0]), float(frame.T_map_base[1]))
         self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
@@ -116,28 +129,48 @@ class Keyframes:
             if number and frame.heading is not None
         ]
 
-    def covariances_from(self, root: int, poses: Array, edges: list[Edge]) -> Array:
+    def covariances_from(self, root: int, poses: Array, edges: list[Edge]) -> tuple[Array, Array]:
         """Covariance (N, 3, 3) of each pose (N, 3) relative to pose `root`, map frame.
+
+        Of independent errors; also returns the derivatives (N, 3, 4) by the calibration.
 
         edges: edges of the graph besides the steps.
         """
         frames = self.frames[: len(poses)]
-        measured = np.array([frame.heading or _UNMEASURED for frame in frames])
-        off = se2.wrap(measured[:, 0] - poses[:, 2])
-        variances = _MAP_VARIANCE + measured[:, 1] + off**2
-        variances[0] = 0.0
-        return covariances_from(root, poses, self.steps + edges, variances[root] + variances)
+        headings = heading_errors([frame.heading for frame in frames], poses)
+        edges = self.steps + edges
+        if root:
+            # Both headings are measured by one direction, and its error is in neither difference.
+            headings[:, 0] += headings[root, 0]
+            headings[:, 1:] = 0.0
+            return covariances_from(root, poses, edges, headings)
+        origin = frames[0]
+        return covariances_from(0, poses, edges, headings, origin.covariance, origin.systematic)
 
     def poses(self) -> Array:
         """Poses (N, 3) of the keyframes."""
         return np.array([frame.T_map_base for frame in self.frames]).reshape(-1, 3)
 
+    def calibrate(self, parameters: Array) -> None:
+        """Correct steps and headings by parameters (N, 4) of the calibration.
+
+        The poses follow by `move`.
+        """
+        self.steps = [step.calibrated(parameters) for step in self.steps]
+        for number, frame in enumerate(self.frames):
+            if frame.heading is not None:
+                heading = frame.heading.calibrated(parameters)
+                self.frames[number] = replace(frame, heading=heading)
+
     def move(self, poses: Array, edges: list[Edge]) -> None:
         """Set the poses (N, 3) of the first N keyframes; `edges`: besides the steps."""
-        covariances = self.covariances_from(0, poses, edges)
+        covariances, derivatives = self.covariances_from(0, poses, edges)
         for number, T in enumerate(poses):
             self.frames[number] = replace(
-                self.frames[number], T_map_base=T, covariance=covariances[number]
+                self.frames[number],
+                T_map_base=T,
+                covariance=covariances[number],
+                systematic=derivatives[number],
             )
             self._buckets.insert(number, float(T[0]), float(T[1]))
 
@@ -180,20 +213,43 @@ def propagated_covariance(covariance: Array, lever: Array) -> Array:
     return np.asarray(F @ covariance @ F.T)
 
 
-def heading_variance(heading: Heading | None, T_map_base: Array) -> float:
-    """Variance of the heading of a pose (3,) by a measurement, plus their squared difference."""
-    if heading is None:
-        return math.inf
-    off = float(se2.wrap(heading.yaw - float(T_map_base[2])))
-    return _MAP_VARIANCE + heading.variance + off**2
+def carried(derivative: Array, lever: Array) -> Array:
+    """Derivative (3, 4) of a pose at a fixed offset (2,), m, from a pose with that derivative."""
+    F = np.array([[1.0, 0.0, -lever[1]], [0.0, 1.0, lever[0]], [0.0, 0.0, 1.0]])
+    return np.asarray(F @ derivative)
 
 
-def with_heading(covariance: Array, variance: float) -> Array:
-    """Covariance (3, 3) of a pose after an independent heading measurement of a variance."""
-    if not math.isfinite(variance):
-        return covariance
-    gain = covariance[:, 2] / (covariance[2, 2] + variance)
-    return np.asarray(covariance - np.outer(gain, covariance[2]))
+def heading_errors(headings: Sequence[Heading | None], poses: Array) -> Array:
+    """Errors (N, 6) of the headings that wall directions measure for poses (N, 3).
+
+    Columns: variance of the measurement and of its difference from the pose, infinite without one;
+    variance of the main direction; its derivative (4,) by the calibration.
+    """
+    rows = np.array([_UNMEASURED if heading is None else heading.row for heading in headings])
+    errors = rows[:, 1:]
+    errors[:, 0] += se2.wrap(rows[:, 0] - poses[:, 2]) ** 2
+    return errors
+
+
+def with_heading(covariance: Array, derivative: Array, error: Array) -> tuple[Array, Array]:
+    """Covariance (3, 3) and derivative (3, 4) of a pose after a heading measurement.
+
+    error (6,): of the measurement, as in `heading_errors`. The error of the main direction is that
+    of earlier headings: it is in both, and stays.
+    """
+    found: tuple[Array, Array] = _with_heading(covariance, derivative, error)
+    return found
+
+
+@inlined
+def _with_heading(covariance: Array, derivative: Array, error: Array) -> tuple[Array, Array]:
+    own = covariance[2, 2] - error[1]  # not in common with the main direction
+    if own <= 0.0 or not np.isfinite(error[0]):
+        return covariance, derivative
+    shared = covariance[2] * (own / covariance[2, 2])
+    gain = shared / (own + error[0])
+    change = error[2:] - derivative[2]
+    return covariance - np.outer(gain, shared), derivative + np.outer(gain, change)
 
 
 def inverse(matrix: Array) -> Array:
@@ -211,16 +267,28 @@ def rotated_covariance(covariance: Array, theta: float) -> Array:
 
 def _heading_edge(number: int, heading: Heading, first: float) -> Edge:
     information = np.zeros((3, 3))
-    information[2, 2] = 1.0 / (_MAP_VARIANCE + heading.variance)
-    return Edge(0, number, np.array([0.0, 0.0, heading.yaw - first]), information, True)
+    reference = heading.reference
+    information[2, 2] = 1.0 / (reference.variance + heading.variance)
+    T = np.array([0.0, 0.0, heading.yaw - first])
+    return Edge(0, number, T, information, True, reference.systematic)
 
 
-def covariances_from(root: int, poses: Array, edges: list[Edge], heading_variances: Array) -> Array:
+def covariances_from(
+    root: int,
+    poses: Array,
+    edges: list[Edge],
+    headings: Array,
+    covariance: Array = _NO_COVARIANCE,
+    derivative: Array = _NO_DERIVATIVE,
+) -> tuple[Array, Array]:
     """Covariance (N, 3, 3) of each pose (N, 3) relative to pose `root`, map frame.
+
+    Of independent errors; also returns the derivatives (N, 3, 4) by the calibration.
+    covariance (3, 3), derivative (3, 4): those of the root; zero without.
 
     Along the chain of edges with the smallest variance: an upper bound, because other chains are
     ignored. It is infinite for poses that are not connected. Edges to poses beyond N are ignored.
-    heading_variances (N,): of measured headings relative to the root; infinite without one.
+    headings (N, 6): as in `heading_errors`.
     """
     edges = [edge for edge in edges if edge.b < len(poses)]
     a = np.array([edge.a for edge in edges], dtype=np.int64)
@@ -237,7 +305,21 @@ def covariances_from(root: int, poses: Array, edges: list[Edge], heading_varianc
     order = np.argsort(np.concatenate([a, b]), kind='stable')
     first = np.searchsorted(np.concatenate([a, b])[order], np.arange(len(poses) + 1))
     own = R @ covariances @ R.transpose(0, 2, 1)
-    found: Array = _covariances(root, poses, first, order, a, b, own, heading_variances)
+    by_calibration = np.array([edge.systematic.derivative for edge in edges])
+    own_by_calibration = np.ascontiguousarray(R @ by_calibration.reshape(-1, 3, 4))
+    found: tuple[Array, Array] = _covariances(
+        root,
+        covariance,
+        derivative,
+        poses,
+        first,
+        order,
+        a,
+        b,
+        own,
+        own_by_calibration,
+        headings,
+    )
     return found
 
 
@@ -253,26 +335,40 @@ def _carry(covariance: Array, x: float, y: float) -> Array:
     return carried_there
 
 
+@inlined
+def _carry_derivative(derivative: Array, x: float, y: float) -> Array:
+    """`carried` with a lever (x, y)."""
+    moved: Array = derivative.copy()
+    moved[0] -= y * derivative[2]
+    moved[1] += x * derivative[2]
+    return moved
+
+
 @kernel
 def _covariances(
     root: int,
+    covariance: Array,
+    derivative: Array,
     poses: Array,
     first: NDArray[np.int64],
     order: NDArray[np.int64],
     a: NDArray[np.int64],
     b: NDArray[np.int64],
     own: Array,
-    heading_variances: Array,
-) -> Array:
+    own_by_calibration: Array,
+    headings: Array,
+) -> tuple[Array, Array]:
     """Dijkstra's algorithm, by the variance of the position.
 
     The M edges at pose k have the numbers order[first[k]] to order[first[k + 1]]. A number n >= M
-    is edge n - M in reverse direction.
+    is edge n - M in reverse direction. headings (N, 6): as in `heading_errors`.
     """
     found = np.full((len(poses), 3, 3), np.inf)
     best = np.full(len(poses), np.inf)
     done = np.zeros(len(poses), dtype=np.bool_)
-    found[root] = 0.0
+    found[root] = covariance
+    derivatives = np.zeros((len(poses), 3, 4))
+    derivatives[root] = derivative
     best[root] = 0.0
     heap = [(0.0, root)]
     while len(heap):
@@ -290,11 +386,15 @@ def _covariances(
             # In reverse direction the heading error of the edge acts at its other end.
             step = own[edge] if tie < len(a) else _carry(own[edge], x, y)
             new = _carry(found[k], x, y) + step
-            gain = new[:, 2] / (new[2, 2] + heading_variances[other])
-            new -= np.outer(gain, new[2])
+            if tie < len(a):
+                by = _carry_derivative(derivatives[k], x, y) + own_by_calibration[edge]
+            else:
+                by = _carry_derivative(derivatives[k] - own_by_calibration[edge], x, y)
+            new, by = _with_heading(new, by, headings[other])
             variance = new[0, 0] + new[1, 1]
             if variance < best[other]:
                 best[other] = variance
                 found[other] = new
+                derivatives[other] = by
                 heapq.heappush(heap, (variance, other))
-    return found
+    return found, derivatives

@@ -16,6 +16,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.ekf_slam.models import rotation
 from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import CHI2
@@ -23,6 +24,8 @@ from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
     Keyframes,
+    Step,
+    carried,
     inverse,
     propagated_covariance,
     rotated_covariance,
@@ -33,7 +36,9 @@ from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized, rounds
 from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
+from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
+_LEAST_MOVE_M = 0.1  # smallest move of a keyframe for which the map follows the calibration
 _RECENT = 8  # recent candidates among which consistent ones are searched
 # Scans within which a keyframe is matched. With three matches for each of the scans of a sparse
 # log, and one done at a time, a loop was closed up to 344 scans after its keyframes.
@@ -46,8 +51,7 @@ class LoopClosureConfig(Config):
 
     Besides the parameters: a keyframe is matched with at most max_visits earlier visits, within
     search_sigmas of its uncertainty and max_uncertainty_m, beyond which place recognition is
-    needed; drift_ratio: systematic error as a ratio of the path, which independent steps do not
-    contain.
+    needed.
     """
 
     search_radius_m: float = parameter(
@@ -80,7 +84,8 @@ class LoopClosureConfig(Config):
     )
     min_consistent_matches: int = parameter(
         5,
-        'Number of consistent candidates that close a loop. Raise it against false loops, lower it '
+        'Number of consistent candidates that close a loop, if they have no more inliers than '
+        '`min_inlier_ratio`: it is fewer if they have more. Raise it against false loops, lower it '
         'to close loops earlier.',
         low=1,
         high=_RECENT,
@@ -88,7 +93,6 @@ class LoopClosureConfig(Config):
     max_visits: int = 3
     search_sigmas: float = 3.0
     max_uncertainty_m: float = 8.0
-    drift_ratio: float = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,16 +121,18 @@ class LoopClosure:
         keyframes: KeyframeConfig,
         matching: MatchingConfig,
         local_map: LocalMapConfig,
+        calibration: OdometryCalibration,
     ) -> None:
+        """calibration: of the odometry, as another part estimates it."""
+        self._calibration = calibration
         self.keyframes = Keyframes(keyframes)
         self.edges: list[Edge] = []
         self.pieces = Pieces()
         self.adjust(config, matching)
         self._jobs: deque[list[_Job]] = deque([[]], maxlen=_LATEST)  # by the scan that began them
-        self._pending: tuple[Keyframe, Array] | None = None
+        self._pending: tuple[Keyframe, Step] | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
         self._here: Keyframe | None = None  # the last keyframe scan, added or not
-        self._is_strained = False  # whether a re-measured step contradicts the poses
         self._submaps = Submaps(local_map)
         self._optimization: _Optimization | None = None
 
@@ -148,14 +154,15 @@ class LoopClosure:
             return 0.0
         return last.path_m + math.dist(last.T_map_base[:2], T_map_base[:2])
 
-    def add(self, frame: Keyframe, step_covariance: Array, jump: Array) -> None:
-        """Add a keyframe, with the covariance (3, 3) of the step from the anchor, anchor frame.
+    def add(self, frame: Keyframe, step: Step, jump: Array) -> None:
+        """Add a keyframe, with the step from the anchor.
 
         jump (3, 3): additional covariance if scans and motion contradicted each other on the step.
         The step is then measured again, by a match with the submap of the keyframes before it.
         """
         self._add_pending()
-        self._pending = (frame, step_covariance + jump)
+        step = replace(step, covariance=step.covariance + jump)
+        self._pending = (frame, step)
         self._here = frame
         jumped = bool(jump.any()) and len(self.keyframes) > 0
         recent = None if jumped else self._recent_alike(frame)
@@ -169,7 +176,7 @@ class LoopClosure:
             self._add_pending()
         if jumped:
             theta = float(self.keyframes.frames[anchor].T_map_base[2])
-            covariance = rotated_covariance(step_covariance + jump, theta)
+            covariance = rotated_covariance(step.covariance, theta)
             self._match(_Job(anchor, self.keyframes.anchor, covariance))
 
     def _recent_alike(self, frame: Keyframe) -> int | None:
@@ -182,7 +189,8 @@ class LoopClosure:
     def _earlier_visits(self, here: Keyframe) -> list[_Job]:
         """Jobs for the most similar keyframe of each earlier visit, the most similar first."""
         frames = self.keyframes.frames
-        spread = math.sqrt(float(np.linalg.eigvalsh(here.covariance[:2, :2])[-1]))
+        covariance = here.covariance + self._systematic_covariance(here.systematic)
+        spread = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
         near = self.keyframes.near(here.T_map_base, self._reach_m(spread))
         near = [j for j in near if self._is_earlier(j, here)]
         if not near:
@@ -218,18 +226,23 @@ class LoopClosure:
         keyframes = self.keyframes
         poses = keyframes.poses()
         anchor = keyframes.anchor
-        there = keyframes.covariances_from(anchor, poses, self.edges)
-        step = rotated_covariance(self._pending[1], float(poses[anchor, 2]))
-        lever = here.T_map_base[:2] - poses[anchor, :2]
-        back = [propagated_covariance(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
-        drift = [
-            _drift(self._config.drift_ratio * (here.path_m - keyframes.frames[j].path_m))
-            for j in near
-        ]
-        return [
-            propagated_covariance(there, lever) + step + own
-            for there, own in zip(back, drift, strict=True)
-        ]
+        covariances, derivatives = keyframes.covariances_from(anchor, poses, self.edges)
+        step = self._pending[1]
+        yaw = float(poses[anchor, 2])
+        moved = rotation(yaw) @ step.systematic.derivative
+        from_anchor = here.T_map_base[:2] - poses[anchor, :2]
+        found = []
+        for j in near:
+            to_anchor = poses[anchor, :2] - poses[j, :2]
+            covariance = propagated_covariance(covariances[j], to_anchor + from_anchor)
+            by = moved - carried(derivatives[j], to_anchor + from_anchor)
+            covariance = covariance + rotated_covariance(step.covariance, yaw)
+            found.append(covariance + self._systematic_covariance(by))
+        return found
+
+    def _systematic_covariance(self, derivative: Array) -> Array:
+        """Covariance (3, 3) of a pose with a derivative (3, 4) by the calibration."""
+        return np.asarray(derivative @ self._calibration.covariance @ derivative.T)
 
     @property
     def is_busy(self) -> bool:
@@ -248,6 +261,8 @@ class LoopClosure:
         elif any(self._jobs):
             self._match(next(jobs for jobs in reversed(self._jobs) if jobs).pop(0))
             self._close()
+        elif self._is_calibration_new():
+            self._follow_calibration()
         self._jobs.append([])
         return correction
 
@@ -265,7 +280,8 @@ class LoopClosure:
         """Loop edges that enough matches agree on, within a piece or between two."""
         fewest = self._config.min_consistent_matches
         consistent = self._consistent(list(self._requested))
-        if len(consistent) >= fewest:
+        evidence = sum(edge.inlier_ratio for edge in consistent)
+        if consistent and evidence >= fewest * self._config.min_inlier_ratio:
             return consistent
         return self.pieces.take_edges(self.keyframes.frames, self._consistent, fewest)
 
@@ -277,17 +293,17 @@ class LoopClosure:
         self._optimization = None
         poses = optimization.poses
         # Keyframes that were added during the optimization move with their anchors.
-        for step in self.keyframes.steps[len(poses) - 1 :]:
-            poses = np.vstack([poses, se2.compose(poses[step.a], step.T_a_b)])
+        for added in self.keyframes.steps[len(poses) - 1 :]:
+            poses = np.vstack([poses, se2.compose(poses[added.a], added.T_a_b)])
         before = self.keyframes.poses()
         self.keyframes.move(poses, self.edges)
         if self._here is not None:
             last = self.keyframes.anchor
             self._here = _moved(self._here, before[last], poses[last])
         if self._pending is not None:
-            frame, covariance = self._pending
+            frame, step = self._pending
             last = self.keyframes.anchor
-            self._pending = (_moved(frame, before[last], poses[last]), covariance)
+            self._pending = (_moved(frame, before[last], poses[last]), step)
         self._submaps.clear()
         self.pieces.join(self.keyframes.frames, self.edges)
         return Correction(before, poses)
@@ -297,8 +313,44 @@ class LoopClosure:
         return k < len(self.keyframes) and self.keyframes.steps[k - 1].a == j
 
     def _begin_rounds(self) -> None:
+        self._calibrate(self._calibration.smoothed())
         poses = self.keyframes.poses()
         self._optimization = _Optimization(rounds(poses, self._all_edges), poses)
+
+    def _calibrate(self, parameters: Array) -> None:
+        """Correct the edges by parameters (N, 4) of the calibration."""
+        self.keyframes.calibrate(parameters)
+        self.edges = [edge.calibrated(parameters) for edge in self.edges]
+        self._calibration.applied = parameters[-1]
+
+    def _follow_calibration(self) -> None:
+        """Begin to move the poses by what is newly known of the calibration, and by nothing else.
+
+        The maps of loops that were accepted without an optimization agree within their noise. What
+        remains of their errors is no news: it stays until a loop closes.
+        """
+        parameters = self._calibration.smoothed()
+        poses = self.keyframes.poses()
+        settled = [edge.settled(poses, parameters) for edge in self._all_edges]
+        moving = rounds(poses, settled)
+        moved = next(moving)
+        self._calibration.applied = parameters[-1]
+        last = self.keyframes.anchor
+        if math.dist(moved[last, :2], poses[last, :2]) > _LEAST_MOVE_M:
+            self._calibrate(parameters)
+            self._optimization = _Optimization(moving, moved)
+
+    def _is_calibration_new(self) -> bool:
+        """Whether the calibration may move the last keyframe by more than it is uncertain itself.
+
+        The parameters have a random walk: what they are now is not what they were.
+        """
+        if len(self.keyframes) < 2:
+            return False
+        by = self.keyframes.frames[self.keyframes.anchor].systematic[:2]
+        off = by @ (self._calibration.parameters - self._calibration.applied)
+        variance = float(np.trace(by @ self._calibration.covariance @ by.T))
+        return float(off @ off) > max(_LEAST_MOVE_M**2, variance)
 
     @property
     def _all_edges(self) -> list[Edge]:
@@ -330,13 +382,12 @@ class LoopClosure:
         T_j_base = se2.between(frames[j].T_map_base, base)
         covariance = rotated_covariance(covariance, float(T_j_base[2]))
         T_j_k = se2.compose(T_j_base, match.T_map_base)
-        edge = Edge(j, k, T_j_k, inverse(covariance), True)
+        edge = Edge(j, k, T_j_k, inverse(covariance), True, inlier_ratio=match.inlier_ratio)
         if not self.pieces.is_here(frames[j].submap):
             self._add_pending()
             self.pieces.add_match(edge)
         elif is_step:
-            self.edges.append(edge)
-            self._is_strained |= self._mahalanobis(edge) > CHI2
+            self.edges.append(edge)  # the next loop corrects poses that contradict it
         elif self._mahalanobis(edge) < CHI2:
             self._confirm(edge)
         else:
@@ -346,13 +397,6 @@ class LoopClosure:
         """Record that the maps of both visits agree here: reuse the keyframe, or add the edge."""
         here = self._frame(edge.b)
         self._requested.clear()
-        if self._is_strained:
-            # The pose has slid onto the old map, which bent the path: the loop is closed.
-            self._is_strained = False
-            self._add_pending()
-            self.edges.append(edge)
-            self._begin_rounds()
-            return
         pending = self._pending
         if (
             pending is not None
@@ -365,8 +409,11 @@ class LoopClosure:
                 T_a_j = se2.compose(T_a_here, se2.invert(edge.T_a_b))
                 covariance = rotated_covariance(inverse(edge.information), float(T_a_j[2]))
                 lever = T_a_j[:2] - T_a_here[:2]
-                covariance = propagated_covariance(covariance + pending[1], lever)
-                self.edges.append(Edge(anchor, edge.a, T_a_j, inverse(covariance), True))
+                step = pending[1]
+                covariance = propagated_covariance(covariance + step.covariance, lever)
+                share = step.systematic
+                share = replace(share, derivative=carried(share.derivative, lever))
+                self.edges.append(Edge(anchor, edge.a, T_a_j, inverse(covariance), True, share))
             self._reuse_keyframe(edge.a)
             return
         self._add_pending()
@@ -425,9 +472,9 @@ class LoopClosure:
     def _add_pending(self) -> None:
         """Add the pending keyframe to the graph, if there is one."""
         if self._pending is not None:
-            frame, covariance = self._pending
+            frame, step = self._pending
             self._pending = None
-            self.keyframes.add(frame, covariance)
+            self.keyframes.add(frame, step)
 
     def _reuse_keyframe(self, j: int) -> None:
         """Reuse an earlier keyframe instead of the pending one."""
@@ -444,12 +491,8 @@ class LoopClosure:
         while self.is_busy:
             self.step()
         self._add_pending()
+        self._calibrate(self._calibration.smoothed())
         return optimized(self.keyframes.poses(), self._all_edges)
-
-
-def _drift(sigma_m: float) -> Array:
-    """Covariance (3, 3) of systematic errors, accumulated along a path, m."""
-    return np.diag(np.square([sigma_m, sigma_m, 0.0]))
 
 
 def _moved(frame: Keyframe, before: Array, after: Array) -> Keyframe:

@@ -8,11 +8,12 @@ for robust spatial perception", 2020.
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array, wrap
 
 
@@ -35,10 +36,35 @@ _CONFIG = OptimizerConfig()
 
 
 @dataclass(frozen=True, eq=False)
+class Systematic:
+    """Share of the odometry in a relative pose.
+
+    derivative (3, 4): of the pose by the calibration; parameters (4,): of the calibration, as the
+    pose contains them; spans: that the calibration was estimated from, then.
+    """
+
+    derivative: Array
+    parameters: Array
+    spans: int
+
+    def change(self, parameters: Array) -> Array:
+        """Change (3,) of the pose with parameters (N, 4), by the number of spans."""
+        return np.asarray(self.derivative @ (parameters[self.spans] - self.parameters))
+
+    def calibrated(self, parameters: Array) -> 'Systematic':
+        """The share after that change."""
+        return replace(self, parameters=parameters[self.spans])
+
+
+NO_SHARE = Systematic(np.zeros((3, 4)), np.zeros(4), 0)
+
+
+@dataclass(frozen=True, eq=False)
 class Edge:
     """Relative pose T_a_b (3,) of keyframe b in a, with its information (3, 3), frame of a.
 
-    robust: whether it may be an outlier.
+    robust: whether it may be an outlier; systematic: its share of the odometry; inlier_ratio: of
+    the match that it is, 0 if it is none.
     """
 
     a: int
@@ -46,6 +72,23 @@ class Edge:
     T_a_b: Array
     information: Array
     robust: bool
+    systematic: Systematic = NO_SHARE
+    inlier_ratio: float = 0.0
+
+    def calibrated(self, parameters: Array) -> 'Edge':
+        """The edge with other parameters (N, 4) of the calibration, by the number of spans."""
+        T_a_b = self.T_a_b + self.systematic.change(parameters)
+        return replace(self, T_a_b=T_a_b, systematic=self.systematic.calibrated(parameters))
+
+    def settled(self, poses: Array, parameters: Array) -> 'Edge':
+        """The edge as the poses (N, 3) have it, with its robust weight, then calibrated."""
+        T = se2.between(poses[self.a], poses[self.b])
+        off = self.T_a_b - T
+        off[2] = wrap(float(off[2]))
+        squared = float(off @ self.information @ off)
+        weight = (1.0 + squared / _CONFIG.large) ** -2 if self.robust else 1.0
+        there = replace(self, T_a_b=T, information=weight * self.information)
+        return there.calibrated(parameters)
 
 
 def optimized(poses: Array, edges: list[Edge]) -> Array:

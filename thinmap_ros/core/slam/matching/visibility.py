@@ -34,8 +34,7 @@ def misses_walls(scan: Scan, local_map: LocalMap, T_map_base: Array, covariance:
 
     T_map_base (3,) with covariance (3, 3), map frame.
     """
-    sigma_m = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
-    reach_m = _REACH * scan.range_max_m - _SIGMAS * sigma_m
+    reach_m = _REACH * scan.range_max_m - _uncertainty_m(covariance)
     if local_map.is_empty or not reach_m > 0.0:
         return False
     T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
@@ -45,17 +44,29 @@ def misses_walls(scan: Scan, local_map: LocalMap, T_map_base: Array, covariance:
     return is_most_missed(scan, missed)
 
 
-def seen_through_ratio(scan: Scan, local_map: LocalMap, T_map_base: Array) -> float:
-    """Ratio of the returns of a scan, made at a pose (3,), that lie behind a wall of the map."""
+def seen_through_ratio(
+    scan: Scan, local_map: LocalMap, T_map_base: Array, covariance: Array
+) -> float:
+    """Ratio of the returns of a scan that lie behind a wall of the map.
+
+    T_map_base (3,) with covariance (3, 3), map frame: what lies behind a wall by no more than the
+    pose is uncertain may lie in front of it. So drift up to a loop is told from a robot that was
+    carried off.
+    """
     returned = scan.returned
     total = int(np.count_nonzero(returned))
     if local_map.is_empty or total == 0:
         return 0.0
     T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
     angles = T_map_laser[2] + scan.angles_rad[returned]
-    reaches_m = scan.ranges_m[returned] - _BEHIND_M
+    reaches_m = scan.ranges_m[returned] - _BEHIND_M - _uncertainty_m(covariance)
     hit_ratio = local_map.config.occupied_min_hit_ratio
     return _count_through(angles, reaches_m, T_map_laser, local_map.lattice, hit_ratio) / total
+
+
+def _uncertainty_m(covariance: Array) -> float:
+    """How far a position with a covariance (3, 3) may be off, m."""
+    return _SIGMAS * math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
 
 
 @kernel
