@@ -98,7 +98,7 @@ def test_a_robot_stands_still_once_its_laser_has_slipped():
 
     simulation.read_sensors = read
     goal = observable_cells(world, start, 0.25, 8.0)
-    outcome = loop.run(goal, 60.0, lambda seconds, coverage: None)
+    outcome = loop.run(goal, 70.0, lambda seconds, coverage: None)
     assert outcome.collisions == 0
     assert path_m[-1] < 8.0
     assert path_m[-1] == path_m[-100], 'it stands in the last seconds'

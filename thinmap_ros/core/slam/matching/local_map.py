@@ -244,6 +244,7 @@ class LocalMap:
         both = np.vstack([points_map, laser_map])
         low = np.floor((both.min(axis=0) - reach) / edge_m).astype(np.int64)[::-1]
         high = np.floor((both.max(axis=0) + reach) / edge_m).astype(np.int64)[::-1]
+        self._grow_to(low, high)
         touched = _touched(points_map, laser_map, low, high, edge_m, reach)
         self._allocate(np.argwhere(touched) + low)
 
@@ -255,11 +256,14 @@ class LocalMap:
 
     def _allocate(self, places: NDArray[np.int64]) -> None:
         """Allocate tiles (N, 2) of cells, and of their surfaces in the same slots."""
-        low = places.min(axis=0).tolist()
-        high = places.max(axis=0).tolist()
+        self._grow_to(places.min(axis=0), places.max(axis=0))
         for store in (self.tiles, self.surfaces):
-            store.grow_to(*low, *high)
             store.allocate(places)
+
+    def _grow_to(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+        """Make room for tiles between two (2,). Raises InputError if they are too far apart."""
+        for store in (self.tiles, self.surfaces):
+            store.grow_to(*low.tolist(), *high.tolist())
 
 
 FIELDS = {
