@@ -191,5 +191,5 @@ def test_of_walls_in_view_a_match_takes_off_what_the_wheels_have_added():
     match = Match(np.zeros(3), 1e-9 * np.eye(3), 1e9 * np.eye(3), 1.0, 0.0, 0.0, 1.0)
     uncertainty.update(match, np.zeros(3), 1e-4 * np.eye(3), True, False)
     after = uncertainty.systematic(None, np.zeros((3, 4)))[0, 0]
-    in_view = 0.2 * 0.75 / 0.25  # of the way since each update, three quarters are not drawn anew
+    in_view = 0.2 * 0.75 / 0.25  # of the way since each update, a quarter goes into the map
     assert left[-1] - after == pytest.approx(in_view, rel=0.05)

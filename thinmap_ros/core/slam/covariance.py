@@ -131,7 +131,7 @@ class PoseUncertainty:
     def map_updated(self, share: float) -> None:
         """Account for a map update; share: of the scan's error that is independent of the last.
 
-        It is the share of the walls in view that are drawn anew, at this pose.
+        It is also the share of the walls in view that the scan draws.
         """
         scan_part = self.scan_part
         self._since_keyframe = self._since_keyframe + self.motion_part + share * scan_part

@@ -49,7 +49,7 @@ def seen_through_ratio(
 ) -> float:
     """Ratio of the returns of a scan that lie behind a wall of the map.
 
-    T_map_base (3,) with covariance (3, 3), map frame: what lies behind a wall by no more than the
+    T_map_base (3,) with covariance (3, 3), map frame: a return behind a wall by no more than the
     pose is uncertain may lie in front of it. So drift up to a loop is told from a robot that was
     carried off.
     """
