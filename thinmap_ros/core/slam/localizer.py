@@ -335,7 +335,10 @@ class Localizer:
         """
         if match is None or not self.config.is_mapping:
             return 0.0
-        return seen_through_ratio(scan, self._map.map, match.T_map_base, self._covariance())
+        # At a given pose no drift explains them: it is right or wrong.
+        is_given = self._tracking.is_delocalized
+        covariance = np.zeros((3, 3)) if is_given else self._covariance()
+        return seen_through_ratio(scan, self._map.map, match.T_map_base, covariance)
 
     def _blind_reason(self, scan: Scan, points: Array, match: Match | None) -> str:
         """Why the laser does not confirm the pose; '' if it does, or if no wall is in range."""
