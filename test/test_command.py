@@ -13,7 +13,7 @@ from support.hidden_library import hide_ros
 
 from thinmap_ros import __main__ as command
 from thinmap_ros import __version__
-from thinmap_ros.core.kernel_cache import BESIDE_PACKAGE
+from thinmap_ros.jit.cache import BESIDE_PACKAGE
 
 pytestmark = pytest.mark.programs
 

@@ -12,8 +12,8 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.strategy import Decision
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
 from thinmap_ros.sim.coverage import ObservableCells, observable_cells
 from thinmap_ros.sim.robot import PRESETS
 

@@ -6,7 +6,8 @@ from typing import Any
 
 from numba.core import event
 
-from thinmap_ros.core import jit, kernel_cache
+from thinmap_ros import jit
+from thinmap_ros.jit import cache
 
 _COMPILATION = 'numba:compile'
 
@@ -43,7 +44,7 @@ class CompilationReport(event.Listener):
     def end(self) -> None:
         """Report duration and cache folder, if any kernels were compiled."""
         if self._seconds:
-            kept = kernel_cache.folder()
+            kept = cache.folder()
             where = f'cached in {kept}' if kept else 'not cached'
             _tell(f'kernels compiled in {self._seconds:.0f} s, {where}')
             self._seconds = 0.0

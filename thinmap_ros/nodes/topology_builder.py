@@ -17,9 +17,9 @@ from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.core.topology.rebuild import Rebuilding
 from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.mapping.rebuild import Rebuilding
 from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
 from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos

@@ -8,11 +8,11 @@ from pathlib import Path
 from rclpy.node import Node
 
 from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.core.private_folder import private_folder, temporary_folder
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.atomic import atomic_write, partial_files
 from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.files.snapshots import read_snapshot, write_snapshot
+from thinmap_ros.jit.private_folder import private_folder, temporary_folder
 
 _FOLDER = 'THINMAP_STATE_DIR'
 _KIND = 'checkpoint'
@@ -37,7 +37,7 @@ class Checkpoint:
             return
         try:
             self._path = checkpoint_directory() / file_name
-        except InputError as error:
+        except OSError as error:
             node.get_logger().warning(f'{error}: no checkpoint is saved')
 
     def load(self) -> State | None:
@@ -151,7 +151,7 @@ class StateStamp:
 def checkpoint_directory() -> Path:
     """The directory of this user alone in which nodes save checkpoints; created where missing.
 
-    Raises InputError where it is a link, of another user, or open to others.
+    Raises OSError where it is a link, of another user, or open to others.
     """
     chosen = os.environ.get(_FOLDER)
     runtime = os.environ.get('XDG_RUNTIME_DIR')

@@ -15,8 +15,8 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
 from thinmap_ros.sim.world import World
 
 CELL_M = 0.1

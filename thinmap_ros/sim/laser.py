@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.raytrace import cast_rays
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
 from thinmap_ros.sim.world import World
 
 _INTO_CELL = 1e-6

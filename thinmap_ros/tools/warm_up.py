@@ -3,10 +3,10 @@
 import argparse
 
 from thinmap_ros.closed_loop import Options
-from thinmap_ros.core import kernel_cache
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
+from thinmap_ros.jit import cache
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
@@ -33,7 +33,7 @@ def work(arguments: argparse.Namespace) -> None:
     world = World.from_patch(*read_world(package_data.world_path('office')))
     # A complete exploration reaches the kernels that need several targets.
     explore(world, world.start, Options(localization='slam'))
-    kept = kernel_cache.folder()
+    kept = cache.folder()
     print(
         f'all kernels are compiled, and cached in {kept}' if kept else 'there is no folder for them'
     )

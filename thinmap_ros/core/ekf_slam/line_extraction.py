@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, transform_points, wrap
+from thinmap_ros.jit import kernel
 
 _FLATTEST_RAD = math.radians(10.0)  # smallest usable angle between wall and beam
 _WIDEST_GAP_M = 0.6  # largest gap in a wall: narrower than a door

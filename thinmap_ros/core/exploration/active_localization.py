@@ -10,7 +10,6 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_CELL
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import Result
 from thinmap_ros.core.places.place_database import FREE, UNKNOWN, WALL, Bytes, Places, free_way
@@ -20,6 +19,7 @@ from thinmap_ros.core.planning.traversability import escape_cells, traversable_c
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, navigation_function
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
 
 _LIKELY = 0.05  # of the weight of the best
 # A goal stands so long, or until it is reached, or the number of places in question changes.

@@ -27,10 +27,10 @@ from thinmap_ros.core.exploration.reachable import Reachable
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode
 from thinmap_ros.core.exploration.viewpoints import is_enclosed, place_beside, place_for
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+from thinmap_ros.jit import kernel
 
 _RIM_M = 0.5  # at the end of its range the laser sees little
 _NEAR_M = 1.5

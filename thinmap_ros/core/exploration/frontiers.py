@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.traversability import Part
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import known_free, true_cells
+from thinmap_ros.jit import kernel
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]

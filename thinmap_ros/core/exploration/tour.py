@@ -11,8 +11,8 @@ piece elsewhere).
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import inlined, kernel
 
 Places = NDArray[np.int64]
 _ROUNDS = 10

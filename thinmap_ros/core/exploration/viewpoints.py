@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import inlined, kernel
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
 
 Mask = NDArray[np.bool_]
 _RIM_M = 0.5

@@ -6,7 +6,7 @@ Runs of true cells are joined row by row, with a union-find structure.
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import kernel
+from thinmap_ros.jit import kernel
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]

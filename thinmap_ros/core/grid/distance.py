@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import kernel
+from thinmap_ros.jit import kernel
 
 FAR = 1.0e6  # squared distance in cells if the set is empty
 

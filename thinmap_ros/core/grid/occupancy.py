@@ -16,10 +16,10 @@ from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.raytrace import fill_segment
 from thinmap_ros.core.grid.rendered_map import RenderedMap
 from thinmap_ros.core.grid.tiles import MAX_TILE_INDEX, TILE, TileStore
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import NO_RETURN_CLEAR_RANGE_M, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, Field
+from thinmap_ros.jit import inlined, kernel
 
 # Log odds are kept as whole thousandths in int16: small, exact to add, and the same on every
 # machine.

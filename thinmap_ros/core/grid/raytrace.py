@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import inlined, kernel
 
 _FRACTION_BITS = 32
 _ONE = float(1 << _FRACTION_BITS)

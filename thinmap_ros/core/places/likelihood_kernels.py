@@ -5,7 +5,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.places.place_database import (
     NEAR_UNIT_M,
     SIGHT_UNIT_M,
@@ -16,6 +15,7 @@ from thinmap_ros.core.places.place_database import (
     free_way,
 )
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import inlined, kernel
 
 _ASIDE_M = 0.12  # a beam is blocked only if parallel ones at this distance are blocked too
 _NO = 0

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.observation import observed_nodes
 from thinmap_ros.core.places.place_database import FREE, Bytes, Places, free_way
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind
+from thinmap_ros.jit import kernel
 
 _TRIALS = 60
 _SAME_NODE_M = 1.0

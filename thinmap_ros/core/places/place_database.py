@@ -10,10 +10,10 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup, line_is_clear
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.jit import kernel
 
 Mask = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]

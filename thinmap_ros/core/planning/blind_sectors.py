@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
 
 # Width of the smallest relevant obstacle: a leg. Sectors are sampled at this spacing.
 MIN_OBSTACLE_WIDTH_M = 0.1

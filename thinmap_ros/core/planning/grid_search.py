@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.graph_search import path_points, shortest_route
 from thinmap_ros.core.planning.grid_search import distance_field_from
 from thinmap_ros.core.planning.traversability import nearest_true, path_collides
 from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, cost_of_cells
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.jit import kernel
 
 Mask = NDArray[np.bool_]
 XY = tuple[float, float]

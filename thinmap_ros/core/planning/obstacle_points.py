@@ -5,10 +5,10 @@ import math
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.blind_sectors import MIN_OBSTACLE_WIDTH_M, BlindSectors
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
 
 _REMEMBERED_M = 1.0
 _SWEEP_STEP_M = 0.03

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core.config import SAFE_LOWER, Config, parameter
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.jit import kernel
 
 
 @dataclass(frozen=True)

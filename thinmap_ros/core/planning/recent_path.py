@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
 
 
 class RecentPath:

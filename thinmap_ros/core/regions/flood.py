@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.jit import inlined, kernel
 
 Labels = NDArray[np.int32]
 Cells = NDArray[np.int64]

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import inlined, kernel
 
 Mask = NDArray[np.bool_]
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import NO_RETURN_CLEAR_RANGE_M, Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
 
 _REACH = 0.8  # of the range: farther walls at a small angle may have gone out of range
 _APART_M = 0.1

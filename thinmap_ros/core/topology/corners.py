@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import inlined, kernel
 
 Cells = NDArray[np.int64]
 

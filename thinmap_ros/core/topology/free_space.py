@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.components import label, reachable
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.jit import kernel
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]

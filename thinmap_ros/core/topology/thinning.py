@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.jit import inlined, kernel
 
 KEPT = 32767  # deletion time of the cells of the skeleton
 Words = NDArray[np.uint64]

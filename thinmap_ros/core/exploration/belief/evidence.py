@@ -26,9 +26,9 @@ from thinmap_ros.core.exploration.position_probability import (
     distance_index,
     reliability,
 )
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
+from thinmap_ros.jit import kernel
 
 Place = tuple[float, float]
 FIELDS = {

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.spatial_hash import SpatialHash
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, Systematic
 from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
 from thinmap_ros.core.slam.wall_compass import Heading
+from thinmap_ros.jit import inlined, kernel
 
 _BUCKET_M = 4.0
 _NO_COVARIANCE = np.zeros((3, 3))

@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from thinmap_ros.core.grid.tiles import NO_TILE, TILE
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.local_map import LocalMapView, cell_of, cells_to_wall, slot_of
 from thinmap_ros.core.slam.matching.matching_cost import (
@@ -22,6 +21,7 @@ from thinmap_ros.core.slam.matching.matching_cost import (
     far_cost,
     loss,
 )
+from thinmap_ros.jit import inlined, kernel
 
 _ROOT = 4.0  # half the size of a root node, in cells
 _LEVELS = 2  # levels of nodes below the root

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.tiles import MAX_TILE_INDEX, NO_TILE, TILE, TileStore
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.surface import COLUMNS
 from thinmap_ros.core.snapshot import Field
+from thinmap_ros.jit import inlined, kernel
 
 # Apart from the surfaces, which walls alone have: kernels pass through many cells for each hit, and
 # most of their time is that of the memory.

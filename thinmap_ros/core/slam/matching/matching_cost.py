@@ -12,9 +12,9 @@ import math
 
 import numpy as np
 
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.local_map import LocalMapView, off_wall
+from thinmap_ros.jit import inlined, kernel
 
 SLIP_SIGMAS = 10.0  # scale of the prior's loss: beyond it, wheel slip is more likely than an error
 FITS_SIGMAS = 2.0  # largest distance of an inlier from its wall

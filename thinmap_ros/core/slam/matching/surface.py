@@ -10,9 +10,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import inlined, kernel
 
 COLUMNS = 5  # of surface points: x, y, double angle of the normal (cosine, sine), spacing
 WINDOW_M = 0.15  # nearer neighbours are on the same surface and determine its normal

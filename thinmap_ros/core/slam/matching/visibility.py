@@ -6,7 +6,6 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.tiles import NO_TILE
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan, is_most_missed
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.local_map import (
@@ -18,6 +17,7 @@ from thinmap_ros.core.slam.matching.local_map import (
     is_wall,
     slot_of,
 )
+from thinmap_ros.jit import kernel
 
 _REACH = 0.9  # of range_max: a farther wall may be out of range
 _STEP_CELLS = 0.5

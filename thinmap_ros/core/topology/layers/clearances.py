@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.layers.free_space import squared_clearance
 from thinmap_ros.core.topology.layers.lattice import Cells, Lattice
+from thinmap_ros.jit import kernel
 
 
 @kernel

@@ -21,7 +21,6 @@ Source: topological map paper section 2.1, steps 1 and 2.
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.topology.layers.lattice import (
     Cells,
     Lattice,
@@ -33,6 +32,7 @@ from thinmap_ros.core.topology.layers.lattice import (
     sorted_unique,
 )
 from thinmap_ros.core.topology.thinning import KEPT
+from thinmap_ros.jit import inlined, kernel
 
 _NEVER = 1 << 20
 _BUCKETS = 1 << 12  # times up to here are processed in order; later ones only take longer

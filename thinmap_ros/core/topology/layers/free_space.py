@@ -13,7 +13,6 @@ from thinmap_ros.core.grid.patch import (
 )
 from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_PERCENT
 from thinmap_ros.core.grid.tiles import TILE
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import column_distance, known_free
 from thinmap_ros.core.topology.layers.deletion_times import skeleton_cells
@@ -32,6 +31,7 @@ from thinmap_ros.core.topology.layers.lattice import (
     row_of,
 )
 from thinmap_ros.core.topology.thinning import deletion_times
+from thinmap_ros.jit import inlined, kernel
 
 _MIN_FRONTIER_CELLS = 3
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.tiles import MAX_TILES, NO_TILE, TILE, TileStore
-from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.jit import inlined, kernel
 
 Cells = NDArray[np.int64]
 UNKNOWN = 0

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.layers.free_space import borders_unknown, squared_clearance
 from thinmap_ros.core.topology.layers.lattice import Cells, col_of, hash_of, key_of, row_of
@@ -25,6 +24,7 @@ from thinmap_ros.core.topology.layers.skeleton_graph import (
     B,
     chain_cells,
 )
+from thinmap_ros.jit import inlined, kernel
 
 # Columns of `measured`: the cell that it was measured at, its squared clearance, and whether its
 # free space borders unknown cells (NONE: not known yet).

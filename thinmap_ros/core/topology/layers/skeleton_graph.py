@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.topology.layers.lattice import (
     Cells,
     Lattice,
@@ -23,6 +22,7 @@ from thinmap_ros.core.topology.layers.lattice import (
     row_of,
     sorted_unique,
 )
+from thinmap_ros.jit import inlined, kernel
 
 NONE = -1
 # Columns of `vertices`: its cell (NONE: unused), then the chains at it.

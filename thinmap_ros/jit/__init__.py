@@ -5,7 +5,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 
-from thinmap_ros.core import kernel_cache
+from thinmap_ros.jit import cache
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 # Kernels of all imported modules.
@@ -25,5 +25,5 @@ def inlined(function: Function) -> Function:
 
 
 def _compiled(function: Function, **options: Any) -> Function:
-    kept = kernel_cache.folder() is not None
+    kept = cache.folder() is not None
     return cast(Function, numba.njit(cache=kept, nogil=True, **options)(function))

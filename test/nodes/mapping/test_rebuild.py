@@ -6,7 +6,7 @@ import pytest
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.topology.builder import TopologyBuilder
-from thinmap_ros.core.topology.rebuild import Rebuilding
+from thinmap_ros.nodes.mapping.rebuild import Rebuilding
 
 POSES = np.array([[4.0 + 0.5 * k, 5.0, 0.0] for k in range(5)])
 STAMPS = np.arange(1, 6)

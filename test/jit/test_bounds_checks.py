@@ -8,7 +8,7 @@ import pytest
 
 MODULE = """
 import numpy as np
-from thinmap_ros.core.jit import kernel
+from thinmap_ros.jit import kernel
 
 @kernel
 def beyond(values, index):

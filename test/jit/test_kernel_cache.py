@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from thinmap_ros.core import kernel_cache
+from thinmap_ros.jit import cache
 
 pytestmark = pytest.mark.programs
 CONSTANT = 'GAIN = {gain}\n'
 MODULE = """
 from thinmap_ros.core.constant import GAIN
-from thinmap_ros.core.jit import kernel
+from thinmap_ros.jit import kernel
 
 @kernel
 def amplified(value):
@@ -28,7 +28,7 @@ class Pair(NamedTuple):
     second: float
 """
 MODULE_OF_PAIRS = """
-from thinmap_ros.core.jit import kernel
+from thinmap_ros.jit import kernel
 from thinmap_ros.core.pair import Pair
 
 @kernel
@@ -38,12 +38,23 @@ def product(pair):
 def amplified(value):
     return product(Pair(value, 2.0))
 """
+MODULE_OF_QUOTIENTS = """
+from thinmap_ros.core.pair import Pair
+from thinmap_ros.jit import kernel
+
+@kernel
+def quotient(pair):
+    return pair.first / pair.second
+
+def amplified(value):
+    return quotient(Pair(first=value, second=2.0))
+"""
 PROGRAM = """
 from thinmap_ros.kernels.progress import report_compilation
 report = report_compilation()
-from thinmap_ros.core import jit, kernel_cache
 from thinmap_ros.core.amplifier import amplified
-print(amplified(3.0), kernel_cache.folder())
+from thinmap_ros.jit import cache
+print(amplified(3.0), cache.folder())
 report.end()
 """
 
@@ -55,8 +66,8 @@ class Install:
         self.folder = folder
         self.package = folder / 'thinmap_ros'
         leave_out = shutil.ignore_patterns('__pycache__')
-        for name in ('core', 'files', 'kernels'):
-            shutil.copytree(kernel_cache.PACKAGE / name, self.package / name, ignore=leave_out)
+        for name in ('core', 'files', 'jit', 'kernels'):
+            shutil.copytree(cache.PACKAGE / name, self.package / name, ignore=leave_out)
         (self.package / '__init__.py').touch()
         (self.package / 'core' / 'amplifier.py').write_text(MODULE)
         self.set_gain(2.0)
@@ -64,6 +75,13 @@ class Install:
     def set_gain(self, gain: float) -> None:
         """Change a constant in another module than that of the kernel."""
         (self.package / 'core' / 'constant.py').write_text(CONSTANT.format(gain=gain))
+
+    def edit(self, module: str, before: str, after: str) -> None:
+        """Replace the first occurrence of a text in a module of the core."""
+        path = self.package / 'core' / f'{module}.py'
+        text = path.read_text()
+        assert before in text
+        path.write_text(text.replace(before, after, 1))
 
     def close_to_writing(self) -> None:
         """Make the folder of the package unwritable, also for root."""
@@ -121,11 +139,37 @@ def test_a_kernel_whose_types_have_moved_is_compiled_again(install: Install) -> 
     assert 'compiling' in said
 
 
-def test_a_comment_elsewhere_costs_nothing(install: Install) -> None:
+@pytest.mark.parametrize(
+    ('module', 'before', 'after'),
+    [
+        ('constant', 'GAIN', '# A comment above what the kernel names.\nGAIN'),
+        ('amplifier', '@kernel', '# A comment above the kernel.\n\n@kernel'),
+        ('amplifier', 'return', '"""A docstring."""\n    # And a comment.\n    return'),
+        ('amplifier', '@kernel', 'class Other:\n    """Beside."""\n\n@kernel'),
+        (
+            'errors',
+            'class InputError',
+            'class Other(Exception): ...\n\n\nclass InputError',
+        ),
+    ],
+)
+def test_what_a_kernel_is_not_compiled_from_recompiles_nothing(
+    install: Install, module: str, before: str, after: str
+) -> None:
     install.run()
-    with (install.package / 'core' / 'scan.py').open('a') as other:
-        other.write('# No module of the kernel.\n')
+    install.edit(module, before, after)
     assert install.run()[1] == ''
+
+
+def test_a_named_tuple_with_other_fields_is_another_type(install: Install) -> None:
+    """Compiled code accesses the fields by their position."""
+    (install.package / 'core' / 'pair.py').write_text(PAIR)
+    (install.package / 'core' / 'amplifier.py').write_text(MODULE_OF_QUOTIENTS)
+    assert install.run()[0][0] == '1.5'
+    install.edit('pair', 'first: float\n    second: float', 'second: float\n    first: float')
+    (value, _), said = install.run()
+    assert value == '1.5'
+    assert 'compiling' in said
 
 
 def test_a_read_only_install_keeps_them_in_the_cache_of_the_user(install: Install) -> None:
@@ -180,8 +224,8 @@ def test_what_was_compiled_at_install_time_is_taken_over(
     """An administrator ran warm_up; the users of the read-only install need not compile."""
     install.run()
     beside = install.package / '__pycache__' / 'kernels'
-    monkeypatch.setattr(kernel_cache, 'BESIDE_PACKAGE', beside)
-    folder = kernel_cache._seeded(install.folder / 'home')
+    monkeypatch.setattr(cache, 'BESIDE_PACKAGE', beside)
+    folder = cache._seeded(install.folder / 'home')
     names = {file.relative_to(beside) for file in beside.rglob('*.nb[ic]')}
     assert names
     assert {file.relative_to(folder) for file in folder.rglob('*.nb[ic]')} == names

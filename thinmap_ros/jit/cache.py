@@ -1,35 +1,31 @@
 """Cache of compiled kernels: its folder, and when a kernel is recompiled.
 
-numba caches a kernel beside its module, or in the home folder, and recompiles it when that module
-changes. That is not enough here. An install may be read-only and a service may have no home: numba
-then refuses to compile at all. A kernel also contains code and constants of the modules that it
-imports. This package therefore keeps its kernels in one folder (`folder`), each with a fingerprint
-of its module and of all modules of this package that it depends on (`fingerprint`).
+numba caches a kernel beside its module, or in the home folder, and recompiles it when the file of
+that module is written. That is too rarely, as a kernel also contains code and constants of other
+modules, and too often, as the file may differ in a comment alone. Besides, an install may be
+read-only and a service may have no home: numba then refuses to compile at all. This package
+therefore keeps its kernels in one folder (`folder`), each with a fingerprint of what it is compiled
+from.
 """
 
 import hashlib
 import os
-import re
 import shutil
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numba
 from numba.core import caching
 
-from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.core.private_folder import private_folder, temporary_folder
+from thinmap_ros.jit.fingerprint import fingerprint, layouts
+from thinmap_ros.jit.private_folder import private_folder, temporary_folder
 
 PACKAGE = Path(__file__).resolve().parents[1]
 BESIDE_PACKAGE = PACKAGE / '__pycache__' / 'kernels'
-_IMPORT = re.compile(
-    rf'^\s*(?:from ({PACKAGE.name}[\w.]*) import (\([^)]*\)|[^\n]*)|import ({PACKAGE.name}[\w.]*))',
-    re.MULTILINE,
-)
 
 
 @cache
@@ -45,8 +41,8 @@ def folder() -> Path | None:
     for make in (*named, _beside_package, _of_user, _temporary):
         try:
             return make()
-        except (OSError, InputError, RuntimeError) as error:
-            refusals.append(one_line_reason(error))
+        except (OSError, RuntimeError) as error:
+            refusals.append(str(error))
     warnings.warn(
         'kernels are compiled at each start, because no cache folder is writable: set '
         f'NUMBA_CACHE_DIR to a writable folder ({"; ".join(refusals)})',
@@ -56,28 +52,11 @@ def folder() -> Path | None:
     return None
 
 
-@cache
-def fingerprint(path: Path) -> str:
-    """Hash of a module and of all modules of this package that it depends on."""
-    known: set[Path] = set()
-    waiting = [path]
-    while waiting:
-        module = waiting.pop()
-        if module not in known:
-            known.add(module)
-            waiting.extend(_imported(module))
-    together = hashlib.sha256()
-    for module in sorted(known):
-        together.update(_digest(module))
-    return together.hexdigest()
-
-
 class KernelLocator:
     """Tells numba where the functions of this package are cached (numba's locator interface)."""
 
     def __init__(self, function: Callable[..., Any], path: Path, cache_folder: Path) -> None:
-        self._py_file = str(path)
-        self._line = function.__code__.co_firstlineno
+        self._function = function
         self._folder = cache_folder.joinpath(*path.relative_to(PACKAGE).parent.parts)
 
     @classmethod
@@ -97,25 +76,42 @@ class KernelLocator:
         """Folder of the kernels of the module."""
         return str(self._folder)
 
-    def get_source_stamp(self) -> str:
-        """Fingerprint that a cached kernel must have."""
-        return fingerprint(Path(self._py_file))
+    def get_source_stamp(self) -> Callable[[], str]:
+        """What returns the fingerprint that a cached kernel must have, once all are imported."""
+        return partial(fingerprint, self._function)
 
     def get_disambiguator(self) -> str:
-        """Distinguish functions of the same name."""
-        return str(self._line)
+        """Nothing but its module and name tells a kernel from others: no line, which changes."""
+        return 'kernel'
 
 
 class _KernelIndex(caching.IndexDataCacheFile):
     """Index of a function's kernels by the types of their arguments."""
 
+    def load(self, key: tuple[Any, ...]) -> Any:
+        """Load the kernel of a key."""
+        return super().load(_with_layouts(key))
+
+    def save(self, key: tuple[Any, ...], data: Any) -> None:
+        """Save the kernel of a key."""
+        super().save(_with_layouts(key), data)
+
     def _load_index(self) -> dict[Any, str]:
         """Read the index; empty if it names types of modules that were moved or renamed."""
+        # Now that all kernels are imported that this one calls.
+        if isinstance(self._source_stamp, partial):
+            self._source_stamp: Any = self._source_stamp()
         try:
             index: dict[Any, str] = super()._load_index()
         except (ImportError, AttributeError):
             return {}
         return index
+
+
+def _with_layouts(key: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Key of an index, with the fields of named tuples among the types of the arguments."""
+    arguments = getattr(key[0], 'args', key[0])
+    return (*key, *layouts(arguments))
 
 
 caching.CacheImpl._locator_classes.insert(0, KernelLocator)
@@ -162,26 +158,3 @@ def _writable(chosen: Path) -> Path:
     chosen.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=chosen).close()
     return chosen
-
-
-@cache
-def _digest(module: Path) -> bytes:
-    return hashlib.sha256(module.read_bytes()).digest()
-
-
-@cache
-def _imported(module: Path) -> frozenset[Path]:
-    """Files of this package that a module imports, anywhere in it."""
-    files: set[Path] = set()
-    for package, names, whole in _IMPORT.findall(module.read_text()):
-        files.update(_files_of(package or whole))
-        for name in re.findall(r'\w+', names):
-            files.update(_files_of(f'{package}.{name}'))
-    return frozenset(files)
-
-
-def _files_of(dotted: str) -> Iterator[Path]:
-    path = PACKAGE.parent.joinpath(*dotted.split('.'))
-    for file in (path.with_suffix('.py'), path / '__init__.py'):
-        if file.is_file():
-            yield file
