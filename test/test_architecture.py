@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import networkx
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -156,14 +157,27 @@ def test_one_statement_a_line():
     assert not found
 
 
-MOST_FILES = 15
+def test_a_folder_names_its_one_concept():
+    """In one sentence: the first line of the docstring of its package."""
+    for path in PACKAGE.rglob('__init__.py'):
+        docstring = ast.get_docstring(ast.parse(path.read_text())) or ''
+        assert re.fullmatch(r'[^.\n]+\.', docstring.split('\n')[0]), path
 
 
-@pytest.mark.parametrize('top', ['thinmap_ros', 'benchmarks', 'test'])
-def test_a_folder_holds_few_files(top):
-    folders = [ROOT / top, *(path for path in (ROOT / top).rglob('*') if path.is_dir())]
-    counts = {str(folder.relative_to(ROOT)): len(list(folder.glob('*.py'))) for folder in folders}
-    assert not {folder: count for folder, count in counts.items() if count > MOST_FILES}
+def test_no_module_imports_itself_through_others():
+    """Neither within functions, nor for type checkers alone."""
+    modules = {
+        '.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__'): path
+        for path in SOURCES
+    }
+    # The package itself names its public interface, whose modules it imports when they are used.
+    arrows = networkx.DiGraph(
+        (name, imported)
+        for name, path in modules.items()
+        for imported in imports(ast.parse(path.read_text()))
+        if PACKAGE.name not in (name, imported)
+    )
+    assert list(networkx.simple_cycles(arrows)) == []
 
 
 MOST_ATTRIBUTES = 12

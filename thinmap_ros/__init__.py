@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.files.occupancy_maps import read_map, write_map
     from thinmap_ros.files.package_data import world_path
     from thinmap_ros.files.worlds import read_world
-    from thinmap_ros.logs.log import open_log, paired_scans
+    from thinmap_ros.logs.reading import open_log, paired_scans
     from thinmap_ros.pipeline import Pipeline, PipelineConfig
     from thinmap_ros.sim.world import World
 
@@ -75,8 +75,8 @@ _PLACES = {
     'PipelineConfig': 'pipeline.PipelineConfig',
     'Scan': 'core.scan.Scan',
     # logs
-    'open_log': 'logs.log.open_log',
-    'paired_scans': 'logs.log.paired_scans',
+    'open_log': 'logs.reading.open_log',
+    'paired_scans': 'logs.reading.paired_scans',
     # maps
     'GridPatch': 'core.grid.patch.GridPatch',
     'OccupancyGrid': 'core.grid.occupancy.OccupancyGrid',

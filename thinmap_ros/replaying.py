@@ -23,8 +23,9 @@ from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
-from thinmap_ros.logs.log import WAITING_SCANS, Event, Log, OdometryEvent, recording_events
+from thinmap_ros.logs.log import Log
 from thinmap_ros.logs.order.unused_scans import UnusedScans
+from thinmap_ros.logs.reading import WAITING_SCANS, complete_scans, recording_events
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import summary_figure
@@ -120,7 +121,7 @@ def replay(
         expected = None
         for number, event in enumerate(recording_events(log)):
             unused.add(event)
-            for stamp_ns in _process(result, _add_event(pairing, event), watcher):
+            for stamp_ns in _process(result, complete_scans(pairing, event), watcher):
                 unused.pair(stamp_ns)
             tidy_up()
             if show_progress:
@@ -174,13 +175,6 @@ def _errors_kept(result: Replay, keep_partial: bool) -> Iterator[None]:
         if not (keep_partial and result.poses):
             raise
         result.ended_by = result.ended_by or error
-
-
-def _add_event(pairing: ScanOdometrySynchronizer, event: Event) -> list[tuple[Scan, Array]]:
-    """Scans that are complete with this event, each with its odometry pose (3,)."""
-    if isinstance(event, OdometryEvent):
-        return pairing.add_odometry(event.stamp_ns, event.T_odom_base)
-    return pairing.add_scan(event.scan)
 
 
 def _process(

@@ -23,13 +23,11 @@ from thinmap_ros.core.config import with_values
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
 from thinmap_ros.experiments.slam.logs import laser_of
-from thinmap_ros.logs.carmen import CarmenLog
-from thinmap_ros.logs.log import OdometryEvent
+from thinmap_ros.logs.reading import open_log, paired_scans
 from thinmap_ros.pipeline import PipelineConfig
 
 _KNOWN_AGAIN_M = 30.0  # of way after a slip or a gap, from which on relations over it are judged
@@ -148,12 +146,7 @@ def _degraded(case: LogCase, own: Path, degrade: Path, folder: Path) -> Path:
 
 def _scans(own: Path, laser: str) -> Iterator[tuple[Scan, Array]]:
     """Scans with the odometry at their stamps, in the order of the file."""
-    pairing = ScanOdometrySynchronizer()
-    for event in CarmenLog(next(own.glob('log.clf*')), laser_of(own, laser)).events():
-        if isinstance(event, OdometryEvent):
-            yield from pairing.add_odometry(event.stamp_ns, event.T_odom_base)
-        else:
-            yield from pairing.add_scan(event.scan)
+    return paired_scans(open_log(next(own.glob('log.clf*')), laser_of(own, laser)))
 
 
 def _disturbed(pairs: Iterator[tuple[Scan, Array]], run: int) -> Iterator[tuple[Scan, Array]]:

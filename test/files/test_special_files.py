@@ -15,7 +15,7 @@ from thinmap_ros.files import graphs, occupancy_maps, sessions, trajectories, wo
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_directory import bag_files
 from thinmap_ros.logs.carmen import CarmenLog
-from thinmap_ros.logs.log import open_log
+from thinmap_ros.logs.reading import open_log
 from thinmap_ros.tools.bag_repair import files_of
 
 # A reader that waits for a writer of the pipe is interrupted; the other tests are run.

@@ -17,7 +17,8 @@ from thinmap_ros.files.limits import LOGS
 from thinmap_ros.logs import ros1_storage
 from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, open_log
+from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
+from thinmap_ros.logs.reading import open_log
 
 
 def assert_equal(found: list[Event], expected: list[Event]) -> None:

@@ -16,6 +16,7 @@ from thinmap_ros.files.limits import LOGS
 from thinmap_ros.files.regular_files import require_regular_file
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag_directory import DecompressedFile, bag_files
+from thinmap_ros.logs.formats import is_bag, is_ros1, is_sqlite
 from thinmap_ros.logs.frames.bag_frames import BagFrames, FrameOptions
 from thinmap_ros.logs.frames.bag_odometry import (
     NONE,
@@ -29,9 +30,6 @@ from thinmap_ros.logs.log import (
     Event,
     ScanEvent,
     SkippedRecords,
-    is_bag,
-    is_ros1,
-    is_sqlite,
 )
 from thinmap_ros.logs.mcap_records import DamagedError, decompress
 from thinmap_ros.logs.ros1_storage import Ros1Storage

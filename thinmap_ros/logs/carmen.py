@@ -28,13 +28,12 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import LATEST_S, SECOND_NS
 from thinmap_ros.files.limits import LOGS
 from thinmap_ros.files.regular_files import open_regular_file
+from thinmap_ros.logs.formats import is_mcap, refuse_foreign
 from thinmap_ros.logs.log import (
     Event,
     OdometryEvent,
     ScanEvent,
     SkippedRecords,
-    is_mcap,
-    refuse_foreign,
 )
 
 _SCAN_KEYWORDS = (b'FLASER', b'ROBOTLASER1')

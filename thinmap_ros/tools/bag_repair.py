@@ -6,7 +6,7 @@ from pathlib import Path
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.bag_directory import bag_files, mcap_files_in
 from thinmap_ros.logs.bag_writer import temporary_bag
-from thinmap_ros.logs.log import is_mcap, refuse_foreign
+from thinmap_ros.logs.formats import is_mcap, refuse_foreign
 from thinmap_ros.logs.repair import RepairReport, repair
 from thinmap_ros.tools import cli
 

@@ -17,7 +17,7 @@ from thinmap_ros.core.config import Config, is_parameter
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.kernels.progress import report_compilation
-from thinmap_ros.logs import log
+from thinmap_ros.logs import reading
 from thinmap_ros.logs.carmen import LaserOptions
 from thinmap_ros.logs.frames.bag_odometry import SOURCES
 from thinmap_ros.logs.frames.laser_mount import parse_laser_pose
@@ -193,7 +193,7 @@ def open_log(arguments: argparse.Namespace, parameters: NodeParameters = _NO_PAR
         given = text('laser_pose')
     offset = getattr(arguments, 'offset_m', None)
     T_base_laser = None if offset is None else np.array([offset, 0.0, 0.0])
-    return log.open_log(
+    return reading.open_log(
         arguments.log,
         config_from(arguments, LaserOptions),
         arguments.scan_topic,

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.distance import distance_cells
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup, line_is_clear
@@ -84,7 +85,7 @@ class Places:
         states = np.where(patch.free, FREE, others).astype(np.uint8)
         if not patch.occupied.any():
             raise InputError(f'map of {patch.shape} cells without an occupied one: expected walls')
-        near = near_walls(states, patch.frame.resolution)
+        near = _near_walls(states, patch.frame.resolution)
         has_room = near * NEAR_UNIT_M >= config.robot_radius_m
         standing = np.argwhere((states == FREE) & has_room).astype(np.int32)
         if not len(standing):
@@ -134,37 +135,13 @@ def _spots(standing: NDArray[np.int32], frame: GridFrame) -> tuple[Array, float]
     return frame.centres_of(standing[order[leads]].astype(np.int64)), edge * frame.resolution
 
 
-@kernel
-def near_walls(states: Bytes, resolution: float) -> Bytes:
+def _near_walls(states: Bytes, resolution: float) -> Bytes:
     """Distance between the centres of each cell (H, W) and of the nearest wall; exact.
 
     In NEAR_UNIT_M, at most 255.
     """
-    rows, cols = states.shape
-    reach = int(_NEAR_CAP * NEAR_UNIT_M / resolution) + 1
-    column = np.full((rows, cols), reach + 1, dtype=np.int16)
-    for col in range(cols):
-        steps = reach + 1
-        for row in range(rows):
-            steps = 0 if states[row, col] == WALL else min(steps + 1, reach + 1)
-            column[row, col] = steps
-        steps = reach + 1
-        for row in range(rows - 1, -1, -1):
-            steps = 0 if states[row, col] == WALL else min(steps + 1, reach + 1)
-            column[row, col] = min(column[row, col], steps)
-    near = np.empty((rows, cols), dtype=np.uint8)
-    for row in range(rows):
-        for col in range(cols):
-            best = np.int64(column[row, col]) ** 2
-            for step in range(1, reach + 1):
-                if step * step >= best:
-                    break
-                if col >= step:
-                    best = min(best, step * step + np.int64(column[row, col - step]) ** 2)
-                if col + step < cols:
-                    best = min(best, step * step + np.int64(column[row, col + step]) ** 2)
-            near[row, col] = min(int(math.sqrt(best) * resolution / NEAR_UNIT_M + 0.5), _NEAR_CAP)
-    return near
+    units = distance_cells(states == WALL) * resolution / NEAR_UNIT_M
+    return np.minimum(units + 0.5, _NEAR_CAP).astype(np.uint8)
 
 
 @kernel

@@ -125,26 +125,6 @@ def path_lengths_to_nodes(topology: TopologicalMap, x: float, y: float) -> dict[
     return costs
 
 
-def path_lengths_to_goals(
-    topology: TopologicalMap, from_pose: Array, goals: dict[int, Array]
-) -> dict[int, float]:
-    """Length of the shortest path on the graph from a pose to each reachable goal (x, y, ...), m.
-
-    The id of a goal is that of its node, if the map has this node.
-    """
-    to_nodes = path_lengths_to_nodes(topology, float(from_pose[0]), float(from_pose[1]))
-    costs = {}
-    for goal_id, goal in goals.items():
-        x = float(goal[0])
-        y = float(goal[1])
-        joins = None if goal_id in topology.nodes else access(topology, x, y)
-        ends = {goal_id: 0.0} if joins is None else joins.to_node_m
-        lengths = [to_nodes[i] + rest for i, rest in ends.items() if i in to_nodes]
-        if lengths:
-            costs[goal_id] = min(lengths)
-    return costs
-
-
 def path_points(topology: TopologicalMap, route: Route) -> Array:
     """Points (K, 2) of a route from its first to its last node, m, map frame, no duplicates."""
     first = topology.nodes[route.node_ids[0]]

@@ -1,9 +1,10 @@
 """Frames of a robot in a bag: poses of its lasers, and the frames of its odometry."""
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
@@ -12,9 +13,7 @@ from thinmap_ros.logs.frames.laser_mount import Mount, StaticTransforms
 from thinmap_ros.logs.frames.odometry_frames import OdometryFrames
 from thinmap_ros.logs.frames.transforms import TransformOdometry
 from thinmap_ros.logs.log import SkippedRecords
-
-if TYPE_CHECKING:
-    from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.storage import RawMessage
 
 _TF = 'tf2_msgs/msg/TFMessage'
 _BASE = 'base_link'
@@ -34,6 +33,28 @@ class FrameOptions:
     odom_frame: str = ''
 
 
+class Messages(Protocol):
+    """The messages of a bag, by topic."""
+
+    @property
+    def path(self) -> Path:
+        """Path of the bag."""
+        ...
+
+    @property
+    def topics(self) -> Mapping[str, str]:
+        """Type of each topic."""
+        ...
+
+    def messages(self, topics: set[str]) -> Iterable[RawMessage]:
+        """Messages of topics, in the order of writing."""
+        ...
+
+    def decode(self, message: RawMessage) -> Any:
+        """Decode a message."""
+        ...
+
+
 class BagFrames:
     """The frames of the robot in a bag.
 
@@ -41,7 +62,7 @@ class BagFrames:
     publish the poses of sensors there.
     """
 
-    def __init__(self, bag: 'Bag', options: FrameOptions, skipped: SkippedRecords) -> None:
+    def __init__(self, bag: Messages, options: FrameOptions, skipped: SkippedRecords) -> None:
         """skipped: receives invalid transforms, and notes on what is assumed."""
         self.base_frame = options.base_frame or _BASE
         self.odom_frame = options.odom_frame or _ODOM
