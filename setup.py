@@ -14,33 +14,6 @@ from tempfile import TemporaryDirectory
 from setuptools import find_packages, setup
 
 NAME = 'thinmap_ros'
-NODES = [
-    'sim',
-    'grid_mapper',
-    'topology_builder',
-    'localizer',
-    'explorer',
-    'navigator',
-    'recorder',
-    'bag_player',
-    'demo_monitor',
-    'rerun_viewer',
-    'markers',
-    'global_localizer',
-    'thinmap',
-]
-TOOLS = [
-    'replay',
-    'explore_world',
-    'compare_exploration',
-    'carmen_to_bag',
-    'map_to_graph',
-    'bag_repair',
-    'demo',
-    'warm_up',
-    'experiment',
-    'record_bags',
-]
 
 # What pip and `python -m build` run of this file.
 IS_WHEEL = bool({'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'} & set(sys.argv))
@@ -62,8 +35,13 @@ ROS_DATA = [
     (f'share/{NAME}/config/sensors', glob('config/sensors/*.yaml')),
     (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
 ]
-ROS_PROGRAMS = [f'{node} = {NAME}.nodes.{node}:main' for node in NODES]
-ROS_PROGRAMS += [f'{tool} = {NAME}.tools.{tool}:main' for tool in TOOLS]
+# A program is a module with a `main`.
+ROS_PROGRAMS = [
+    f'{path.stem} = {NAME}.{folder}.{path.stem}:main'
+    for folder in ('nodes', 'tools')
+    for path in sorted((Path(__file__).parent / NAME / folder).glob('*.py'))
+    if '\ndef main(' in path.read_text()
+]
 
 
 def version() -> str:

@@ -1,3 +1,3 @@
 """Benchmarks: what thinmap does against named peers in the same run, and against own targets."""
 
-import thinmap_ros  # noqa: F401  before NumPy, for which it sets the number of threads
+import thinmap_ros.startup  # noqa: F401  before NumPy, for which it sets the number of threads

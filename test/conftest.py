@@ -9,6 +9,9 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import thinmap_ros.startup  # noqa: F401  before NumPy, for which it sets the number of threads
+
+# isort: split
 import pytest
 from hypothesis import settings
 from support.hidden_library import hide_ros

@@ -34,6 +34,18 @@ def test_importing_the_package_loads_no_library() -> None:
     assert not {'numpy', 'numba', 'rclpy', 'rosbags', 'scipy'} & set(loaded)
 
 
+def test_importing_the_package_changes_nothing_in_the_process() -> None:
+    code = """
+import os, signal
+def state():
+    return dict(os.environ), [signal.getsignal(number) for number in signal.valid_signals()]
+before = state()
+import thinmap_ros
+print(state() == before)
+"""
+    assert run(code) == 'True\n'
+
+
 def test_every_name_resolves_without_ros() -> None:
     code = """
 import sys

@@ -2,11 +2,9 @@
 
 The names of `__all__` are the public Python interface; other modules may change without notice.
 Each name is imported when it is first used: `import thinmap_ros` loads no library and needs no ROS.
+It changes nothing in the process.
 """
 
-import os
-import signal
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -60,11 +58,6 @@ __all__ = [
     'write_graph',
     'write_map',
 ]
-
-# Matrices here are small: sharing one among threads costs more than it saves, ten times in the
-# filter, and sums in another order on every number of cores, so that the same log gives other last
-# digits. It counts if NumPy comes later.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # The only place of the version: setup.py reads it, and a test compares the two package.xml with it.
 __version__ = '0.2.0'
@@ -123,32 +116,3 @@ if not TYPE_CHECKING:  # else no type checker would find a name that does not ex
 def __dir__() -> list[str]:
     """The public names, imported or not."""
     return [*__all__, '__version__']
-
-
-def _program() -> str:
-    """Name of the program of this package that this process runs; empty for any other process."""
-    words = sys.orig_argv
-    module = words[words.index('-m') + 1] if '-m' in words[:-1] else ''
-    if module == __name__ or module.startswith(f'{__name__}.'):
-        return 'thinmap' if module == __name__ else module.rpartition('.')[2]
-    folder, name = os.path.split(sys.argv[0] if sys.argv else '')
-    return name if name == 'thinmap' or os.path.basename(folder) == __name__ else ''  # noqa: PTH119
-
-
-def _end_on_interrupt(program: str) -> None:
-    """End with 130 and one line on Ctrl-C while a program imports its modules.
-
-    Programs and nodes set their own handlers when they begin to work.
-    """
-
-    def end(number: int, frame: object) -> None:
-        os.write(2, f'{program}: interrupted\n'.encode())
-        os._exit(130)
-
-    # Where the shell has chosen to ignore it, as for jobs in the background, it stays ignored.
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, end)
-
-
-if _program():
-    _end_on_interrupt(_program())

@@ -4,6 +4,7 @@ import sys
 from importlib import import_module
 from typing import NamedTuple
 
+import thinmap_ros.startup  # isort: skip  # noqa: F401  before all other modules
 from thinmap_ros import __version__
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.tools.cli import BAD_INPUT

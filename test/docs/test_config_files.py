@@ -1,6 +1,6 @@
 """config/*.yaml contain every parameter that the nodes declare, its default and its description.
 
-THINMAP_WRITE_CONFIG=1 rewrites the files from the declarations.
+scripts/generate rewrites the files from the declarations.
 """
 
 import json

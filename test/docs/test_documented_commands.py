@@ -71,12 +71,12 @@ MOST_MARKS = 9
 HELP_ONLY = {
     'scripts/demo': 'test/live/test_demo.py runs the demo to its end',
     'scripts/endurance': 'hours; scripts/endurance --minutes 10 is for releases',
-    'scripts/experiments/all.sh': 'test/experiments/test_experiments.py runs each experiment',
+    'scripts/experiment all': 'test/experiments/test_experiments.py runs each experiment',
 }
 # Shortened by options that the same lines of the documents name.
 SHORTER = {
     'scripts/test': 'scripts/test test/core/topology/test_thinning.py',
-    'scripts/experiments/exploration.sh': 'scripts/experiments/exploration.sh --from-bag bags',
+    'scripts/experiment exploration': 'scripts/experiment exploration --from-bag bags',
 }
 
 # Errors of commands whose exit code is 0 all the same.
@@ -109,15 +109,13 @@ PAGES: dict[str, Nodes] = {
 }
 
 FIVE = ['localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer']
-NODE_NAMES = re.compile(r"'(\w+)',")
 ENDS_BY_ITSELF = ('bag_player',)
 _START = 'ros2 run thinmap_ros '
 
 
 def nodes_of_package() -> set[str]:
-    listed = re.search(r'NODES = \[(.*?)\]', (ROOT / 'setup.py').read_text(), re.DOTALL)
-    assert listed
-    return set(NODE_NAMES.findall(listed[1])) - set(ENDS_BY_ITSELF)
+    modules = (ROOT / 'thinmap_ros' / 'nodes').glob('[!_]*.py')
+    return {module.stem for module in modules} - set(ENDS_BY_ITSELF)
 
 
 def told_by(text: str) -> list[str]:

@@ -1,6 +1,6 @@
 """Parameter files of other packages start thinmap's nodes; a page lists their names.
 
-THINMAP_WRITE_CONFIG=1 rewrites the tables of docs/reference/parameters_of_other_packages.md.
+scripts/generate rewrites the tables of docs/reference/parameters_of_other_packages.md.
 """
 
 import os

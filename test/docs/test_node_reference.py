@@ -1,6 +1,6 @@
 """docs/reference/nodes.md lists subscriptions, publishers, services and parameters of each node.
 
-THINMAP_WRITE_CONFIG=1 rewrites the page.
+scripts/generate rewrites the page.
 """
 
 import inspect

@@ -1,6 +1,6 @@
 """docs/reference lists messages, options of programs, and public Python names as they are.
 
-THINMAP_WRITE_CONFIG=1 rewrites the pages.
+scripts/generate rewrites the pages.
 """
 
 import os

@@ -85,9 +85,9 @@ _HEAD = """\
 
 {provenance}
 
-`scripts/experiments/all.sh --docs docs` runs all experiments and generates this page. The robots
+`scripts/experiment all --docs docs` runs all experiments and generates this page. The robots
 are simulated with realistic noise. The last section replays logs of real robots. The same seed
-gives the same numbers, except for times. `scripts/experiments/NAME.sh` runs one experiment. With
+gives the same numbers, except for times. `scripts/experiment NAME` runs one experiment. With
 `--from-bag bags` it reads the recorded drives instead of the simulator; poses agree within 1 mm.
 
 Papers: 1 thinning-based topological maps, 2 exploration by position probability, 3 EKF-SLAM with

@@ -1,5 +1,6 @@
 """All nodes in one process: less memory and less work than a process for each."""
 
+import pkgutil
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -8,10 +9,16 @@ from importlib import import_module
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
+from thinmap_ros import nodes
 from thinmap_ros.ros import node_main
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
-_OTHERS = ('global_localizer', 'sim', 'recorder', 'bag_player', 'rerun_viewer', 'markers')
+_NO_CHOICE = ('demo_monitor', 'thinmap')
+_OTHERS = [
+    module.name
+    for module in pkgutil.iter_modules(nodes.__path__)
+    if not module.ispkg and module.name not in (*_NODES, *_NO_CHOICE)
+]
 _USAGE = f"""usage: {{program}} [NODE ...] [--ros-args ...]
 
 Runs nodes in one process. Without names: {', '.join(_NODES)}.

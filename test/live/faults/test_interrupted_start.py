@@ -14,7 +14,7 @@ PROGRAMS = {
 }
 
 
-@pytest.mark.parametrize('module', ['thinmap_ros', 'numpy', 'numba.core.types'])
+@pytest.mark.parametrize('module', ['thinmap_ros.startup', 'numpy', 'numba.core.types'])
 @pytest.mark.parametrize('name', PROGRAMS)
 @pytest.mark.usefixtures('ros_domain')
 def test_an_interrupted_start_ends_with_one_line(tmp_path, name, module):
@@ -32,7 +32,7 @@ def test_an_interrupted_start_ends_with_one_line(tmp_path, name, module):
 
 
 def test_a_library_that_is_imported_leaves_the_handler_as_it_is():
-    program = 'import signal, thinmap_ros\n'
+    program = 'import signal, thinmap_ros, thinmap_ros.nodes.localizer\n'
     program += 'print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)'
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
     assert done.stdout == 'True\n'
