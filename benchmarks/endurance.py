@@ -53,7 +53,7 @@ _STOP_S = 10.0
 _START_S = 120.0
 _LAG = 5  # scans whose pose may not have arrived at the end
 _DEPTH = 1000
-_FEWEST_SAMPLES = 4  # a quarter of them is evaluated
+_MIN_SAMPLES = 4  # a quarter of them is evaluated
 _MINUTES = 120.0
 _FAULTS_MINUTES = 5.0
 _RATE = 100.0
@@ -297,10 +297,10 @@ def work(arguments: argparse.Namespace) -> None:
     """Do what the command line asks for; ends the program with 1 where the result is bad."""
     if arguments.minutes is None:
         arguments.minutes = _FAULTS_MINUTES if arguments.faults else _MINUTES
-    if not arguments.minutes > 0.0 or arguments.samples < _FEWEST_SAMPLES:
+    if not arguments.minutes > 0.0 or arguments.samples < _MIN_SAMPLES:
         given = f'--minutes {arguments.minutes}, --samples {arguments.samples}'
         raise InputError(
-            f'{given}: expected more than 0 minutes and at least {_FEWEST_SAMPLES} samples'
+            f'{given}: expected more than 0 minutes and at least {_MIN_SAMPLES} samples'
         )
     path = package_data.world_path(arguments.world)
     world = World.from_patch(*read_world(path))

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.programs
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
-MOST_LINES = 40
+MAX_LINES = 40
 
 
 def output_of(folder: Path, *words: str) -> str:
@@ -42,7 +42,7 @@ def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def test_an_example_is_short_and_uses_public_names(path: Path) -> None:
     text = path.read_text()
     tree = ast.parse(text)
-    assert len(text.splitlines()) < MOST_LINES
+    assert len(text.splitlines()) < MAX_LINES
     assert f'Usage: python examples/{path.name}' in (ast.get_docstring(tree) or '')
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module.startswith('thinmap_ros'):

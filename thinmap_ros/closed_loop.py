@@ -201,7 +201,7 @@ class ClosedLoop:
 
     def _drive_to(self, goal: Array) -> None:
         """Set the goal, as a node would: one that was reached, and stays, has failed."""
-        if self._drive.arrivals.are_useless(goal):
+        if self._drive.arrivals.are_repeated(goal):
             self._drive.arrivals.clear()
             self._drive.goal = None
             self.navigator.cancel()

@@ -17,7 +17,7 @@ WRONG_POSE_M = 0.5
 WRONG_WALL_M = 0.3
 # Cells that touch. A beam that meets two surfaces marks a cell between them: in room_10x10 up to
 # nine at a time, each by itself. A wall at a wrong place marks a row.
-_LEAST_WALL = 3
+_MIN_WALL_CELLS = 3
 
 
 class Walls:
@@ -165,7 +165,7 @@ class MapWatch:
 def are_walls(patch: GridPatch) -> NDArray[np.bool_]:
     """Which cells of a map (H, W) are occupied together with others that they touch."""
     parts, _ = ndimage.label(patch.occupied, structure=np.ones((3, 3)))
-    is_large = np.bincount(parts.ravel()) >= _LEAST_WALL
+    is_large = np.bincount(parts.ravel()) >= _MIN_WALL_CELLS
     is_large[0] = False
     walls: NDArray[np.bool_] = is_large[parts]
     return walls

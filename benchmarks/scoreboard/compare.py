@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmarks.scoreboard.cases import Case
-from benchmarks.scoreboard.page import MOST_M, errors, worst_tenth
+from benchmarks.scoreboard.page import MAX_ERROR_M, errors, worst_tenth
 from benchmarks.scoreboard.played import Numbers
 
 _SAME = 0.05  # a change of an error by a smaller share, or by less than 5 mm, is not listed
@@ -27,8 +27,9 @@ def against(
         f'## Comparison with another run ({len(both)} of {len(cases)} cases)\n',
         f'Live error: median of the ratios {np.median(ratio):.3f}; worst tenth '
         f'{worst_tenth(common, ours):.3f} m (other run {worst_tenth(common, theirs):.3f} m); '
-        f'{MOST_M:g} m or failed: {np.count_nonzero(here >= MOST_M)} '
-        f'(other run {np.count_nonzero(there >= MOST_M)}). Changes by more than {_SAME:.0%} and '
+        f'{MAX_ERROR_M:g} m or failed: {np.count_nonzero(here >= MAX_ERROR_M)} '
+        f'(other run {np.count_nonzero(there >= MAX_ERROR_M)}). '
+        f'Changes by more than {_SAME:.0%} and '
         f'{1000 * _SAME_M:.0f} mm:\n',
         '| case | this run (m) | other run (m) | ratio |',
         '|---|---|---|---|',

@@ -22,7 +22,7 @@ _LENGTH_M = 250.0
 _NEAR_M = 40.0  # a part that is so near may be the next
 _DETOUR_M = 25.0  # maximum detour of paths
 _CHOICES = 5  # the next is one of so many nearest that were not visited
-_MOST_GOALS = 60
+_MAX_GOALS = 60
 _PIECE_M = 16.0  # of a hall: what a laser of 8 m sees from its middle
 _ODOMETRY = (
     'scale_sigma',
@@ -57,7 +57,7 @@ def paths(made: Building, start: Array, robot: RobotConfig, seed: int) -> Iterat
     at = start[:2]
     driven = []
     length_m = 0.0
-    for _ in range(_MOST_GOALS):
+    for _ in range(_MAX_GOALS):
         away = np.where(left, np.hypot(*(goals - at).T), np.inf)
         nearest = np.argsort(away)[:_CHOICES]
         nearest = nearest[away[nearest] < _NEAR_M]

@@ -10,7 +10,7 @@ from benchmarks.scoreboard.measure import DISTURBED
 from benchmarks.scoreboard.played import Numbers
 from thinmap_ros.core import se2
 
-MOST_M = 10.0  # larger errors count as this
+MAX_ERROR_M = 10.0  # larger errors count as this
 _SHORT_S = 240.0  # of the processor for the short form
 _START_S = 3.0  # of the processor for a process that runs a case, before it begins
 _PEERS = """\
@@ -85,7 +85,7 @@ def page(cases: Sequence[Case], reports: Sequence[Numbers], made: str = '') -> s
     parts = [
         _HEAD.format(provenance=made) + COLUMN_NOTES,
         f'**Worst tenth, live: {worst_tenth(cases, reports):.3f} m** (mean; an error '
-        f'counts as at most {MOST_M:g} m). Its cases: {", ".join(worst)}.\n',
+        f'counts as at most {MAX_ERROR_M:g} m). Its cases: {", ".join(worst)}.\n',
         _PEERS,
         *([f'**Failed**: {", ".join(failed)}.\n'] if failed else []),
     ]
@@ -143,7 +143,7 @@ def errors(cases: Sequence[Case], reports: Sequence[Numbers]) -> np.ndarray:
         error = report.get('live_m')
         if 'path' in report and isinstance(case, LogCase):
             error = _against(paths.get(case.log), report['path'])
-        found.append(MOST_M if error is None or not error < MOST_M else error)
+        found.append(MAX_ERROR_M if error is None or not error < MAX_ERROR_M else error)
     return np.array(found)
 
 
@@ -199,8 +199,8 @@ def _repeated(cases: Sequence[Case], reports: Sequence[Numbers], live: np.ndarra
     for name, own in runs.items():
         # A log without relations has none; a run of another that failed has the largest.
         known = any('final_m' in reports[k] for k in own)
-        final = [reports[k].get('final_m', MOST_M) for k in own] if known else []
-        cells = [_mean_and_worst(metres) for metres in (live[own], np.minimum(final, MOST_M))]
+        final = [reports[k].get('final_m', MAX_ERROR_M) for k in own] if known else []
+        cells = [_mean_and_worst(metres) for metres in (live[own], np.minimum(final, MAX_ERROR_M))]
         lines.append(f'| {name} | {len(own)} | ' + ' | '.join(cells) + ' |')
     return '\n'.join(lines) + '\n'
 

@@ -24,7 +24,7 @@ from benchmarks.scoreboard.cases import (
 )
 from benchmarks.scoreboard.compare import against
 from benchmarks.scoreboard.measure import Task, _disturbed, measure
-from benchmarks.scoreboard.page import MOST_M, errors, page, shortened, worst_tenth
+from benchmarks.scoreboard.page import MAX_ERROR_M, errors, page, shortened, worst_tenth
 from benchmarks.scoreboard.played import Played, consistency
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError
@@ -72,7 +72,7 @@ def test_a_degraded_log_without_relations_is_judged_by_the_undegraded_one(report
     found = errors(CASES, reports)
     assert found[0] == 0.0
     assert found[1] == pytest.approx(0.5 * math.sqrt(8 / 11))
-    assert errors(CASES[1:], reports[1:])[0] == MOST_M  # no ground truth
+    assert errors(CASES[1:], reports[1:])[0] == MAX_ERROR_M  # no ground truth
 
 
 def test_the_worst_tenth_is_one_number_and_named(reports):
@@ -104,7 +104,7 @@ def test_a_case_that_failed_is_named_and_counts_as_the_worst(reports):
     text = page(CASES, reports)
     assert f'**Failed**: {CASES[5].name}.' in text
     assert f'| {CASES[5].name} | | failed: no scan |' in text
-    assert errors(CASES, reports)[5] == MOST_M
+    assert errors(CASES, reports)[5] == MAX_ERROR_M
 
 
 def test_the_short_form_is_the_worst_tenth_in_so_far_as_time_permits(reports):

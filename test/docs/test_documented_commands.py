@@ -65,7 +65,7 @@ NOT_RUN = {
     'scripts/fuzz': 'hours; test/fuzz runs a part of it',
     'scripts/endurance --faults': 'hours',
 }
-MOST_MARKS = 9
+MAX_MARKS = 9
 
 # Too long for every run: only their help is run, to check script, program and options.
 HELP_ONLY = {
@@ -273,7 +273,7 @@ def _end_namesakes(graph: Any, running: list[Line], text: str) -> None:
         if is_namesake and not line.has_ended():
             line.interrupt()
             line.end(0)
-    graph.hear_out()
+    graph.drain()
 
 
 def _follow(graph: Any, line: Line, health: list[DiagnosticArray]) -> None:
@@ -331,7 +331,7 @@ def test_no_command_is_left_out():
     pages = {c.document for c in COMMANDS if not c.marked}
     assert pages <= set(PAGES), 'not covered: name the page in PAGES'
     assert {c.text for c in COMMANDS if c.marked} == set(NOT_RUN)
-    assert sum(commands.marks(path) for path in DOCUMENTS) <= MOST_MARKS
+    assert sum(commands.marks(path) for path in DOCUMENTS) <= MAX_MARKS
     texts = {c.text.split('#')[0].strip() for c in COMMANDS}
     assert set(HELP_ONLY) | set(SHORTER) <= texts
 

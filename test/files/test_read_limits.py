@@ -44,7 +44,7 @@ from thinmap_ros.tools.carmen_to_bag import convert
 
 MAGIC = b'\x89MCAP0\r\n'
 EXPANDED = 900 * 2**20
-MOST_MB = 300
+MAX_MB = 300
 RUNNER = """
 import pathlib, runpy, sys, time
 del sys.argv[0]
@@ -57,7 +57,7 @@ finally:
     print('peak', int(status.split('VmHWM:')[1].split()[0]) // 1024)
 """
 # Generous for a slow machine; without limits it takes minutes.
-MOST_CPU_S = 120.0
+MAX_CPU_S = 120.0
 
 
 def run(tool: str, *arguments: Path | str) -> tuple[int, str, int]:
@@ -66,7 +66,7 @@ def run(tool: str, *arguments: Path | str) -> tuple[int, str, int]:
     done = subprocess.run(command, capture_output=True, text=True)
     assert 'Traceback' not in done.stderr, done.stderr[-2000:]
     peak = int(done.stdout.split()[-1])
-    assert float(done.stdout.split()[-3]) < MOST_CPU_S
+    assert float(done.stdout.split()[-3]) < MAX_CPU_S
     return done.returncode, (done.stderr.splitlines() or [''])[-1], peak
 
 
@@ -111,7 +111,7 @@ def test_a_chunk_that_expands_without_end(
     code, line, peak_mb = run(tool, path, '-o', tmp_path / 'out')
     assert code == 2
     assert 'bomb.mcap' in line and 'bytes uncompressed' in line and len(line) < 500
-    assert peak_mb < MOST_MB
+    assert peak_mb < MAX_MB
     assert not (tmp_path / 'out').exists()
 
 
@@ -248,7 +248,7 @@ def test_a_line_that_never_ends(tmp_path: Path) -> None:
         assert (
             f'log.clf.gz:2: a line of more than {LOGS.line_bytes} bytes' in line and len(line) < 400
         )
-        assert peak_mb < MOST_MB
+        assert peak_mb < MAX_MB
     assert not (tmp_path / 'out').exists()
 
 
@@ -266,7 +266,7 @@ def test_empty_lines_without_end(tmp_path: Path) -> None:
     path.write_bytes(begin + 1000 * gzip.compress(b'\n' * 2**20))
     code, line, peak_mb = run('replay', path, '-o', tmp_path / 'out', '--quiet')
     assert code == 0, line
-    assert peak_mb < MOST_MB
+    assert peak_mb < MAX_MB
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
     assert report['scans'] == 30, 'what comes before the limit is used'
     assert f'log.clf.gz:{LOGS.lines + 1}: expected at most' in report['first_skipped']
@@ -390,8 +390,8 @@ def test_records_that_nobody_reads_take_no_memory(tmp_path: Path, name: str) -> 
     )
     *found, cpu_s, peak_mb = done.stdout.split()
     assert found == ['before', 'behind']
-    assert float(cpu_s) < MOST_CPU_S
-    assert int(peak_mb) < MOST_MB
+    assert float(cpu_s) < MAX_CPU_S
+    assert int(peak_mb) < MAX_MB
 
 
 def scan_definition(*extra: str) -> Schema:

@@ -20,7 +20,7 @@ from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.logs.log import OdometryEvent
 
 WORLDS = Path(__file__).resolve().parents[2] / 'worlds'
-_LARGEST_WORLD = 4_000
+_MAX_WORLD = 4_000
 
 
 def write(rng: np.random.Generator, path: Path, text: str) -> Path:
@@ -169,7 +169,7 @@ def _read_as_world(path: Path) -> None:
 
 def world_texts(folder: Path) -> list[str]:
     texts = [path.read_text() for path in sorted(WORLDS.glob('*.yaml'))]
-    return [text for text in texts if len(text) < _LARGEST_WORLD]
+    return [text for text in texts if len(text) < _MAX_WORLD]
 
 
 def read_any_world(shared: list[str], rng: np.random.Generator, folder: Path) -> None:

@@ -146,7 +146,7 @@ def test_a_mapper_that_is_killed_meanwhile_resumes_with_the_published_map(graph)
 
     graph.until(is_kept, 'its state')
     graph.stop('grid_mapper', signal.SIGKILL)
-    graph.hear_out()
+    graph.drain()
     mapping.maps.clear()
     mapping.start()
     graph.until(lambda: mapping.maps, 'the map, at once')

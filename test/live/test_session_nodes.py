@@ -90,7 +90,7 @@ def test_ids_and_cells_survive_a_restart_and_mapping_continues(graph, tmp_path):
     assert sorted(file.name for file in stem.parent.iterdir()) == [f'room{end}' for end in ends]
     for name in MAPPERS:
         assert graph.stop(name) == 0
-    graph.hear_out()
+    graph.drain()
     before = places(graphs[-1])
     edges = {edge.id for edge in graphs[-1].edges}
     known = sessions.load_grid(str(stem)).known_area()

@@ -18,7 +18,7 @@ from pathlib import Path
 from mutants.mutations import Mutation
 from mutants.selection import Selection
 
-_MOST_MEMORY = 8 * 2**30  # bytes: a mutant may allocate any amount
+_MAX_MEMORY = 8 * 2**30  # bytes: a mutant may allocate any amount
 # CPU time of the tests with a mutant over that without it. A busy machine hardly matters:
 # the same tests took 4.04 to 4.24 s of it with 5 to 12 processes on two cores. The rest is for
 # mutants that make the tests slower, and end.
@@ -192,7 +192,7 @@ def _changed(module: Path, text: bytes) -> Iterator[None]:
 
 
 def _set_limits(cpu_s: int | None) -> None:
-    for kind, limit in ((resource.RLIMIT_AS, _MOST_MEMORY), (resource.RLIMIT_CPU, cpu_s)):
+    for kind, limit in ((resource.RLIMIT_AS, _MAX_MEMORY), (resource.RLIMIT_CPU, cpu_s)):
         if limit is not None:
             _, hard = resource.getrlimit(kind)
             resource.setrlimit(kind, (limit, hard))

@@ -9,7 +9,7 @@ from pathlib import Path
 # Tests that start programs take too long, and check other things.
 _LEFT_OUT = {'live', 'docs', 'fuzz', 'tools', 'ros', 'benchmarks', 'experiments', 'mutants'}
 # Largest number of test files for a mutant; the nearest come first.
-MOST_FILES = 6
+MAX_FILES = 6
 # Compares defaults and ranges of parameters with those of the documentation.
 _PARAMETERS = Path('test/docs/test_node_reference.py')
 
@@ -44,7 +44,7 @@ class Selection:
             is_near = distances[test] <= 1 or test.parent == mirrored.parent
             return not is_near, distances[test], self._n_imported[test], test
 
-        nearest = sorted(distances, key=key)[:MOST_FILES]
+        nearest = sorted(distances, key=key)[:MAX_FILES]
         has_parameters = b'= parameter(' in module.read_bytes()
         if has_parameters and (self._root / _PARAMETERS).exists():
             nearest.append(_PARAMETERS)

@@ -109,7 +109,7 @@ class Graph:
             self._pacemaker = heard_too
         return ('local_topology:=heard_too',)
 
-    def hear_out(self) -> None:
+    def drain(self) -> None:
         """Receive queued messages until there are no more: stopped nodes publish nothing later."""
         last_heard = self._heard
         quiet = 0

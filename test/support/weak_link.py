@@ -23,7 +23,7 @@ _CLONE_NEWNET = 0x40000000
 _TUNSETIFF = 0x400454CA
 _IFF_TAP = 0x0002
 _IFF_NO_PI = 0x1000
-_LARGEST_FRAME = 65_536
+_MAX_FRAME = 65_536
 
 
 def tap(name: str) -> int:
@@ -73,7 +73,7 @@ class Link:
 
     def _take(self, end: int) -> None:
         try:
-            frame = os.read(end, _LARGEST_FRAME)
+            frame = os.read(end, _MAX_FRAME)
         except OSError:  # unplugged
             return
         if self._chance.random() < self._loss:

@@ -11,7 +11,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.view import report_page
 from thinmap_ros.view.summary import summary_figure
 
-MOST_BYTES = 3_000_000
+MAX_BYTES = 3_000_000
 VOID = {'meta', 'img', 'input'}
 EXPLORATION = {
     'reason': 'all end nodes resolved',
@@ -62,7 +62,7 @@ class Page(HTMLParser):
 def page_of(folder, report=EXPLORATION, title='a room', command='thinmap explore_world a'):
     path = report_page.write(folder, title, report, command)
     assert path == folder / 'report.html'
-    assert path.stat().st_size < MOST_BYTES
+    assert path.stat().st_size < MAX_BYTES
     return Page(path.read_text())
 
 

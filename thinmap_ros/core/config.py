@@ -17,7 +17,7 @@ from thinmap_ros.core.errors import ConfigError, quoted
 SAFE_LOWER = 'lower'
 SAFE_HIGHER = 'higher'
 # Of numbers whose range is not declared: seconds up to here are int64 nanoseconds.
-_LARGEST = 1e9
+_MAX_ABSOLUTE = 1e9
 
 
 def parameter(
@@ -174,8 +174,10 @@ def require_number(name: str, value: Any, low: float | None, high: float | None)
         raise ConfigError(f'{name} = {quoted(value)}: expected a finite number')
     if (low is not None and value < low) or (high is not None and value > high):
         raise ConfigError(f'{name} = {quoted(value)}: expected {_interval(low, high)}')
-    if isinstance(value, float) and abs(value) > _LARGEST:
-        raise ConfigError(f'{name} = {quoted(value)}: expected {_interval(-_LARGEST, _LARGEST)}')
+    if isinstance(value, float) and abs(value) > _MAX_ABSOLUTE:
+        raise ConfigError(
+            f'{name} = {quoted(value)}: expected {_interval(-_MAX_ABSOLUTE, _MAX_ABSOLUTE)}'
+        )
 
 
 def _is_finite(value: float) -> bool:

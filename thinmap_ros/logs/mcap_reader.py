@@ -182,7 +182,7 @@ class McapFile:
 class _LogOrder:
     """Merges the messages of chunks by log time.
 
-    It buffers about _MOST_HELD bytes at most: beyond that, messages are out of order.
+    It buffers about `LOGS.buffered_bytes` at most: beyond that, messages are out of order.
     """
 
     def __init__(self) -> None:

@@ -87,7 +87,7 @@ class ExplorerNode(ThinmapNode):
         ).arrays()
 
     def _restore(self, arrays: State) -> None:
-        """Continue with the mission of a killed explorer. Raises InputError where it is none."""
+        """Continue with the mission of a killed explorer. Raises InputError for another state."""
         state = ExplorerState.from_arrays(arrays)
         strategy = self._strategies.restored(state.strategy)
         watchdog = self._source.watchdog

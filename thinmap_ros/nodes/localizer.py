@@ -285,7 +285,7 @@ class LocalizerNode(ThinmapNode):
         return {**last.state(), 'map_id': np.array(map_id)}
 
     def _restore(self, state: State) -> None:
-        """Continue at the last pose of a killed localizer. Raises InputError where it is none."""
+        """Continue at the last pose of a killed localizer. Raises InputError for another state."""
         map_id, anchor = snapshot.split_map_id(state)
         self._relocation = _Relocation(OdometryAnchor.from_state(anchor))
         self._relocation.map = self._given.source.patch

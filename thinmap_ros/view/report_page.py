@@ -15,7 +15,7 @@ from thinmap_ros.files.atomic import write_text
 
 NAME = 'report.html'
 _PICTURE = 'summary.png'
-_MOST_PLACES = 20
+_MAX_PLACES = 20
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def _missing(report: Mapping[str, Any]) -> str:
         )
     rows = [
         (f'({place["x"]:.2f}, {place["y"]:.2f}) m', f'{place["expected_m2"]:.1f} m²')
-        for place in places[:_MOST_PLACES]
+        for place in places[:_MAX_PLACES]
     ]
     more = len(places) - len(rows)
     return text + '\n' + _table(rows) + (f'\n<p>And {more} more places.</p>' if more else '')

@@ -12,7 +12,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 _WALL_M = 0.5
 _PASSES = 2  # the second one closes what the first one left between filled cells
 # The largest side of a drawn map, cells: a cell of a smaller size than a pixel may vanish.
-_MOST_CELLS = 1100
+_MAX_CELLS = 1100
 # Codes of cells.
 _UNKNOWN = 0
 _FREE = 1
@@ -73,7 +73,7 @@ def drawn_cells(patch: GridPatch) -> DrawnCells:
 
 def reduction(shape: tuple[int, int]) -> int:
     """Cells of a map per side of a drawn cell."""
-    return -(-max(shape) // _MOST_CELLS)
+    return -(-max(shape) // _MAX_CELLS)
 
 
 def reduced(cells: DrawnCells, factor: int) -> DrawnCells:

@@ -25,7 +25,7 @@ def looked(known, *looks, novelty=1.0):
     return known
 
 
-def test_what_chance_brings_about_at_edges_counts_for_nothing_however_often_it_comes():
+def test_random_misses_at_edges_are_no_evidence():
     rng = np.random.default_rng(2)
     three = some([0, 0, 0], [5, 0, 1], [0, 5, 2])
     known = looked(three, *([58.0 - rng.binomial(3, 0.3), 57.0, 57.0] for _ in range(50)))

@@ -112,7 +112,7 @@ def test_a_nav2_that_takes_the_place_of_another_gets_the_goal_again(graph):
     scene.until_it_drives()
     graph.stop('nav2', signal.SIGKILL)
     # Otherwise commands of the killed one would count as those of the other.
-    graph.hear_out()
+    graph.drain()
     graph.start(
         'nav2', package='support.peers', label='nav2_again', laser_pose='0,0,0', use_sim_time=True
     )

@@ -250,7 +250,7 @@ def test_a_whole_robot_that_was_killed_and_reset_is_not_mixed_with_earlier_data(
     graph.until(lambda: len(maps) > 3, 'time to be kept')
     for name in ('thinmap', 'sim'):
         kill(graph, name)
-    graph.hear_out()
+    graph.drain()
     robot.poses.clear(), robot.truth.clear(), maps.clear()
     start_together(graph, *MAPPING)
     graph.until(lambda: len(robot.poses) > 10 and len(maps) > 2, 'a new map')
@@ -276,7 +276,7 @@ def test_a_clock_set_back_resets_all_nodes(graph):
     robot.drive(1.5)
     graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
     assert graph.stop('sim') == 0
-    graph.hear_out()
+    graph.drain()
     robot.poses.clear(), robot.truth.clear(), maps.clear()
     graph.start(
         'sim',
@@ -338,7 +338,7 @@ def test_what_waited_while_the_clock_was_set_back_does_not_begin_the_new_map(gra
         return doctor.number('localizer', cause) > 0
 
     graph.until(left_over, 'it is counted')
-    graph.hear_out()
+    graph.drain()
     poses.clear()
     graph.until(lambda: go_on(0.0) or len(poses) > 5, 'poses of the new time')
     newest_ns = max(messages.stamp_ns(pose.header.stamp) for pose in poses)

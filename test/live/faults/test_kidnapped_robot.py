@@ -89,7 +89,7 @@ def test_a_robot_is_localized_in_a_saved_map_and_after_kidnapping(graph, tmp_pat
     saved = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
     assert saved.success and '.slam.npz' in saved.message, saved.message
     assert [graph.stop(name) for name in ('sim', *NODES)] == [0] * 4
-    graph.hear_out()
+    graph.drain()
     heard = robot.truth, robot.poses, robot.status, robot.maps
     for messages_of_then in heard:
         messages_of_then.clear()

@@ -87,7 +87,7 @@ def test_old_scans_are_dropped_and_counted_and_the_delay_does_not_grow(no_shared
     enough = len(poses) + 20
     graph.until(lambda: len(poses) > enough and len(graphs) > 20, 'it continues as before')
     assert graph.stop('sim') == 0
-    graph.hear_out()
+    graph.drain()
     sent = {ns for ns in stamps(scans) if ns >= stamps(poses)[0]}
     located = set(stamps(poses))
     missing = len(sent - located)

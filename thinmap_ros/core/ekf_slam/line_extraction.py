@@ -23,8 +23,8 @@ from thinmap_ros.jit import kernel
 
 _FLATTEST_RAD = math.radians(10.0)  # smallest usable angle between wall and beam
 _WIDEST_GAP_M = 0.6  # largest gap in a wall: narrower than a door
-_MOST_MISSING = 2  # largest number of adjacent beams without return inside a wall
-_MOST_CHI2 = 3.0  # per degree of freedom: rough walls pass, clutter does not
+_MAX_MISSING = 2  # largest number of adjacent beams without return inside a wall
+_MAX_CHI2 = 3.0  # per degree of freedom: rough walls pass, clutter does not
 _TRIM_SIGMAS = 3.0  # end points with a larger distance are mixed pixels or on the next wall
 # Columns of a fit.
 _R, _ALPHA, _RR, _RA, _AA, _CHI2, _BOW, _BOW_SIGMA, _LOW, _HIGH = range(10)
@@ -128,7 +128,7 @@ def extract_lines(scan: Scan, config: LineConfig) -> Lines:
     fits = fits[:count]
     length = fits[:, _HIGH] - fits[:, _LOW]
     straight = (fits[:, _BOW] < config.max_sagitta_m) | (fits[:, _BOW] < 3.0 * fits[:, _BOW_SIGMA])
-    good = (length >= config.min_length_m) & (fits[:, _CHI2] < _MOST_CHI2) & straight
+    good = (length >= config.min_length_m) & (fits[:, _CHI2] < _MAX_CHI2) & straight
     return _in_robot_frame(fits[good], scan.T_base_laser)
 
 
@@ -189,7 +189,7 @@ def _extract(
             # Merge with the parts that follow while one line explains both.
             while k + 1 < number:
                 _fit(x, y, ranges, angles, a, parts[k + 1, 1], sigmas, fit)
-                if fit[_CHI2] > _MOST_CHI2 or fit[_BOW] > 0.5 * sigmas[2]:
+                if fit[_CHI2] > _MAX_CHI2 or fit[_BOW] > 0.5 * sigmas[2]:
                     break
                 k += 1
                 b = parts[k, 1]
@@ -208,7 +208,7 @@ def _apart(
 ) -> bool:
     """Whether point i is too far from point i - 1 to be on the same wall."""
     turn = (beams[i] - beams[i - 1]) * step
-    if beams[i] - beams[i - 1] > 1 + _MOST_MISSING or turn >= 0.9 * _FLATTEST_RAD:
+    if beams[i] - beams[i - 1] > 1 + _MAX_MISSING or turn >= 0.9 * _FLATTEST_RAD:
         return True
     reach = (
         min(ranges[i], ranges[i - 1]) * math.sin(turn) / math.sin(_FLATTEST_RAD - turn)

@@ -9,7 +9,7 @@ from thinmap_ros.core.se2 import Array, compose
 
 _BEYOND_M = 0.3  # a beam that ends this far behind a feature has passed through it
 _END_M = 0.15  # margin at the ends of a feature where beams are ignored
-_FEWEST_BEAMS = 8
+_MIN_BEAMS = 8
 _SHARE = 0.7  # smallest share of passing beams among those that reach the feature
 _FLATTEST = 0.17  # smallest sine of the angle between beam and wall
 
@@ -41,4 +41,4 @@ def seen_through(
     ranges = scan.ranges_m[scan.hit][:, None]
     through = (aimed & (ranges > expected + _BEYOND_M)).sum(axis=0)
     reaching = (aimed & (ranges > expected - _BEYOND_M)).sum(axis=0)
-    return np.asarray((through >= _FEWEST_BEAMS) & (through > _SHARE * reaching))
+    return np.asarray((through >= _MIN_BEAMS) & (through > _SHARE * reaching))

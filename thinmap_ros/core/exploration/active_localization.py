@@ -23,12 +23,12 @@ from thinmap_ros.jit import kernel
 
 _LIKELY = 0.05  # of the weight of the best
 # A goal stands so long, or until it is reached, or the number of places in question changes.
-_THOUGHT_OVER_S = 4.0
+_REPLAN_PERIOD_S = 4.0
 _CHANGED_S = 1.0  # but for so long at least
 # A look from elsewhere
 _LOOK_M = 0.4
 _LOOK_RAD = 0.4
-_MOST_PLACES = 8  # the likeliest, which are compared
+_MAX_PLACES = 8  # the likeliest, which are compared
 _WINDOW_M = 30.0
 _SPACING_M = 0.6  # of the viewpoints that are compared
 _BEARINGS = 24
@@ -37,7 +37,7 @@ _BEARINGS = 24
 _DIFFERENT_M = 0.4
 _DIFFERENT_SHARE = 0.1
 _ENOUGH = 0.25
-_LEAST_GAIN = 0.05
+_MIN_GAIN = 0.05
 _CONFIRMED_M = 5.0  # of way, where one place only is left: it has then been seen from enough sides
 _NEAREST_M = 0.5  # nearer than this only a turn shows new things
 _WAY_M = 2.0  # so much way costs half of what is gained
@@ -90,7 +90,7 @@ class ActiveSearch:
         self._age_s = math.inf
 
     def take(self, result: Result, T_odom_base: Array) -> None:
-        """Hear what a look at an odometry pose (3,) has brought."""
+        """Add the result of a scan at an odometry pose (3,)."""
         self._look(T_odom_base)
         most = max((h.weight for h in result.hypotheses), default=0.0)
         likely = [h for h in result.hypotheses if h.weight >= _LIKELY * most]
@@ -113,7 +113,7 @@ class ActiveSearch:
         """
         self._age_s += dt_s
         changed = len(self._starts) != self._chosen_of and self._age_s > _CHANGED_S
-        if changed or self._age_s > _THOUGHT_OVER_S:
+        if changed or self._age_s > _REPLAN_PERIOD_S:
             self._choose(T_odom_base)
         if self._view is None:
             reason = 'nothing in reach tells the places apart, and all was looked at'
@@ -168,7 +168,7 @@ def best_viewpoint(
     worth = gains if len(starts) > 1 else np.minimum(ways / _CONFIRMED_M, 1.0)
     worth = np.where(_is_new(at, bearings, looked), worth, 0.0) / (ways + _WAY_M)
     best = int(worth.argmax())
-    if worth[best] >= _LEAST_GAIN:
+    if worth[best] >= _MIN_GAIN:
         view = se2.pose(at[best, 0], at[best, 1], bearings[best])
         return Viewpoint(view, patch, float(gains[best]))
     onwards = np.arctan2(at[:, 1] - T_odom_base[1], at[:, 0] - T_odom_base[0])
@@ -189,7 +189,7 @@ def _distinct(T_odom_base: Array, starts: Array, weights: Array) -> tuple[Array,
     """
     order = np.argsort(-weights, kind='stable')
     robots = np.array([se2.compose(T, T_odom_base) for T in starts[order]])
-    kept = order[distinct_indices(robots, _SAME_M, _SAME_RAD, _MOST_PLACES)]
+    kept = order[distinct_indices(robots, _SAME_M, _SAME_RAD, _MAX_PLACES)]
     return starts[kept], weights[kept]
 
 

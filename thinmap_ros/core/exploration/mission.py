@@ -18,7 +18,7 @@ from thinmap_ros.core.exploration.strategy import Decision, FinishCode, Strategy
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 
-_SMALLEST_STEP_M = 0.02
+_MIN_STEP_M = 0.02
 _WALL = np.int8(100)
 _MIN_CORNERS = 3
 _EXPLORED = (FinishCode.ALL_RESOLVED, FinishCode.UNREACHABLE)
@@ -42,7 +42,7 @@ class Odometer:
             self._last = T_map_base
             return
         step = float(np.hypot(*(T_map_base[:2] - self._last[:2])))
-        if step >= _SMALLEST_STEP_M:
+        if step >= _MIN_STEP_M:
             self.distance_m += step
             self._last = T_map_base
 

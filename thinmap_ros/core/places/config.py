@@ -7,7 +7,7 @@ from thinmap_ros.core.config import Config, parameter, robot_radius
 
 @dataclass(frozen=True)
 class GlobalLocalizationConfig(Config):
-    """How many samples, how often looked at, what counts as explained, when the robot is sure."""
+    """How many samples, how often updated, what counts as explained, when the robot is sure."""
 
     samples: int = parameter(
         5000,

@@ -1,4 +1,4 @@
-"""How much of a scan a map explains from the right place, found out on the map itself."""
+"""Share of a scan that a map explains from the right place, by scans simulated in that map."""
 
 from dataclasses import replace
 
@@ -7,12 +7,12 @@ import numpy as np
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.likelihood import Judge
 from thinmap_ros.core.places.observation import observed_beams
-from thinmap_ros.core.places.observation_model import made_up_scan, random_pose
+from thinmap_ros.core.places.observation_model import random_pose, simulated_scan
 from thinmap_ros.core.places.place_database import Places
 from thinmap_ros.core.scan import Scan
 
 _TRIALS = 400  # where walls are smooth, few places leave anything unexplained
-_LEAST = 0.7  # whatever the map looks like: what explains less is not the right place
+_MIN_RATIO = 0.7  # whatever the map looks like: what explains less is not the right place
 
 
 def usual_share(
@@ -33,7 +33,7 @@ def usual_share(
     asked = 0.0
     for _ in range(_TRIALS):
         T = random_pose(places, rng)
-        scan = made_up_scan(places, T, like)
+        scan = simulated_scan(places, T, like)
         noisy = scan.ranges_m + rng.normal(0.0, config.range_noise_m, scan.ranges_m.size)
         seen = observed_beams(replace(scan, ranges_m=noisy), config)
         noise = (config.map_noise_m, config.map_noise_m, config.heading_noise_rad)
@@ -41,4 +41,4 @@ def usual_share(
         explained, silent = judge.explained((T + off)[None], seen)
         counts += float(explained[0])
         asked += len(seen.ranges_m) - float(silent[0])
-    return max(counts / max(asked, 1.0), _LEAST)
+    return max(counts / max(asked, 1.0), _MIN_RATIO)

@@ -26,27 +26,27 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 
 __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Result', 'State']
 
-# Looks from about the same place meet the same errors of the map; they are independent after so
+# Updates from about the same place meet the same errors of the map; they are independent after so
 # much motion.
 _NEW_WAY_M = 0.5
 _NEW_TURN_RAD = 0.5
-# Independent looks that a place must have explained: more for each e-fold of places that looked
-# alike, and for each look before it turned up. A look counts the less, the more it leaves
+# Independent updates that a place must have explained: more for each e-fold of places that looked
+# alike, and for each update before it turned up. An update counts the less, the more it leaves
 # unexplained of what it should explain in this map, and nothing from a share on: so many times what
 # the right one leaves unexplained there (no less than the least, as few scans were made in the map;
 # no more than the most), and more in rough maps, which draw things in part.
-_SURE_LOOKS = 1.0
-_SURE_LOOKS_CROWD = 0.75
-_SURE_LOOKS_LATE = 2.0
+_SURE_UPDATES = 1.0
+_SURE_UPDATES_CROWD = 0.75
+_SURE_UPDATES_LATE = 2.0
 _WORTHLESS_TIMES = 10.0
-_LEAST_WORTHLESS = 0.0075
-_MOST_WORTHLESS = 0.03
+_MIN_WORTHLESS = 0.0075
+_MAX_WORTHLESS = 0.03
 _WORTHLESS_ROUGH = 0.5
-# After so many independent looks, a place that explains must have lasted for this share of them,
+# After so many independent updates, a place that explains must have lasted for this share of them,
 # but not for ever.
-_MANY_LOOKS = 16.0
+_MANY_UPDATES = 16.0
 _LASTING_SHARE = 0.4
-_LASTING_LOOKS = 20.0
+_LASTING_UPDATES = 20.0
 _VIEWS = 6
 _FRESH_SHARE = 0.2  # of the samples: drawn from the whole map during the search
 _FRESH_BEST = 100
@@ -58,9 +58,9 @@ _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
 # up late is unlikely, but what one search misses the next ones may miss for the same reason: so
 # often they all do.
 _LOG_MISSED = math.log(0.3)
-_LEAST_LOG_PRIOR = math.log(0.05)
+_MIN_LOG_PRIOR = math.log(0.05)
 _TRUST_FROM = 0.6  # share of the beams that must be explained for that
-# Looks: once all places are known, the map is searched less often.
+# Updates: once all places are known, the map is searched less often.
 _FIRST_SEARCHES = 6
 _LATER_EVERY = 4.0
 
@@ -133,7 +133,7 @@ class GlobalLocalization:
         config: GlobalLocalizationConfig | None = None,
         seed: int = 0,
     ) -> None:
-        """Look at a map.
+        """Search a map.
 
         Raises InputError where it has no wall, no free place, or the topology no node.
         """
@@ -153,17 +153,17 @@ class GlobalLocalization:
         self._T_step: Array | None = None
         self._T_look: Array | None = None
         self._way_m = 0.0
-        self._independent = 0.0  # looks
+        self._independent = 0.0  # updates
         self._since_search = math.inf
         self._searches = 0  # that were complete, since there were not too many places to keep
-        self._overview = 0.0  # looks in which all places that explain them have been known
-        self._convinced = 0  # looks in a row at which all spoke for one place
+        self._overview = 0.0  # updates in which all places that explain them have been known
+        self._convinced = 0  # updates in a row at which all spoke for one place
         self._crowd = 1.0  # how many places looked alike at the most, counted by their weights
         self._drawn = self._draw(self.config.samples)
 
     @property
     def samples(self) -> Array:
-        """The samples (N, 3) as of the last look."""
+        """The samples (N, 3) as of the last update."""
         return self._known.samples if len(self._known) else self._drawn
 
     def step(self, scan: Scan, T_odom_base: Array) -> Result:
@@ -197,9 +197,9 @@ class GlobalLocalization:
         return far or abs(float(motion[2])) > _JUMP_RAD
 
     def _novelty(self, T_odom_base: Array) -> float:
-        """How much of an independent look this is, 0 to 1.
+        """How much of an independent update this is, 0 to 1.
 
-        0: none, the robot is where it looked last.
+        0: none, the robot is where it was at the last update.
         """
         if self._T_look is None:
             return 1.0
@@ -211,7 +211,7 @@ class GlobalLocalization:
         return min(1.0, way / _NEW_WAY_M + turn / _NEW_TURN_RAD)
 
     def _look(self, scan: Scan, T_odom_base: Array, novelty: float) -> None:
-        """One look: move, search if that is due, weigh, drop what does not explain the scan."""
+        """One update: move, search if that is due, weigh, drop what does not explain the scan."""
         judge = self._ready(scan)
         seen = observe(scan, self.places.frame.resolution, self.config)
         self._advance(T_odom_base)
@@ -258,7 +258,7 @@ class GlobalLocalization:
         return self._judge
 
     def _advance(self, T_odom_base: Array) -> None:
-        """Move hypotheses and samples with the odometry since the last look."""
+        """Move hypotheses and samples with the odometry since the last update."""
         if self._T_look is None:
             return
         motion = se2.between(self._T_look, T_odom_base)
@@ -271,7 +271,7 @@ class GlobalLocalization:
         self._drawn = moved(self._drawn, motion)
 
     def _search(self, judge: Judge, seen: Observation, T_odom_base: Array) -> None:
-        """Look for places all over the map that explain this scan and those before it."""
+        """Search for places all over the map that explain this scan and those before it."""
         self._since_search = 0.0
         self._drawn = self._draw(self.config.samples if not len(self._known) else self._fresh)
         logs = judge.log_likelihoods(self._drawn, seen)
@@ -302,7 +302,7 @@ class GlobalLocalization:
         """
         most = float(self._fits.max(initial=0.0))
         trust = min(max((most - _TRUST_FROM) / (1.0 - _TRUST_FROM), 0.0), 1.0)
-        return trust * max(self._searches * _LOG_MISSED, _LEAST_LOG_PRIOR)
+        return trust * max(self._searches * _LOG_MISSED, _MIN_LOG_PRIOR)
 
     def _explains_badly(self) -> bool:
         """Whether no hypothesis explains enough to be sure of."""
@@ -327,9 +327,9 @@ class GlobalLocalization:
 
     @property
     def is_sure(self) -> bool:
-        """Whether one place alone is left for some looks in a row, and has explained enough.
+        """Whether one place alone is left for some updates in a row, and has explained enough.
 
-        Enough of the looks since it turned up: the less it explains, the later it turned up, and
+        Enough of the updates since it turned up: the less it explains, the later it turned up, and
         the more places of this map have looked alike, the more; a place in a map of another
         building may look alike for a while.
         """
@@ -339,12 +339,12 @@ class GlobalLocalization:
         age = float(self._known.ages[best])
         missing = 1.0 - float(self._fits[best])
         rough = 1.0 - self._usual
-        varies = min(max(_WORTHLESS_TIMES * rough, _LEAST_WORTHLESS), _MOST_WORTHLESS)
-        needed = _SURE_LOOKS + _SURE_LOOKS_CROWD * math.log(self._crowd)
+        varies = min(max(_WORTHLESS_TIMES * rough, _MIN_WORTHLESS), _MAX_WORTHLESS)
+        needed = _SURE_UPDATES + _SURE_UPDATES_CROWD * math.log(self._crowd)
         # Bare walls explain the same share everywhere, at wrong places, too: there it takes more of
         # them.
-        needed *= _MOST_WORTHLESS / varies
-        needed += _SURE_LOOKS_LATE * max(self._overview - age, 0.0)
+        needed *= _MAX_WORTHLESS / varies
+        needed += _SURE_UPDATES_LATE * max(self._overview - age, 0.0)
         return age * (1.0 - missing / (varies + _WORTHLESS_ROUGH * rough)) >= needed
 
     def _speaks_for_one(self) -> bool:
@@ -366,9 +366,9 @@ class GlobalLocalization:
         """Hypotheses (H,) that explain enough, and for some time where much has been seen."""
         known = self._known
         enough = self._fits >= self.config.min_inlier_ratio
-        if self._overview < _MANY_LOOKS:
+        if self._overview < _MANY_UPDATES:
             return enough
-        least_age = min(_LASTING_SHARE * self._overview, _LASTING_LOOKS)
+        least_age = min(_LASTING_SHARE * self._overview, _LASTING_UPDATES)
         return np.asarray(enough & (known.ages >= least_age))
 
     def _waiting(self, reason: str) -> Result:

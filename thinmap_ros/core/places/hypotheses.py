@@ -16,31 +16,30 @@ from thinmap_ros.jit import kernel
 _EDGE_SHARE = 0.05
 _LASTING_SHARE = 0.01
 _SIGMAS = 3.0
-# Now and then a whole look tells nonsense (someone stands in the way, a door has moved): no look
-# settles the matter.
-_MOST_A_LOOK = 14.0  # beams
-_LEAST_LOG_WEIGHT = -14.0
-_MOST = 400
+# A single scan may mislead (a person in the way, a door that has moved): its evidence is limited.
+_MAX_MISSING_BEAMS = 14.0  # beams
+_MIN_LOG_WEIGHT = -14.0
+_MAX_HYPOTHESES = 400
 _SAME_M = 0.3
 _SAME_RAD = 0.15
-_LEAST_ASKED = 0.6  # share of the beams
+_MIN_COMPARED_SHARE = 0.6  # share of the beams
 # Of those this near to each other one is kept: the place may be anywhere between.
 _NEW_SIGMA_M = 0.5 * _SAME_M
 _NEW_SIGMA_RAD = 0.5 * _SAME_RAD
-_MEMORY = 0.85  # of what was explained, from one independent look to the next
+_MEMORY = 0.85  # of what was explained, from one independent update to the next
 
 
 def missed_beams(judged: tuple[Array, Array], beams: int) -> Array:
-    """Beams of a look that are not explained, more than by the best one, (N,).
+    """Beams of an update that are not explained, more than by the best one, (N,).
 
     judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each.
     """
     missing = beams - judged[0] - SILENT_COUNTS * judged[1]
-    return np.asarray(np.minimum(missing - missing.min(initial=np.inf), _MOST_A_LOOK))
+    return np.asarray(np.minimum(missing - missing.min(initial=np.inf), _MAX_MISSING_BEAMS))
 
 
 def allowed_beams(beams: Array) -> Array:
-    """How many of so many beams, over all looks, one place may explain more than its double."""
+    """How many of so many beams, over all updates, one place may explain more than its double."""
     spread = np.sqrt(beams * _EDGE_SHARE * (1.0 - _EDGE_SHARE))
     return np.asarray(_SIGMAS * spread + _LASTING_SHARE * beams)
 
@@ -51,9 +50,9 @@ class Hypotheses:
 
     poses (H, 3); priors (H,): log odds of each from the beginning; missed, compared (H,): beams
     that it did not explain while the best one did, and of how many; covariances (H, 3, 3);
-    ages (H,): independent looks since each was found; explained, asked, beams (H,): sums over looks
-    of the beams that the map explains, of those it says something about, and of all; older ones
-    count less.
+    ages (H,): independent updates since each was found; explained, asked, beams (H,): sums over
+    updates of the beams that the map explains, of those it says something about, and of all; older
+    ones count less.
     """
 
     poses: Array
@@ -86,7 +85,7 @@ class Hypotheses:
     @property
     def are_too_many(self) -> bool:
         """Whether there may be more places than can be kept."""
-        return len(self) == _MOST
+        return len(self) == _MAX_HYPOTHESES
 
     @property
     def log_weights(self) -> Array:
@@ -94,7 +93,7 @@ class Hypotheses:
 
         Differences that chance brings about at edges count for nothing, however often they come:
         two rooms that look the same stay equally likely. What is allowed for chance grows with the
-        root of the looks, what a place that is not the right one misses grows with the looks.
+        root of the updates, what a place that is not the right one misses grows with the updates.
         """
         if not len(self):
             return np.empty(0)
@@ -112,12 +111,12 @@ class Hypotheses:
 
     @property
     def shares_explained(self) -> Array:
-        """Share (H,) of the beams of its looks that each explains.
+        """Share (H,) of the beams of its updates that each explains.
 
         Only beams that the map says something about count.
         """
         # Where that are few, they prove little.
-        asked = np.maximum(self.asked, _LEAST_ASKED * self.beams)
+        asked = np.maximum(self.asked, _MIN_COMPARED_SHARE * self.beams)
         return np.asarray(self.explained / np.maximum(asked, 1e-9))
 
     def move(self, motion: Array, noise: tuple[float, float], rng: np.random.Generator) -> None:
@@ -171,8 +170,8 @@ class Hypotheses:
         """Drop what is out of the question, and of what has come together all but the likeliest."""
         logs = self.log_weights
         order = np.lexsort((self.missed, -logs))
-        order = order[logs[order] > _LEAST_LOG_WEIGHT]
-        kept = order[distinct_indices(self.poses[order], _SAME_M, _SAME_RAD, _MOST)]
+        order = order[logs[order] > _MIN_LOG_WEIGHT]
+        kept = order[distinct_indices(self.poses[order], _SAME_M, _SAME_RAD, _MAX_HYPOTHESES)]
         if len(kept) == len(self) == int(self.owners.max(initial=-1)) + 1:
             return
         renumbered = np.full(len(self.poses), -1)

@@ -29,11 +29,11 @@ _PULLS: tuple[tuple[float, Array], ...] = (
 _OUTLIERS = 0.1
 # Beams are not independent of each other: neighbours meet the same wall, which the map has drawn
 # once, and well or not.
-_BEAMS_A_FACT = 6.0
-_NODES_A_FACT = 2.0
+_BEAMS_PER_OBSERVATION = 6.0
+_NODES_PER_OBSERVATION = 2.0
 _FINE_STEPS = np.array([[0.04, 0.015], [0.02, 0.0075]])
 _ROUNDS = 6
-_LEAST_COVARIANCE = np.diag([0.02**2, 0.02**2, 0.01**2])
+_MIN_COVARIANCE = np.diag([0.02**2, 0.02**2, 0.01**2])
 
 
 class Judge:
@@ -52,7 +52,7 @@ class Judge:
         self.tolerance = (_SIGMAS * sigma, _SIGMAS * config.heading_noise_rad)
         off = np.arange(256) * NEAR_UNIT_M / sigma
         bell = np.exp(-0.5 * off**2)
-        self._log_table = np.log((1.0 - _OUTLIERS) * bell + _OUTLIERS) / _BEAMS_A_FACT
+        self._log_table = np.log((1.0 - _OUTLIERS) * bell + _OUTLIERS) / _BEAMS_PER_OBSERVATION
         self._pulls = [(np.exp(-0.5 * (off * sigma / pull) ** 2), steps) for pull, steps in _PULLS]
 
     def log_likelihoods(self, poses: Array, seen: Observation) -> Array:
@@ -80,7 +80,7 @@ class Judge:
             model.spread_m,
             model.gain,
         )
-        return np.asarray(ratios / _NODES_A_FACT)
+        return np.asarray(ratios / _NODES_PER_OBSERVATION)
 
     def refined(
         self,
@@ -99,7 +99,7 @@ class Judge:
         free = np.zeros((len(poses), 3, 3))
         held: Array = free
         if covariances is not None:
-            held = np.asarray(np.linalg.inv(covariances + _LEAST_COVARIANCE))
+            held = np.asarray(np.linalg.inv(covariances + _MIN_COVARIANCE))
         near, near_score = self._uphill(poses, seen, self._log_table, _FINE_STEPS, poses, held)
         far = poses
         for table, steps in self._pulls:

@@ -1,4 +1,4 @@
-"""How far the nodes that a single scan shows can be trusted, found out on the map itself."""
+"""Reliability of the nodes that a single scan shows, by scans simulated in the map."""
 
 from dataclasses import dataclass
 
@@ -47,7 +47,7 @@ def calibrate(
     for _ in range(_TRIALS):
         T = random_pose(places, rng)
         nodes, kinds = observed_nodes(
-            made_up_scan(places, T, like), places.frame.resolution, config
+            simulated_scan(places, T, like), places.frame.resolution, config
         )
         away = se2.transform_points(T, nodes)[:, None, :] - places.nodes[None]
         nearest = np.hypot(away[..., 0], away[..., 1]).min(axis=1)
@@ -75,7 +75,7 @@ def random_pose(places: Places, rng: np.random.Generator) -> Array:
     return se2.pose(float(at[0]), float(at[1]), float(rng.uniform(-np.pi, np.pi)))
 
 
-def made_up_scan(places: Places, T_map_base: Array, like: Scan) -> Scan:
+def simulated_scan(places: Places, T_map_base: Array, like: Scan) -> Scan:
     """The scan that a laser would make in the map, without noise.
 
     What is unknown lets nothing through.

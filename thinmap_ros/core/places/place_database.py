@@ -25,7 +25,7 @@ NEAR_UNIT_M = 0.004  # of the distance to the nearest wall: up to 1.02 m in a by
 RANGE_UNIT_M = 0.05  # of the ranges all round: up to 12.75 m in a byte
 _NEAR_CAP = 255
 _SPACING_M = 0.3
-_MOST_PLACES = 100_000
+_MAX_PLACES = 100_000
 _BLOCK_M = 0.5  # nodes in sight are listed for blocks of this size
 SIGHT_UNIT_M = 0.002  # of where these lie, from the corner of their block: up to 65 m in two bytes
 
@@ -124,7 +124,7 @@ def _spots(standing: NDArray[np.int32], frame: GridFrame) -> tuple[Array, float]
 
     Returns points (P, 2), and the spacing in m.
     """
-    spacing = max(_SPACING_M, math.sqrt(len(standing) * frame.resolution**2 / _MOST_PLACES))
+    spacing = max(_SPACING_M, math.sqrt(len(standing) * frame.resolution**2 / _MAX_PLACES))
     edge = max(1, round(spacing / frame.resolution))
     squares = standing // edge
     off = np.abs(standing - squares * edge - (edge - 1) / 2.0).sum(axis=1)

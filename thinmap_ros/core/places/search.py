@@ -1,4 +1,4 @@
-"""A look at all of the map for places where the last few scans could have been made."""
+"""An update at all of the map for places where the last few scans could have been made."""
 
 from dataclasses import dataclass
 
@@ -11,10 +11,10 @@ from thinmap_ros.core.places.observation import Observation, profile
 from thinmap_ros.core.places.place_database import DIRECTIONS, RANGE_UNIT_M, Places
 from thinmap_ros.core.se2 import Array
 
-_FEWEST_WALLS = 6  # beams that met something, below which a scan could be anywhere
-_MOST_SPOTS = 3000
-_MOST_LOOKED_AT_TWICE = 600
-_LEAST_SHARE = 0.6  # of the directions that must show what was measured
+_MIN_WALLS = 6  # beams that met something, below which a scan could be anywhere
+_MAX_SPOTS = 3000
+_MAX_REFINED = 600
+_MIN_SHARE = 0.6  # of the directions that must show what was measured
 _CLEARLY_WORSE = 0.1  # share of the directions
 _BELOW_BEST = 0.2  # share of the beams that a candidate may explain less than the best one
 
@@ -35,7 +35,7 @@ def candidates(
     The ranges are compared at each position of the map and each heading; the samples drawn (M, 3)
     are added to the best poses. No candidates if the scan has too few hits.
     """
-    if int(seen.met.sum()) < _FEWEST_WALLS:
+    if int(seen.met.sum()) < _MIN_WALLS:
         return np.empty((0, 3)), False
     spots, complete = _best_spots(places, seen, rng)
     poses = judge.refined(np.concatenate([spots, drawn]), seen)
@@ -44,8 +44,8 @@ def candidates(
     good = counts >= counts.max() - _BELOW_BEST * len(seen.ranges_m)
     poses = poses[good]
     counts = counts[good]
-    found = distinct(poses[np.argsort(-counts, kind='stable')], 0.3, 0.15, _MOST_LOOKED_AT_TWICE)
-    return found, complete and len(found) < _MOST_LOOKED_AT_TWICE
+    found = distinct(poses[np.argsort(-counts, kind='stable')], 0.3, 0.15, _MAX_REFINED)
+    return found, complete and len(found) < _MAX_REFINED
 
 
 def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> tuple[Array, bool]:
@@ -60,14 +60,14 @@ def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> 
     farthest = np.clip((ranges + slack) / RANGE_UNIT_M, 0.0, 255.0)
     low = np.where(known, nearest, 0.0).astype(np.uint8)
     high = np.where(known & met, farthest, 255.0).astype(np.uint8)
-    least = DIRECTIONS - round((1.0 - _LEAST_SHARE) * int(known.sum()))
+    least = DIRECTIONS - round((1.0 - _MIN_SHARE) * int(known.sum()))
     spots, headings, counts = likelihood_kernels.spot_scores(places.around, low, high, least)
     # Equals in random order: where there are too many, each has its chance.
-    order = np.argsort(-(counts + rng.random(len(counts))), kind='stable')[:_MOST_SPOTS]
+    order = np.argsort(-(counts + rng.random(len(counts))), kind='stable')[:_MAX_SPOTS]
     turns = headings[order] * (2.0 * np.pi / DIRECTIONS)
     # Those left out must be clearly worse than the best.
     margin = _CLEARLY_WORSE * int(known.sum())
-    cut = len(counts) > _MOST_SPOTS and counts[order[-1]] > counts.max() - margin
+    cut = len(counts) > _MAX_SPOTS and counts[order[-1]] > counts.max() - margin
     return np.column_stack([places.spots[spots[order]], turns]), not cut
 
 

@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 _GAP_M = TopologyConfig().max_unknown_gap_m
 _ROOM_M = 3.0  # around start and goal
 _ROOM_SHARE = 0.5  # of the distance between them, in addition
-_LARGEST_SHARE = 0.5  # of the map: a larger window saves nothing
+_MAX_SHARE = 0.5  # of the map: a larger window saves nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def _window(
     room = rim + math.ceil(room_m / resolution)
     low = np.maximum(ends.min(axis=0) - room, 0)
     high = np.minimum(ends.max(axis=0) + room + 1, shape)
-    if np.prod(high - low) > _LARGEST_SHARE * np.prod(shape):
+    if np.prod(high - low) > _MAX_SHARE * np.prod(shape):
         return None
     row, col = (int(first) for first in low)
     cells = np.ascontiguousarray(patch.cells[row : high[0], col : high[1]])

@@ -24,7 +24,7 @@ from thinmap_ros.core.slam.matching.scan_matcher import Match
 CHI2 = 11.34  # 99 % of three degrees of freedom
 UNKNOWN = np.diag(np.square([300.0, 300.0, np.pi]))  # covariance of an unknown pose
 NO_DERIVATIVE = np.zeros((3, 4))
-_LEAST_STEP = np.diag(np.square([2e-3, 2e-3, 5e-4]))  # smallest covariance between keyframes
+_MIN_STEP = np.diag(np.square([2e-3, 2e-3, 5e-4]))  # smallest covariance between keyframes
 
 
 class Contradiction:
@@ -51,7 +51,7 @@ class Contradiction:
         Many small innovations in one direction pull the pose onto an earlier map; they are no
         motion of the robot.
         """
-        expected = self._expected + _LEAST_STEP
+        expected = self._expected + _MIN_STEP
         if float(self._moved @ np.linalg.solve(expected, self._moved)) < CHI2:
             return self._known
         return self._known + np.outer(self._moved, self._moved)
@@ -74,7 +74,7 @@ class PoseUncertainty:
 
     def place(self, T_map_base: Array, covariance: Array) -> None:
         """Set the pose (3,) and its covariance (3, 3), without any motion."""
-        own = 0.5 * (covariance + covariance.T) + _LEAST_STEP
+        own = 0.5 * (covariance + covariance.T) + _MIN_STEP
         self._T_moved = T_map_base
         self.since_match = own
         self.since_map_update = own
@@ -161,7 +161,7 @@ class PoseUncertainty:
         jumps (3, 3).
         """
         by_calibration = rotation(-yaw) @ self._systematic_since_anchor
-        covariance = rotated_covariance(self._since_keyframe, -yaw) + _LEAST_STEP
+        covariance = rotated_covariance(self._since_keyframe, -yaw) + _MIN_STEP
         return by_calibration, covariance, rotated_covariance(self._contradiction.covariance, -yaw)
 
     def start_step(self) -> None:

@@ -41,7 +41,7 @@ from thinmap_ros.core.slam.matching import local_map
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points
 from thinmap_ros.core.slam.matching.scan_matcher import (
-    FEWEST_POINTS,
+    MIN_POINTS,
     Match,
     Matcher,
     MatchingConfig,
@@ -320,7 +320,7 @@ class Localizer:
 
     def _match(self, scan: Scan, points: Array, prior: Array) -> Match | None:
         """Match a scan with the local map; None if scan or map have too little structure."""
-        if len(points) < FEWEST_POINTS or self._map.map.is_empty:
+        if len(points) < MIN_POINTS or self._map.map.is_empty:
             return None
         if np.ptp(points[:, :2], axis=0).max() < self.config.local_map.resolution_m:
             return None  # all points in one cell do not determine a pose
@@ -358,12 +358,12 @@ class Localizer:
         """
         has_confirmed = not self.config.is_mapping or bool(self.keyframes)
         hits = int(np.count_nonzero(scan.hit))
-        is_sparse = len(points) < FEWEST_POINTS <= hits
+        is_sparse = len(points) < MIN_POINTS <= hits
         if not is_sparse or (has_confirmed and not self._tracking.is_delocalized):
             return ''
         return (
             f'{hits} returns, {len(points)} of them side by side on a surface: '
-            f'expected at least {FEWEST_POINTS}'
+            f'expected at least {MIN_POINTS}'
         )
 
     def _update(
@@ -424,7 +424,7 @@ class Localizer:
         # Motion errors are independent in each step. The error of a match is correlated with that
         # of the previous match as long as the same walls are observed.
         self._uncertainty.map_updated(min(1.0, path_m / _VIEW_M + turn))
-        if len(points) >= FEWEST_POINTS and self._loops.needs_keyframe(self._pose):
+        if len(points) >= MIN_POINTS and self._loops.needs_keyframe(self._pose):
             self._add_keyframe(scan, points)
 
     def _correct_heading(self, scan: Scan) -> None:

@@ -68,7 +68,7 @@ class TargetPublisher:
 
 
 class ForeignDriver:
-    """Somebody who drives to the published targets: the robot arrives, or the target changes."""
+    """Another navigator drives to the published targets until it arrives, or the target changes."""
 
     is_yielding = False
     goal_prefix = bytes(PREFIX_BYTES)

@@ -96,7 +96,7 @@ class NavigationClient:
     def drive_to(self, goal: Array) -> None:
         """Set the goal (3,), unless the server has about the same."""
         self._goal = goal
-        if self._arrivals.are_useless(goal):
+        if self._arrivals.are_repeated(goal):
             self._arrivals.clear()
             self._end(False, 'reached, but the target stays')
             return

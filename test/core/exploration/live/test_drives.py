@@ -1,4 +1,4 @@
-"""Progress of drives, useless arrivals, and goals at a server that answers late or refuses."""
+"""Progress of drives, repeated arrivals, and goals at a server that answers late or refuses."""
 
 import math
 
@@ -50,16 +50,16 @@ def test_missing_inputs_are_no_standstill():
     assert progress.idle_s == 10.0
 
 
-def test_arrivals_are_useless_when_the_goal_stays_the_same():
+def test_arrivals_are_repeated_when_the_goal_stays_the_same():
     arrivals = Arrivals()
     for _ in range(5):
         arrivals.add(GOAL)
-        assert not arrivals.are_useless(GOAL)
+        assert not arrivals.are_repeated(GOAL)
     arrivals.add(pose(10.05, 0.0, 0.1))
-    assert arrivals.are_useless(GOAL)
-    assert not arrivals.are_useless(pose(9.0, 0.0, 0.0))
+    assert arrivals.are_repeated(GOAL)
+    assert not arrivals.are_repeated(pose(9.0, 0.0, 0.0))
     arrivals.clear()
-    assert not arrivals.are_useless(GOAL)
+    assert not arrivals.are_repeated(GOAL)
 
 
 def test_a_goal_is_sent_again_when_it_changes():

@@ -19,7 +19,7 @@ from thinmap_ros.core.slam.graph.keyframes import (
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
-from thinmap_ros.core.slam.matching.scan_matcher import FEWEST_POINTS, MatchingConfig
+from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS, MatchingConfig
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
@@ -89,7 +89,7 @@ class Driver:
         scan = scan_in(self.walls, truth, self.rng, len(self.truths) - 1)
         points = surface_points(scan)
         frame = Keyframe(scan, points, self.pose, self.path_m(), self.covariance, 0)
-        if len(points) >= FEWEST_POINTS and self.loops.needs_keyframe(self.pose):
+        if len(points) >= MIN_POINTS and self.loops.needs_keyframe(self.pose):
             self.loops.add(frame, Step(STEP), NONE)
         for _ in range(works):
             correction = self.loops.step()

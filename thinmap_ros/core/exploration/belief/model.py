@@ -30,7 +30,7 @@ _CLOSED_AREA_M2 = 1.0
 _R_LIMIT = 0.02  # R stays this far from 0 and 1, as one view is never certain
 _LOG_ODDS_LIMIT = 14.0
 _SHORTEST_M = 0.1
-_SMALLEST_M2 = 0.05
+_MIN_M2 = 0.05
 _SAMPLES = 200
 _CONFIDENCE = 0.95
 
@@ -62,7 +62,7 @@ class BeliefModel:
         log_odds = (
             self.log_odds
             + self.length * math.log(max(length_m, _SHORTEST_M))
-            + self.hidden * math.log(max(hidden_m2, _SMALLEST_M2))
+            + self.hidden * math.log(max(hidden_m2, _MIN_M2))
             + self.reliability * math.log(reliability / (1.0 - reliability))
             + self.visit * evidence.visits
         )

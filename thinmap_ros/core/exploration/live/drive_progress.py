@@ -82,8 +82,8 @@ class Arrivals:
         self._count = self._count + 1 if is_repeated else 1
         self._goal = goal
 
-    def are_useless(self, goal: Array) -> bool:
-        """Whether another drive to a goal (3,) would not change anything."""
+    def are_repeated(self, goal: Array) -> bool:
+        """Whether a goal (3,) was reached so often that another drive changes nothing."""
         is_repeated = self._goal is not None and is_same_goal(self._goal, goal)
         return is_repeated and self._count >= _MAX_ARRIVALS
 

@@ -38,7 +38,7 @@ from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
-_LEAST_MOVE_M = 0.1  # smallest move of a keyframe for which the map follows the calibration
+_MIN_MOVE_M = 0.1  # smallest move of a keyframe for which the map follows the calibration
 _RECENT = 8  # recent candidates among which consistent ones are searched
 # Scans within which a keyframe is matched. With three matches for each of the scans of a sparse
 # log, and one done at a time, a loop was closed up to 344 scans after its keyframes.
@@ -336,7 +336,7 @@ class LoopClosure:
         moved = next(moving)
         self._calibration.applied = parameters[-1]
         last = self.keyframes.anchor
-        if math.dist(moved[last, :2], poses[last, :2]) > _LEAST_MOVE_M:
+        if math.dist(moved[last, :2], poses[last, :2]) > _MIN_MOVE_M:
             self._calibrate(parameters)
             self._optimization = _Optimization(moving, moved)
 
@@ -350,7 +350,7 @@ class LoopClosure:
         by = self.keyframes.frames[self.keyframes.anchor].systematic[:2]
         off = by @ (self._calibration.parameters - self._calibration.applied)
         variance = float(np.trace(by @ self._calibration.covariance @ by.T))
-        return float(off @ off) > max(_LEAST_MOVE_M**2, variance)
+        return float(off @ off) > max(_MIN_MOVE_M**2, variance)
 
     @property
     def _all_edges(self) -> list[Edge]:

@@ -48,7 +48,7 @@ SURFACE = np.dtype(
 HERE = 100  # stored value of an offset of 0
 _SHIFT = TILE.bit_length() - 1
 TILE_MASK = TILE - 1
-_MOST_SEEN = 255
+_MAX_SEEN = 255
 _MAX_EXTENT_TILES = 1 << 20  # at cells of 0.05 m 3.3 km in each direction, mostly without tiles
 _FAR_M = 1e4  # distance from which the walls of an occupancy map are taken to be observed
 
@@ -382,7 +382,7 @@ def is_wall(cell: Any, share: float) -> bool:
 @inlined
 def _observe(cell: Any, hit: int) -> None:
     """Count an observation; the weight of old ones decays once the counter is full."""
-    if cell['seen'] == _MOST_SEEN:
+    if cell['seen'] == _MAX_SEEN:
         cell['seen'] //= 2
         cell['hits'] //= 2
     cell['seen'] += 1

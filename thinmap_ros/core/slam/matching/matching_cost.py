@@ -25,7 +25,7 @@ _YOUNG_HITS = 1.0  # hits at which a wall has half its weight: moving people are
 _BEHIND = -0.1  # cosine to a wall's normal below which a beam comes from behind the wall
 _ROUNDS = 20
 _SETTLED = 1e-4  # m and rad: a smaller step ends the minimization
-_LARGEST_DAMPING = 1e2
+_MAX_DAMPING = 1e2
 
 
 @inlined
@@ -169,7 +169,7 @@ def minimize(
             damping = max(0.1 * damping, 1e-6)
         else:
             damping *= 10.0
-        if np.abs(step).max() < _SETTLED or damping > _LARGEST_DAMPING:
+        if np.abs(step).max() < _SETTLED or damping > _MAX_DAMPING:
             break
     sums[0] += sums[4]
     pose[2] = math.atan2(math.sin(pose[2]), math.cos(pose[2]))

@@ -17,7 +17,7 @@ from thinmap_ros.core.slam.matching.correlative_search import search
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.matching_cost import minimize
 
-FEWEST_POINTS = 10
+MIN_POINTS = 10
 
 
 @dataclass(frozen=True)

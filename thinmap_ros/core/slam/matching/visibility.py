@@ -24,8 +24,8 @@ _STEP_CELLS = 0.5
 _BETWEEN_CELLS = 2.0  # a way may end in a cell whose offset is longer by less than this
 _SIGMAS = 3.0
 _BEHIND_M = 0.3  # by which a beam ends behind a wall that it has passed through
-_FEWEST_HITS = 2  # of a cell that is a wall for certain
-_MOST_OBLIQUE = 0.5  # cosine; more oblique beams pass the cells of a wall beside them
+_MIN_HITS = 2  # of a cell that is a wall for certain
+_MAX_COSINE = 0.5  # cosine; more oblique beams pass the cells of a wall beside them
 _SAME_SIDE = 0.5  # length of the mean double-angle vector of normals that agree
 
 
@@ -97,13 +97,13 @@ def _count_through(
             if free > 0.0:
                 step += int(free / _STEP_CELLS)
                 continue
-            if cell['hits'] < _FEWEST_HITS or not is_wall(cell, hit_ratio):
+            if cell['hits'] < _MIN_HITS or not is_wall(cell, hit_ratio):
                 continue
             wall = lattice.surfaces[slot, row & TILE_MASK, col & TILE_MASK]
             if math.hypot(wall['cos2'], wall['sin2']) < _SAME_SIDE:
                 continue
             normal = 0.5 * math.atan2(wall['sin2'], wall['cos2'])
-            if abs(math.cos(normal) * cos + math.sin(normal) * sin) > _MOST_OBLIQUE:
+            if abs(math.cos(normal) * cos + math.sin(normal) * sin) > _MAX_COSINE:
                 count += 1
                 break
     return count
