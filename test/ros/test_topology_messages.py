@@ -202,3 +202,14 @@ def test_altered_messages_are_refused_in_one_line_or_read():
         else:
             assert list(graph.nodes) == list(message.node_ids)
             assert list(graph.edges) == list(message.edge_ids)
+
+
+def test_the_same_map_at_another_time_is_the_same():
+    message = messages.topology_msg(random_map(5), 'map', 1, map_id=3)
+    later = messages.topology_msg(random_map(5), 'map', 2, map_id=3)
+    assert messages.is_same_topology(message, later)
+    assert not messages.is_same_topology(message, messages.topology_msg(random_map(5), 'map', 1))
+    for name in FIELDS:
+        changed = messages.topology_msg(random_map(5), 'map', 1, map_id=3)
+        getattr(changed, name)[-1] += 1
+        assert not messages.is_same_topology(message, changed), name

@@ -32,7 +32,7 @@ from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
-from thinmap_ros.core.topology.flat import flat_topology
+from thinmap_ros.core.topology.flat import FIELDS, flat_topology
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.logs import decode
 
@@ -284,3 +284,9 @@ def topology_msg(
         # An array of the field's type: rclpy copies it as it is, and anything else value by value.
         getattr(message, name).frombytes(values.tobytes())
     return message
+
+
+def is_same_topology(one: TopologicalMapMsg, other: TopologicalMapMsg) -> bool:
+    """Whether two messages hold the same graph of the same map, at whatever time."""
+    names = ('map_id', *FIELDS)
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
