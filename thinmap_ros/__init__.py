@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.core.scan import Scan
     from thinmap_ros.core.topology.builder import build as build_topology
     from thinmap_ros.core.topology.config import TopologyConfig
+    from thinmap_ros.core.topology.flat import topology_from_msg
     from thinmap_ros.core.topology.graph import TopologicalMap
     from thinmap_ros.core.topology.thinning import thin
     from thinmap_ros.evaluation.exploration_run import explore
@@ -54,6 +55,7 @@ __all__ = [
     'read_world',
     'shortest_path',
     'thin',
+    'topology_from_msg',
     'world_path',
     'write_graph',
     'write_map',
@@ -81,6 +83,7 @@ _PLACES = {
     'build_topology': 'core.topology.builder.build',
     'shortest_path': 'core.planning.graph_search.shortest_path',
     'thin': 'core.topology.thinning.thin',
+    'topology_from_msg': 'core.topology.flat.topology_from_msg',
     'write_graph': 'files.graphs.write_graph',
     # localization in a finished map
     'GlobalLocalizer': 'core.places.global_localizer.GlobalLocalization',

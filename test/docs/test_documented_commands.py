@@ -324,6 +324,7 @@ def test_python_in_the_tutorials_runs(place):
     program = [sys.executable, '-c', '\n'.join(blocks)]
     done = subprocess.run(program, cwd=place, env=shell, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+    assert '18 to 110: 3.8 m in 39 points\n' in done.stdout
     assert 'nothing.yaml: No such file or directory' in done.stdout
 
 

@@ -80,12 +80,13 @@ def definition(text):
 
 
 def section(path):
-    """A message, service or action; the comment in its first line is what it is."""
+    """A message, service or action; the comment in its first lines is what it is."""
     text = path.read_text().strip()
     lines = [f'### {path.stem}', '']
-    if text.startswith('#'):
-        first, _, text = text.partition('\n')
-        lines += [first.removeprefix('# '), '']
+    comment = re.match(r'(#.*\n)+', text)
+    if comment:
+        lines += [re.sub('^# ?', '', line) for line in comment[0].splitlines()] + ['']
+        text = text[comment.end() :]
     for name, part in zip(
         PARTS[path.suffix[1:]], re.split('^---$', text, flags=re.MULTILINE), strict=True
     ):

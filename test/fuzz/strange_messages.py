@@ -8,15 +8,17 @@ from array import array
 
 import hypothesis
 import numpy as np
-from geometry_msgs.msg import Point32, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from nav_msgs.msg import OccupancyGrid, Odometry
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import ProbabilityGrid, TopologicalEdge, TopologicalMap, TopologicalNode
+from thinmap_msgs.msg import ProbabilityGrid, TopologicalMap
+from thinmap_ros.core.topology.flat import FIELDS, topology_from_msg
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind
+from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.ros import messages
-from thinmap_ros.ros.decoding.topology_reader import topology_from_msg
 
 STRANGE = st.sampled_from(
     [
@@ -178,41 +180,38 @@ def grids(draw, ns=10**9):
 
 @st.composite
 def topologies(draw, ns=10**9):
-    message = stamped(draw, TopologicalMap(), ns)
-    message.header.frame_id = 'map'
-    message.nodes = [TopologicalNode(id=i, kind=0, clearance_m=0.5) for i in range(1, 4)]
-    for i, node in enumerate(message.nodes):
-        node.position.x = float(i)
-    path = [Point32(x=float(i)) for i in range(2)]
-    message.edges = [
-        TopologicalEdge(id=9, node_a=1, node_b=2, length_m=1.0, clearance_m=0.5, path=path)
-    ]
-    node = message.nodes[draw(st.integers(0, 2))]
-    edge = message.edges[0]
+    nodes = [Node(i, NodeKind.END, float(i - 1), 0.0, 0.5) for i in range(1, 4)]
+    path = np.array([[0.0, 0.0], [1.0, 0.0]])
+    graph = Graph(nodes, [Edge(9, 1, 2, path, 1.0, 0.5)])
+    message = stamped(draw, messages.topology_msg(graph, 'map', ns), ns)
 
-    def place():
-        node.position.x = draw(STRANGE)
+    def anywhere(name):
+        values = getattr(message, name)
+        return values, draw(st.integers(0, max(len(values) - 1, 0)))
 
-    def point():
-        path[1].y = draw(STRANGE_32)
+    def number(name, strange):
+        def change():
+            values, place = anywhere(name)
+            if values:
+                values[place] = draw(strange)
 
-    def number(thing, name):
-        return lambda: setattr(thing, name, draw(st.sampled_from([0, 1, 2, 9, 255])))
+        return change
 
-    def value(thing, name):
-        return lambda: setattr(thing, name, draw(STRANGE_32))
+    def size(name):
+        def change():
+            values, place = anywhere(name)
+            if draw(st.booleans()):
+                values.insert(place, 1)
+            elif values:
+                values.pop(place)
 
-    def empty():
-        edge.path = []
+        return change
 
-    values = [value(edge, 'length_m'), value(edge, 'clearance_m'), value(node, 'clearance_m')]
-    numbers = [
-        number(edge, 'node_a'),
-        number(edge, 'node_b'),
-        number(edge, 'id'),
-        number(node, 'id'),
-    ]
-    changed(draw, [place, point, empty, number(node, 'kind'), *values, *numbers])
+    whole = st.sampled_from([0, 1, 2, 9, 255])
+    floats = {'node_xy': STRANGE, 'node_clearance_m': STRANGE_32, 'edge_length_m': STRANGE_32}
+    floats |= {'edge_clearance_m': STRANGE_32, 'edge_xy': STRANGE_32}
+    numbers = [number(name, floats.get(name, whole)) for name in FIELDS]
+    changed(draw, [*numbers, *(size(name) for name in FIELDS)])
     return message
 
 
@@ -261,7 +260,8 @@ def check_grid(message):
 
 def check_topology(message):
     found = topology_from_msg(message)
-    assert len(found.nodes) == len(message.nodes) and len(found.edges) == len(message.edges)
+    assert list(found.nodes) == list(message.node_ids)
+    assert list(found.edges) == list(message.edge_ids)
     assert all(math.isfinite(node.x + node.y + node.clearance_m) for node in found.nodes.values())
     assert all(
         np.isfinite(edge.path).all() and {edge.a, edge.b} <= found.nodes.keys()

@@ -12,6 +12,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
+from support.bag_maker import Maker
 from support.doctor import Doctor
 from support.timeouts import PATIENCE_S
 
@@ -23,6 +24,7 @@ from thinmap_ros.ros import messages, qos
 pytestmark = pytest.mark.live
 STRING = 'std_msgs/msg/String'
 SCAN = 'sensor_msgs/msg/LaserScan'
+GRAPH = 'thinmap_msgs/msg/TopologicalMap'
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -267,3 +269,25 @@ def test_the_player_leaves_out_topics_whose_names_are_damaged(graph, tmp_path):
     graph.until(lambda: heard, 'what was said')
     assert '/sa id is not played: Invalid topic name' in graph.log('bag_player')
     assert 'Traceback' not in graph.log('bag_player')
+
+
+def test_the_player_leaves_out_topics_whose_types_are_of_another_version(graph, tmp_path):
+    definitions = {GRAPH: 'std_msgs/Header header\nuint32[] nodes\nuint32[] edges\n'}
+    writer = BagWriter(tmp_path / 'bag', live=True, definitions=definitions)
+    make = Maker(writer)
+    none = np.zeros(0, dtype=np.uint32)
+    old = make(GRAPH, header=make.header('map', 10**9), nodes=none, edges=none)
+    writer.write('/topology', GRAPH, 10**9, old)
+    writer.write('/said', STRING, 10**9, make(STRING, data='0'))
+    writer.close()
+    reason = f'{GRAPH} of another version, with header, nodes, edges: expected header, map_id, '
+    heard = graph.heard('said', String)
+    graph.start('bag_player', bag=str(tmp_path / 'bag'))
+    graph.until(lambda: heard, 'what was said')
+    assert f'/topology is not played: {reason}' in graph.log('bag_player')
+    assert 'Traceback' not in graph.log('bag_player')
+    chosen = graph.start(
+        'bag_player', label='chosen', bag=str(tmp_path / 'bag'), topics='/topology'
+    )
+    assert graph.ended(chosen) == 2
+    assert graph.log('chosen').strip().splitlines()[-1].startswith(f'error: /topology: {reason}')

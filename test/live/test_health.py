@@ -240,7 +240,7 @@ def test_pause_and_reset(graph):
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)
     graph.start('sim', start=START, wait_for_subscribers=2, real_time_factor=4.0)
-    graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
+    graph.until(lambda: maps and graphs and graphs[-1].node_ids, 'map and graph')
     assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=True)).success
 
     def said_of_a_paused_one():
@@ -265,13 +265,13 @@ def test_pause_and_reset(graph):
     for name in ('grid_mapper', 'topology_builder'):
         assert graph.call(Trigger, f'/{name}/reset', Trigger.Request()).success
     graph.until(
-        lambda: not graphs[-1].nodes and (len(maps[-1].data) == 0 or max(maps[-1].data) == -1),
+        lambda: not graphs[-1].node_ids and (len(maps[-1].data) == 0 or max(maps[-1].data) == -1),
         'emptiness',
     )
     assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=False)).success
     graph.until(lambda: poses, 'poses')
     graph.until(lambda: doctor.status('localizer').message == 'tracking', 'it tracks')
-    graph.until(lambda: graphs[-1].nodes, 'a graph')
+    graph.until(lambda: graphs[-1].node_ids, 'a graph')
     graph.until(lambda: maps and max(maps[-1].data) == 100, 'a map')
 
 

@@ -90,7 +90,7 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     # Late subscribers still receive map and graph: both are transient local.
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
-    graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and topology')
+    graph.until(lambda: maps and graphs and graphs[-1].node_ids, 'map and topology')
     assert maps[-1].info.resolution == pytest.approx(0.05)
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
     assert response.success, response.message

@@ -9,9 +9,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from thinmap_msgs.msg import EndNode, EndNodeArray, LineFeature, LineFeatureArray, TopologicalMap
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.nodes import markers
 from thinmap_ros.ros import qos
-from thinmap_ros.ros.decoding.topology_reader import topology_from_msg
 
 pytestmark = pytest.mark.live
 
@@ -22,11 +22,11 @@ def by_name(array):
 
 
 def test_a_graph_as_lines_and_balls():
-    message = next(m for m in made(TopologicalMap, 20) if len(m.edges[0].path) == 2 and is_sound(m))
+    message = next(m for m in made(TopologicalMap, 20) if is_sound(m))
+    assert len(message.edge_xy) == 4
     shown = by_name(markers.topology(message))
-    assert [(p.x, p.y) for p in shown['nodes'].points] == [
-        (n.position.x, n.position.y) for n in message.nodes
-    ]
+    positions = np.reshape(message.node_xy, (-1, 2))
+    np.testing.assert_array_equal([(p.x, p.y) for p in shown['nodes'].points], positions)
     assert len(shown['nodes'].colors) == 3 and len(shown['edges'].points) == 2
     assert shown['edges'].header.frame_id == 'map' and shown['edges'].type == Marker.LINE_LIST
     assert [m.action for m in markers.topology(TopologicalMap()).markers] == [Marker.DELETEALL]
@@ -37,7 +37,7 @@ def is_sound(message):
         topology_from_msg(message)
     except InputError:
         return False
-    return all(node.kind == 0 for node in message.nodes)
+    return not any(message.node_kinds)
 
 
 def test_end_nodes_show_their_probability():

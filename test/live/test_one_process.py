@@ -49,7 +49,7 @@ def test_one_process_locates_maps_and_drives(graph):
         wait_for_subscribers=3,
     )
     graph.until(
-        lambda: maps and free_at(maps[-1], 3.0, 2.0) and graphs and graphs[-1].nodes,
+        lambda: maps and free_at(maps[-1], 3.0, 2.0) and graphs and graphs[-1].node_ids,
         'a map and a graph',
     )
     goal = NavigateToPose.Goal()

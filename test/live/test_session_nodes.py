@@ -17,6 +17,7 @@ from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.se2 import pose
 from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.files import occupancy_maps, sessions
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
@@ -28,7 +29,7 @@ MAPPERS = ('grid_mapper', 'topology_builder')
 
 def places(topology):
     """Kind and position by id."""
-    return {n.id: (n.kind, n.position.x, n.position.y) for n in topology.nodes}
+    return {n.id: (n.kind, n.x, n.y) for n in topology_from_msg(topology).nodes.values()}
 
 
 def heard_maps(graph):
@@ -92,7 +93,7 @@ def test_ids_and_cells_survive_a_restart_and_mapping_continues(graph, tmp_path):
         assert graph.stop(name) == 0
     graph.drain()
     before = places(graphs[-1])
-    edges = {edge.id for edge in graphs[-1].edges}
+    edges = set(graphs[-1].edge_ids)
     known = sessions.load_grid(str(stem)).known_area()
     assert len(before) > 3
     maps.clear(), graphs.clear(), local.clear()
@@ -100,7 +101,7 @@ def test_ids_and_cells_survive_a_restart_and_mapping_continues(graph, tmp_path):
         graph.start(name, use_sim_time=True, session_path=str(stem))
     graph.until(lambda: maps and graphs, 'the saved map and graph, without a scan')
     assert not local
-    assert places(graphs[-1]) == before and {edge.id for edge in graphs[-1].edges} == edges
+    assert places(graphs[-1]) == before and set(graphs[-1].edge_ids) == edges
     assert np.array_equal(messages.grid_from_msg(maps[-1]).cells, known.trinary())
     drive(graph, *T.tolist(), 0.3)
     # Mapping has continued: more is known, remaining nodes have their ids, and no id is used twice.
@@ -185,7 +186,7 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
         lambda: 'topology_builder is not running' not in load('room').message,
         'the mapper sees the builder',
     )
-    graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph, published at once')
+    graph.until(lambda: maps and graphs and graphs[-1].node_ids, 'map and graph, published at once')
     expected = places(messages.topology_msg(builder.map, 'map', 0))
     assert places(graphs[-1]) == expected
     for name, said in write_bad_sessions(tmp_path, grid, builder).items():
@@ -201,7 +202,7 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     occupancy_maps.write_map(tmp_path / 'map', grid.known_area())
     response = load('map.yaml')
     assert response.success and 'graph reset' in response.message
-    graph.until(lambda: not graphs[-1].nodes, 'an empty graph')
+    graph.until(lambda: not graphs[-1].node_ids, 'an empty graph')
     known = messages.grid_from_msg(maps[-1])
     assert np.array_equal(known.occupied, grid.known_area().occupied)
     # The mapper adopts the resolution of a map.

@@ -14,6 +14,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.topology.flat import flat_topology
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.view import palette, rerun_blueprint, rerun_sinks
@@ -270,17 +271,10 @@ def test_null_view_takes_all_that_a_view_takes():
 
 
 def test_feed_refuses_what_makes_no_sense():
-    class Header:
-        class stamp:  # noqa: N801
-            sec = 1
-            nanosec = 0
-
-    class Message:
-        header = Header
-        nodes = (type('N', (), {'id': 1, 'kind': 9}),)
-
-    with pytest.raises(InputError):
-        MessageView(NullView(), lambda frame: None).show('topology', Message)
+    flat = flat_topology(TopologicalMap([Node(1, NodeKind.END, 0.0, 0.0, 0.5)]))
+    flat['node_kinds'][0] = 9
+    with pytest.raises(InputError, match='kind 9'):
+        MessageView(NullView(), lambda frame: None).show('topology', stamped(**flat))
 
 
 class Diary(NullView):
@@ -324,10 +318,8 @@ def test_step_times_are_those_of_the_robot_that_is_shown():
 def test_local_area_is_where_its_features_are_stored():
     diary = Diary()
     feed = MessageView(diary, lambda frame: None)
-    nodes = [
-        plain(id=i, kind=0, position=plain(x=1.0 * i, y=0.0), clearance_m=0.5) for i in (1, 2, 3)
-    ]
-    feed.show('topology', stamped(nodes=nodes, edges=[]))
+    nodes = [Node(i, NodeKind.END, 1.0 * i, 0.0, 0.5) for i in (1, 2, 3)]
+    feed.show('topology', stamped(**flat_topology(TopologicalMap(nodes))))
     point = plain(x=0.0, y=0.0)
     kept = [([1, 7], True), ([2], True), ([3], False)]  # node 7 is gone
     features = [

@@ -16,6 +16,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.exploration_metrics import (
     EndNodeCensus,
@@ -93,7 +94,7 @@ def read(path: Path) -> Recording:
         elif raw.topic == '/map':
             recording.maps.append((ns, decode.patch(message)))
         elif raw.topic == '/topology':
-            recording.topology = decode.topology(message)
+            recording.topology = _topology(path, message)
         elif raw.topic == '/end_nodes':
             nodes = [(int(n.node_id), n.position.x, n.position.y) for n in message.end_nodes]
             recording.end_nodes.append((ns, nodes))
@@ -110,6 +111,13 @@ def read(path: Path) -> Recording:
             f'it has {", ".join(sorted(bag.topics))}'
         )
     return recording
+
+
+def _topology(path: Path, message: Any) -> TopologicalMap:
+    try:
+        return topology_from_msg(message)
+    except InputError as error:
+        raise InputError(f'{path}: /topology: {error}') from error
 
 
 def _missing_area(message: Any) -> MissingArea | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rosbags.interfaces import Qos
+from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
@@ -121,10 +122,8 @@ class Bag:
 
     def decode(self, message: RawMessage) -> Any:
         """Decode a raw message. Raises InputError if its bytes do not fit its type."""
-        holders = (s for s in self._storages if s.topics.get(message.topic) == message.type_name)
-        storage = next(holders, self._storages[0])
         try:
-            return storage.typestore(message.type_name).deserialize_cdr(
+            return self._typestore(message.topic, message.type_name).deserialize_cdr(
                 message.data, message.type_name
             )
         except Exception as error:  # the deserializer raises many types
@@ -133,6 +132,16 @@ class Bag:
             raise InputError(
                 f'{where}: no {validation.quoted_name(message.type_name)}: {reason}'
             ) from error
+
+    def field_names(self, topic: str) -> list[str]:
+        """Names of the fields of a topic's type in the bag; empty if the bag does not define it."""
+        type_name = self.topics[topic]
+        definitions = self._typestore(topic, type_name).fielddefs
+        return [name for name, _ in definitions[type_name][1]] if type_name in definitions else []
+
+    def _typestore(self, topic: str, type_name: str) -> Typestore:
+        holders = (s for s in self._storages if s.topics.get(topic) == type_name)
+        return next(holders, self._storages[0]).typestore(type_name)
 
     def _opened(self, file: Path) -> Storage:
         if file.suffix != '.zstd':

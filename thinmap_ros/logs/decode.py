@@ -13,7 +13,6 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
-from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 
 def time_ns(stamp: Any) -> int:
@@ -100,32 +99,8 @@ def patch(message: Any) -> GridPatch:
     )
 
 
-def topology(message: Any) -> TopologicalMap:
-    """Graph of a thinmap_msgs/TopologicalMap."""
-    nodes = [
-        Node(int(n.id), NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m))
-        for n in message.nodes
-    ]
-    edges = [
-        Edge(
-            int(e.id),
-            int(e.node_a),
-            int(e.node_b),
-            _points(e.path),
-            float(e.length_m),
-            float(e.clearance_m),
-        )
-        for e in message.edges
-    ]
-    return TopologicalMap(nodes, edges)
-
-
 def outline(region: Any) -> Array:
     """Outline (K, 2) of a thinmap_msgs/Region. Raises InputError where it is not finite."""
-    points = _points(region.outline.points)
+    points = np.array([[p.x, p.y] for p in region.outline.points], dtype=np.float64).reshape(-1, 2)
     validation.require_bounded(f'region {region.id}', points.ravel().tolist())
     return points
-
-
-def _points(path: Any) -> Array:
-    return np.array([[p.x, p.y] for p in path], dtype=np.float64).reshape(-1, 2)

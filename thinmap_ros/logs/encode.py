@@ -8,7 +8,8 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
-from thinmap_ros.core.topology.graph import Edge, Node, TopologicalMap
+from thinmap_ros.core.topology.flat import flat_topology
+from thinmap_ros.core.topology.graph import TopologicalMap
 
 
 class BagObjects:
@@ -132,33 +133,9 @@ class BagObjects:
 
     def topology(self, ns: int, graph: TopologicalMap) -> Any:
         """thinmap_msgs/TopologicalMap in the map."""
-        nodes = [self._node(node) for node in graph.nodes.values()]
-        edges = [self._edge(edge) for edge in graph.edges.values()]
         return self._make(
             'thinmap_msgs/msg/TopologicalMap',
             header=self.header('map', ns),
-            nodes=nodes,
-            edges=edges,
             map_id=0,
-        )
-
-    def _node(self, node: Node) -> Any:
-        return self._make(
-            'thinmap_msgs/msg/TopologicalNode',
-            id=node.id,
-            kind=int(node.kind),
-            clearance_m=node.clearance_m,
-            position=self._vector('Point', node.x, node.y),
-            feature_ids=np.zeros(0, dtype=np.uint32),
-        )
-
-    def _edge(self, edge: Edge) -> Any:
-        return self._make(
-            'thinmap_msgs/msg/TopologicalEdge',
-            id=edge.id,
-            node_a=edge.a,
-            node_b=edge.b,
-            length_m=edge.length_m,
-            clearance_m=edge.clearance_m,
-            path=[self._vector('Point32', x, y) for x, y in edge.path],
+            **flat_topology(graph),
         )

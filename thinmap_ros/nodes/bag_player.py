@@ -152,18 +152,28 @@ class BagPlayerNode(Node):
     def _offer(self, topic: str) -> None:
         """Create the publisher of a topic.
 
-        A type that is not installed is skipped, unless its topic was chosen by name.
+        A type that is not installed, or with other fields, is skipped, unless its topic was chosen
+        by name.
         """
         name = f'/{self._config.prefix.strip("/")}{topic}' if self._config.prefix else topic
         profile = qos.as_recorded(topic, self._bag.offers.get(topic, []))
         try:
             kind = message_class(self._bag.topics[topic])
+            self._require_same_fields(topic, list(kind.get_fields_and_field_types()))
             self._publishers_by_topic[topic] = self.create_publisher(kind, name, profile)
         except (InputError, NameValidationException) as error:
             reason = ' '.join(str(error).split())[:200]
             if self._config.topics:
                 raise InputError(f'{validation.quoted_name(topic)}: {reason}') from error
             self.get_logger().warning(f'{validation.quoted_name(topic)} is not played: {reason}')
+
+    def _require_same_fields(self, topic: str, installed: list[str]) -> None:
+        recorded = self._bag.field_names(topic)
+        if recorded not in ([], installed):
+            raise InputError(
+                f'{self._bag.topics[topic]} of another version, with {", ".join(recorded)}: '
+                f'expected {", ".join(installed)}'
+            )
 
     def _has_subscribers(self) -> bool:
         scans = [t for t in self._publishers_by_topic if self._bag.topics[t] == _SCAN]

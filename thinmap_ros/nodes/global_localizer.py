@@ -33,12 +33,12 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.input_stream import InputStream
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.files import occupancy_maps
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
-from thinmap_ros.ros.decoding.topology_reader import read_topology
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
@@ -293,9 +293,7 @@ class GlobalLocalizerNode(ThinmapNode):
         self.reset_state()
         if not self._settings.node.map_path:
             subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-            subscribe_guarded(
-                self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED, read_topology
-            )
+            subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._odometry.subscribe()
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
@@ -332,8 +330,8 @@ class GlobalLocalizerNode(ThinmapNode):
     def _on_map(self, message: OccupancyGrid) -> None:
         self._patch = messages.grid_from_msg(message)
 
-    def _on_topology(self, topology: Topology) -> None:
-        self._topology = topology
+    def _on_topology(self, message: TopologicalMap) -> None:
+        self._topology = topology_from_msg(message)
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         """Start when the localizer reports that it is lost (kidnapped robot)."""

@@ -38,6 +38,7 @@ from thinmap_ros.core.slam.localizers import (
     set_topology,
 )
 from thinmap_ros.core.snapshot import State
+from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.files.sessions import LOCALIZER
 from thinmap_ros.kernels import warm_up
@@ -48,7 +49,6 @@ from thinmap_ros.nodes.localization.known_area import require_near_map
 from thinmap_ros.nodes.localization.map_source import load_localizer
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN, new_map_id
-from thinmap_ros.ros.decoding.topology_reader import read_topology
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -240,9 +240,7 @@ class LocalizerNode(ThinmapNode):
         self.diagnostics.add_check(WARN, lambda: '; '.join(self._input.warnings.values()))
         # Before the scans: of messages that wait together, the executor processes the graph of the
         # last scan first.
-        subscribe_guarded(
-            self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED, read_topology
-        )
+        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         self._odometry.subscribe()
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         poses = InitialPoses(
@@ -315,9 +313,9 @@ class LocalizerNode(ThinmapNode):
         elif (patch := self._given.source.patch) is not None:
             self._relocate_in(self._relocation, patch)
 
-    def _on_topology(self, topology: Graph) -> None:
-        self._topology = topology
-        set_topology(self._localizer, topology)
+    def _on_topology(self, message: TopologicalMap) -> None:
+        self._topology = topology_from_msg(message)
+        set_topology(self._localizer, self._topology)
 
     def _process(self, ready: list[tuple[Scan, Array]]) -> None:
         if self._relocation is not None:

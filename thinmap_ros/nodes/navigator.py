@@ -17,6 +17,7 @@ from thinmap_ros.core.planning.navigator import (
 )
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.logs.frames.bag_odometry import NONE
 from thinmap_ros.nodes.navigation.map_input import MapInput
@@ -24,7 +25,6 @@ from thinmap_ros.nodes.navigation.robot_state import RobotState
 from thinmap_ros.nodes.navigation.tasks import ErrorCode, NavigationTask, TaskReader
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
-from thinmap_ros.ros.decoding.topology_reader import read_topology
 from thinmap_ros.ros.diagnostics import OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -36,8 +36,8 @@ from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
 _MIN_SPEED_M_S = 0.01
 _MIN_DISTANCE_M = 0.1
 _MAX_INT16 = 2**15 - 1
-# Of a serialized graph, which is read within one control period: about 50,000 m2 of a building.
-_MAX_TOPOLOGY_BYTES = 2_000_000
+# Nodes and edges, which are read in a part of a control period: about 50,000 m2 of a building.
+_MAX_TOPOLOGY_SIZE = 4_000
 _POSE_FAULTS = {
     SlamStatus.LOST: 'lost (the place of the robot in the map is unknown)',
     SlamStatus.BLIND: 'laser blind (it does not confirm the pose)',
@@ -102,7 +102,7 @@ class NavigatorNode(ThinmapNode):
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._map.subscribe(self)
-        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED, bytes)
+        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, PoseStamped, 'goal_pose', self._on_goal_pose, qos.STREAM)
         self._goals = SingleGoalServer(
             self,
@@ -160,14 +160,15 @@ class NavigatorNode(ThinmapNode):
         self._robot.pose_fault = _POSE_FAULTS.get(message.state, '')
         self._map.pose_map_id = message.map_id
 
-    def _on_topology(self, data: bytes) -> None:
-        if len(data) > _MAX_TOPOLOGY_BYTES:
+    def _on_topology(self, message: TopologicalMap) -> None:
+        size = len(message.node_ids) + len(message.edge_ids)
+        if size > _MAX_TOPOLOGY_SIZE:
             self._navigator.topology = None
             raise InputError(
-                f'topology of {len(data)} bytes: expected at most {_MAX_TOPOLOGY_BYTES}: distant '
-                'goals are planned without it'
+                f'topology of {size} nodes and edges: expected at most {_MAX_TOPOLOGY_SIZE}: '
+                'distant goals are planned without it'
             )
-        self._navigator.topology = read_topology(data)
+        self._navigator.topology = topology_from_msg(message)
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._tasks.pose(message)  # raises for an invalid one, which is counted

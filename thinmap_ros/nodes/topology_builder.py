@@ -24,13 +24,42 @@ from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
 from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
-from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
+from thinmap_ros.ros.decoding.map_identity import UNKNOWN, FollowedMap, Origin
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 _ID_RESERVE = 1000  # ids that a builder may have assigned after its last checkpoint
+
+
+class _GraphPublisher:
+    """Publishes graphs on a latched topic, which gives the newest one to late subscribers."""
+
+    def __init__(self, node: Node, topic: str, frame_id: str) -> None:
+        self._topic = node.create_publisher(TopologicalMapMsg, topic, qos.LATCHED)
+        self._frame_id = frame_id
+        self._latched: TopologicalMapMsg | None = None
+
+    @property
+    def has_published(self) -> bool:
+        return self._latched is not None
+
+    @property
+    def has_subscribers(self) -> bool:
+        return bool(self._topic.get_subscription_count())
+
+    def publish(
+        self, topology: TopologicalMap, stamp_ns: int, map_id: int = UNKNOWN, again: bool = False
+    ) -> bool:
+        """Publish a graph; one that is latched already only if `again`. Returns whether it was."""
+        message = messages.topology_msg(topology, self._frame_id, stamp_ns, map_id)
+        is_latched = self._latched is not None and messages.is_same_topology(message, self._latched)
+        if is_latched and not again:
+            return False
+        self._topic.publish(message)
+        self._latched = message
+        return True
 
 
 class _TopologyPublishers:
@@ -41,25 +70,28 @@ class _TopologyPublishers:
 
     def __init__(self, node: Node) -> None:
         self.frame_id = parameters.declare_map_frame(node)
-        self._local = node.create_publisher(TopologicalMapMsg, 'local_topology', qos.LATCHED)
-        self._global = node.create_publisher(TopologicalMapMsg, 'topology', qos.LATCHED)
-        self.has_published = False
+        self._local = _GraphPublisher(node, 'local_topology', self.frame_id)
+        self._global = _GraphPublisher(node, 'topology', self.frame_id)
         self.followed = FollowedMap()
 
-    def publish_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
-        self.has_published = True
-        map_id = self.followed.id
-        self._global.publish(messages.topology_msg(topology, self.frame_id, stamp_ns, map_id))
+    @property
+    def has_published(self) -> bool:
+        return self._global.has_published
+
+    def publish_map(self, topology: TopologicalMap, stamp_ns: int, again: bool) -> bool:
+        return self._global.publish(topology, stamp_ns, self.followed.id, again)
 
     def publish_local_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
-        self._local.publish(messages.topology_msg(topology, self.frame_id, stamp_ns))
+        # A subscriber may wait for the result of each scan (lockstep).
+        self._local.publish(topology, stamp_ns, again=self._local.has_subscribers)
 
 
 class TopologyBuilderNode(ThinmapNode):
     """/local_grid, /grid and /pose in; /local_topology, /topology and /regions out.
 
     Services save_topology, load_topology and check_topology, which reads a saved graph without
-    replacing the present one. Where Nav2's route server runs, it is given the graph
+    replacing the present one. A graph is published when it has changed, /local_topology for each
+    scan while somebody subscribes to it. Where Nav2's route server runs, it is given the graph
     when it has changed, and when it is saved: client of route_server/set_route_graph.
     Cells outside of the windows are those of /grid. After a /trajectory the graph is rebuilt from
     the /grid that has undergone that correction, in a thread; until then the graph stays as it is.
@@ -164,7 +196,7 @@ class TopologyBuilderNode(ThinmapNode):
             self._builder, changed = self._rebuilding.update(self._builder, window, T_map_base)
         self._rebuilding.add_pose(stamp_ns, T_map_base)
         if changed:
-            self._publish(stamp_ns)
+            self._publish(stamp_ns, again=False)
         # The local map comes last: a subscriber that receives it has all results of this scan.
         self._output.publish_local_map(self._builder.local_map(), stamp_ns)
 
@@ -189,12 +221,12 @@ class TopologyBuilderNode(ThinmapNode):
         with self.diagnostics.time_step('whole map'):
             changed = self._builder.update(shown, self._T_map_base)
         if changed:
-            self._publish(messages.stamp_ns(message.header.stamp))
+            self._publish(messages.stamp_ns(message.header.stamp), again=False)
 
-    def _publish(self, stamp_ns: int) -> None:
+    def _publish(self, stamp_ns: int, again: bool = True) -> None:
         self._checkpoint_new_ids()
-        self._output.publish_map(self._builder.map, stamp_ns)
-        self._route_graph.graph_changed()
+        if self._output.publish_map(self._builder.map, stamp_ns, again):
+            self._route_graph.graph_changed()
 
     def _checkpoint_new_ids(self) -> None:
         """Save a checkpoint before new ids are published: other nodes may rely on them."""

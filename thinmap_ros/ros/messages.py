@@ -10,7 +10,6 @@ import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import (
     Point,
-    Point32,
     Pose,
     PoseStamped,
     PoseWithCovarianceStamped,
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Header
 
-from thinmap_msgs.msg import ProbabilityGrid, SlamStatus, TopologicalEdge, TopologicalNode
+from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
@@ -33,7 +32,8 @@ from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
-from thinmap_ros.core.topology.graph import Edge, Node, TopologicalMap
+from thinmap_ros.core.topology.flat import FIELDS, flat_topology
+from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.logs import decode
 
 # A bag or a publisher cannot name anything else to import.
@@ -279,29 +279,14 @@ def topology_msg(
     topology: TopologicalMap, frame_id: str, ns: int, map_id: int = 0
 ) -> TopologicalMapMsg:
     """Message of a topological map; map_id: of its grid."""
-    return TopologicalMapMsg(
-        header=header(frame_id, ns),
-        nodes=[_node_msg(node) for node in topology.nodes.values()],
-        edges=[_edge_msg(edge) for edge in topology.edges.values()],
-        map_id=map_id,
-    )
+    message = TopologicalMapMsg(header=header(frame_id, ns), map_id=map_id)
+    for name, values in flat_topology(topology).items():
+        # An array of the field's type: rclpy copies it as it is, and anything else value by value.
+        getattr(message, name).frombytes(values.tobytes())
+    return message
 
 
-def _node_msg(node: Node) -> TopologicalNode:
-    return TopologicalNode(
-        id=node.id,
-        kind=int(node.kind),
-        position=Point(x=node.x, y=node.y),
-        clearance_m=node.clearance_m,
-    )
-
-
-def _edge_msg(edge: Edge) -> TopologicalEdge:
-    return TopologicalEdge(
-        id=edge.id,
-        node_a=edge.a,
-        node_b=edge.b,
-        length_m=edge.length_m,
-        clearance_m=edge.clearance_m,
-        path=[Point32(x=x, y=y) for x, y in edge.path.tolist()],
-    )
+def is_same_topology(one: TopologicalMapMsg, other: TopologicalMapMsg) -> bool:
+    """Whether two messages hold the same graph of the same map, at whatever time."""
+    names = ('map_id', *FIELDS)
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)

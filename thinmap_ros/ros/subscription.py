@@ -3,7 +3,6 @@
 Invalid messages are counted, logged and dropped; messages lost on the way are counted.
 """
 
-import struct
 from collections import deque
 from collections.abc import Callable
 from time import monotonic
@@ -32,8 +31,6 @@ WARN_PERIOD_S = 5.0  # between two warnings of the same kind
 _TIMEOUT_S = 3.0
 # Data of one sensor: those of two mixed are of none. Positions of two odometries jump.
 _SOLE_SOURCE = (LaserScan, Odometry)
-_ENCAPSULATION = 4  # bytes before the first field of a serialized message
-_STAMP_BYTES = 8
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 
@@ -43,16 +40,13 @@ def subscribe_guarded(
     topic: str,
     process: Callable[[Any], None],
     profile: QoSProfile,
-    read: Callable[[bytes], Any] | None = None,
 ) -> None:
     """Subscribe to a topic.
-
-    read: where given, `process` receives what it returns for the serialized message.
 
     A message for which `process` raises InputError is dropped with a throttled warning. Where a
     publisher offers less than the profile requests (best effort, volatile), less is requested.
     """
-    _GuardedSubscription(node, kind, topic, process, profile, read)
+    _GuardedSubscription(node, kind, topic, process, profile)
 
 
 class _GuardedSubscription:
@@ -65,11 +59,10 @@ class _GuardedSubscription:
         topic: str,
         process: Callable[[Any], None],
         profile: QoSProfile,
-        read: Callable[[bytes], Any] | None,
     ) -> None:
         self._node = node
         self._topic = topic
-        self._process = process if read is None else lambda data: process(read(data))
+        self._process = process
         self._is_scan = kind is LaserScan
         self._is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._latched_message: Any = None
@@ -78,8 +71,7 @@ class _GuardedSubscription:
         self._time_jumps = 0
         self._losses = MessageLossCounter()
         node.diagnostics.expect_topic(topic)
-        is_raw = read is not None
-        AdaptiveSubscription(node, kind, topic, self._on_message, profile, is_raw)
+        AdaptiveSubscription(node, kind, topic, self._on_message, profile)
         if kind in _SOLE_SOURCE:
             node.diagnostics.check_sole_publisher(topic, WARN)
         if self._is_scan:
@@ -153,10 +145,7 @@ class AdaptiveSubscription:
         topic: str,
         on_message: Callable[[Any, dict[str, Any]], None],
         profile: QoSProfile,
-        is_raw: bool = False,
     ) -> None:
-        """is_raw: `on_message` receives serialized messages."""
-        self._is_raw = is_raw
         self._node = node
         self._kind = kind
         self._topic = topic
@@ -173,7 +162,6 @@ class AdaptiveSubscription:
             self._on_message,
             self._profile,
             event_callbacks=events,
-            raw=self._is_raw,
         )
 
     def _on_incompatible_qos(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
@@ -245,11 +233,5 @@ class MessageLossCounter:
 
 
 def _stamp_ns(message: Any) -> int:
-    """Stamp of a message, unchecked; of a serialized one, too."""
-    if isinstance(message, bytes):
-        if len(message) < _ENCAPSULATION + _STAMP_BYTES:
-            return 0  # rejected when it is read
-        order = '<' if message[1:2] == b'\x01' else '>'
-        seconds, nanoseconds = struct.unpack_from(f'{order}iI', message, _ENCAPSULATION)
-        return int(SECOND_NS * seconds + nanoseconds)
+    """Stamp of a message, unchecked."""
     return int(SECOND_NS * message.header.stamp.sec + message.header.stamp.nanosec)

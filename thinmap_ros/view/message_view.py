@@ -13,6 +13,7 @@ from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamp_matcher import StampMatcher
+from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
@@ -70,7 +71,7 @@ class MessageView:
         """Show a message (of ROS's class or rosbags'). Raises InputError if it is invalid."""
         try:
             self._takers[topic](decode.stamp_ns(message), message)
-        except ValueError as error:  # unknown node kinds, cells that form no rectangle
+        except ValueError as error:  # unknown region kinds, cells that form no rectangle
             raise InputError(' '.join(str(error).split())) from error
 
     def _on_map(self, ns: int, message: Any) -> None:
@@ -119,7 +120,7 @@ class MessageView:
         self._view.scalar(ns, 'error', 'heading, deg', heading)
 
     def _on_topology(self, ns: int, message: Any) -> None:
-        topology = decode.topology(message)
+        topology = topology_from_msg(message)
         self._places = {node.id: node.position for node in topology.nodes.values()}
         self._view.topology(ns, topology)
         self._view.scalar(ns, 'count', 'nodes', len(topology.nodes))

@@ -19,6 +19,7 @@ from support.slam_room import ROOM, scan_in
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
+from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.files.snapshots import write_snapshot
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.sim.robot import after_arc
@@ -138,7 +139,7 @@ def kept(graph):
 
 
 def places(graph_message):
-    return {n.id: (n.position.x, n.position.y) for n in graph_message.nodes}
+    return {n.id: (n.x, n.y) for n in topology_from_msg(graph_message).nodes.values()}
 
 
 def test_mapping_continues_after_each_node_was_killed(graph):
@@ -147,7 +148,7 @@ def test_mapping_continues_after_each_node_was_killed(graph):
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     start_mapping(graph)
     robot.drive(3.2)
-    graph.until(lambda: maps and graphs and len(graphs[-1].nodes) > 2, 'map and graph')
+    graph.until(lambda: maps and graphs and len(graphs[-1].node_ids) > 2, 'map and graph')
     for name in MAPPING:
         robot.settle()
         kept(graph)
@@ -274,7 +275,7 @@ def test_a_clock_set_back_resets_all_nodes(graph):
     names = (*MAPPING, 'explorer', 'navigator')
     start_together(graph, *names)
     robot.drive(1.5)
-    graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
+    graph.until(lambda: maps and graphs and graphs[-1].node_ids, 'map and graph')
     assert graph.stop('sim') == 0
     graph.drain()
     robot.poses.clear(), robot.truth.clear(), maps.clear()

@@ -35,16 +35,15 @@ def test_regions_name_the_nodes_of_the_graph(graph):
         return (
             graphs
             and heard
-            and {n.id for n in graphs[-1].nodes}
-            == {i for r in heard[-1].regions for i in r.node_ids}
-            and len(graphs[-1].nodes) > 0
+            and set(graphs[-1].node_ids) == {i for r in heard[-1].regions for i in r.node_ids}
+            and len(graphs[-1].node_ids) > 0
         )
 
     graph.until(is_complete, 'regions of all nodes')
     message = heard[-1]
     assert message.header.frame_id == 'map'
     assert sorted(r.kind for r in message.regions) == [Region.ROOM, Region.ROOM, Region.CORRIDOR]
-    edges = {edge.id for edge in graphs[-1].edges}
+    edges = set(graphs[-1].edge_ids)
     assert {number for r in message.regions for number in r.edge_ids} == edges
     assert len(message.doors) == 2
     assert all(door.edge_ids and set(door.edge_ids) <= edges for door in message.doors)

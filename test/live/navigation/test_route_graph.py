@@ -7,6 +7,7 @@ from support.peers.route_server import RouteServer
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_msgs.srv import SaveMap
+from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import NodeKind
 from thinmap_ros.ros import messages, qos
 
@@ -32,7 +33,7 @@ class Mapping:
             real_time_factor=4.0,
             lockstep='local_topology',
         )
-        graph.until(lambda: self.graphs and self.graphs[-1].edges, 'a graph with edges')
+        graph.until(lambda: self.graphs and self.graphs[-1].edge_ids, 'a graph with edges')
 
     def drives_until(self, condition, what):
         """Drive in a circle until a condition holds."""
@@ -57,11 +58,14 @@ class Mapping:
 
 
 def is_of(route_graph, topology):
-    """Whether a route graph has the nodes of a published graph, at their places."""
-    received = {number: node[:2] for number, node in route_graph.nodes.items()}
+    """Whether a route graph has the nodes of a published graph, as they are."""
+    received = {
+        number: (x, y, metadata['clearance'])
+        for number, (x, y, _, metadata) in route_graph.nodes.items()
+    }
     return received == {
-        node.id: pytest.approx((node.position.x, node.position.y), abs=1e-3)
-        for node in topology.nodes
+        node.id: pytest.approx((node.x, node.y, node.clearance_m), abs=1e-3)
+        for node in topology_from_msg(topology).nodes.values()
     }
 
 
@@ -73,20 +77,20 @@ def test_a_route_server_receives_the_graph_as_it_grows_and_when_it_is_saved(grap
         'a graph that has grown',
     )
     mapping.stands()
-    topology = mapping.graphs[-1]
-    graph.until(lambda: is_of(server.graphs[-1], topology), 'the newest graph')
+    graph.until(lambda: is_of(server.graphs[-1], mapping.graphs[-1]), 'the newest graph')
+    topology = topology_from_msg(mapping.graphs[-1])
     received = server.graphs[-1]
-    for node in topology.nodes:
+    for node in topology.nodes.values():
         _, _, frame, metadata = received.nodes[node.id]
         assert frame == 'map'
         assert metadata == {
             'class': NodeKind(node.kind).name.lower(),
             'clearance': pytest.approx(node.clearance_m, abs=1e-3),
         }
-    both_ways = sorted((e.node_a, e.node_b) for e in topology.edges)
-    both_ways += sorted((e.node_b, e.node_a) for e in topology.edges)
+    both_ways = sorted((e.a, e.b) for e in topology.edges.values())
+    both_ways += sorted((e.b, e.a) for e in topology.edges.values())
     assert sorted((start, end) for start, end, _ in received.edges.values()) == sorted(both_ways)
-    ends = {node.id for node in topology.nodes if node.kind == NodeKind.END}
+    ends = {node.id for node in topology.nodes.values() if node.kind == NodeKind.END}
     for start, end, metadata in received.edges.values():
         assert metadata['class'] == ('dead_end' if ends & {start, end} else 'passage')
         assert metadata['clearance'] > 0.2 and metadata['length'] > 0.0

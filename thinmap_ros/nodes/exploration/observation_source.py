@@ -12,6 +12,7 @@ from thinmap_ros.core.exploration.live.map_graph import MapGraph
 from thinmap_ros.core.exploration.mission import InputWatchdog
 from thinmap_ros.core.exploration.observations import Observation, ObservationBuffer
 from thinmap_ros.core.topology.builder import TopologyConfig
+from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.nodes.exploration.foreign_map import ForeignMap
 from thinmap_ros.nodes.exploration.publishers import PublisherCheck
@@ -19,7 +20,6 @@ from thinmap_ros.nodes.exploration.robot_view import RobotView
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
-from thinmap_ros.ros.decoding.topology_reader import read_topology
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
@@ -83,9 +83,7 @@ class ObservationSource:
         self._view = RobotView(node, settings, frames.map_frame, frames.laser_transform)
         self._map = ForeignMap(node, settings, frames.map_frame, self._uses_foreign_map)
         self.reset()
-        subscribe_guarded(
-            node, TopologicalMap, 'topology', self._on_topology, qos.LATCHED, read_topology
-        )
+        subscribe_guarded(node, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(node, ProbabilityGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
         subscribe_guarded(node, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
@@ -117,9 +115,9 @@ class ObservationSource:
 
     # Inputs.
 
-    def _on_topology(self, topology: Topology) -> None:
+    def _on_topology(self, message: TopologicalMap) -> None:
+        self._buffer.topology = topology_from_msg(message)
         self._topologies.message_received()
-        self._buffer.topology = topology
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
         self._grids.received(message)

@@ -1,1 +1,1 @@
-"""Large messages, read from their serialized form."""
+"""What messages tell of their maps."""
