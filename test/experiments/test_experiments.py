@@ -5,6 +5,7 @@ Their output is complete and reproducible, and the same from a bag as from live 
 
 import csv
 import json
+import re
 import sys
 from itertools import islice
 from pathlib import Path
@@ -88,11 +89,15 @@ def test_the_same_seed_gives_the_same_numbers(name: str) -> None:
     ]
 
 
-def test_every_experiment_has_its_script() -> None:
-    scripts = {path.stem for path in (ROOT / 'scripts' / 'experiments').glob('*.sh')}
-    assert scripts == {*EXPERIMENTS, 'all', 'logs'}
-    for name in scripts:
-        assert f'/run" {name} "$@"' in (ROOT / 'scripts' / 'experiments' / f'{name}.sh').read_text()
+def test_the_script_runs_every_experiment(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / 'scripts' / 'experiment').read_text()
+    assert 'thinmap_ros.tools.experiment "$1"' in text
+    (listed,) = re.findall(r'^# .*scripts/experiment NAME\|(\S+)', text, re.MULTILINE)
+    words = ['experiment', 'nothing', '-o', 'out']
+    with patch.object(sys, 'argv', words), pytest.raises(SystemExit):
+        main()
+    refused = capsys.readouterr().err
+    assert all(name in refused for name in (*EXPERIMENTS, *listed.split('|')))
 
 
 def test_the_plain_stages_end_where_nothing_changes() -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.atomic import atomic_write, partial_files
 from thinmap_ros.ros.checkpoint import Checkpoint, checkpoint_directory
 
@@ -81,7 +80,7 @@ def test_folders_that_are_not_of_this_user_alone(folder: Path, tmp_path: Path, w
         folder.symlink_to(tmp_path / 'other') if wrong == 'link' else folder.mkdir()
     if wrong == 'open':
         folder.chmod(0o770)
-    with pytest.raises(InputError, match='state: '):
+    with pytest.raises(OSError, match='state: '):
         checkpoint_directory()
     node = FakeNode()
     checkpoint = Checkpoint(node, 30.0)
@@ -95,7 +94,7 @@ def test_folders_that_are_not_of_this_user_alone(folder: Path, tmp_path: Path, w
 def test_a_folder_that_is_open_in_any_way(folder: Path, bit: int) -> None:
     folder.mkdir()
     folder.chmod(0o700 | bit)
-    with pytest.raises(InputError, match=f'mode {0o700 | bit:o}: expected 700, closed to other'):
+    with pytest.raises(OSError, match=f'mode {0o700 | bit:o}: expected 700, closed to other'):
         checkpoint_directory()
     folder.chmod(0o700)
     assert checkpoint_directory() == folder
@@ -112,7 +111,7 @@ def test_a_new_folder_is_closed_whatever_new_files_are_else(folder: Path) -> Non
 
 def test_a_link_to_nowhere_is_no_folder(folder: Path, tmp_path: Path) -> None:
     folder.symlink_to(tmp_path / 'nowhere')
-    with pytest.raises(InputError, match='state: '):
+    with pytest.raises(OSError, match='state: '):
         checkpoint_directory()
     assert not (tmp_path / 'nowhere').exists()
 
@@ -157,7 +156,7 @@ def test_a_file_of_another_user_is_left_alone(
 def test_a_folder_of_another_user(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.mkdir(mode=0o700)
     monkeypatch.setattr(os, 'getuid', lambda: folder.stat().st_uid + 1)
-    with pytest.raises(InputError, match=r'owned by user .*: expected a folder of this user'):
+    with pytest.raises(OSError, match=r'owned by user .*: expected a folder of this user'):
         checkpoint_directory()
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.covariances import rotation
 from thinmap_ros.core.se2 import Array
 
 _SIGMAS = 3.0
@@ -159,13 +160,13 @@ class MountErrorEstimator:
         M = se2.between(begin.T_odom_base, end.T_odom_base)
         # The chord of an arc is rotated by half the turn that the odometry lacks.
         unexplained = float(se2.wrap(float(F[2] - M[2])))
-        along, aside = (_rotation(0.5 * unexplained) @ M[:2]).tolist()
+        along, aside = (rotation(0.5 * unexplained)[:2, :2] @ M[:2]).tolist()
         length = math.hypot(along, aside)
-        lever = _rotation(float(F[2])) - np.eye(2)
+        lever = rotation(float(F[2]))[:2, :2] - np.eye(2)
         # By a coarse integration of the odometry its direction is wrong by up to half the turn.
         turn_variance = float(begin.covariance[2, 2]) + 0.25 * (float(F[2]) ** 2 + unexplained**2)
         noise = config.noise_m**2 + length**2 * (config.noise_share**2 + turn_variance)
-        R = _rotation(-float(begin.T_map_base[2]))
+        R = rotation(-float(begin.T_map_base[2]))[:2, :2]
         ends = R @ (begin.covariance + end.covariance)[:2, :2] @ R.T
         covariance = ends + noise * np.eye(2)
         _, scale, place, _ = config.prior_sigmas
@@ -206,7 +207,7 @@ def _support(straight: list[_Span], x: Array, place: Array) -> float:
     if not straight:
         return 0.0
     without = np.concatenate([[x[1], 0.0], place + x[2:]])
-    R = _rotation(-float(x[0]))
+    R = rotation(-float(x[0]))[:2, :2]
     found = np.concatenate([x[1] * R[0], R @ without[2:]])
     gains = [
         np.square(span.y - span.H @ without).sum() - np.square(span.y - span.H @ found).sum()
@@ -226,7 +227,7 @@ def _solve(H: Array, y: Array, place: Array, config: MountErrorConfig) -> tuple[
     prior = np.diag(np.array(config.prior_sigmas) ** -2.0)
     x = np.array([_first_yaw(H, y, place, config), *mean[1:].tolist()])
     for _ in range(_ITERATIONS):
-        R = _rotation(-float(x[0]))
+        R = rotation(-float(x[0]))[:2, :2]
         turned = R @ (place + x[2:])
         direction = x[1] * R[0]  # cos and sin of the yaw error, times the scale
         residuals = y - H @ np.concatenate([direction, turned])
@@ -256,10 +257,3 @@ def _first_yaw(H: Array, y: Array, place: Array, config: MountErrorConfig) -> fl
     x = np.stack([c, s, c * place[0] + s * place[1], c * place[1] - s * place[0]])
     cost = np.log1p(np.square((y[:, None] - H @ x) / config.outlier_sigmas)).sum(axis=0)
     return float(yaws[int(cost.argmin())])
-
-
-def _rotation(angle: float) -> Array:
-    """Rotation matrix (2, 2)."""
-    c = math.cos(angle)
-    s = math.sin(angle)
-    return np.array([[c, -s], [s, c]])

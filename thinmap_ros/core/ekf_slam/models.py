@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.covariances import rotation
 from thinmap_ros.core.se2 import Array, wrap
 
 
@@ -48,13 +49,6 @@ def odometry_variances(increment: Array, config: OdometryConfig) -> Array:
     turn = abs(float(increment[2]))
     sigmas = odometry_slip(config) + config.noise_ratio * np.array([length_m, length_m, turn])
     return np.square(sigmas)
-
-
-def rotation(theta: float) -> Array:
-    """Matrix R (3, 3) that rotates increments by theta, and covariances C by R C R'."""
-    c = math.cos(theta)
-    s = math.sin(theta)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def motion_jacobians(T_map_base: Array, increment: Array) -> tuple[Array, Array]:

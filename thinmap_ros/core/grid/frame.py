@@ -37,10 +37,13 @@ class GridFrame:
                 f'{MAX_RESOLUTION_M:g} m'
             )
 
+    def in_cells(self, points: Array) -> Array:
+        """Points (N, 2), as x and y in cells from the corner of cell (0, 0)."""
+        return np.asarray((points - (self.origin_x, self.origin_y)) / self.resolution)
+
     def cells_of(self, points: Array) -> NDArray[np.int64]:
         """Cells (N, 2) as (row, col) that hold the points (N, 2)."""
-        scaled = (np.atleast_2d(points) - (self.origin_x, self.origin_y)) / self.resolution
-        return np.floor(scaled[:, ::-1]).astype(np.int64)
+        return np.floor(self.in_cells(np.atleast_2d(points))[:, ::-1]).astype(np.int64)
 
     def centres_of(self, cells: NDArray[np.int64]) -> Array:
         """World points (N, 2) at the centres of the cells (N, 2) given as (row, col)."""

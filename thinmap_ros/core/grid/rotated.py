@@ -1,7 +1,5 @@
 """Maps whose rows are not parallel to the x axis, as map_server files may have."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,7 +39,7 @@ def aligned_patch(
         resampled[row, inside] = cells[tuple(old_cells[inside].T)]
     occupied = np.argwhere(cells >= OCCUPIED_AT_LEAST)
     centres = (occupied[:, ::-1].astype(np.float64) + 0.5) * resolution_m
-    centres = _transformed(centres, T_map_origin)
+    centres = se2.transform_points(T_map_origin, centres)
     resampled[tuple(frame.cells_of(centres).T)] = cells[tuple(occupied.T)]
     return GridPatch(frame, resampled)
 
@@ -53,21 +51,14 @@ def _bounds(
     height_m = shape[0] * resolution_m
     width_m = shape[1] * resolution_m
     corners = np.array([[0.0, 0.0], [width_m, 0.0], [0.0, height_m], [width_m, height_m]])
-    corners = _transformed(corners, T_map_origin)
+    corners = se2.transform_points(T_map_origin, corners)
     low = corners.min(axis=0)
     # Rounded, so that a quarter turn keeps the number of cells.
     cols, rows = np.ceil(np.round((corners.max(axis=0) - low) / resolution_m, 6)).astype(int)
     return GridFrame(float(low[0]), float(low[1]), resolution_m), (int(rows), int(cols))
 
 
-def _transformed(points: Array, T: Array) -> Array:
-    """Points (N, 2) in the parent frame of a pose T (3,)."""
-    c = math.cos(T[2])
-    s = math.sin(T[2])
-    return np.asarray(points @ np.array([[c, s], [-s, c]]) + T[:2])
-
-
 def _cells_at(points: Array, T_map_origin: Array, resolution_m: float) -> NDArray[np.int64]:
     """Rows and columns (N, 2) of the rotated grid in which points (N, 2) of the map lie."""
-    inner = _transformed(points, se2.invert(T_map_origin))
+    inner = se2.transform_points(se2.invert(T_map_origin), points)
     return np.floor(inner[:, ::-1] / resolution_m + 1e-9).astype(np.int64)

@@ -94,7 +94,7 @@ class Places:
                 f'of {config.robot_radius_m} m'
             )
         spots, spacing_m = _spots(standing, patch.frame)
-        around = ranges_around(states, _in_cells(spots, patch.frame), patch.frame.resolution)
+        around = ranges_around(states, patch.frame.in_cells(spots), patch.frame.resolution)
         nodes = np.array([node.position for node in topology.nodes.values()])
         block_cells = max(1, round(_BLOCK_M / patch.frame.resolution))
         blocks, first, in_sight = _sights(states, standing, nodes, patch.frame, block_cells, config)
@@ -112,11 +112,6 @@ class Places:
             in_sight,
             block_cells,
         )
-
-
-def _in_cells(points: Array, frame: GridFrame) -> Array:
-    """Points (N, 2) as x and y in cells."""
-    return (points - (frame.origin_x, frame.origin_y)) / frame.resolution
 
 
 def _spots(standing: NDArray[np.int32], frame: GridFrame) -> tuple[Array, float]:

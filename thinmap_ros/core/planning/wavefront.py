@@ -136,7 +136,7 @@ def find_path(
         inflation_radius = config.inflation_radius_m / cell_m
         _inflate_points(
             cost,
-            _in_cells(patch, points),
+            patch.frame.in_cells(points),
             obstacles.radius_m / cell_m,
             inflation_radius,
             config.inflation_cost,
@@ -158,7 +158,7 @@ def find_path(
     if goal is None:
         return None
     field = navigation_function(cost, goal, start)
-    x, y = _in_cells(patch, np.array([start_xy]))[0].tolist()
+    x, y = patch.frame.in_cells(np.array([start_xy]))[0].tolist()
     path = trace_gradient_path(field, x, y, *goal) * patch.frame.resolution
     path += (patch.frame.origin_x, patch.frame.origin_y)
     path[0] = start_xy
@@ -205,11 +205,6 @@ def trace_gradient_path(field: Array, x: float, y: float, goal_row: int, goal_co
     It leads from a point to the centre of the goal cell.
     """
     return np.asarray(_trace_gradient_path(field, x, y, goal_row, goal_col))
-
-
-def _in_cells(patch: GridPatch, points: Array) -> Array:
-    frame = patch.frame
-    return np.asarray((points - (frame.origin_x, frame.origin_y)) / frame.resolution)
 
 
 def _open_escape_cells(

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter, parameters_of, part
+from thinmap_ros.core.covariances import rotated_covariance, rotation
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
-from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances, rotation
+from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
@@ -30,7 +31,6 @@ from thinmap_ros.core.slam.graph.keyframes import (
     KeyframeConfig,
     Step,
     heading_errors,
-    rotated_covariance,
     with_heading,
 )
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig

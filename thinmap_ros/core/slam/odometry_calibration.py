@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.models import rotation
+from thinmap_ros.core.covariances import carried, rotation
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.keyframes import carried
 
 _OUTLIER_SIGMAS = 3.0  # beyond which all innovations teach the same
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.covariances import propagated_covariance, rotated_covariance
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.keyframes import propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 from thinmap_ros.core.slam.odometry_prediction import Prediction
 

@@ -8,6 +8,7 @@ import pytest
 from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.covariances import inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph import keyframes as module
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
@@ -16,9 +17,6 @@ from thinmap_ros.core.slam.graph.keyframes import (
     Step,
     covariances_from,
     heading_errors,
-    inverse,
-    propagated_covariance,
-    rotated_covariance,
     view_difference_m,
     with_heading,
 )

@@ -7,15 +7,9 @@ import pytest
 from support.slam_room import ROOM, corridor_ring, scan_in
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.covariances import inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph import loop_closure as module
-from thinmap_ros.core.slam.graph.keyframes import (
-    Keyframe,
-    KeyframeConfig,
-    Step,
-    inverse,
-    propagated_covariance,
-    rotated_covariance,
-)
+from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Step
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig

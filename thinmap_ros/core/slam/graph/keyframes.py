@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.covariances import inverse
 from thinmap_ros.core.grid.spatial_hash import SpatialHash
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -203,22 +204,6 @@ def view_difference_m(T_a: Array, T_b: Array) -> float:
     return float(math.hypot(x, y) + _RADIAN_M * abs(turn))
 
 
-def propagated_covariance(covariance: Array, lever: Array) -> Array:
-    """Covariance (3, 3) of a pose at a fixed offset from a pose of that covariance, map frame.
-
-    lever (2,): offset, m. Source: Smith, Self and Cheeseman, "Estimating uncertain spatial
-    relationships in robotics", 1990, compounding.
-    """
-    F = np.array([[1.0, 0.0, -lever[1]], [0.0, 1.0, lever[0]], [0.0, 0.0, 1.0]])
-    return np.asarray(F @ covariance @ F.T)
-
-
-def carried(derivative: Array, lever: Array) -> Array:
-    """Derivative (3, 4) of a pose at a fixed offset (2,), m, from a pose with that derivative."""
-    F = np.array([[1.0, 0.0, -lever[1]], [0.0, 1.0, lever[0]], [0.0, 0.0, 1.0]])
-    return np.asarray(F @ derivative)
-
-
 def heading_errors(headings: Sequence[Heading | None], poses: Array) -> Array:
     """Errors (N, 6) of the headings that wall directions measure for poses (N, 3).
 
@@ -250,19 +235,6 @@ def _with_heading(covariance: Array, derivative: Array, error: Array) -> tuple[A
     gain = shared / (own + error[0])
     change = error[2:] - derivative[2]
     return covariance - np.outer(gain, shared), derivative + np.outer(gain, change)
-
-
-def inverse(matrix: Array) -> Array:
-    """Information (3, 3) of a covariance, and vice versa."""
-    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-
-
-def rotated_covariance(covariance: Array, theta: float) -> Array:
-    """Covariance (3, 3) of a relative pose, rotated by theta into the map frame."""
-    c = math.cos(theta)
-    s = math.sin(theta)
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(R @ covariance @ R.T)
 
 
 def _heading_edge(number: int, heading: Heading, first: float) -> Edge:

@@ -16,7 +16,13 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.ekf_slam.models import rotation
+from thinmap_ros.core.covariances import (
+    carried,
+    inverse,
+    propagated_covariance,
+    rotated_covariance,
+    rotation,
+)
 from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import CHI2
@@ -25,10 +31,6 @@ from thinmap_ros.core.slam.graph.keyframes import (
     KeyframeConfig,
     Keyframes,
     Step,
-    carried,
-    inverse,
-    propagated_covariance,
-    rotated_covariance,
     view_difference_m,
 )
 from thinmap_ros.core.slam.graph.pieces import Pieces

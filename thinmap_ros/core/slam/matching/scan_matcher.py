@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.covariances import inverse
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.keyframes import inverse
 from thinmap_ros.core.slam.matching.correlative_search import search
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.matching_cost import minimize
