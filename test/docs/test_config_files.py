@@ -210,3 +210,5 @@ def test_presets_fit_together():
         assert localizer['lines.max_range_m'] <= max_range_m <= sim['range_max_m']
         reach_m = max(grid['no_return_clear_range_m'], min(max_range_m, 4.0))
         assert grid['local_map_size_m'] >= 2.0 * reach_m
+        searching = content['/**/global_localizer']['ros__parameters']
+        assert searching['range_noise_m'] == localizer['lines.range_noise_m']
