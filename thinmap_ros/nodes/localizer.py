@@ -36,6 +36,7 @@ from thinmap_ros.core.slam.localizers import (
     line_features,
     localizer_class,
     set_topology,
+    without_effect,
 )
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.flat import topology_from_msg
@@ -229,6 +230,8 @@ class LocalizerNode(ThinmapNode):
         self._given = GivenMap(self, self._config)
         self._save_directory = SaveDirectory(self)
         parameters.reject_unknown(self)
+        for name in without_effect(self._config):
+            self.get_logger().warning(f'{name}: no effect with slam = {self._config.slam}')
         warm_up.localizer()
         self._map_ids: _MapIds | None = _MapIds() if self._config.is_mapping else None
         self._begin()

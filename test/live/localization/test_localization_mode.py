@@ -232,3 +232,10 @@ def test_contradicting_parameters_end_the_start_in_words(graph):
     assert graph.ended(process) == 2
     graph.processes.clear()
     assert 'expected a session_path' in graph.log('localizer')
+
+
+def test_parameters_of_another_localizer_have_no_effect_and_are_named(graph):
+    graph.start('localizer', **{'association.gate': 4.0, 'matching.noise_m': 0.08})
+    text = 'association.gate: no effect with slam = scan_matching'
+    graph.until(lambda: text in graph.log('localizer'), 'a warning')
+    assert 'matching.noise_m' not in graph.log('localizer')
