@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
+from support.forks import forked
 from support.hidden_library import hide_ros
 from support.ros_domains import free_domain
 from support.timeouts import limited_cpu_time as limited_cpu_time
@@ -47,6 +48,7 @@ def without_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         if 'THINMAP_WITHOUT_ROS' in os.environ:
             hide_ros(tmp_path_factory.mktemp('without_ros'), patch)
+        forked.server()
         yield
 
 
@@ -67,6 +69,7 @@ def started_programs(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(subprocess.Popen, '__init__', refuse)
     monkeypatch.setattr(BaseProcess, 'start', refuse)
+    monkeypatch.setattr(forked, 'start', refuse)
 
 
 @pytest.fixture(scope='session')
