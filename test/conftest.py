@@ -14,6 +14,7 @@ import thinmap_ros.startup  # noqa: F401  before NumPy, for which it sets the nu
 # isort: split
 import pytest
 from hypothesis import settings
+from support.forks import forked
 from support.hidden_library import hide_ros
 from support.ros_domains import free_domain
 from support.timeouts import limited_cpu_time as limited_cpu_time
@@ -50,6 +51,7 @@ def without_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         if 'THINMAP_WITHOUT_ROS' in os.environ:
             hide_ros(tmp_path_factory.mktemp('without_ros'), patch)
+        forked.server()
         yield
 
 
@@ -70,6 +72,7 @@ def started_programs(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(subprocess.Popen, '__init__', refuse)
     monkeypatch.setattr(BaseProcess, 'start', refuse)
+    monkeypatch.setattr(forked, 'start', refuse)
 
 
 @pytest.fixture(scope='session')

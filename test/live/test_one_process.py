@@ -4,8 +4,6 @@ Each node behaves as in its own process.
 """
 
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import psutil
@@ -15,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid
+from support.forks import forked
 from support.timeouts import PATIENCE_S
 from tf2_msgs.msg import TFMessage
 
@@ -38,6 +37,7 @@ def test_one_process_locates_maps_and_drives(graph):
     truth = graph.heard('ground_truth', PoseStamped)
     health = graph.heard('/diagnostics', DiagnosticArray)
     start = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'use_sim_time': True}
+    graph.forks = False  # the memory is that of a process as users start it
     process = graph.start('thinmap', **start)
     # Paced: otherwise the result could arrive before the true poses of the path.
     graph.start(
@@ -130,8 +130,7 @@ def test_two_robots_in_namespaces_keep_to_themselves(graph):
 
 
 def run(*arguments):
-    command = [sys.executable, '-m', 'thinmap_ros.nodes.thinmap', *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+    return forked.run('thinmap_ros.nodes.thinmap', *arguments, timeout=PATIENCE_S)
 
 
 def test_what_cannot_be_run_is_reported_in_one_line(ros_domain):

@@ -1,8 +1,5 @@
 """Parameters of running nodes: changes are accepted, or rejected with a reason."""
 
-import subprocess
-import sys
-
 import pytest
 from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -12,6 +9,8 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
+from support.forks import forked
+from support.timeouts import PATIENCE_S
 
 from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
 from thinmap_ros.ros import qos
@@ -146,9 +145,8 @@ def test_what_cannot_change_is_marked_and_refused(graph):
     ],
 )
 def test_numbers_that_make_no_sense_end_the_start_with_a_line(node, name, number):
-    command = [sys.executable, '-m', f'thinmap_ros.nodes.{node}', '--ros-args']
-    command += ['-p', f'{name}:={number}']
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    words = ('--ros-args', '-p', f'{name}:={number}')
+    done = forked.run(f'thinmap_ros.nodes.{node}', *words, timeout=PATIENCE_S)
     line = done.stderr.splitlines()[-1]
     assert 'Traceback' not in done.stderr
     assert done.returncode == 2 and f'{name} = ' in line and 'expected' in line
@@ -172,8 +170,7 @@ def test_a_running_global_localizer_keeps_its_parameters(graph):
     ],
 )
 def test_arguments_that_ros_cannot_read_end_the_start_with_a_line(arguments, said):
-    command = [sys.executable, '-m', 'thinmap_ros.nodes.navigator', '--ros-args', *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = forked.run('thinmap_ros.nodes.navigator', '--ros-args', *arguments)
     assert done.returncode == 2
     line = done.stderr.splitlines()[-1]  # after one of rcl's log
     assert 'Traceback' not in done.stderr

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.forks import forked
 from support.ros1_bag import ros1_bag
 
 from thinmap_ros.core.errors import InputError
@@ -23,8 +24,7 @@ def sqlite_file(path: Path) -> None:
 
 
 def run(folder: Path, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, '-m', f'thinmap_ros.tools.{program}', *arguments]
-    return subprocess.run(command, capture_output=True, text=True, cwd=folder)
+    return forked.run(f'thinmap_ros.tools.{program}', *arguments, folder=folder)
 
 
 @pytest.mark.programs

@@ -5,7 +5,6 @@ No damage causes a traceback in any program.
 
 import os
 import subprocess
-import sys
 from bisect import bisect_right
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
+from support.forks import forked
 
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.bag import Bag
@@ -57,8 +57,7 @@ def numbers(path: Path) -> list[int]:
 
 
 def repaired(source: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, '-m', 'thinmap_ros.tools.bag_repair', str(source), *arguments]
-    return subprocess.run(command, capture_output=True, text=True)
+    return forked.run('thinmap_ros.tools.bag_repair', source, *arguments)
 
 
 def test_what_is_flushed_is_readable_at_once(tmp_path: Path) -> None:

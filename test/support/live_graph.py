@@ -3,8 +3,6 @@
 import math
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,23 +17,27 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from support.forks import forked
 from support.timeouts import PATIENCE_S
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.ros import qos
 
-TESTS = Path(__file__).resolve().parents[1]
 _DEPTH = 1000
 # Time after which a response is taken to be lost.
 _ASK_AGAIN_S = 20.0
 
 
 class Graph:
-    """Node processes, and the test's own node, with subscriptions and clients."""
+    """Node processes, and the test's own node, with subscriptions and clients.
+
+    forks: whether nodes share the memory of a server that has imported what they need.
+    """
 
     def __init__(self, domain: int, folder: Path) -> None:
         self.folder = folder
-        self.processes = {}
+        self.forks = True
+        self.processes: dict[str, forked.Started] = {}
         self._clients: dict[str, Client] = {}
         self._pacemaker: Publisher | None = None
         self._heard = 0
@@ -53,30 +55,24 @@ class Graph:
         label: str = '',
         package: str = 'thinmap_ros.nodes',
         **values: Any,
-    ) -> subprocess.Popen[bytes]:
+    ) -> forked.Started:
         """Start a node with arguments, ROS's remapping rules and its parameters.
 
         Its key is its label, or its name. package: of its module.
         """
-        command = [sys.executable, '-m', f'{package}.{name}', *arguments, '--ros-args']
-        name = label or name
+        words = [*arguments, '--ros-args']
         for rule in remap:
-            command += ['-r', rule]
-        for key, value in values.items():
+            words += ['-r', rule]
+        for parameter, value in values.items():
             text = f"'{value}'" if isinstance(value, str) else str(value).lower()
-            command += ['-p', f'{key}:={text}']
-        log = (self.folder / f'{name}.log').open('wb')
-        # Services save and load below the working directory only.
-        process = subprocess.Popen(
-            command,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            cwd=self.folder,
-            env={**os.environ, 'PYTHONPATH': f'{TESTS}:{os.environ.get("PYTHONPATH", "")}'},
-        )
-        log.close()
-        self.processes[name] = process
+            words += ['-p', f'{parameter}:={text}']
+        key = label or name
+        with (self.folder / f'{key}.log').open('wb') as log:
+            # Services save and load below the working directory only.
+            module = f'{package}.{name}'
+            anew = not self.forks
+            process = forked.start(module, words, self.folder, (log, log), anew=anew)
+        self.processes[key] = process
         return process
 
     def log(self, name: str) -> str:
@@ -187,7 +183,7 @@ class Graph:
         """Answer to a cancel of an accepted goal; asks again, as it may be lost."""
         return self._first(handle.cancel_goal_async, 'an answer to the cancel', again_s)
 
-    def ended(self, process: subprocess.Popen[bytes]) -> int:
+    def ended(self, process: forked.Started) -> int:
         """Exit code of a node that ends by itself."""
         return process.wait(timeout=PATIENCE_S)
 

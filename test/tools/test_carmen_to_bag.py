@@ -1,11 +1,11 @@
 """A log converted to a bag: both give identical data."""
 
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.forks import forked
 from support.timeouts import PROGRAM_S
 
 from thinmap_ros.core import se2
@@ -95,11 +95,9 @@ def test_real_logs(tmp_path: Path, name: str, options: dict[str, float]) -> None
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, '-m', 'thinmap_ros.tools.carmen_to_bag', *map(str, arguments)]
     root = Path(__file__).parents[2]
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=PROGRAM_S, cwd=root, check=False
-    )
+    module = 'thinmap_ros.tools.carmen_to_bag'
+    return forked.run(module, *arguments, folder=root, timeout=PROGRAM_S)
 
 
 @pytest.mark.programs

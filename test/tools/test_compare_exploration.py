@@ -1,13 +1,12 @@
 """Table of strategies x worlds x starts: resumable, paired, and the same on a cluster."""
 
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from support.forks import forked
 from support.timeouts import PROGRAM_S
 
 from benchmarks.exploration.page import page
@@ -90,17 +89,8 @@ def test_the_page_has_a_section_for_each_way_of_exploring_and_names_every_fault(
 
 
 def compare(*words: str) -> 'subprocess.CompletedProcess[str]':
-    command = [sys.executable, '-m', 'thinmap_ros.tools.compare_exploration', *words, '--quiet']
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    return subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        timeout=PROGRAM_S,
-        env=environment,
-        cwd=ROOT,
-        check=False,
-    )
+    module = 'thinmap_ros.tools.compare_exploration'
+    return forked.run(module, *words, '--quiet', folder=ROOT, timeout=PROGRAM_S)
 
 
 @pytest.fixture

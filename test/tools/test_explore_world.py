@@ -1,13 +1,12 @@
 """The program explore_world."""
 
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from support.forks import forked
 from support.timeouts import PROGRAM_S
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,17 +34,8 @@ FIELDS = {
 
 
 def explore(*words: str) -> 'subprocess.CompletedProcess[str]':
-    command = [sys.executable, '-m', 'thinmap_ros.tools.explore_world', *words, '--quiet']
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    return subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        timeout=PROGRAM_S,
-        env=environment,
-        cwd=ROOT,
-        check=False,
-    )
+    module = 'thinmap_ros.tools.explore_world'
+    return forked.run(module, *words, '--quiet', folder=ROOT, timeout=PROGRAM_S)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from support.carmen_log import BEAMS, carmen_lines
+from support.forks import forked
 from support.hidden_library import hide
 from support.timeouts import PATIENCE_S
 
@@ -38,8 +39,7 @@ needs_rerun = pytest.mark.skipif(
 
 
 def run(*arguments):
-    command = [sys.executable, '-m', 'thinmap_ros.tools.replay', *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True)
+    return forked.run('thinmap_ros.tools.replay', *arguments)
 
 
 @pytest.fixture

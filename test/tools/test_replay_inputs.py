@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from support.bag_maker import ODOMETRY, SCAN, TF, Maker, write
 from support.carmen_log import box_ranges, carmen_lines
+from support.forks import forked
 
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.logs.bag_writer import BagWriter
@@ -22,8 +22,7 @@ Made = tuple[str, str, int, Any]
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, '-m', 'thinmap_ros.tools.replay', *map(str, arguments), '--quiet']
-    return subprocess.run(command, capture_output=True, text=True)
+    return forked.run('thinmap_ros.tools.replay', *arguments, '--quiet')
 
 
 def scan_of(make: Maker, k: int) -> Any:

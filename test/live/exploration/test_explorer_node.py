@@ -4,8 +4,6 @@ The reasons for the end of an exploration, resuming, and strategies.
 """
 
 import math
-import subprocess
-import sys
 from itertools import count
 
 import numpy as np
@@ -17,6 +15,7 @@ from rclpy.action import ActionClient, ActionServer
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
+from support.forks import forked
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import (
@@ -242,10 +241,8 @@ def test_a_baseline_explores(graph):
 
 @pytest.mark.parametrize('name', ['nearest', 'nowhere:strategy', 'math:pi'])
 def test_a_strategy_that_there_is_not_ends_the_start_with_a_line(ros_domain, name):
-    command = [sys.executable, '-m', 'thinmap_ros.nodes.explorer', '--ros-args']
-    done = subprocess.run(
-        [*command, '-p', f"strategy:='{name}'"], capture_output=True, text=True, check=False
-    )
+    words = ('--ros-args', '-p', f"strategy:='{name}'")
+    done = forked.run('thinmap_ros.nodes.explorer', *words)
     assert done.returncode == 2
     assert 'Traceback' not in done.stderr
     line = done.stderr.splitlines()[-1]
