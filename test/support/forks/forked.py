@@ -112,8 +112,9 @@ def start(
 ) -> Started:
     """Start a module in a session of its own, with files for its standard output and error.
 
-    Not as a fork if anew, or if its variables ask for other libraries.
+    Not as a fork if anew, if its variables ask for other libraries, or if it loads rerun.
     """
+    anew = anew or _loads_rerun(module, arguments)
     variables = _with_tests(environment)
     with Path(os.devnull).open('rb') as nothing:
         streams = (nothing, *output)
@@ -152,6 +153,12 @@ def run(
         output.seek(0)
         errors.seek(0)
         return subprocess.CompletedProcess([module, *words], code, output.read(), errors.read())
+
+
+def _loads_rerun(module: str, arguments: list[str]) -> bool:
+    """Whether a program loads rerun, whose threads panic at the end of some forks."""
+    options = ('--view', '--recording')
+    return module.endswith('.rerun_viewer') or any(word.startswith(options) for word in arguments)
 
 
 def _with_tests(environment: Mapping[str, str]) -> dict[str, str]:

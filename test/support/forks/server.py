@@ -17,7 +17,7 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-import thinmap_ros
+import thinmap_ros.startup
 from thinmap_ros.kernels import warm_up
 
 REQUEST_BYTES = 1 << 20
@@ -122,8 +122,8 @@ def _run(program: Program) -> None:
     sys.path[0] = program.folder
     sys.orig_argv = [sys.executable, '-m', program.module, *program.arguments]
     sys.argv = ['-m', *program.arguments]
-    # What the package does where it is imported by a program.
-    importlib.reload(thinmap_ros)
+    # What a program does before its modules are imported.
+    importlib.reload(thinmap_ros.startup)
     sys.modules.pop(program.module, None)
     runpy.run_module(program.module, run_name='__main__', alter_sys=True)
 
