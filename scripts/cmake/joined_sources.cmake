@@ -3,7 +3,7 @@
 function(thinmap_join_sources)
   get_property(targets DIRECTORY PROPERTY BUILDSYSTEM_TARGETS)
   foreach(target IN LISTS targets)
-    if(target MATCHES "__rosidl_typesupport_(fastrtps_c|fastrtps_cpp|introspection_cpp|c|cpp)$")
+    if(target MATCHES "__rosidl_typesupport_(fastrtps_c|c)$")
       set_target_properties(${target} PROPERTIES UNITY_BUILD ON UNITY_BUILD_BATCH_SIZE 0)
       target_compile_options(${target} PRIVATE $<$<COMPILE_LANGUAGE:CXX>:-Wno-redundant-decls>)
     endif()

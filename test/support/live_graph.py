@@ -92,18 +92,16 @@ class Graph:
         self.node.create_subscription(kind, topic, hear, deep)
         return messages
 
-    def paced(self) -> tuple[str, ...]:
-        """Remapping so that a simulation in lockstep with the local graph waits for the test, too.
+    def paced(self, topic: str = 'local_topology', kind: type = TopologicalMap) -> tuple[str, ...]:
+        """Remapping so that a simulation in lockstep with a topic waits for the test, too.
 
         Otherwise a test that receives poses late could drive the robot into a wall.
         """
         if self._pacemaker is None:
-            heard_too = self.node.create_publisher(TopologicalMap, 'heard_too', qos.STREAM)
-            self.node.create_subscription(
-                TopologicalMap, 'local_topology', heard_too.publish, qos.STREAM
-            )
+            heard_too = self.node.create_publisher(kind, 'heard_too', qos.STREAM)
+            self.node.create_subscription(kind, topic, heard_too.publish, qos.STREAM)
             self._pacemaker = heard_too
-        return ('local_topology:=heard_too',)
+        return (f'{topic}:=heard_too',)
 
     def drain(self) -> None:
         """Receive queued messages until there are no more: stopped nodes publish nothing later."""

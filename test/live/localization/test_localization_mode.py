@@ -37,6 +37,8 @@ class Robot:
         self.initial = graph.node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 10)
         graph.start(
             'sim',
+            # Paced: otherwise it would drive on with an old command while the test is busy.
+            remap=graph.paced('pose', PoseWithCovarianceStamped),
             world=WORLD,
             start=','.join(map(str, start)),
             real_time_factor=real_time_factor,
