@@ -14,7 +14,7 @@ import pytest
 import yaml
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from action_msgs.srv import CancelGoal
-from geometry_msgs.msg import PoseStamped
+from lifecycle_msgs.srv import GetState
 from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid
 from rclpy.duration import Duration
@@ -29,8 +29,7 @@ pytestmark = pytest.mark.live
 ROOT = Path(__file__).resolve().parents[2]
 ROS2 = ROOT / 'scripts' / 'shim' / 'ros2'
 WAIT = ('--spin-time', str(PATIENCE_S))
-FIVE = ['/explorer', '/grid_mapper', '/localizer', '/navigator', '/sim']
-NODES = [name.lstrip('/') for name in FIVE]
+NODES = ('explorer', 'grid_mapper', 'localizer', 'navigator', 'sim')
 
 
 @pytest.fixture(scope='module')
@@ -94,32 +93,9 @@ def listed(wanted, *words):
 
 
 def test_lists_show_what_there_is(robot):
-    names = sorted([*FIVE, '/topology_builder', '/test_client'])
-    assert listed(names, 'node', 'list') == names
     topics = listed(['/scan [sensor_msgs/msg/LaserScan]'], 'topic', 'list', '-t')
     assert not [line for line in topics if '/_action/' in line]
     listed(['/explore/_action/status'], 'topic', 'list', '--include-hidden-topics')
-    listed(['/save_map [thinmap_msgs/srv/SaveMap]'], 'service', 'list', '-t')
-    listed(['/save_map', '/localizer/get_state'], 'service', 'list')
-    actions = ['/explore [thinmap_msgs/action/Explore]']
-    listed(actions, 'action', 'list', '-t')
-    # Each command discovers the graph itself, and on a busy machine only a part of it at first.
-    robot.until(lambda: int(output('action', 'list', '-c')) > 0, 'actions to count')
-    states = listed(['/localizer', '/explorer'], 'lifecycle', 'nodes')
-    assert '/sim' not in states
-    listed(['Action: /explore', 'Action servers: 1', '    /explorer'], 'action', 'info', '/explore')
-    info = ['  Subscribers:', '    /scan: sensor_msgs/msg/LaserScan', '  Action Clients:']
-    listed(info, 'node', 'info', '/grid_mapper')
-
-
-def test_a_topic_is_described(robot):
-    assert output('topic', 'type', '/scan', *WAIT) == 'sensor_msgs/msg/LaserScan\n'
-    assert output('service', 'type', '/save_map', *WAIT) == 'thinmap_msgs/srv/SaveMap\n'
-    lines = listed(['Publisher count: 1'], 'topic', 'info', '/scan', *WAIT)
-    assert lines[0] == 'Type: sensor_msgs/msg/LaserScan'
-    assert lines[2].startswith('Subscription count: ')
-    wanted = ['Node name: sim', 'Endpoint type: PUBLISHER', 'Node name: grid_mapper']
-    listed([*wanted, '  Reliability: BEST_EFFORT'], 'topic', 'info', '-v', '/scan', *WAIT)
 
 
 def test_a_message_is_echoed_as_yaml(robot):
@@ -175,22 +151,6 @@ def test_a_closed_pipe_and_ctrl_c_end_it_quietly(robot):
     assert rate.returncode == signal.SIGINT
 
 
-def test_messages_are_published(robot):
-    texts = robot.heard('/said', String)
-    poses = robot.heard('/there', PoseStamped)
-    once = start('topic', 'pub', '--once', '/said', 'std_msgs/msg/String', '{data: 5 o clock}')
-    robot.until(lambda: once.poll() is not None and texts, 'a text')
-    said = once.communicate()[0]
-    assert [text.data for text in texts] == ['5 o clock']
-    assert 'publisher: beginning loop\npublishing #1: ' in said
-    values = '{header: auto, pose: {position: {x: 1}}}'
-    kind = 'geometry_msgs/msg/PoseStamped'
-    twice = start('topic', 'pub', '-t', '2', '-r', '10', '/there', kind, values)
-    robot.until(lambda: twice.poll() is not None and len(poses) == 2, 'two poses')
-    twice.communicate()
-    assert poses[0].header.stamp.sec > 1_600_000_000 and poses[0].pose.position.x == 1.0
-
-
 def test_a_service_is_called(robot):
     said = output('service', 'call', '/save_map', 'thinmap_msgs/srv/SaveMap', '{path: maps/room}')
     assert "requester: making request: thinmap_msgs.srv.SaveMap_Request(path='maps/room')" in said
@@ -201,30 +161,18 @@ def test_a_service_is_called(robot):
 
 
 def test_parameters_are_read_and_set(robot):
-    names = output('param', 'list', '/navigator', *WAIT).splitlines()
-    assert '  controller.max_speed_m_s' in names and names == sorted(names)
     before = output(
         'param', 'get', '--hide-type', 'navigator', 'controller.max_speed_m_s', *WAIT
     ).strip()
     value = ('/navigator', 'controller.max_speed_m_s')
     assert output('param', 'set', *value, '0.15', *WAIT) == 'Set parameter successful\n'
     assert output('param', 'get', *value, *WAIT) == 'Double value is: 0.15\n'
-    dumped = yaml.safe_load(output('param', 'dump', '/navigator', *WAIT))
-    assert dumped['/navigator']['ros__parameters']['controller']['max_speed_m_s'] == 0.15
     refused = run('param', 'set', *value, '-0.2', *WAIT)
     assert refused.returncode == 0 and not refused.stdout
     assert refused.stderr.startswith('Setting parameter failed: ')
     assert 'max_speed_m_s' in refused.stderr and len(refused.stderr.splitlines()) == 1
     assert output('param', 'get', *value, *WAIT) == 'Double value is: 0.15\n'
     output('param', 'set', *value, before, *WAIT)
-    # The test's own node does not respond while the test waits: this is reported, the rest listed.
-    everywhere = set()
-    end = time.monotonic() + PATIENCE_S
-    while not {'/navigator:', '/sim:', '  controller.max_speed_m_s', '  lockstep'} <= everywhere:
-        assert time.monotonic() < end, everywhere
-        done = run('param', 'list', '--spin-time', '5')
-        assert done.returncode == 0
-        everywhere = set(done.stdout.splitlines())
     unknown = run('param', 'get', '/navigator', 'nix', *WAIT)
     assert unknown.returncode == 1
     assert unknown.stderr == "Parameter not set: 'nix' of /navigator\n"
@@ -232,13 +180,17 @@ def test_parameters_are_read_and_set(robot):
 
 def test_a_node_makes_transitions(robot):
     node = '/grid_mapper'
-    assert output('lifecycle', 'get', node, *WAIT) == 'active [3]\n'
-    known = output('lifecycle', 'list', node, *WAIT)
-    assert known.startswith('- deactivate [4]\n\tStart: active\n\tGoal: deactivating\n')
+
+    def state():
+        name = f'{node}/get_state'
+        return robot.call(GetState, name, GetState.Request()).current_state.label
+
+    assert state() == 'active'
     done = 'Transitioning successful\n'
     assert output('lifecycle', 'set', node, 'deactivate', *WAIT) == done
-    listed([f'{node}: inactive [2]'], 'lifecycle', 'get', *WAIT)
+    assert state() == 'inactive'
     assert output('lifecycle', 'set', node, 'activate', *WAIT) == done
+    assert state() == 'active'
     wrong = run('lifecycle', 'set', node, 'fly', *WAIT)
     assert wrong.returncode == 1 and not wrong.stdout
     assert wrong.stderr.startswith("Unknown transition requested: 'fly', available ones are: ")
@@ -324,38 +276,35 @@ def test_ctrl_c_cancels_the_goal(robot):
     robot.until(ended, 'goal is canceled')
 
 
-def test_programs_packages_and_fields_need_no_graph():
-    assert 'thinmap_ros replay' in output('pkg', 'executables', 'thinmap_ros').splitlines()
-    assert {'rclpy', 'thinmap_ros'} <= set(output('pkg', 'list').splitlines())
+def test_programs_and_packages_need_no_graph():
     share = Path(output('pkg', 'prefix', '--share', 'thinmap_ros').strip())
     assert (share / 'config' / 'robots' / 'turtlebot3.yaml').exists()
     assert share.is_relative_to(output('pkg', 'prefix', 'thinmap_ros').strip())
     assert 'usage: replay' in output('run', 'thinmap_ros', 'replay', '--help')
-    shown = output('interface', 'show', 'geometry_msgs/msg/TwistStamped')
-    assert 'std_msgs/Header header\n\tbuiltin_interfaces/Time stamp\n\t\tint32 sec\n' in shown
-    assert '---\n' in output('interface', 'show', 'thinmap_msgs/action/Explore')
 
 
 def test_help_names_what_there_is():
     text = output('-h')
-    for word in ('action', 'lifecycle', 'node', 'param', 'pkg', 'run', 'service', 'topic'):
+    for word in ('action', 'lifecycle', 'param', 'pkg', 'run', 'service', 'topic'):
         assert f'\n  {word} ' in text
-    assert '\n  echo ' in output('topic', '-h')
+    assert 'Verbs:\n  echo ' in output('topic', '-h')
     assert '--field' in output('topic', 'echo', '-h')
     assert 'program' in output('run', '-h')
 
 
 SAVE = ('service', 'call', '/save_map', 'thinmap_msgs/srv/SaveMap')
-POSE = ('topic', 'pub', '/x', 'geometry_msgs/msg/PoseStamped')
+GOAL = ('action', 'send_goal', '/x', 'nav2_msgs/action/NavigateToPose')
+COMMANDS = 'expected one of action, lifecycle, param, pkg, run, service, topic\n'
 AT_ONCE = ('--spin-time', '0.5')
 
 
 @pytest.mark.parametrize(
     ('words', 'code', 'said'),
     [
-        (['bag', 'record'], 2, 'no command bag: this is'),
+        (['bag', 'record'], 2, f'ros2 bag: not in this ros2: {COMMANDS}'),
+        (['node', 'list'], 2, f'ros2 node: not in this ros2: {COMMANDS}'),
         (['security', 'create_keystore', 'x'], 2, 'needs a ROS 2 Jazzy with the package'),
-        (['topic', 'bw', '/scan'], 2, 'no verb bw: this is'),
+        (['topic', 'info', '/scan'], 2, 'ros2 topic info: not in this ros2: expected one of echo,'),
         (['topic', 'echo'], 2, 'topic_name'),
         (['topic', 'hz', '/scan', '/odom'], 2, '/odom'),
         (['run', 'thinmap_ros'], 2, 'program'),
@@ -372,22 +321,18 @@ AT_ONCE = ('--spin-time', '0.5')
         ([*SAVE, 'room'], 1, "needs to be a dictionary in YAML format: 'room'"),
         ([*SAVE, '{pahts: room}'], 1, "has no 'pahts'; it has path"),
         ([*SAVE, '{path: [1]}'], 1, "SaveMap_Request.path: '[1]', expected string"),
-        ([*POSE, '{pose: {position: {x: far}}}'], 1, "Point.x: 'far', expected double"),
-        ([*POSE, '{pose: {position: 5}}'], 1, "Point: '5', expected a dictionary"),
-        ([*POSE, '{header: {stamp: {sec: 1.5}}}'], 1, "Time.sec: '1.5', expected int32"),
-        ([*POSE, '{header: {stamp: {sec: 1e12}}}'], 1, "Time.sec: '1e12', expected int32"),
-        (['topic', 'pub', '/a b', 'std_msgs/msg/String'], 1, "'/a b' is no name of a topic"),
+        ([*GOAL, '{pose: {pose: {position: {x: far}}}}'], 1, "Point.x: 'far', expected double"),
+        ([*GOAL, '{pose: {pose: {position: 5}}}'], 1, "Point: '5', expected a dictionary"),
+        ([*GOAL, '{pose: {header: {stamp: {sec: 1.5}}}}'], 1, "sec: '1.5', expected int32"),
+        ([*GOAL, '{pose: {header: {stamp: {sec: 1e12}}}}'], 1, "sec: '1e12', expected int32"),
+        ([*GOAL, '{pose: {header: {stamp: {sec: true}}}}'], 1, "sec: 'True', expected int32"),
         (['topic', 'echo', '/a b', *AT_ONCE], 1, "'/a b' is no name of a topic"),
         (['topic', 'echo', '/x', 'std_msgs/msg/Nix'], 1, 'message type is invalid'),
         (['action', 'send_goal', '/x', 'x/action/X', '{}'], 1, 'action type is invalid'),
-        (['topic', 'type', '/nowhere', *AT_ONCE], 1, "Unknown topic '/nowhere'"),
-        (['service', 'type', '/nowhere', *AT_ONCE], 1, "Unknown service '/nowhere'"),
-        (['service', 'type'], 2, 'required: service_name'),
+        (['service', 'call', '/a b', 'std_srvs/srv/Trigger'], 1, "'/a b' is no name of a service"),
         (['param', 'get', '/nobody', 'x', *AT_ONCE], 1, "Node not found: '/nobody'"),
         (['lifecycle', 'set', 'nobody', 'activate', *AT_ONCE], 1, "Node not found: '/nobody'"),
-        (['node', 'info', '/nobody', *AT_ONCE], 1, "Node not found: '/nobody'"),
         (['topic', 'list', '--spin-time', 'long'], 2, 'long'),
-        (['interface', 'show', 'nowhere/msg/X'], 1, "'nowhere/msg/X', expected PACKAGE/msg/NAME"),
     ],
 )
 def test_errors_are_reported_in_one_line(ros_domain, words, code, said):

@@ -1,22 +1,16 @@
-"""`ros2 action`."""
+"""`ros2 action send_goal`."""
 
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from rclpy.action import (
-    ActionClient,
-    get_action_client_names_and_types_by_node,
-    get_action_names_and_types,
-    get_action_server_names_and_types_by_node,
-)
+from rclpy.action import ActionClient
 from rclpy.task import Future
 
 from ros2_shim import values
-from ros2_shim.named import Named
-from ros2_shim.session import Session, split
-from ros2_shim.verbs import ShimError, Verb, add_graph_arguments, say
+from ros2_shim.session import Session
+from ros2_shim.verb import ShimError, Verb, argument, flag, say
 
 _STATUS = {
     GoalStatus.STATUS_ACCEPTED: 'ACCEPTED',
@@ -27,53 +21,11 @@ _STATUS = {
     GoalStatus.STATUS_ABORTED: 'ABORTED',
 }
 _CANCEL_S = 10.0
-_ACTIONS = Named('action', get_action_names_and_types, hides=False)
-
-
-def _info_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('action_name')
-    parser.add_argument('-t', '--show-types', action='store_true', help='types, too')
-    parser.add_argument('-c', '--count', action='store_true', help='only the number')
-
-
-def _info(args: Namespace) -> None:
-    with Session(args) as session:
-        name = session.full_name(args.action_name, 'action')
-        session.settle()
-        say(f'Action: {name}')
-        for title, ask in (
-            ('clients', get_action_client_names_and_types_by_node),
-            ('servers', get_action_server_names_and_types_by_node),
-        ):
-            found = _nodes_with(session, ask, name)
-            say(f'Action {title}: {len(found)}')
-            for node, types in [] if args.count else found:
-                say(f'    {node} [{", ".join(types)}]' if args.show_types else f'    {node}')
-
-
-def _nodes_with(session: Session, ask: Any, action: str) -> list[tuple[str, list[str]]]:
-    found = []
-    for node in session.node_names(hidden=True):
-        types = dict(ask(session.node, *split(node))).get(action)
-        if types:
-            found.append((node, types))
-    return found
-
-
-def _send_goal_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument('action_name')
-    parser.add_argument('action_type', help='as in thinmap_msgs/action/Explore')
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument('goal', nargs='?', default='{}', help="as in '{time_limit_s: 60.0}'")
-    group.add_argument('--stdin', action='store_true', help='read the goal from stdin')
-    parser.add_argument('-f', '--feedback', action='store_true', help='show the feedback')
 
 
 def _send_goal(args: Namespace) -> None:
     kind = values.type_named(args.action_type, 'action')
-    text = sys.stdin.read() if args.stdin else args.goal
-    goal = values.fill(kind.Goal(), values.mapping(text))
+    goal = values.read(kind.Goal, args.goal)
     with Session(args) as session:
         name = session.full_name(args.action_name, 'action')
         client = ActionClient(session.node, kind, name)
@@ -156,9 +108,14 @@ def _say_somewhere(text: str) -> None:
 
 
 VERBS = {
-    'info': Verb('Servers and clients of an action.', _info_arguments, _info),
-    'list': _ACTIONS.list_verb,
     'send_goal': Verb(
-        'Send a goal and wait for its end; Ctrl-C cancels it.', _send_goal_arguments, _send_goal
+        'Send a goal and wait for its end; Ctrl-C cancels it.',
+        _send_goal,
+        (
+            argument('action_name'),
+            argument('action_type', help='as in thinmap_msgs/action/Explore'),
+            argument('goal', nargs='?', default='{}', help="as in '{time_limit_s: 60.0}'"),
+            flag('-f --feedback', 'show the feedback'),
+        ),
     ),
 }

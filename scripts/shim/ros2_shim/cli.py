@@ -4,20 +4,20 @@ import importlib
 import os
 import signal
 import sys
+from collections.abc import Iterable
 
-from ros2_shim.verbs import Parser, ShimError, Verb
+from ros2_shim import pkg
+from ros2_shim.verb import ShimError, Verb
 
-# Each is a module beside this one, imported on demand.
+# Each but `run` is a module beside this one, imported on demand.
 COMMANDS = {
-    'action': 'list actions, send goals',
-    'interface': 'show the fields of a type',
-    'lifecycle': 'states of lifecycle nodes',
-    'node': 'list nodes and their topics, services and actions',
+    'action': 'send goals',
+    'lifecycle': 'transitions of lifecycle nodes',
     'param': 'parameters of running nodes',
-    'pkg': 'packages and their programs',
+    'pkg': 'folders of packages',
     'run': 'run a program of a package',
-    'service': 'list and call services',
-    'topic': 'list topics, show and publish messages',
+    'service': 'call services',
+    'topic': 'list topics, show their messages',
 }
 # Of the real one: what they need, that the Python wheels of ROS do not have.
 ELSEWHERE = {
@@ -25,6 +25,7 @@ ELSEWHERE = {
     'the Fast DDS of the Python wheels is built without security',
 }
 SMALL = "thinmap's small ros2 for machines without ROS"
+HELP = ('-h', '--help')
 
 
 def main(words: list[str]) -> int:
@@ -38,57 +39,53 @@ def main(words: list[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except ShimError as failure:
-        print(_one_line(failure), file=sys.stderr)
+        return _fail(str(failure), 1)
     except RuntimeError as error:
         # Errors of rclpy and of the middleware.
-        print(f'ros2: {_one_line(error)}', file=sys.stderr)
-    return 1
+        return _fail(f'ros2: {error}', 1)
 
 
-def _one_line(error: Exception) -> str:
-    return ' '.join(str(error).split())
+def _fail(text: str, code: int) -> int:
+    print(' '.join(text.split()), file=sys.stderr)
+    return code
 
 
 def _command(words: list[str]) -> int:
-    if not words or words[0] in ('-h', '--help'):
-        print(f'usage: ros2 COMMAND ...\n\n{SMALL}. Commands:')
-        _table(COMMANDS)
+    command = words[0] if words else '-h'
+    if command in HELP:
+        _show_help('ros2 COMMAND', f'{SMALL}. Commands', COMMANDS)
         print('\nros2 COMMAND -h: its verbs')
         return 0
-    if words[0] in ELSEWHERE:
-        print(f'ros2: no command {words[0]}: {ELSEWHERE[words[0]]}', file=sys.stderr)
-        return 2
-    if words[0] not in COMMANDS:
-        return _unknown('ros2', 'command', words[0], COMMANDS)
-    if words[0] == 'run':
-        module = importlib.import_module('ros2_shim.pkg')
-        module.run(words[1:])
+    if command in ELSEWHERE:
+        return _fail(f'ros2: no command {command}: {ELSEWHERE[command]}', 2)
+    if command not in COMMANDS:
+        return _unknown(f'ros2 {command}', COMMANDS)
+    if command == 'run':
+        pkg.RUN.run('ros2 run', words[1:])
         return 0
-    return _verb(words[0], words[1:])
+    return _verb(command, words[1:])
 
 
 def _verb(command: str, words: list[str]) -> int:
     verbs: dict[str, Verb] = importlib.import_module(f'ros2_shim.{command}').VERBS
-    if not words or words[0] in ('-h', '--help'):
-        print(f'usage: ros2 {command} VERB ...\n\n{SMALL}: {COMMANDS[command]}. Verbs:')
-        _table({name: verb.help for name, verb in verbs.items()})
+    verb = words[0] if words else '-h'
+    if verb in HELP:
+        texts = {name: each.help for name, each in verbs.items()}
+        _show_help(f'ros2 {command} VERB', f'{SMALL}: {COMMANDS[command]}. Verbs', texts)
         return 0
-    if words[0] not in verbs:
-        return _unknown(f'ros2 {command}', 'verb', words[0], verbs)
-    verb = verbs[words[0]]
-    parser = Parser(prog=f'ros2 {command} {words[0]}', description=verb.help, allow_abbrev=False)
-    verb.arguments(parser)
-    verb.main(parser.parse_args(words[1:]))
+    program = f'ros2 {command} {verb}'
+    if verb not in verbs:
+        return _unknown(program, verbs)
+    verbs[verb].run(program, words[1:])
     return 0
 
 
-def _table(lines: dict[str, str]) -> None:
-    width = max(len(name) for name in lines)
-    for name, text in lines.items():
+def _show_help(usage: str, title: str, texts: dict[str, str]) -> None:
+    print(f'usage: {usage} ...\n\n{title}:')
+    width = max(len(name) for name in texts)
+    for name, text in texts.items():
         print(f'  {name:{width}}  {text}')
 
 
-def _unknown(program: str, kind: str, word: str, known: dict[str, str] | dict[str, Verb]) -> int:
-    has = ', '.join(known)
-    print(f'{program}: no {kind} {word}: this is {SMALL}; it has {has}', file=sys.stderr)
-    return 2
+def _unknown(program: str, known: Iterable[str]) -> int:
+    return _fail(f'{program}: not in this ros2: expected one of {", ".join(known)}', 2)

@@ -1,16 +1,15 @@
 """`ros2 param`: parameters of running nodes."""
 
 import sys
-from argparse import ArgumentParser, Namespace
-from typing import Any
+from argparse import Namespace
 
 import yaml
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import get_parameter_value
 
 from ros2_shim.session import Session
-from ros2_shim.verbs import ShimError, Verb, add_graph_arguments, say
+from ros2_shim.verb import SPIN_TIME, ShimError, Verb, argument, flag, say
 
 _FIELDS = {
     ParameterType.PARAMETER_BOOL: ('Boolean value is:', 'bool_value'),
@@ -25,69 +24,16 @@ _FIELDS = {
 }
 
 
-def _names(session: Session, node: str) -> list[str]:
-    response = session.ask(ListParameters, f'{node}/list_parameters', ListParameters.Request())
-    return sorted(response.result.names)
-
-
-def _values(session: Session, node: str, names: list[str]) -> list[ParameterValue]:
-    request = GetParameters.Request(names=names)
-    return list(session.ask(GetParameters, f'{node}/get_parameters', request).values)
-
-
-def _list_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('node_name', nargs='?', help='without it, all nodes')
-
-
-def _list(args: Namespace) -> None:
-    with Session(args) as session:
-        if args.node_name:
-            for name in _names(session, session.find_node(args.node_name)):
-                say(f'  {name}')
-            return
-        session.settle()
-        services = dict(session.node.get_service_names_and_types())
-        for node in session.node_names():
-            if f'{node}/list_parameters' in services:
-                _list_one(session, node)
-
-
-def _list_one(session: Session, node: str) -> None:
-    """Show the parameter names of a node; one that does not respond is reported and skipped."""
-    try:
-        names = _names(session, node)
-    except ShimError as error:
-        print(f"Exception while calling service of node '{node}': {error}", file=sys.stderr)
-        return
-    say(f'{node}:')
-    for name in names:
-        say(f'  {name}')
-
-
-def _get_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('node_name')
-    parser.add_argument('parameter_name')
-    parser.add_argument('--hide-type', action='store_true', help='only the value')
-
-
 def _get(args: Namespace) -> None:
+    request = GetParameters.Request(names=[args.parameter_name])
     with Session(args) as session:
         node = session.find_node(args.node_name)
-        found = _values(session, node, [args.parameter_name])
+        found = session.ask(GetParameters, f'{node}/get_parameters', request).values
     if not found or found[0].type == ParameterType.PARAMETER_NOT_SET:
         raise ShimError(f"Parameter not set: '{args.parameter_name}' of {node}")
     label, field = _FIELDS[found[0].type]
     value = getattr(found[0], field)
     say(f'{value}' if args.hide_type else f'{label} {value}')
-
-
-def _set_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('node_name')
-    parser.add_argument('parameter_name')
-    parser.add_argument('value', help='in YAML: 1.5 is a double, 1 an integer')
 
 
 def _set(args: Namespace) -> None:
@@ -112,37 +58,14 @@ def _read(text: str) -> ParameterValue:
         return ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
 
 
-def _dump_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('node_name')
-
-
-def _dump(args: Namespace) -> None:
-    with Session(args) as session:
-        node = session.find_node(args.node_name)
-        names = _names(session, node)
-        found = _values(session, node, names)
-    tree: dict[str, Any] = {}
-    for name, value in zip(names, found, strict=True):
-        *folders, last = name.split('.')
-        branch = tree
-        for folder in folders:
-            branch = branch.setdefault(folder, {})
-        branch[last] = _plain(value)
-    say(yaml.dump({node: {'ros__parameters': tree}}, default_flow_style=False))
-
-
-def _plain(value: ParameterValue) -> Any:
-    if value.type not in _FIELDS:
-        return None
-    label, field = _FIELDS[value.type]
-    found = getattr(value, field)
-    return list(found) if 'values' in label else found
-
-
+_NAMES = (argument('node_name'), argument('parameter_name'))
 VERBS = {
-    'dump': Verb('All parameters of a node, as a parameter file.', _dump_arguments, _dump),
-    'get': Verb('Value of a parameter.', _get_arguments, _get),
-    'list': Verb('Names of the parameters of a node, or of all.', _list_arguments, _list),
-    'set': Verb('Set a parameter.', _set_arguments, _set),
+    'get': Verb(
+        'Value of a parameter.', _get, (*_NAMES, flag('--hide-type', 'only the value'), SPIN_TIME)
+    ),
+    'set': Verb(
+        'Set a parameter.',
+        _set,
+        (*_NAMES, argument('value', help='in YAML: 1.5 is a double, 1 an integer'), SPIN_TIME),
+    ),
 }

@@ -1,30 +1,15 @@
-"""`ros2 service`."""
+"""`ros2 service call`."""
 
-import sys
-from argparse import ArgumentParser, Namespace
-
-from rclpy.node import Node
+from argparse import Namespace
 
 from ros2_shim import values
-from ros2_shim.named import Named
 from ros2_shim.session import Session
-from ros2_shim.verbs import Verb, say
-
-_SERVICES = Named('service', Node.get_service_names_and_types)
-
-
-def _call_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument('service_name')
-    parser.add_argument('service_type', help='as in std_srvs/srv/Trigger')
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument('values', nargs='?', default='{}', help="as in '{data: true}'")
-    group.add_argument('--stdin', action='store_true', help='read the values from stdin')
+from ros2_shim.verb import Verb, argument, say
 
 
 def _call(args: Namespace) -> None:
     kind = values.type_named(args.service_type, 'srv')
-    text = sys.stdin.read() if args.stdin else args.values
-    request = values.fill(kind.Request(), values.mapping(text))
+    request = values.read(kind.Request, args.values)
     with Session(args) as session:
         name = session.full_name(args.service_name, 'service')
         client = session.node.create_client(kind, name)
@@ -37,7 +22,13 @@ def _call(args: Namespace) -> None:
 
 
 VERBS = {
-    'call': Verb('Call a service.', _call_arguments, _call),
-    'list': _SERVICES.list_verb,
-    'type': _SERVICES.type_verb,
+    'call': Verb(
+        'Call a service.',
+        _call,
+        (
+            argument('service_name'),
+            argument('service_type', help='as in std_srvs/srv/Trigger'),
+            argument('values', nargs='?', default='{}', help="as in '{data: true}'"),
+        ),
+    ),
 }

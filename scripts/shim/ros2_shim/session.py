@@ -4,11 +4,10 @@ There is no daemon with a known graph: named entities are waited for, and lists 
 discovery has found nothing new for a while.
 """
 
-import itertools
 import os
 import time
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Self
 
 import rclpy
@@ -20,7 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
-from ros2_shim.verbs import SPIN_TIME_S, ShimError
+from ros2_shim.verb import SPIN_TIME_S, ShimError
 
 # A spin is short, as Python handles Ctrl-C only after it.
 _SPIN_S = 0.05
@@ -35,9 +34,9 @@ _MEET_S = 0.2
 class Session:
     """A hidden node, as a context manager."""
 
-    def __init__(self, args: Namespace, name: str = '') -> None:
-        self.patience_s: float = getattr(args, 'spin_time', SPIN_TIME_S)
-        self._name = name or f'_ros2cli_{os.getpid()}'
+    def __init__(self, args: Namespace) -> None:
+        self._patience_s: float = getattr(args, 'spin_time', SPIN_TIME_S)
+        self._name = f'_ros2cli_{os.getpid()}'
         self._begun = time.monotonic()
         self.node: Node
 
@@ -50,9 +49,9 @@ class Session:
         self.node.destroy_node()
         rclpy.shutdown()
 
-    def spin(self, seconds: float = _SPIN_S) -> None:
+    def _spin(self) -> None:
         """Process one callback, or wait."""
-        rclpy.spin_once(self.node, timeout_sec=seconds)
+        rclpy.spin_once(self.node, timeout_sec=_SPIN_S)
 
     def until(self, condition: Callable[[], Any], seconds: float | None = None) -> bool:
         """Spin until a condition holds, at most for some seconds; returns whether it holds."""
@@ -60,34 +59,25 @@ class Session:
         while not condition():
             if end is not None and time.monotonic() > end:
                 return False
-            self.spin()
+            self._spin()
         return True
-
-    def beats(self, period_s: float) -> Iterator[None]:
-        """Yield once per period, and spin in between; the first time at once."""
-        begun = time.monotonic()
-        for count in itertools.count():
-            due = begun + count * period_s
-            while time.monotonic() < due:
-                self.spin(min(_SPIN_S, max(0.0, due - time.monotonic())))
-            yield
 
     def found(self, condition: Callable[[], Any]) -> bool:
         """Wait until a condition holds, up to the time in the options; returns whether it holds."""
-        return self.until(condition, self.patience_s)
+        return self.until(condition, self._patience_s)
 
     def settle(self) -> None:
         """Wait until nothing new has been found for a while."""
         known = self._snapshot()
         quiet_since = time.monotonic()
-        while time.monotonic() < self._begun + self.patience_s:
-            self.spin()
+        while time.monotonic() < self._begun + self._patience_s:
+            self._spin()
             now = time.monotonic()
             seen = self._snapshot()
             if seen != known:
                 known = seen
                 quiet_since = now
-            look_s = _LOOK_S if self.node_names(hidden=True) else _LOOK_LONGER_S
+            look_s = _LOOK_S if self._nodes() else _LOOK_LONGER_S
             if now > self._begun + look_s and now > quiet_since + _QUIET_S:
                 return
 
@@ -108,26 +98,25 @@ class Session:
             raise ShimError(f"'{name}' is no name of a {kind}: {reason}") from None
         return str(full)
 
-    def node_names(self, hidden: bool = False) -> list[str]:
-        """Full names of all nodes except this one, sorted."""
+    def _nodes(self) -> dict[str, tuple[str, str]]:
+        """Name and namespace of all nodes except this one, by full name."""
         pairs = self.node.get_node_names_and_namespaces()
-        names = [f'{namespace.rstrip("/")}/{name}' for name, namespace in pairs]
-        own = f'/{self._name}'
-        shown = [name for name in names if name != own]
-        return sorted(name for name in shown if hidden or '/_' not in name)
+        nodes = {f'{pair[1].rstrip("/")}/{pair[0]}': pair for pair in pairs}
+        nodes.pop(f'/{self._name}', None)
+        return nodes
 
     def find_node(self, name: str) -> str:
         """Full name of an existing node; raises ShimError if it is not found."""
-        full = absolute(name)
-        if not self.found(lambda: full in self.node_names(hidden=True)):
+        full = f'/{name.removeprefix("/")}'
+        if not self.found(lambda: full in self._nodes()):
             raise ShimError(f"Node not found: '{full}'")
         return full
 
     def server_of(self, service: str) -> str | None:
         """Name of the node that offers a service."""
-        for node in self.node_names(hidden=True):
+        for node, pair in self._nodes().items():
             try:
-                pairs = self.node.get_service_names_and_types_by_node(*split(node))
+                pairs = self.node.get_service_names_and_types_by_node(*pair)
             except NodeNameNonExistentError:
                 continue
             if service in dict(pairs):
@@ -145,7 +134,7 @@ class Session:
         if node is None or not self.until(client.service_is_ready, _LOOK_S):
             self.until(lambda: False, _MEET_S)
             return
-        end = time.monotonic() + self.patience_s
+        end = time.monotonic() + self._patience_s
         while time.monotonic() < end:
             answer = client.call_async(GetParameters.Request())
             if self.until(answer.done, _LOOK_S):
@@ -154,11 +143,11 @@ class Session:
     def ask(self, kind: Any, name: str, request: Any) -> Any:
         """Response of a service of an existing node."""
         client = self.node.create_client(kind, name)
-        if not self.until(client.service_is_ready, self.patience_s):
+        if not self.until(client.service_is_ready, self._patience_s):
             raise ShimError(f"Wait for service timed out: '{name}'")
         self.introduce(name.rpartition('/')[0])
         future = client.call_async(request)
-        if not self.until(future.done, 2.0 * self.patience_s):
+        if not self.until(future.done, 2.0 * self._patience_s):
             raise ShimError(f"No answer from service '{name}'")
         return self.result(future)
 
@@ -169,14 +158,3 @@ class Session:
         if error is not None:
             raise ShimError(f'{type(error).__name__}: {error}')
         return future.result()
-
-
-def absolute(name: str) -> str:
-    """Name of a node from the root."""
-    return name if name.startswith('/') else f'/{name}'
-
-
-def split(name: str) -> tuple[str, str]:
-    """Name and namespace of a node."""
-    namespace, _, last = name.rpartition('/')
-    return last, namespace or '/'

@@ -1,31 +1,37 @@
 """`ros2 topic`: topics and their messages."""
 
 import itertools
+import statistics
 import time
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
+from collections import deque
 from typing import Any
 
-from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
-from ros2_shim import qos, values
-from ros2_shim.named import Named
-from ros2_shim.rates import Rates
+from ros2_shim import values
 from ros2_shim.session import Session
-from ros2_shim.verbs import (
-    ShimError,
-    Verb,
-    add_graph_arguments,
-    positive_float,
-    positive_int,
-    say,
+from ros2_shim.verb import SPIN_TIME, ShimError, Verb, argument, flag, say
+
+_MAX_LENGTH = 128
+_MAX_ARRIVALS = 10001
+_DEPTH = 10
+_QUIET_S = 0.5
+_REPORT_S = 1.0
+_POLICIES = (
+    ('reliability', ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT),
+    ('durability', DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE),
 )
 
-_TRUNCATE = 128
-_TOPICS = Named('topic', Node.get_topic_names_and_types)
+
+def _types(session: Session, topic: str) -> list[str]:
+    """Types of a topic; empty if it is unknown."""
+    return list(dict(session.node.get_topic_names_and_types()).get(topic, []))
 
 
-def _single_type(session: Session, topic: str) -> Any:
-    types = _TOPICS.types(session, topic)
+def _class_of(session: Session, topic: str) -> Any:
+    types = _types(session, topic)
     if len(types) > 1:
         raise ShimError(
             f"Cannot echo topic '{topic}', as it contains more than one type: [{', '.join(types)}]"
@@ -33,78 +39,79 @@ def _single_type(session: Session, topic: str) -> Any:
     return values.type_named(types[0], 'msg')
 
 
-def _not_published(topic: str) -> None:
+def _is_published(session: Session, topic: str) -> bool:
+    """Wait until a topic has a type; one that has none in time is reported."""
+    if session.found(lambda: _types(session, topic)):
+        return True
     say(f'WARNING: topic [{topic}] does not appear to be published yet')
+    return False
 
 
-# info ------------------------------------------------------------------------------------------
+def _publishers(session: Session, topic: str) -> list[Any]:
+    """Publishers of a topic, after discovery has settled."""
+    node = session.node
+    session.found(lambda: node.count_publishers(topic))
+    count = -1
+
+    def is_new() -> bool:
+        return bool(node.count_publishers(topic) != count)
+
+    while is_new():
+        count = node.count_publishers(topic)
+        session.until(is_new, _QUIET_S)
+    return list(node.get_publishers_info_by_topic(topic))
 
 
-def _info_arguments(parser: ArgumentParser) -> None:
-    _TOPICS.name_arguments(parser)
-    parser.add_argument(
-        '-v', '--verbose', action='store_true', help='each publisher and subscription, with its QoS'
-    )
+def _compatible_qos(session: Session, topic: str) -> QoSProfile:
+    """QoS of a subscription that all publishers of a topic can serve."""
+    offers = [info.qos_profile for info in _publishers(session, topic)]
+    policies = {}
+    for name, better, worse in _POLICIES:
+        offered = [getattr(offer, name) == better for offer in offers]
+        policies[name] = better if offers and all(offered) else worse
+        if any(offered) and not all(offered):
+            say(
+                f'Some, but not all, publishers are offering {_policy_name(better)}. '
+                f'Falling back to {_policy_name(worse)} as it will connect to all publishers'
+            )
+    return QoSProfile(depth=_DEPTH, **policies)
 
 
-def _info(args: Namespace) -> None:
-    end = '\n\n' if args.verbose else '\n'
+def _policy_name(policy: Any) -> str:
+    return f'QoS{type(policy).__name__}.{policy.name}'
+
+
+def _list(args: Namespace) -> None:
     with Session(args) as session:
-        topic = _TOPICS.known(session, args.name)
         session.settle()
-        types = _TOPICS.types(session, topic)
-        node = session.node
-        say(f'Type: {types[0] if len(types) == 1 else types}', end)
-        say(f'Publisher count: {node.count_publishers(topic)}', end)
-        for info in node.get_publishers_info_by_topic(topic) if args.verbose else ():
-            say(str(info), end)
-        say(f'Subscription count: {node.count_subscribers(topic)}', end)
-        for info in node.get_subscriptions_info_by_topic(topic) if args.verbose else ():
-            say(str(info), end)
-
-
-# echo ------------------------------------------------------------------------------------------
-
-
-def _echo_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('topic_name')
-    parser.add_argument('message_type', nargs='?', help='as in std_msgs/msg/String')
-    parser.add_argument('--once', action='store_true', help='the first message only')
-    parser.add_argument('--field', metavar='F', help='a part of it, as in pose.pose.position')
-    parser.add_argument('-f', '--full-length', action='store_true', help='do not truncate')
-    parser.add_argument('-l', '--truncate-length', type=positive_int, default=_TRUNCATE)
-    parser.add_argument('--no-arr', action='store_true', help='show only the length of sequences')
-    parser.add_argument('--no-str', action='store_true', help='show only the length of texts')
-    parser.add_argument('--flow-style', action='store_true', help='in one line')
-    qos.add_arguments(parser)
+        topics = session.node.get_topic_names_and_types()
+    for name, types in topics:
+        if args.include_hidden_topics or not topic_or_service_is_hidden(name):
+            say(f'{name} [{", ".join(types)}]' if args.show_types else name)
 
 
 def _echo(args: Namespace) -> None:
-    heard = 0
     given = values.type_named(args.message_type, 'msg') if args.message_type else None
+    is_shown = False
+
+    def show(message: Any) -> None:
+        nonlocal is_shown
+        if not (args.once and is_shown):
+            say(_echoed(_part(message, args.field), args), '---\n')
+        is_shown = True
+
     with Session(args) as session:
         topic = session.full_name(args.topic_name)
-        if given is None and not session.found(lambda: _TOPICS.types(session, topic)):
-            _not_published(topic)
+        if given is None and not _is_published(session, topic):
             raise ShimError('Could not determine the type for the passed topic')
-        kind = given or _single_type(session, topic)
-
-        def show(message: Any) -> None:
-            nonlocal heard
-            if args.once and heard:
-                return
-            heard += 1
-            say(_echoed(_part(message, args.field), args), '---\n')
-
-        profile = qos.to_hear(session, topic, args)
-        session.node.create_subscription(kind, topic, show, profile)
-        session.until(lambda: args.once and heard)
+        kind = given or _class_of(session, topic)
+        session.node.create_subscription(kind, topic, show, _compatible_qos(session, topic))
+        session.until(lambda: args.once and is_shown)
 
 
-def _part(message: Any, path: str | None) -> Any:
+def _part(message: Any, path: str) -> Any:
     """Value of a field by its path, with dots for nested fields."""
-    for field in filter(None, (path or '').split('.')):
+    for field in filter(None, path.split('.')):
         if not hasattr(message, 'get_fields_and_field_types'):
             raise ShimError(f"Invalid field '{path}': what holds '{field}' is not a message")
         fields = message.get_fields_and_field_types()
@@ -117,101 +124,64 @@ def _part(message: Any, path: str | None) -> Any:
 def _echoed(value: Any, args: Namespace) -> str:
     if not hasattr(value, 'get_fields_and_field_types'):
         return f'{value}\n'
-    longest = None if args.full_length else args.truncate_length
-    return values.to_yaml(value, longest, args.no_arr, args.no_str, args.flow_style)
-
-
-# hz --------------------------------------------------------------------------------------------
-
-
-def _hz_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('topic_name')
-    parser.add_argument('-w', '--window', type=positive_int, default=10000, metavar='N')
-    qos.add_arguments(parser)
+    return values.to_yaml(value, _MAX_LENGTH, args.no_arr, args.flow_style)
 
 
 def _hz(args: Namespace) -> None:
-    rates = Rates(args.window)
+    arrivals_s: deque[float] = deque(maxlen=_MAX_ARRIVALS)
+    reported_s = time.monotonic()
+
+    def is_due() -> bool:
+        return len(arrivals_s) > 1 and arrivals_s[-1] >= reported_s + _REPORT_S
+
     with Session(args) as session:
         topic = session.full_name(args.topic_name)
-        if not session.found(lambda: _TOPICS.types(session, topic)):
-            _not_published(topic)
-            session.until(lambda: _TOPICS.types(session, topic))
-        kind = _single_type(session, topic)
-        profile = qos.to_hear(session, topic, args)
-
-        def hear(_: bytes) -> None:
-            text = rates.heard(time.monotonic())
-            if text:
-                say(text)
-
+        if not _is_published(session, topic):
+            session.until(lambda: _types(session, topic))
+        kind = _class_of(session, topic)
+        profile = _compatible_qos(session, topic)
         # Not decoded: only the time of arrival is needed.
-        session.node.create_subscription(kind, topic, hear, profile, raw=True)
-        session.until(lambda: False)
+        session.node.create_subscription(
+            kind, topic, lambda _: arrivals_s.append(time.monotonic()), profile, raw=True
+        )
+        while session.until(is_due):
+            reported_s = arrivals_s[-1]
+            say(_rate(list(arrivals_s)))
 
 
-# pub -------------------------------------------------------------------------------------------
-
-
-def _pub_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument('topic_name')
-    parser.add_argument('message_type', help='as in std_msgs/msg/String')
-    parser.add_argument('values', nargs='?', default='{}', help="as in '{data: text}'")
-    parser.add_argument('-r', '--rate', type=positive_float, default=1.0, metavar='HZ')
-    parser.add_argument(
-        '-p', '--print', type=int, default=1, metavar='N', help='print every N-th message only'
+def _rate(arrivals_s: list[float]) -> str:
+    """Mean rate of messages with these times of arrival (s), and their standard deviation."""
+    gaps_s = [end - begin for begin, end in itertools.pairwise(arrivals_s)]
+    return (
+        f'average rate: {1.0 / statistics.fmean(gaps_s):.3f}\n\tmin: {min(gaps_s):.3f}s '
+        f'max: {max(gaps_s):.3f}s std dev: {statistics.pstdev(gaps_s):.5f}s '
+        f'window: {len(gaps_s)}'
     )
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument('-1', '--once', action='store_true', help='one message, then end')
-    group.add_argument(
-        '-t', '--times', type=positive_int, default=0, help='number of messages, then end'
-    )
-    parser.add_argument(
-        '-w',
-        '--wait-matching-subscriptions',
-        type=int,
-        metavar='N',
-        help='number of subscriptions to wait for (default: 1 with --once and --times, else 0)',
-    )
-    parser.add_argument('--keep-alive', type=float, default=0.1, metavar='SECONDS')
-    qos.add_arguments(parser)
 
 
-def _pub(args: Namespace) -> None:
-    kind = values.type_named(args.message_type, 'msg')
-    fields = values.mapping(args.values)
-    times = 1 if args.once else args.times
-    waited_for = args.wait_matching_subscriptions
-    if waited_for is None:
-        waited_for = 1 if times else 0
-    with Session(args) as session:
-
-        def now() -> Any:
-            return session.node.get_clock().now().to_msg()
-
-        values.fill(kind(), fields, now)
-        topic = session.full_name(args.topic_name)
-        publisher = session.node.create_publisher(kind, topic, qos.to_publish(args))
-        while not session.until(lambda: publisher.get_subscription_count() >= waited_for, 1.0):
-            say(f'Waiting for at least {waited_for} matching subscription(s)...')
-        say('publisher: beginning loop')
-        beats = session.beats(1.0 / args.rate)
-        for count in range(1, times + 1) if times else itertools.count(1):
-            next(beats)
-            message = values.fill(kind(), fields, now)
-            if args.print > 0 and count % args.print == 0:
-                say(f'publishing #{count}: {message!r}\n')
-            publisher.publish(message)
-        # The last message must be sent before the process ends.
-        session.until(lambda: False, args.keep_alive)
-
-
+_TOPIC = argument('topic_name')
 VERBS = {
-    'echo': Verb('Print the messages of a topic.', _echo_arguments, _echo),
-    'hz': Verb('Rate of the messages of a topic.', _hz_arguments, _hz),
-    'info': Verb('Publishers and subscriptions of a topic.', _info_arguments, _info),
-    'list': _TOPICS.list_verb,
-    'pub': Verb('Publish messages on a topic.', _pub_arguments, _pub),
-    'type': _TOPICS.type_verb,
+    'echo': Verb(
+        'Print the messages of a topic.',
+        _echo,
+        (
+            _TOPIC,
+            argument('message_type', nargs='?', help='as in std_msgs/msg/String'),
+            flag('--once', 'the first message only'),
+            argument('--field', metavar='F', default='', help='as in pose.pose.position'),
+            flag('--no-arr', 'show only the length of sequences'),
+            flag('--flow-style', 'in one line'),
+            SPIN_TIME,
+        ),
+    ),
+    'hz': Verb('Rate of the messages of a topic.', _hz, (_TOPIC, SPIN_TIME)),
+    'list': Verb(
+        'Names of all topics.',
+        _list,
+        (
+            flag('-t --show-types', 'types, too'),
+            flag('--include-hidden-topics', 'hidden ones, too'),
+            SPIN_TIME,
+        ),
+    ),
 }
