@@ -17,11 +17,11 @@ from thinmap_ros.core.topology import topology_state
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import Edge, TopologicalMap
-from thinmap_ros.core.topology.layers.lattice import Cells
+from thinmap_ros.core.topology.layers.lattice import Cells, Lattice
 from thinmap_ros.core.topology.layers.stack import Layers, Span
-from thinmap_ros.core.topology.registry import Registry
+from thinmap_ros.core.topology.registry import Changes, Registry
 
-__all__ = ['TopologyBuilder', 'TopologyConfig', 'build', 'build_along']
+__all__ = ['TopologyBuilder', 'TopologyConfig', 'build', 'build_again', 'build_along']
 
 _OFF_LATTICE = 1e-3  # of a cell: windows farther off do not belong to the same grid
 
@@ -44,11 +44,36 @@ def build_along(
     free (H, W): traversable cells. The lines are cells among these, up to a few cells wide, from
     another method than thinning: nodes and edges along them follow the same rules.
     """
+    registry = Registry(patch.frame, config)
+    registry.update(*_all_edges(patch, free, lines, config))
+    return registry.map
+
+
+def build_again(
+    last: Registry | None, patch: GridPatch, seed_xy: tuple[float, float], config: TopologyConfig
+) -> Registry:
+    """Registry with the map of `build`, whose ids continue those of the last grid of the place.
+
+    The grids may differ in their frames. A node keeps its id where the last map has a node within
+    node_match_radius_m, nearest pairs first; edges between the same nodes keep theirs.
+    """
+    registry = Registry(patch.frame, config)
+    if last is not None:
+        registry = Registry(patch.frame, config, last.map, last.next_id)
+    free = select_free_space(patch, seed_xy, config)
+    registry.update(*_all_edges(patch, free, None, config))
+    return registry
+
+
+def _all_edges(
+    patch: GridPatch,
+    free: NDArray[np.bool_],
+    lines: NDArray[np.bool_] | None,
+    config: TopologyConfig,
+) -> tuple[Lattice, Changes]:
     layers = Layers(patch.frame.resolution, config)
     layers.fill(patch, (0, 0), free, lines)
-    registry = Registry(patch.frame, config)
-    registry.update(layers.lattice, layers.edge_changes(set(), is_everywhere=True))
-    return registry.map
+    return layers.lattice, layers.edge_changes(set(), is_everywhere=True)
 
 
 class TopologyBuilder:

@@ -8,7 +8,7 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import ProbabilityGrid, SlamStatus, TopologicalMap
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.live.map_graph import MapGraph
+from thinmap_ros.core.exploration.live.map_view import MapGraph
 from thinmap_ros.core.exploration.mission import InputWatchdog
 from thinmap_ros.core.exploration.observations import Observation, ObservationBuffer
 from thinmap_ros.core.topology.builder import TopologyConfig

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.live.map_graph import MapGraph
 from thinmap_ros.core.exploration.live.map_view import (
+    MapGraph,
     occupancy_from_costs,
     scan_in_map,
     with_update,
 )
-from thinmap_ros.core.exploration.live.stable_ids import StableIds
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import pose
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.builder import TopologyConfig, build, build_again
 from thinmap_ros.core.topology.graph import NodeKind
 
 SECOND_NS = 1_000_000_000
@@ -109,11 +108,12 @@ def test_where_the_robot_stands_in_no_free_space_the_last_graph_holds():
 
 
 def test_ids_are_never_given_twice():
-    ids = StableIds(0.5)
+    last = None
     seen = set()
     for known_cols in (80, 100, 120, 90, 120):
         fresh = build(crossing(known_cols), (1.0, 3.0), TopologyConfig())
-        found = ids.renamed(fresh)
+        last = build_again(last, crossing(known_cols), (1.0, 3.0), TopologyConfig())
+        found = last.map
         used = [*found.nodes, *found.edges]
         assert len(used) == len(set(used))
         assert {n.kind for n in found.nodes.values()} == {n.kind for n in fresh.nodes.values()}
@@ -124,14 +124,24 @@ def test_ids_are_never_given_twice():
     assert max(seen) == len(seen)
 
 
+def test_ids_stay_where_the_next_map_lies_on_other_cells():
+    first = build_again(None, crossing(), (1.0, 3.0), TopologyConfig())
+    patch = crossing(origin=(0.013, -0.021))
+    second = build_again(first, patch, (1.0, 3.0), TopologyConfig())
+    assert second.map.nodes.keys() == first.map.nodes.keys()
+    assert second.map.edges.keys() == first.map.edges.keys()
+    for node in second.map.nodes.values():
+        before = first.map.nodes[node.id]
+        assert (node.x - before.x, node.y - before.y) == pytest.approx((0.013, -0.021))
+
+
 def test_parallel_edges_keep_their_own_ids():
     cells = np.full((60, 120), 100, dtype=np.int8)
     cells[4:56, 4:116] = 0
     cells[20:30, 20:100] = 100
     cells[44:46, 50:60] = 100
     patch = GridPatch(GridFrame(0.0, 0.0, 0.05), cells)
-    ids = StableIds(0.5)
-    first = ids.renamed(build(patch, (0.5, 0.5), TopologyConfig()))
-    lengths = {e.id: e.length_m for e in first.edges.values()}
-    second = ids.renamed(build(patch, (0.5, 0.5), TopologyConfig()))
-    assert {e.id: e.length_m for e in second.edges.values()} == lengths
+    first = build_again(None, patch, (0.5, 0.5), TopologyConfig())
+    lengths = {e.id: e.length_m for e in first.map.edges.values()}
+    second = build_again(first, patch, (0.5, 0.5), TopologyConfig())
+    assert {e.id: e.length_m for e in second.map.edges.values()} == lengths

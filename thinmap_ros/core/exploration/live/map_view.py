@@ -1,4 +1,4 @@
-"""Maps of any publisher as an exploration needs them, and what a robot sees in a map."""
+"""Maps of any publisher as an exploration needs them, their graph, and what a robot sees in them."""
 
 import math
 
@@ -10,7 +10,13 @@ from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.builder import TopologyConfig, build_again
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.registry import Registry
 
+# The time for the graph of the whole of a map grows with its cells.
+_GRAPH_PERIOD_NS = 2_000_000_000
+_CELLS_A_PERIOD = 1_000_000
 _LETHAL = 100
 _BEAMS = 360
 _RANGE_MIN_M = 0.01
@@ -55,3 +61,38 @@ def scan_in_map(patch: GridPatch, T_map_base: Array, range_m: float, stamp_ns: i
     opaque = (~patch.free).astype(np.uint8)
     ranges = resolution * cast_rays(opaque, x, y, angles, range_m / resolution)
     return Scan.create(stamp_ns, ranges, -math.pi, step, _RANGE_MIN_M, range_m)
+
+
+class MapGraph:
+    """Builds the graph of the whole map again when it has changed, at most every two seconds.
+
+    Maps above a million cells are processed proportionally less often. Nodes and edges keep their
+    ids from one map to the next.
+    """
+
+    def __init__(self, config: TopologyConfig) -> None:
+        self._config = config
+        self._registry: Registry | None = None
+        self._patch: GridPatch | None = None
+        self._built_ns = 0
+
+    def update(self, patch: GridPatch, T_map_base: Array, stamp_ns: int) -> TopologicalMap:
+        """Graph of what can be reached from a pose (3,) in a map.
+
+        An earlier one within the period, and where the robot stands in no free space.
+        """
+        if self._registry is not None and not self._is_due(patch, stamp_ns):
+            return self._registry.map
+        self._patch = patch
+        self._built_ns = stamp_ns
+        seed_xy = (float(T_map_base[0]), float(T_map_base[1]))
+        registry = build_again(self._registry, patch, seed_xy, self._config)
+        if self._registry is None or registry.map.nodes:
+            self._registry = registry
+        return self._registry.map
+
+    def _is_due(self, patch: GridPatch, stamp_ns: int) -> bool:
+        if patch is self._patch:
+            return False
+        period_ns = _GRAPH_PERIOD_NS * max(1.0, patch.cells.size / _CELLS_A_PERIOD)
+        return not 0 <= stamp_ns - self._built_ns < period_ns
