@@ -80,12 +80,12 @@ def test_a_fork_is_to_a_program_what_a_start_is(
     (tmp_path / 'told.py').write_text(PROGRAM)
     told = []
     errors = []
-    for anew in (False, True):
+    for fresh in (False, True):
         out = tmp_path / 'out'
         err = tmp_path / 'err'
         with out.open('w') as output, err.open('w') as error:
-            process = forked.start('told', words, tmp_path, (output, error), anew=anew)
-        assert isinstance(process, forked.Process) != anew
+            process = forked.start('told', words, tmp_path, (output, error), fresh=fresh)
+        assert isinstance(process, forked.Process) != fresh
         assert process.wait(PATIENCE_S) == code
         told.append(json.loads(out.read_text()))
         errors.append(err.read_text().splitlines()[-1])

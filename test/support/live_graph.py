@@ -70,8 +70,8 @@ class Graph:
         with (self.folder / f'{key}.log').open('wb') as log:
             # Services save and load below the working directory only.
             module = f'{package}.{name}'
-            anew = not self.forks
-            process = forked.start(module, words, self.folder, (log, log), anew=anew)
+            fresh = not self.forks
+            process = forked.start(module, words, self.folder, (log, log), fresh=fresh)
         self.processes[key] = process
         return process
 

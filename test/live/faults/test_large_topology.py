@@ -33,7 +33,7 @@ def longest_gap_s(robot):
 
 
 class Robot(StandingRobot):
-    """A robot that stands, and is given its goal anew before the navigator gives it up."""
+    """A robot that stands, and is given its goal again before the navigator gives it up."""
 
     def __init__(self, graph):
         super().__init__(graph, command=TwistStamped)

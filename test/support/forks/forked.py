@@ -108,17 +108,17 @@ def start(
     folder: Path,
     output: tuple[IO[Any], IO[Any]],
     environment: Mapping[str, str] = os.environ,
-    anew: bool = False,
+    fresh: bool = False,
 ) -> Started:
     """Start a module in a session of its own, with files for its standard output and error.
 
-    Not as a fork if anew, if its variables ask for other libraries, or if it loads rerun.
+    Not as a fork if fresh, if its variables ask for other libraries, or if it loads rerun.
     """
-    anew = anew or _loads_rerun(module, arguments)
+    fresh = fresh or _loads_rerun(module, arguments)
     variables = _with_tests(environment)
     with Path(os.devnull).open('rb') as nothing:
         streams = (nothing, *output)
-        if server().can_start(environment) and not anew:
+        if server().can_start(environment) and not fresh:
             return server().start(
                 [stream.fileno() for stream in streams],
                 module=module,

@@ -1,6 +1,6 @@
 """Runs Python modules as forks of a process that has imported what they need.
 
-A module that is run anew spends most of its start on imports. The forks belong to the process that
+A fresh interpreter spends most of its start on imports. The forks belong to the process that
 has started the server, which waits for them as for its own: each loses its parent as soon as it is
 there, and then falls to the nearest ancestor that asks for orphans (`support.forks.forked`).
 """

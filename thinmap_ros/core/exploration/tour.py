@@ -2,7 +2,7 @@
 
 An open tour from where the robot is.
 
-A place that is left out now costs a way back later: a tour weighs both, which "the nearest
+A place that is left out now costs a return later: a tour weighs both, which "the nearest
 first" does not. Source: Kulich, Faigl and Preucil, "On distance utility in the exploration task",
 2011; Croes, "A method for solving traveling-salesman problems", 1958 (2-opt); Or, 1976 (moving a
 piece elsewhere).

@@ -1,4 +1,4 @@
-"""Maps of any publisher as an exploration needs them, their graph, and what a robot sees in them."""
+"""Maps of any publisher as an exploration needs them, their graphs, and what robots see there."""
 
 import math
 
