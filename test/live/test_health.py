@@ -109,7 +109,8 @@ def test_two_sources_of_scans_and_odometry_are_reported_by_name(graph):
     for topic in ('scan', 'odom'):
         line = f'2 nodes publish /{topic}: /other, /sim: stop all but one'
         graph.until(lambda text=line: text in graph.log('localizer'), f'two sources of {topic}')
-    assert doctor.level('localizer') == DiagnosticStatus.WARN
+    # The log comes before the diagnostics.
+    graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.WARN, 'the warning')
     graph.stop('other')
     graph.until(lambda: 'nodes publish' not in doctor.status('localizer').message, 'one again')
 
