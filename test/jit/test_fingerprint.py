@@ -11,7 +11,7 @@ import pytest
 
 from thinmap_ros import jit
 from thinmap_ros.jit.cache import PACKAGE
-from thinmap_ros.jit.fingerprint import fingerprint
+from thinmap_ros.jit.fingerprint import OPTIONS, fingerprint
 
 # Of all kernels of the core and of the simulator, by module and name.
 FINGERPRINTS = """
@@ -34,16 +34,17 @@ from thinmap_ros.jit import inlined, kernel
 
 LIMIT = {limit}
 STEPS = np.array({steps})
+CELL = np.dtype([('{field}', np.uint8)])
 
 @kernel
 def walk(value):
-    return step(value) + {addend}
+    return step(value) + np.zeros(1, CELL).size + {addend}
 
-@inlined
+@{decorator}
 def step(value):
     return min(value + STEPS[0], LIMIT)
 """
-AS_IT_IS = {'limit': 2.0, 'steps': [1, 2], 'addend': 1}
+AS_IT_IS = {'limit': 2.0, 'steps': [1, 2], 'addend': 1, 'field': 'hits', 'decorator': 'inlined'}
 
 
 def fingerprints(folder: Path) -> dict[str, str]:
@@ -111,12 +112,26 @@ def fingerprint_of(**changes: object) -> str:
 
 @pytest.mark.parametrize(
     'change',
-    [{'limit': 3.0}, {'limit': 2}, {'steps': [1, 3]}, {'steps': [1.0, 2.0]}, {'addend': 2}],
+    [
+        {'limit': 3.0},
+        {'limit': 2},
+        {'steps': [1, 3]},
+        {'steps': [1.0, 2.0]},
+        {'addend': 2},
+        {'field': 'seen'},
+        {'decorator': 'kernel'},
+    ],
     ids=str,
 )
 def test_code_and_the_values_that_it_names_count(change: dict[str, object]) -> None:
     assert fingerprint_of() == fingerprint_of()
     assert fingerprint_of(**change) != fingerprint_of()
+
+
+def test_how_all_kernels_are_compiled_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = fingerprint_of()
+    monkeypatch.setitem(OPTIONS, 'fastmath', True)
+    assert fingerprint_of() != before
 
 
 def test_members_of_an_enumeration_count() -> None:

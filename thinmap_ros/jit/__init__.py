@@ -6,6 +6,7 @@ from typing import Any, TypeVar, cast
 import numba
 
 from thinmap_ros.jit import cache
+from thinmap_ros.jit.fingerprint import OPTIONS
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 # Kernels of all imported modules.
@@ -26,4 +27,4 @@ def inlined(function: Function) -> Function:
 
 def _compiled(function: Function, **options: Any) -> Function:
     kept = cache.folder() is not None
-    return cast(Function, numba.njit(cache=kept, nogil=True, **options)(function))
+    return cast(Function, numba.njit(cache=kept, **OPTIONS, **options)(function))

@@ -12,8 +12,10 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.types.abstract import Type
 from numba.core.types.containers import BaseNamedTuple, BaseTuple
 
+# How all kernels are compiled, besides what their decorators say.
+OPTIONS = {'nogil': True}
 _PACKAGE = __name__.partition('.')[0]
-_SCALARS = (bool, int, float, complex, str, bytes, np.generic, type(None))
+_SCALARS = (bool, int, float, complex, str, bytes, np.generic, np.dtype, type(None))
 Function = Callable[..., Any]
 
 
@@ -22,18 +24,18 @@ def fingerprint(function: Function) -> str:
     """Hash of the code of a kernel, of all kernels that it calls, and of the values that they name.
 
     To be called once all modules of the kernels are imported: kernels call some that stand below
-    them. Numba accepts no other global names than those that count here.
+    them. What Numba accepts as a global value counts: numbers, texts, tuples, arrays, their types,
+    enumerations, named tuples, kernels; of a function of another module its name alone.
     """
-    together = hashlib.sha256()
+    together = hashlib.sha256(repr(OPTIONS).encode())
     known = {function}
     waiting = [function]
     while waiting:
         current = waiting.pop()
         together.update(repr((current.__qualname__, _code(current), current.__defaults__)).encode())
         for name, value in _named_values(current):
-            if not isinstance(value, Dispatcher):
-                together.update(repr((name, _value(value))).encode())
-            elif value.py_func not in known:
+            together.update(repr((name, _value(value))).encode())
+            if isinstance(value, Dispatcher) and value.py_func not in known:
                 known.add(value.py_func)
                 waiting.append(value.py_func)
     return together.hexdigest()
@@ -95,7 +97,9 @@ def _value(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_value(member) for member in value]
     if isinstance(value, np.ndarray):
-        return value.dtype.str, value.shape, value.tobytes()
+        return repr(value.dtype), value.shape, value.tobytes()
+    if isinstance(value, Dispatcher):
+        return sorted(value.targetoptions.items())
     if isinstance(value, ModuleType):
         return value.__name__
     if isinstance(value, EnumType):
