@@ -22,7 +22,7 @@ from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.buildings import Building, generate_building
 from thinmap_ros.sim.drives import DriveSample, world_to_grid

@@ -13,7 +13,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class, set_topology
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 

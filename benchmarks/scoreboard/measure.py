@@ -23,7 +23,7 @@ from thinmap_ros.core.config import with_values
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
 from thinmap_ros.experiments.slam.logs import laser_of

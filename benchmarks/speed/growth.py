@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.evaluation.machine import CpuTimedPipeline, resident_mb
 from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.files.package_data import world_path

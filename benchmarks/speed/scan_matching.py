@@ -130,9 +130,7 @@ def _ours(before: list[tuple[Scan, Array]], errors: tuple[float, float]) -> Matc
     sigmas = np.array([errors[0], errors[0], np.radians(errors[1])]) / np.sqrt(3.0)
     covariance = np.diag(np.square(sigmas))
     return lambda scan, prior: (
-        matcher.match(
-            surface_points(scan), scan.T_base_laser, local_map, prior, covariance
-        ).T_map_base
+        matcher.match(surface_points(scan), scan.T_base_laser, local_map, prior, covariance).pose
     )
 
 

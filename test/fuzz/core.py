@@ -20,7 +20,7 @@ from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class, set_topology
 from thinmap_ros.core.topology.builder import TopologyBuilder
 

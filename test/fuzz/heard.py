@@ -14,7 +14,8 @@ from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.logs.carmen import LaserOptions

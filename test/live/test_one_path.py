@@ -17,7 +17,7 @@ from support.timeouts import PATIENCE_S
 
 from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.files import occupancy_maps, package_data, sessions
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.bag import BagLog

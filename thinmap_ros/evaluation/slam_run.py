@@ -8,7 +8,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig, PipelineResult
 from thinmap_ros.sim.drives import DriveSample
 

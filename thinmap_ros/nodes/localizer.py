@@ -29,7 +29,8 @@ from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.core.slam.localizer import LIVE_PARAMETERS, Localizer, LocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.localizer_config import LIVE_PARAMETERS, LocalizerConfig
 from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
     adjust,

@@ -18,7 +18,7 @@ from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.files.atomic import atomic_write

@@ -10,7 +10,8 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 

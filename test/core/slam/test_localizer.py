@@ -16,7 +16,8 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.sim.drives import DriveConfig
 from thinmap_ros.sim.drives import drive as drive_along
@@ -71,7 +72,7 @@ def on(localizer, steps, truth, odom, rng, segments=ROOM, turn=0.1):
         step = se2.pose(0.02, 0.0, turn)
         truth = se2.compose(truth, step)
         odom = se2.compose(odom, step)
-        stamp = (localizer._prediction.stamp_ns or 0) + PERIOD_NS
+        stamp = (localizer._tracker.prediction.stamp_ns or 0) + PERIOD_NS
         rows.append((truth, localizer.step(scan_in(segments, truth, rng, stamp), odom), odom))
     return rows
 
@@ -318,7 +319,7 @@ def test_after_dead_reckoning_a_few_points_that_fit_badly_do_not_move_the_pose(s
     for k in range(150):
         odom = se2.compose(odom, se2.pose(0.05, 0.0, 0.03))
         predicted = localizer.step(replace(BLIND, stamp_ns=(60 + k) * PERIOD_NS), odom)
-    assert localizer.config.matching.is_wide(localizer._uncertainty.since_match)
+    assert localizer.config.matching.is_wide(localizer._tracker.track.uncertainty.since_match)
     scan = scan_in(ELSEWHERE, se2.pose(1.0, 1.5, 0.5), rng, 210 * PERIOD_NS)
     ranges = np.full(scan.ranges_m.size, np.inf)
     ranges[60:100] = scan.ranges_m[60:100]
@@ -512,7 +513,7 @@ def driven_elsewhere(localizer, start, odom_before=None):
     """Estimates of a drive that starts at another place (3,) than the localizer believes."""
     rng = np.random.default_rng(5)
     before = np.zeros(3) if odom_before is None else odom_before
-    stamp_ns = localizer._prediction.stamp_ns or 0
+    stamp_ns = localizer._tracker.prediction.stamp_ns or 0
     for k, (truth, odom) in enumerate(drive(300, rng, np.array(start))):
         scan = scan_in(ROOM, truth, rng, stamp_ns + (k + 1) * PERIOD_NS)
         yield truth, localizer.step(scan, se2.compose(before, odom))
@@ -718,11 +719,11 @@ def test_the_error_of_a_pose_that_was_set_is_not_taken_for_noise_of_the_odometry
     localizer = deepcopy(first)
     truth, _, odom = rows[-1]
     on(localizer, 1, truth, odom, np.random.default_rng(1))
-    before = localizer._prediction._model._share.copy()
+    before = localizer._tracker.prediction._model._share.copy()
     localizer.set_pose(truth + [0.3, -0.2, 0.1], np.diag([0.1, 0.1, 0.02]))
     after = on(localizer, 3, truth, odom, np.random.default_rng(1))
     assert np.hypot(*errors_of(after)[-1][:2]) < 0.06
-    assert (localizer._prediction._model._share < 1.5 * before).all()
+    assert (localizer._tracker.prediction._model._share < 1.5 * before).all()
 
 
 def test_a_robot_outside_of_a_loaded_map_stays_lost(whole_drive):
@@ -812,7 +813,7 @@ def test_a_state_with_more_hits_than_observations_in_one_cell_is_refused(whole_d
 
 def is_loop_found(localizer):
     """Whether the last keyframes are tied to the first ones round the block."""
-    return any(edge.b - edge.a > 50 for edge in localizer._loops.edges)
+    return any(edge.b - edge.a > 50 for edge in localizer._mapping.loops.edges)
 
 
 def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed_well():
@@ -856,7 +857,7 @@ def test_the_path_at_the_end_holds_the_loop_that_is_being_closed_and_the_pose_fo
     localizer = at_start(initial_x_m=3.15, initial_y_m=1.2)
     for scan, odom, _ in drive_round_the_block():
         localizer.step(scan, odom)
-        if is_loop_found(localizer) and localizer._loops._optimization is not None:
+        if is_loop_found(localizer) and localizer._mapping.loops._optimization is not None:
             break
     before = localizer.pose
     path = localizer.optimized_trajectory()
@@ -873,7 +874,7 @@ def test_the_map_is_rendered_again_the_nearest_part_first(round_the_block):
 
     def known():
         """Which of the former walls are rendered again."""
-        return localizer._map.map.distances(walls) < 0.1
+        return localizer._mapping.local.map.distances(walls) < 0.1
 
     localizer.set_pose(localizer.pose, 1e-4 * np.eye(3))
     assert known()[near].mean() > 0.95
@@ -923,7 +924,7 @@ def test_where_the_map_would_become_too_large_a_new_one_begins():
     for leap in range(1, 4):
         # As far as odometry can have come while only the scans were missing.
         odom = se2.compose(odom, np.array([240.0, 240.0, 0.0]))
-        stamp = localizer._prediction.stamp_ns + 1000 * PERIOD_NS
+        stamp = localizer._tracker.prediction.stamp_ns + 1000 * PERIOD_NS
         scan = replace(scan_in(ROOM, truth, rng, stamp), odometry_silence_s=0.0)
         estimate = localizer.step(scan, odom)
         assert (localizer.rejected, estimate.is_lost) == ((0, False) if leap < 3 else (1, True))

@@ -3,7 +3,7 @@
 import pytest
 
 from thinmap_ros.core.config import with_values
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import without_effect
 
 VALUES = {

@@ -14,7 +14,7 @@ from fuzz.cases import Source, chosen, damaged_bytes, damaged_text, finite, noth
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.log import (

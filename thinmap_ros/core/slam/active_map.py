@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.keyframes import Keyframe
+from thinmap_ros.core.slam.graph.keyframes import Keyframe, Keyframes
 from thinmap_ros.core.slam.graph.pieces import Pieces
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 
@@ -27,10 +26,10 @@ class ActiveMap:
         self._pieces = pieces
         self._render_first = render_first
         self.map = LocalMap(config)
-        self.T_at_update: Array | None = None  # pose (3,) of the last scan that was added
         self.refused = 0  # scans that lie too far from the others for one map
         self._loaded: Mapping[str, NDArray[Any]] | None = None
         self._pending: list[int] = []
+        self._revision = 0
 
     def load(self, given: Mapping[str, NDArray[Any]]) -> None:
         """Set the cells of a `LocalMap.state` with which every re-rendered map starts."""
@@ -41,12 +40,7 @@ class ActiveMap:
 
         Returns False, and counts the scan in `refused`, if the map would become too large.
         """
-        self.T_at_update = T_map_base
         return self._add(points, T_base_laser, T_map_base)
-
-    def moved(self, T_map_base: Array) -> Array | None:
-        """Motion (3,) from the last map update to a pose (3,); None before the first update."""
-        return None if self.T_at_update is None else se2.between(self.T_at_update, T_map_base)
 
     def start_submap(self) -> None:
         """Continue in an empty map."""
@@ -60,7 +54,14 @@ class ActiveMap:
         away = np.hypot(*(places - T_map_base[:2]).T)
         order = np.argsort(-away).tolist()
         self._pending = [k for k in order if self._pieces.is_here(keyframes[k].submap)]
-        self.render(keyframes, self._render_first)
+        self._render(keyframes, self._render_first)
+
+    def follow(self, keyframes: Keyframes, T_map_base: Array) -> None:
+        """Render the keyframes as they were corrected last, some in each step."""
+        if keyframes.revision != self._revision:
+            self._revision = keyframes.revision
+            self.rerender(keyframes.frames, T_map_base)
+        self._render(keyframes.frames)
 
     def published(self, keyframes: Sequence[Keyframe]) -> LocalMap:
         """The local map of the published piece: rendered again while the robot is in another."""
@@ -73,7 +74,7 @@ class ActiveMap:
                     rendered.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
         return rendered
 
-    def render(self, keyframes: Sequence[Keyframe], count: int = 2) -> None:
+    def _render(self, keyframes: Sequence[Keyframe], count: int = 2) -> None:
         """Render up to `count` of the pending keyframes."""
         for _ in range(min(count, len(self._pending))):
             frame = keyframes[self._pending.pop()]

@@ -23,7 +23,7 @@ from thinmap_ros.core.slam.matching.scan_matcher import Match
 
 CHI2 = 11.34  # 99 % of three degrees of freedom
 UNKNOWN = np.diag(np.square([300.0, 300.0, np.pi]))  # covariance of an unknown pose
-NO_DERIVATIVE = np.zeros((3, 4))
+_NO_DERIVATIVE = np.zeros((3, 4))
 _MIN_STEP = np.diag(np.square([2e-3, 2e-3, 5e-4]))  # smallest covariance between keyframes
 
 
@@ -58,30 +58,33 @@ class Contradiction:
 
 
 class PoseUncertainty:
-    """Covariances (3, 3), map frame, of the pose relative to several earlier poses."""
+    """Covariances (3, 3), frame of the anchor, of the pose relative to several earlier poses.
 
-    def __init__(self, T_map_base: Array) -> None:
+    T_moved: pose (3,) after the last motion, relative to the anchor.
+    """
+
+    def __init__(self, T_anchor_base: Array) -> None:
         self.since_match = np.zeros((3, 3))  # motion since the last good match: the next prior
         self.since_map_update = np.zeros((3, 3))  # pose since the last map update
         self.motion_part: Array = np.zeros((3, 3))  # share of since_map_update from the motion
         self._since_keyframe = np.zeros((3, 3))
         self._map_update_covariance = np.zeros((3, 3))  # last update, not in _since_keyframe
         # Since the walls in view were drawn, which matches measure; and besides, from the anchor.
-        self._systematic_in_view = NO_DERIVATIVE
-        self._systematic_of_step = NO_DERIVATIVE
+        self._systematic_in_view = _NO_DERIVATIVE
+        self._systematic_of_step = _NO_DERIVATIVE
         self._contradiction = Contradiction()
-        self._T_moved = T_map_base  # pose after the last motion
+        self.T_moved = T_anchor_base
 
-    def place(self, T_map_base: Array, covariance: Array) -> None:
+    def place(self, T_anchor_base: Array, covariance: Array) -> None:
         """Set the pose (3,) and its covariance (3, 3), without any motion."""
         own = 0.5 * (covariance + covariance.T) + _MIN_STEP
-        self._T_moved = T_map_base
+        self.T_moved = T_anchor_base
         self.since_match = own
         self.since_map_update = own
         self._since_keyframe = np.zeros((3, 3))
         self._map_update_covariance = np.zeros((3, 3))
-        self._systematic_in_view = NO_DERIVATIVE
-        self._systematic_of_step = NO_DERIVATIVE
+        self._systematic_in_view = _NO_DERIVATIVE
+        self._systematic_of_step = _NO_DERIVATIVE
         self._contradiction.add_jump(own + UNKNOWN)
 
     def predict(
@@ -89,30 +92,30 @@ class PoseUncertainty:
     ) -> None:
         """Propagate by a motion from a pose (3,) to the prior (3,), with covariance Q (3, 3).
 
-        by_calibration (3, 4): derivative of the motion by the calibration, map frame.
+        by_calibration (3, 4): derivative of the motion by the calibration.
         """
         self.since_match = propagated_covariance(self.since_match, prior[:2] - before[:2]) + Q
         if not is_stationary:
-            lever = prior[:2] - self._T_moved[:2]
+            lever = prior[:2] - self.T_moved[:2]
             self._since_keyframe = propagated_covariance(self._since_keyframe, lever)
             self.since_map_update = propagated_covariance(self.since_map_update, lever)
             self._systematic_of_step = carried(self._systematic_of_step, lever)
             self._systematic_in_view = carried(self._systematic_in_view, lever) + by_calibration
 
-    def is_stationary(self, T_map_base: Array, slip: Array) -> bool:
+    def is_stationary(self, T_anchor_base: Array, slip: Array) -> bool:
         """Whether a pose (3,) differs from the last moved one by at most the slip (3,)."""
-        return bool((np.abs(se2.pose_difference(T_map_base, self._T_moved)) <= slip).all())
+        return bool((np.abs(se2.pose_difference(T_anchor_base, self.T_moved)) <= slip).all())
 
-    def coast(self, T_map_base: Array, Q: Array, is_stationary: bool) -> None:
+    def coast(self, T_anchor_base: Array, Q: Array, is_stationary: bool) -> None:
         """Use the predicted pose (3,) of this step, without a match."""
         if not is_stationary:
             self.since_map_update = self.since_map_update + Q
-            self._T_moved = T_map_base
+            self.T_moved = T_anchor_base
         self.motion_part = self.since_map_update
 
     def update(self, match: Match, prior: Array, Q: Array, fits: bool, is_stationary: bool) -> None:
         """Update by a match with a prior (3,); fits: whether enough points are inliers."""
-        self._contradiction.add(se2.pose_difference(match.T_map_base, prior), self.since_match)
+        self._contradiction.add(se2.pose_difference(match.pose, prior), self.since_match)
         self.since_match = np.zeros((3, 3)) if fits else match.covariance
         if is_stationary:
             return
@@ -121,11 +124,11 @@ class PoseUncertainty:
         unmeasured = self.since_map_update @ motion_part  # share of the prior: I - K
         self.motion_part = unmeasured @ self.since_map_update
         self._systematic_in_view = unmeasured @ self._systematic_in_view
-        self._T_moved = match.T_map_base
+        self.T_moved = match.pose
 
     def is_unexpected(self, match: Match, prior: Array) -> bool:
         """Whether the innovation of a match from its prior (3,) exceeds the 99 % gate."""
-        off = se2.pose_difference(match.T_map_base, prior)
+        off = se2.pose_difference(match.pose, prior)
         return float(off @ np.linalg.solve(self.since_match, off)) > CHI2
 
     def map_updated(self, share: float) -> None:
@@ -147,55 +150,40 @@ class PoseUncertainty:
         """Share (3, 3) of `since_map_update` that is due to the scan."""
         return self.since_map_update - self.motion_part
 
-    def start_submap(self, T_map_base: Array, covariance: Array) -> None:
+    def start_submap(self, T_anchor_base: Array, covariance: Array) -> None:
         """Start a submap at a pose (3,), with covariance (3, 3) relative to the previous one."""
         self._contradiction.add_jump(covariance)
         self._since_keyframe = self._since_keyframe + covariance
         self.since_match = np.zeros((3, 3))
-        self._T_moved = T_map_base
+        self.T_moved = T_anchor_base
 
-    def step_from(self, yaw: float) -> tuple[Array, Array, Array]:
-        """The step from an anchor with heading yaw, in its frame.
+    def step(self) -> tuple[Array, Array]:
+        """Covariance (3, 3) of the step from the anchor, and that of its jumps (3, 3)."""
+        return self._since_keyframe + _MIN_STEP, self._contradiction.covariance
 
-        Returns its derivative (3, 4) by the calibration, its covariance (3, 3), and that of its
-        jumps (3, 3).
-        """
-        by_calibration = rotation(-yaw) @ self._systematic_since_anchor
-        covariance = rotated_covariance(self._since_keyframe, -yaw) + _MIN_STEP
-        return by_calibration, covariance, rotated_covariance(self._contradiction.covariance, -yaw)
-
-    def start_step(self) -> None:
-        """Make the current pose the anchor: its step covariance restarts at 0."""
+    def start_step(self, T_old_new: Array) -> None:
+        """Make a pose (3,), the current one, the anchor: its step covariance restarts at 0."""
+        yaw = -float(T_old_new[2])
+        self.T_moved = se2.between(T_old_new, self.T_moved)
+        self.since_match = rotated_covariance(self.since_match, yaw)
+        self.since_map_update = rotated_covariance(self.since_map_update, yaw)
+        self.motion_part = rotated_covariance(self.motion_part, yaw)
         self._since_keyframe = np.zeros((3, 3))
         self._map_update_covariance = np.zeros((3, 3))
+        self._systematic_in_view = rotation(yaw) @ self._systematic_in_view
         # What a match takes off the part in view is then taken off the new step.
         self._systematic_of_step = -self._systematic_in_view
         self._contradiction = Contradiction()
 
     @property
-    def _systematic_since_anchor(self) -> Array:
+    def systematic(self) -> Array:
+        """Derivative (3, 4) of the pose relative to the anchor by the calibration."""
         return self._systematic_of_step + self._systematic_in_view
 
-    def systematic(self, T_anchor: Array | None, anchor_systematic: Array) -> Array:
-        """Derivative (3, 4) of the pose by the calibration, map frame, given that of the anchor."""
-        own = self._systematic_since_anchor
-        if T_anchor is None:
-            return own
-        return own + carried(anchor_systematic, self._T_moved[:2] - T_anchor[:2])
-
-    def move(self, T_map_base: Array) -> None:
-        """Set the corrected pose (3,); covariances relative to earlier poses do not change."""
-        self._T_moved = T_map_base
-
-    def covariance(self, T_anchor: Array | None, anchor_covariance: Array | None) -> Array:
-        """Covariance (3, 3) of the independent errors of the pose, map frame.
-
-        Given the pose (3,) of the anchor, and its covariance (3, 3).
-        """
+    @property
+    def since_anchor(self) -> Array:
+        """Covariance (3, 3) of the independent errors of the pose relative to the anchor."""
         # A match cannot be more accurate than the scan that was last added to the map.
-        own = self._since_keyframe + max(
+        return self._since_keyframe + max(
             self._map_update_covariance, self.since_map_update, key=np.trace
         )
-        if T_anchor is not None and anchor_covariance is not None:
-            own = own + propagated_covariance(anchor_covariance, self._T_moved[:2] - T_anchor[:2])
-        return np.asarray(0.5 * (own + own.T))

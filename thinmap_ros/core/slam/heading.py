@@ -5,6 +5,7 @@ from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import PoseUncertainty
+from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 from thinmap_ros.core.slam.wall_compass import Heading, Reference, WallCompass
 
 
@@ -12,9 +13,15 @@ class HeadingCorrection:
     """Corrects the heading of scans before they are added to the map."""
 
     def __init__(
-        self, config: LineConfig, min_sigma_rad: float = 5e-4, new_ratio: float = 0.2
+        self,
+        config: LineConfig,
+        calibration: OdometryCalibration,
+        min_sigma_rad: float = 5e-4,
+        new_ratio: float = 0.2,
     ) -> None:
         """new_ratio: of a match's error, that is independent of the previous map update."""
+        self._calibration = calibration
+        self._revision = 0
         self._new_ratio = new_ratio
         self._config = config
         self._compass = WallCompass()
@@ -29,13 +36,18 @@ class HeadingCorrection:
         path_m: float,
         fits: bool,
         own: Reference,
+        revision: int,
     ) -> Array:
         """Pose (3,) with the heading corrected by the wall directions, if they give one.
 
         path_m: length of the path so far (m); walls near the start of the path weigh most.
         fits: whether scans agree with the map; otherwise the pose is unchanged; own: error of the
-        heading, relative to where the map began.
+        heading, relative to where the map began; revision: number of corrections of the map, with
+        which the main direction turns as the calibration of the odometry has it.
         """
+        if revision != self._revision:
+            self._revision = revision
+            self._compass.calibrate(self._calibration.smoothed())
         # The gate is narrower than the variance of the pose: a larger heading error is also in the
         # local map, and a scan that is corrected alone would no longer fit this map.
         self._variance += float(pose.motion_part[2, 2] + self._new_ratio * pose.scan_part[2, 2])
@@ -51,7 +63,3 @@ class HeadingCorrection:
             self._variance *= 1.0 - gain
         self._compass.add_lines(lines, heading, path_m, own)
         return se2.pose(x, y, heading)
-
-    def calibrate(self, parameters: Array) -> None:
-        """Turn the main wall direction as parameters (N, 4) of the calibration have it."""
-        self._compass.calibrate(parameters)

@@ -3,7 +3,8 @@
 from thinmap_ros.core.config import parameters_of
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfLocalizer
 from thinmap_ros.core.ekf_slam.features import LineFeature
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 AnyLocalizer = Localizer | EkfLocalizer

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import rotated_covariance
+from thinmap_ros.core.covariances import rotated_covariance, rotation
 from thinmap_ros.core.ekf_slam.models import odometry_variances
 from thinmap_ros.core.odometry import OdometryIncrement, OdometryIncrements
 from thinmap_ros.core.scan import Scan
@@ -17,7 +17,7 @@ from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
 @dataclass(frozen=True, eq=False)
 class Reversal:
-    """Expected reversal of an odometry error by the next increment, map frame.
+    """Expected reversal of an odometry error by the next increment, in the robot frame before it.
 
     mean (3,), covariance (3, 3). The next reading reverses a wrong reading of the odometry, but
     not wheel slip. Both are assumed to be equally likely.
@@ -29,14 +29,14 @@ class Reversal:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Predicted pose T_map_base (3,), and covariance (3, 3) of its motion, map frame.
+    """Poses (3,) before a motion and, as predicted, after it, and covariance (3, 3) of the motion.
 
-    motion: the increment in the robot frame; T_before (3,): pose before the motion, map frame;
+    In the frame of the pose before, the anchor's. motion: the increment in the robot frame;
     discontinuity: description of an odometry jump; '' without one.
     """
 
-    T_before: Array
-    T_map_base: Array
+    before: Array
+    prior: Array
     covariance: Array
     motion: MotionPrediction
     discontinuity: str
@@ -52,6 +52,7 @@ class OdometryPrediction:
         self._model = MotionModel(config)
         self._reversal = Reversal()
         self._begins_known = False  # whether the next motion starts at a matched pose
+        self._revision = 0
 
     @property
     def rejected(self) -> int:
@@ -68,38 +69,45 @@ class OdometryPrediction:
         """Odometry pose (3,) of the last scan."""
         return self._increments.T_odom_base
 
-    def predict(self, scan: Scan, T_odom_base: Array, T_before: Array) -> Prediction:
-        """Predict the pose of a scan by its odometry pose (3,) and the previous pose (3,)."""
+    def predict(
+        self, scan: Scan, T_odom_base: Array, before: Array, revision: int = 0
+    ) -> Prediction:
+        """Predict the pose of a scan by its odometry pose (3,) and the previous pose (3,).
+
+        revision: number of corrections of the map so far: matches before one are not compared with
+        those after it.
+        """
+        if revision != self._revision:
+            self._revision = revision
+            self.reset_segment()
         increment = self._increments.add(scan, T_odom_base)
         motion = self._motion(increment)
         reversal = self._reversal
         self._reversal = Reversal()
-        expected = se2.compose(T_before, motion.increment) + reversal.mean
-        covariance = rotated_covariance(motion.covariance, float(T_before[2])) + reversal.covariance
-        T_map_base = se2.pose(*expected.tolist())
-        return Prediction(T_before, T_map_base, covariance, motion, increment.discontinuity)
+        R = rotation(float(before[2]))
+        expected = se2.compose(before, motion.increment) + R @ reversal.mean
+        covariance = R @ (motion.covariance + reversal.covariance) @ R.T
+        prior = se2.pose(*expected.tolist())
+        return Prediction(before, prior, covariance, motion, increment.discontinuity)
 
     def contradict(self, prediction: Prediction, match: Match, accepted: bool) -> None:
         """Expect that the next increment may reverse the innovation of an unexpected match."""
-        off = se2.pose_difference(match.T_map_base, prediction.T_map_base)
+        after = match.pose if accepted else prediction.prior
+        off = rotation(-float(after[2])) @ se2.pose_difference(match.pose, prediction.prior)
         mean = -0.5 * off if accepted else np.zeros(3)
         self._reversal = Reversal(mean, 0.25 * np.outer(off, off))
 
-    def update(self, prediction: Prediction, match: Match, systematic: Array) -> None:
-        """Update the odometry noise and calibration by a match with enough inliers.
-
-        systematic (3, 4): derivative of the matched pose by the calibration, map frame.
-        """
+    def update(self, prediction: Prediction, match: Match) -> None:
+        """Update the odometry noise by a match with enough inliers, in the prediction's frame."""
         if self._begins_known:
             scan_information = rotated_covariance(
-                match.scan_information, -float(prediction.T_before[2])
+                match.scan_information, -float(prediction.before[2])
             )
-            self._model.update(se2.between(prediction.T_before, match.T_map_base), scan_information)
+            self._model.update(se2.between(prediction.before, match.pose), scan_information)
         self._begins_known = True
-        self.calibration.update(match.T_map_base, match.scan_information, systematic)
 
     def reset_segment(self) -> None:
-        """Stop comparing odometry with matches across a pose that was set, corrected or lost."""
+        """Stop comparing odometry with matches across a pose that was set or lost."""
         self._begins_known = False
         self.calibration.reset_segment()
 

@@ -9,7 +9,8 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
@@ -64,8 +65,8 @@ def test_faces_of_a_map_hold_a_robot_along_their_normals():
     doubt = np.diag(np.square([0.1, 0.1, 0.1]))
     found = Matcher().match(seen_in(walls, truth), np.zeros(3), local_map, prior, doubt)
     assert found.inlier_ratio > 0.95
-    assert np.hypot(*(found.T_map_base - truth)[:2]) < 0.01
-    assert abs(found.T_map_base[2] - truth[2]) < 0.003
+    assert np.hypot(*(found.pose - truth)[:2]) < 0.01
+    assert abs(found.pose[2] - truth[2]) < 0.003
 
 
 def test_a_map_without_walls_has_no_points():

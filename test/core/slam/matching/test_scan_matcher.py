@@ -31,7 +31,7 @@ def nearest_minimum(local_map, points, prior, covariance):
 
 
 def off(match_, truth=TRUTH):
-    return se2.pose_difference(match_.T_map_base, truth)
+    return se2.pose_difference(match_.pose, truth)
 
 
 def clutter(rng, number):
@@ -140,9 +140,9 @@ def test_along_a_corridor_the_prior_decides(rng):
         local_map = in_corridor(rng)
         prior = np.array([rng.choice([-0.1, 0.1]), 0.06, 0.02])
         found = match(local_map, seen_in(CORRIDOR, np.zeros(3), rng), prior)
-        assert abs(found.T_map_base[0] - prior[0]) < 0.03
-        assert abs(found.T_map_base[1]) < 0.02
-        assert abs(found.T_map_base[2]) < 0.01
+        assert abs(found.pose[0] - prior[0]) < 0.03
+        assert abs(found.pose[1]) < 0.02
+        assert abs(found.pose[2]) < 0.01
         assert found.scan_information[0, 0] < 0.01 * found.scan_information[1, 1]
         assert found.covariance[0, 0] > 0.3 * DOUBT[0, 0]
         assert found.covariance[1, 1] < 0.02 * DOUBT[1, 1]
@@ -158,8 +158,8 @@ def test_a_wide_covariance_is_searched_though_the_nearest_minimum_fits(rng):
     covariance = np.diag(np.square([0.3, 0.05, 0.02]))
     alone = nearest_minimum(local_map, points, prior, covariance)
     assert alone.inlier_ratio > MATCHER.config.min_inlier_ratio
-    assert abs(alone.T_map_base[0]) > 0.3
-    assert abs(match(local_map, points, prior, covariance).T_map_base[0]) < 0.03
+    assert abs(alone.pose[0]) > 0.3
+    assert abs(match(local_map, points, prior, covariance).pose[0]) < 0.03
 
 
 def test_an_unknown_heading_is_searched_though_the_nearest_minimum_fits(rng):
@@ -173,8 +173,8 @@ def test_an_unknown_heading_is_searched_though_the_nearest_minimum_fits(rng):
     covariance = np.diag(np.square([0.03, 0.03, 0.6]))
     alone = nearest_minimum(local_map, points, prior, covariance)
     assert alone.inlier_ratio > 0.5
-    assert abs(alone.T_map_base[2]) > 1.0
-    assert abs(match(local_map, points, prior, covariance).T_map_base[2]) < 0.02
+    assert abs(alone.pose[2]) > 1.0
+    assert abs(match(local_map, points, prior, covariance).pose[2]) < 0.02
 
 
 def test_in_a_corridor_without_visible_end_the_prior_decides():
@@ -192,7 +192,7 @@ def test_in_a_corridor_without_visible_end_the_prior_decides():
             )
         points = surface_points(replace(scan_in(CORRIDOR, truth, rng), max_range_m=6.0))
         found = match(local_map, points, truth, covariance)
-        back.append(truth[0] - found.T_map_base[0])
+        back.append(truth[0] - found.pose[0])
     # At most the prior's sigma: without information along the corridor, the prior decides.
     assert np.sqrt(np.mean(np.square(back))) < 0.12
     assert np.median(np.abs(back)) < 0.05
@@ -287,8 +287,8 @@ def test_a_new_wall_as_wide_as_a_door_does_not_pull_the_robot_to_a_known_one(rng
     door = np.array([[0.3, 0.7, 1.2, 0.7]])
     points = seen_in(np.vstack([CORRIDOR, door]), np.zeros(3), rng)
     found = match(local_map, points, np.zeros(3), np.diag(np.square([0.01, 0.01, 0.05])))
-    assert abs(found.T_map_base[1]) < 0.03
-    assert abs(found.T_map_base[0]) < 0.01
+    assert abs(found.pose[1]) < 0.03
+    assert abs(found.pose[0]) < 0.01
     assert found.inlier_ratio < 0.9
 
 
@@ -310,7 +310,7 @@ def test_ground_that_is_new_contradicts_nothing(rng, room):
     """Points in unobserved space behind a door do not contradict; in free space they do."""
     elsewhere = match(room, seen_in(ROOM, TRUTH, rng), TRUTH + [50.0, 0.0, 0.0])
     assert elsewhere.contradiction_ratio == elsewhere.inlier_ratio == 0.0
-    np.testing.assert_allclose(elsewhere.T_map_base, TRUTH + [50.0, 0.0, 0.0])
+    np.testing.assert_allclose(elsewhere.pose, TRUTH + [50.0, 0.0, 0.0])
     np.testing.assert_allclose(elsewhere.scan_information, 0.0)
     np.testing.assert_allclose(elsewhere.covariance, DOUBT, atol=1e-12)
     ring = np.linspace(-1.2, 1.2, 60)
@@ -346,7 +346,7 @@ def test_the_same_input_gives_the_same_output_and_stays_as_it_is(rng, room):
     covariance = DOUBT.copy()
     copies = points.copy(), prior.copy(), {k: v.copy() for k, v in room.state().items()}
     first, second = (match(room, points, prior, covariance) for _ in range(2))
-    np.testing.assert_array_equal(first.T_map_base, second.T_map_base)
+    np.testing.assert_array_equal(first.pose, second.pose)
     np.testing.assert_array_equal(first.covariance, second.covariance)
     np.testing.assert_array_equal(points, copies[0])
     np.testing.assert_array_equal(prior, copies[1])
@@ -377,8 +377,8 @@ def test_wide_headings_are_wrapped(rng):
     for heading in (-math.pi + 0.02, math.pi - 0.04):
         for covariance in (DOUBT, np.diag(np.square([0.3, 0.3, 0.3]))):
             found = match(local_map, points, np.array([2.03, 1.98, heading]), covariance)
-            assert abs(found.T_map_base[2]) <= math.pi
-            assert abs(se2.wrap(float(found.T_map_base[2] - truth[2]))) < 0.01
+            assert abs(found.pose[2]) <= math.pi
+            assert abs(se2.wrap(float(found.pose[2] - truth[2]))) < 0.01
             assert np.hypot(*off(found, truth)[:2]) < 0.02
 
 

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.covariances import inverse
+from thinmap_ros.core.covariances import (
+    carried,
+    inverse,
+    propagated_covariance,
+    rotated_covariance,
+    rotation,
+)
 from thinmap_ros.core.grid.spatial_hash import SpatialHash
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -81,9 +87,70 @@ class Step:
     covariance: Array
     systematic: Systematic = NO_SHARE
 
+    def turned(self, theta: float) -> 'Step':
+        """The step in a frame in which its own is turned by theta, rad."""
+        share = replace(self.systematic, derivative=rotation(theta) @ self.systematic.derivative)
+        return Step(rotated_covariance(self.covariance, theta), share)
+
+
+@dataclass(frozen=True, eq=False)
+class Anchor:
+    """The last keyframe scan, to which the pose of the robot is relative: its pose T_map (3,).
+
+    The origin of the map before the first. covariance (3, 3), systematic (3, 4): those of the pose,
+    map frame; path_m: length of the path up to it; None: there is no path yet. A correction of the
+    keyframes moves it, and thereby whatever is relative to it.
+    """
+
+    T_map: Array = field(default_factory=lambda: np.zeros(3))
+    covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    systematic: Array = field(default_factory=lambda: np.zeros((3, 4)))
+    path_m: float | None = None
+
+    @staticmethod
+    def at(frame: Keyframe, T_frame: Array) -> 'Anchor':
+        """Anchor at a pose (3,) relative to a keyframe, of which it is known exactly."""
+        T_map = se2.compose(frame.T_map_base, T_frame)
+        lever = T_map[:2] - frame.T_map_base[:2]
+        covariance = propagated_covariance(frame.covariance, lever)
+        return Anchor(T_map, covariance, carried(frame.systematic, lever), frame.path_m)
+
+    def pose(self, T_anchor_base: Array) -> Array:
+        """Pose T_map_base (3,) of a pose relative to the anchor."""
+        return se2.compose(self.T_map, T_anchor_base)
+
+    def relative(self, T_map_base: Array) -> Array:
+        """Pose (3,) relative to the anchor of a pose in the map."""
+        return se2.between(self.T_map, T_map_base)
+
+    def path_m_at(self, T_anchor_base: Array) -> float:
+        """Length of the path, m, along straight lines between keyframes, to a pose (3,)."""
+        if self.path_m is None:
+            return 0.0
+        return self.path_m + math.hypot(T_anchor_base[0], T_anchor_base[1])
+
+    def turned(self, covariance: Array) -> Array:
+        """A covariance (3, 3) in the frame of the anchor, given that in the map frame."""
+        return rotated_covariance(covariance, -float(self.T_map[2]))
+
+    def covariance_at(self, T_anchor_base: Array, own: Array) -> Array:
+        """Covariance (3, 3), map frame, of a pose whose covariance since the anchor is `own`."""
+        yaw = float(self.T_map[2])
+        lever = (rotation(yaw) @ T_anchor_base)[:2]
+        total = rotated_covariance(own, yaw) + propagated_covariance(self.covariance, lever)
+        return np.asarray(0.5 * (total + total.T))
+
+    def systematic_at(self, T_anchor_base: Array, own: Array) -> Array:
+        """Derivative (3, 4) by the calibration, map frame, of a pose; own: since the anchor."""
+        R = rotation(float(self.T_map[2]))
+        return np.asarray(R @ own + carried(self.systematic, (R @ T_anchor_base)[:2]))
+
 
 class Keyframes:
-    """The keyframes, the edges between consecutive ones, and the trajectory relative to them."""
+    """The keyframes, the edges between consecutive ones, and the trajectory relative to them.
+
+    revision: number of corrections so far.
+    """
 
     def __init__(self, config: KeyframeConfig) -> None:
         self._config = config
@@ -91,6 +158,7 @@ class Keyframes:
         self.steps: list[Edge] = []  # from its anchor to each keyframe but the first
         self._buckets = SpatialHash(_BUCKET_M)
         self._path = KeyframeTrajectory()
+        self.revision = 0
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -99,6 +167,11 @@ class Keyframes:
     def anchor(self) -> int:
         """Number of the last added or reused keyframe; -1 before the first."""
         return self._path.last
+
+    @property
+    def T_anchor_last(self) -> Array:  # noqa: N802
+        """Pose (3,) of the last keyframe scan relative to its keyframe: 0 unless it reuses one."""
+        return self._path.T_last
 
     def add(self, frame: Keyframe, step: Step) -> int:
         """Add a keyframe with an edge from the anchor, by its step; returns its number."""
@@ -165,6 +238,7 @@ class Keyframes:
 
     def move(self, poses: Array, edges: list[Edge]) -> None:
         """Set the poses (N, 3) of the first N keyframes; `edges`: besides the steps."""
+        self.revision += 1
         covariances, derivatives = self.covariances_from(0, poses, edges)
         for number, T in enumerate(poses):
             self.frames[number] = replace(

@@ -27,6 +27,7 @@ from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import CHI2
 from thinmap_ros.core.slam.graph.keyframes import (
+    Anchor,
     Keyframe,
     KeyframeConfig,
     Keyframes,
@@ -106,6 +107,15 @@ class _Job:
     covariance: Array
 
 
+@dataclass(frozen=True, eq=False)
+class _Pending:
+    """A keyframe scan that may yet reuse a keyframe, with its step; T_anchor_frame (3,)."""
+
+    frame: Keyframe
+    step: Step
+    T_anchor_frame: Array
+
+
 @dataclass(eq=False)
 class _Optimization:
     """An optimization in progress: its rounds, and the poses (N, 3) after the last one."""
@@ -132,9 +142,8 @@ class LoopClosure:
         self.pieces = Pieces()
         self.adjust(config, matching)
         self._jobs: deque[list[_Job]] = deque([[]], maxlen=_LATEST)  # by the scan that began them
-        self._pending: tuple[Keyframe, Step] | None = None
+        self._pending: _Pending | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
-        self._here: Keyframe | None = None  # the last keyframe scan, added or not
         self._submaps = Submaps(local_map)
         self._optimization: _Optimization | None = None
 
@@ -144,28 +153,31 @@ class LoopClosure:
         # No wheel slip here: the covariance along the graph contains it.
         self._matcher = Matcher(replace(matching, wheel_slip_m=0.001, wheel_slip_rad=0.001))
 
-    def needs_keyframe(self, T_map_base: Array) -> bool:
-        """Whether a scan at a pose (3,) becomes the next keyframe."""
-        last = self._here
-        return last is None or self.keyframes.differ(last.T_map_base, T_map_base)
+    @property
+    def anchor(self) -> Anchor:
+        """The last keyframe scan, added or not; the origin of the map before the first."""
+        keyframes = self.keyframes
+        if self._pending is not None:
+            return Anchor.at(self._frame(len(keyframes)), np.zeros(3))
+        if not keyframes.frames:
+            return Anchor()
+        return Anchor.at(keyframes.frames[keyframes.anchor], keyframes.T_anchor_last)
 
-    def path_m(self, T_map_base: Array) -> float:
-        """Length of the path up to a pose (3,), m, along straight lines between keyframes."""
-        last = self._here
-        if last is None:
-            return 0.0
-        return last.path_m + math.dist(last.T_map_base[:2], T_map_base[:2])
+    def needs_keyframe(self, T_anchor_base: Array) -> bool:
+        """Whether a scan at a pose (3,) relative to the anchor becomes the next keyframe."""
+        is_first = self.anchor.path_m is None
+        return is_first or self.keyframes.differ(np.zeros(3), T_anchor_base)
 
     def add(self, frame: Keyframe, step: Step, jump: Array) -> None:
-        """Add a keyframe, with the step from the anchor.
+        """Add a keyframe, with the step from the last keyframe scan.
 
         jump (3, 3): additional covariance if scans and motion contradicted each other on the step.
         The step is then measured again, by a match with the submap of the keyframes before it.
         """
         self._add_pending()
         step = replace(step, covariance=step.covariance + jump)
-        self._pending = (frame, step)
-        self._here = frame
+        step = step.turned(float(self.keyframes.T_anchor_last[2]))
+        self._pending = _Pending(frame, step, se2.between(self._T_map_anchor, frame.T_map_base))
         jumped = bool(jump.any()) and len(self.keyframes) > 0
         recent = None if jumped else self._recent_alike(frame)
         if recent is not None:
@@ -229,7 +241,7 @@ class LoopClosure:
         poses = keyframes.poses()
         anchor = keyframes.anchor
         covariances, derivatives = keyframes.covariances_from(anchor, poses, self.edges)
-        step = self._pending[1]
+        step = self._pending.step
         yaw = float(poses[anchor, 2])
         moved = rotation(yaw) @ step.systematic.derivative
         from_anchor = here.T_map_base[:2] - poses[anchor, :2]
@@ -299,13 +311,6 @@ class LoopClosure:
             poses = np.vstack([poses, se2.compose(poses[added.a], added.T_a_b)])
         before = self.keyframes.poses()
         self.keyframes.move(poses, self.edges)
-        if self._here is not None:
-            last = self.keyframes.anchor
-            self._here = _moved(self._here, before[last], poses[last])
-        if self._pending is not None:
-            frame, step = self._pending
-            last = self.keyframes.anchor
-            self._pending = (_moved(frame, before[last], poses[last]), step)
         self._submaps.clear()
         self.pieces.join(self.keyframes.frames, self.edges)
         return Correction(before, poses)
@@ -378,12 +383,12 @@ class LoopClosure:
             return
         own = np.diag(np.square([config.noise_m] * 2 + [config.noise_rad]))
         covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + own
-        off = se2.pose_difference(match.T_map_base, prior)
+        off = se2.pose_difference(match.pose, prior)
         if float(off @ np.linalg.solve(relative + covariance, off)) > CHI2:
             return
         T_j_base = se2.between(frames[j].T_map_base, base)
         covariance = rotated_covariance(covariance, float(T_j_base[2]))
-        T_j_k = se2.compose(T_j_base, match.T_map_base)
+        T_j_k = se2.compose(T_j_base, match.pose)
         edge = Edge(j, k, T_j_k, inverse(covariance), True, inlier_ratio=match.inlier_ratio)
         if not self.pieces.is_here(frames[j].submap):
             self._add_pending()
@@ -411,7 +416,7 @@ class LoopClosure:
                 T_a_j = se2.compose(T_a_here, se2.invert(edge.T_a_b))
                 covariance = rotated_covariance(inverse(edge.information), float(T_a_j[2]))
                 lever = T_a_j[:2] - T_a_here[:2]
-                step = pending[1]
+                step = pending.step
                 covariance = propagated_covariance(covariance + step.covariance, lever)
                 share = step.systematic
                 share = replace(share, derivative=carried(share.derivative, lever))
@@ -462,9 +467,17 @@ class LoopClosure:
         return float(off @ np.linalg.solve(covariance, off)) < CHI2
 
     def _frame(self, k: int) -> Keyframe:
-        if k < len(self.keyframes) or self._pending is None:
+        pending = self._pending
+        if k < len(self.keyframes) or pending is None:
             return self.keyframes.frames[k]
-        return self._pending[0]
+        T_map_base = se2.compose(self._T_map_anchor, pending.T_anchor_frame)
+        return replace(pending.frame, T_map_base=T_map_base)
+
+    @property
+    def _T_map_anchor(self) -> Array:  # noqa: N802
+        """Pose (3,) of the anchor keyframe; the origin of the map without one."""
+        anchor = self.keyframes.anchor
+        return np.zeros(3) if anchor < 0 else self.keyframes.frames[anchor].T_map_base
 
     def _is_pending_matched(self) -> bool:
         """Whether there are pending matches of the pending keyframe."""
@@ -474,16 +487,17 @@ class LoopClosure:
     def _add_pending(self) -> None:
         """Add the pending keyframe to the graph, if there is one."""
         if self._pending is not None:
-            frame, step = self._pending
+            frame = self._frame(len(self.keyframes))
+            step = self._pending.step
             self._pending = None
             self.keyframes.add(frame, step)
 
     def _reuse_keyframe(self, j: int) -> None:
         """Reuse an earlier keyframe instead of the pending one."""
         assert self._pending is not None
-        frame, _ = self._pending
-        self._pending = None
         number = len(self.keyframes)
+        frame = self._frame(number)
+        self._pending = None
         for jobs in self._jobs:
             jobs[:] = [job for job in jobs if job.k != number]
         self.keyframes.reuse(j, frame)
@@ -495,7 +509,3 @@ class LoopClosure:
         self._add_pending()
         self._calibrate(self._calibration.smoothed())
         return optimized(self.keyframes.poses(), self._all_edges)
-
-
-def _moved(frame: Keyframe, before: Array, after: Array) -> Keyframe:
-    return replace(frame, T_map_base=se2.compose(after, se2.between(before, frame.T_map_base)))

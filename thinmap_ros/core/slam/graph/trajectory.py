@@ -32,6 +32,11 @@ class KeyframeTrajectory:
         return self._anchors[-1] if self._anchors else -1
 
     @property
+    def T_last(self) -> Array:  # noqa: N802
+        """The last pose (3,), relative to its keyframe; 0 without one."""
+        return np.array(self._from_anchor[-3:] or np.zeros(3))
+
+    @property
     def stamps_ns(self) -> NDArray[np.int64]:
         """Stamps (N,), ns."""
         return np.array(self._stamps, dtype=np.int64)

@@ -6,12 +6,13 @@ the prior is wider than the basin of convergence, the poses within three sigmas 
 searched (`correlative_search.py`). The lower cost is used.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.covariances import inverse
+from thinmap_ros.core.covariances import inverse, rotated_covariance
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.correlative_search import search
 from thinmap_ros.core.slam.matching.local_map import LocalMap
@@ -78,20 +79,30 @@ class MatchingConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Posterior pose T_map_base (3,) with covariance (3, 3), map frame, of scan and prior.
+    """Posterior pose (3,) with covariance (3, 3), frame of the local map, of scan and prior.
 
     scan_information (3, 3): of the scan alone; inlier_ratio: of points on walls;
     contradiction_ratio: of points in cells observed to be free; cost: the minimum; prior_weight:
     robust weight of the prior, below 1 if the pose is an outlier to it.
     """
 
-    T_map_base: Array
+    pose: Array
     covariance: Array
     scan_information: Array
     inlier_ratio: float
     contradiction_ratio: float
     cost: float
     prior_weight: float
+
+    def seen_from(self, T_map_frame: Array) -> 'Match':
+        """The match in another frame, whose pose in the frame of the local map is given (3,)."""
+        yaw = -float(T_map_frame[2])
+        return replace(
+            self,
+            pose=se2.between(T_map_frame, self.pose),
+            covariance=rotated_covariance(self.covariance, yaw),
+            scan_information=rotated_covariance(self.scan_information, yaw),
+        )
 
 
 class Matcher:
@@ -108,7 +119,7 @@ class Matcher:
         prior: Array,
         covariance: Array,
     ) -> Match:
-        """Match a scan with a local map, given a prior (3,) with covariance (3, 3), map frame.
+        """Match a scan with a local map, given a prior (3,) with covariance (3, 3), in its frame.
 
         points (N, 5): surface points, robot frame; T_base_laser (3,): pose of the laser.
         """
@@ -127,7 +138,7 @@ class Matcher:
             prior,
             information,
             np.minimum(reach, self.config.max_search),
-            match.T_map_base,
+            match.pose,
             local_map.lattice,
             *self._noise,
             self.config.search_nodes,

@@ -1,14 +1,6 @@
-"""Tracking state: scans agree with the map, the robot is lost, or it is delocalized."""
+"""Evidence against the map: scans agree with it, the robot is lost, or it is delocalized."""
 
-from dataclasses import dataclass
-
-import numpy as np
-
-from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import propagated_covariance, rotated_covariance
-from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.scan_matcher import Match
-from thinmap_ros.core.slam.odometry_prediction import Prediction
 
 # Inliers for each contradicting point with which a match overrides the odometry.
 INLIERS_PER_CONTRADICTION = 3.0
@@ -19,23 +11,7 @@ _SEEN_THROUGH = 0.25
 _UNCONFIRMED_EVIDENCE = 0.3 / INLIERS_PER_CONTRADICTION
 
 
-@dataclass(frozen=True, eq=False)
-class DeadReckoning:
-    """Dead-reckoned pose (3,) and covariance (3, 3) since the last scan that agreed, map frame."""
-
-    T_map_base: Array
-    covariance: Array
-
-    def moved(self, prediction: Prediction) -> 'DeadReckoning':
-        """The dead-reckoned pose after the motion of a prediction."""
-        motion = prediction.motion
-        after = se2.compose(self.T_map_base, motion.increment)
-        Q = rotated_covariance(motion.covariance, float(self.T_map_base[2]))
-        lever = after[:2] - self.T_map_base[:2]
-        return DeadReckoning(after, propagated_covariance(self.covariance, lever) + Q)
-
-
-class Tracking:
+class MapEvidence:
     """Detects by CUSUM tests that scans contradict the map.
 
     The evidence sums up the contradiction ratio less a third of the inlier ratio, and is never
@@ -48,17 +24,15 @@ class Tracking:
         self,
         lost_threshold: float,
         least_fit: float,
-        T_map_base: Array,
         loaded_evidence: float = 0.5,
     ) -> None:
         """loaded_evidence: initial evidence in a loaded map: one or two fitting scans remove it."""
         self._loaded_evidence = loaded_evidence
-        self.evidence = 0.0
+        self.level = 0.0
         self._seen_through = 0.0
         self._before_look = 0.0  # the same before the present look
         self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
         self.is_unconfirmed = False  # after a scan without a match, until one fits
-        self.dead_reckoned = DeadReckoning(T_map_base, np.zeros((3, 3)))
         self.adjust(lost_threshold, least_fit)
 
     def adjust(self, lost_threshold: float, least_fit: float) -> None:
@@ -69,7 +43,7 @@ class Tracking:
     @property
     def agrees(self) -> bool:
         """Whether there is no evidence against the map."""
-        return self.evidence == 0.0 and self._seen_through == 0.0
+        return self.level == 0.0 and self._seen_through == 0.0
 
     @property
     def is_lost(self) -> bool:
@@ -79,7 +53,7 @@ class Tracking:
     @property
     def needs_submap(self) -> bool:
         """Whether the evidence against the map, or against a given pose, reaches the threshold."""
-        return max(self.evidence, self._seen_through) >= self._lost_evidence
+        return max(self.level, self._seen_through) >= self._lost_evidence
 
     def update(
         self, match: Match | None, seen_through: float = 0.0, is_stationary: bool = False
@@ -95,12 +69,12 @@ class Tracking:
         if match.inlier_ratio >= self._least_fit:
             self.is_unconfirmed = False
         more = match.contradiction_ratio - match.inlier_ratio / INLIERS_PER_CONTRADICTION
-        self.evidence = max(self.evidence + more, 0.0)
+        self.level = max(self.level + more, 0.0)
         if not is_stationary:
             self._end_look(self._seen_through)
         self._seen_through = max(self._before_look + seen_through - _SEEN_THROUGH, 0.0)
         if self.is_delocalized:
-            self.evidence = min(self.evidence, self._lost_evidence)
+            self.level = min(self.level, self._lost_evidence)
             self.is_delocalized = not self.agrees or match.inlier_ratio < self._least_fit
 
     def _end_look(self, seen_through: float) -> None:
@@ -108,40 +82,30 @@ class Tracking:
         self._before_look = seen_through
         self._seen_through = seen_through
 
-    def record_pose(self, T_map_base: Array, covariance: Array) -> None:
-        """Restart dead reckoning at the pose (3,) of this scan if the scan agrees with the map."""
-        if self.agrees:
-            self.dead_reckoned = DeadReckoning(T_map_base, covariance)
-
-    def place(self, T_map_base: Array, covariance: Array, is_map_given: bool = False) -> None:
-        """Set the pose (3,) with covariance (3, 3); the robot is delocalized until scans fit.
+    def place(self, is_map_given: bool = False) -> None:
+        """The pose was given: the robot is delocalized until scans fit.
 
         is_map_given: the map does not change: the robot is also lost until the first scan that
         fits. Outside of the map no scan contradicts it.
         """
         self.is_delocalized = True
         self.is_unconfirmed = False
-        self.evidence = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
+        self.level = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
         self._end_look(0.0)
-        self.dead_reckoned = DeadReckoning(T_map_base, covariance)
 
     def start_delocalized(self) -> None:
         """Start in a loaded map, at an unconfirmed pose."""
         self.is_delocalized = True
-        self.evidence = self._loaded_evidence
+        self.level = self._loaded_evidence
 
     def lose(self) -> None:
         """The robot is delocalized in the map as it is, until scans fit."""
         self.is_delocalized = True
-        self.evidence = min(self.evidence, self._lost_evidence)
+        self.level = min(self.level, self._lost_evidence)
         self._end_look(0.0)
 
     def start_submap(self) -> None:
         """Start a new local map, which no scan contradicts."""
-        self.evidence = 0.0
+        self.level = 0.0
         self._end_look(0.0)
         self.is_delocalized = False
-
-    def move(self, T_map_base: Array) -> None:
-        """Apply a loop closure to the dead-reckoned pose, which is then (3,)."""
-        self.dead_reckoned = DeadReckoning(T_map_base, self.dead_reckoned.covariance)

@@ -1,0 +1,80 @@
+"""Evidence against the map: how soon a robot that was put into a map is placed in it."""
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.slam.map_evidence import MapEvidence
+from thinmap_ros.core.slam.matching.scan_matcher import Match
+
+
+def match(inlier_ratio: float, contradiction_ratio: float) -> Match:
+    return Match(np.zeros(3), np.eye(3), np.eye(3), inlier_ratio, contradiction_ratio, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(('inlier_ratio', 'scans'), [(1.0, 2), (0.7, 3)])
+def test_two_scans_that_fit_well_or_three_that_fit_place_a_robot(inlier_ratio, scans):
+    evidence = MapEvidence(4.0, 0.6)
+    evidence.start_delocalized()
+    for _ in range(scans):
+        assert evidence.is_lost
+        evidence.update(match(inlier_ratio, 0.0))
+    assert not evidence.is_lost
+    assert evidence.agrees
+
+
+def test_points_that_contradict_count_three_times_as_much_as_points_that_fit():
+    evidence = MapEvidence(4.0, 0.6)
+    evidence.update(match(0.75, 0.5))
+    assert evidence.level == 0.25
+    evidence.update(match(0.75, 0.0))
+    assert evidence.agrees
+
+
+def test_evidence_that_is_high_is_limited_when_the_robot_is_lost_so_that_scans_place_it_again():
+    evidence = MapEvidence(4.0, 0.6)
+    for _ in range(20):
+        evidence.update(match(0.0, 1.0))
+    assert evidence.level == pytest.approx(20.0)
+    assert not evidence.is_lost
+    evidence.lose()
+    assert evidence.is_lost
+    assert evidence.level == 4.0
+    evidence.update(match(0.0, 1.0))
+    assert evidence.level == 4.0
+    scans = 0
+    while evidence.is_lost:
+        evidence.update(match(1.0, 0.0))
+        scans += 1
+    assert scans == 12
+    assert not evidence.is_delocalized
+
+
+def test_in_a_given_map_a_pose_is_lost_until_a_scan_fits():
+    for is_map_given in (False, True):
+        evidence = MapEvidence(4.0, 0.6)
+        evidence.place(is_map_given)
+        for update in (None, match(0.0, 0.0)):
+            assert evidence.is_lost == is_map_given
+            evidence.update(update)
+        assert evidence.is_lost == is_map_given
+        evidence.update(match(0.7, 0.0))
+        assert not evidence.is_lost
+
+
+def test_walls_that_are_seen_through_are_evidence_that_no_inlier_reduces():
+    evidence = MapEvidence(4.0, 0.6)
+    scans = 0
+    while not evidence.needs_submap:
+        evidence.update(match(1.0, 0.0), seen_through=0.5)
+        scans += 1
+        assert not evidence.agrees
+    assert scans == 16
+    evidence.start_submap()
+    assert evidence.agrees
+
+
+def test_glass_is_seen_through_and_no_evidence():
+    evidence = MapEvidence(4.0, 0.6)
+    for _ in range(1000):
+        evidence.update(match(0.9, 0.05), seen_through=0.2)
+    assert evidence.agrees

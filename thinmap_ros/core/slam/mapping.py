@@ -1,0 +1,161 @@
+"""The map of the localizer: its local map, keyframes, pose graph and trajectory."""
+
+import math
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.estimate import Correction
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.active_map import ActiveMap
+from thinmap_ros.core.slam.graph.keyframes import Keyframe, Step, heading_errors, with_heading
+from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
+from thinmap_ros.core.slam.graph.pose_graph import Systematic
+from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
+from thinmap_ros.core.slam.heading import HeadingCorrection
+from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS
+from thinmap_ros.core.slam.tracker import Surroundings, Tracker
+from thinmap_ros.core.slam.wall_compass import Reference
+
+_VIEW_M = 1.0  # path length after which the errors of two matches are independent
+
+
+class Mapping:
+    """Adds the scans of a tracker to the local map and to the keyframes, and closes loops."""
+
+    def __init__(self, config: LocalizerConfig, tracker: Tracker) -> None:
+        self._config = config
+        self._tracker = tracker
+        calibration = tracker.prediction.calibration
+        self._heading = HeadingCorrection(config.lines, calibration)
+        self.loops = LoopClosure(
+            config.loop_closure, config.keyframes, config.matching, config.local_map, calibration
+        )
+        self.local = ActiveMap(config.local_map, self.loops.pieces)
+        self._path = KeyframeTrajectory()
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """What the next scan is matched with."""
+        keyframes = self.loops.keyframes
+        return Surroundings(
+            self.local.map,
+            self.loops.anchor,
+            keyframes.revision,
+            has_keyframes=len(keyframes) > 0,
+            is_apart=self.loops.pieces.is_apart,
+        )
+
+    @property
+    def pose(self) -> Array:
+        """Current pose T_map_base (3,)."""
+        return self.loops.anchor.pose(self._tracker.track.T_anchor_base)
+
+    def add(self, scan: Scan, points: Array) -> None:
+        """Add a scan with surface points (N, 5) if the robot has moved far enough since the last.
+
+        In a submap of its own if scans contradict the map.
+        """
+        config = self._config.local_map
+        track = self._tracker.track
+        moved = track.since_update
+        path_m = 0.0 if moved is None else math.hypot(moved[0], moved[1])
+        turn = 0.0 if moved is None else abs(float(moved[2]))
+        is_near = path_m < config.update_distance_m and turn < config.update_angle_rad
+        if moved is not None and is_near:
+            return
+        if track.evidence.needs_submap:
+            self.start_submap()
+        self._correct_heading(scan)
+        if not self.local.add_scan(points, scan.T_base_laser, self.pose):
+            # No building is that large: the pose is wrong, or was.
+            self.start_submap()
+            self.local.add_scan(points, scan.T_base_laser, self.pose)
+        track.T_anchor_update = track.T_anchor_base
+        # Motion errors are independent in each step. The error of a match is correlated with that
+        # of the previous match as long as the same walls are observed.
+        track.uncertainty.map_updated(min(1.0, path_m / _VIEW_M + turn))
+        if len(points) >= MIN_POINTS and self.loops.needs_keyframe(track.T_anchor_base):
+            self._add_keyframe(scan, points)
+
+    def start_submap(self) -> None:
+        """Start a new local map at the dead-reckoned pose."""
+        covariance = self._tracker.fall_back()
+        track = self._tracker.track
+        track.uncertainty.start_submap(track.T_anchor_base, covariance)
+        track.evidence.start_submap()
+        self.loops.pieces.begin()
+        self.local.start_submap()
+
+    def close_loops(self) -> Correction | None:
+        """Do one step of loop closure; the local map follows its correction."""
+        correction = self.loops.step()
+        self.local.follow(self.loops.keyframes, self.pose)
+        return correction
+
+    def record_pose(self, stamp_ns: int) -> None:
+        """Store the pose of this step relative to its keyframe."""
+        keyframes = self.loops.keyframes
+        number = keyframes.anchor
+        T_keyframe = np.zeros(3) if number < 0 else keyframes.frames[number].T_map_base
+        self._path.add(stamp_ns, number, se2.between(T_keyframe, self.pose))
+
+    def trajectory(self) -> Array:
+        """Poses (N, 3) of all steps, after all corrections; pending matches are done."""
+        while self.loops.is_busy:
+            self.close_loops()
+        return self._path.poses(self.loops.finish())
+
+    def known_places(self) -> Array:
+        """Places (N, 2) that enclose the published map: cells, and keyframes, m."""
+        frames = self.loops.keyframes.frames
+        is_published = self.loops.pieces.is_published
+        keyframes = [frame.T_map_base[:2] for frame in frames if is_published(frame.submap)]
+        cells = self.local.published(frames).corners()
+        return np.vstack([cells, np.array(keyframes).reshape(-1, 2)])
+
+    def _correct_heading(self, scan: Scan) -> None:
+        """Correct the heading by the wall directions if scans agree with the map."""
+        anchor = self.loops.anchor
+        track = self._tracker.track
+        derivative = np.vstack([np.zeros((2, 4)), self._tracker.systematic(anchor)[2]])
+        variance = float(self._tracker.random_covariance(anchor)[2, 2])
+        corrected = self._heading.correct(
+            scan,
+            anchor.pose(track.T_anchor_base),
+            track.uncertainty,
+            anchor.path_m_at(track.T_anchor_base),
+            track.evidence.agrees,
+            Reference(variance, self._share(derivative)),
+            self.loops.keyframes.revision,
+        )
+        track.turn(anchor.relative(corrected))
+
+    def _add_keyframe(self, scan: Scan, points: Array) -> None:
+        """Make the scan a keyframe, to which the pose is relative from now on."""
+        loops = self.loops
+        tracker = self._tracker
+        anchor = loops.anchor
+        T_map_base = self.pose
+        uncertainty = tracker.track.uncertainty
+        covariance, jump = uncertainty.step()
+        step = Step(covariance, self._share(uncertainty.systematic))
+        # In a new submap the heading is unknown, also by multiples of 90 degrees.
+        is_lost = loops.pieces.is_apart or tracker.track.evidence.is_lost
+        heading = None if is_lost else self._heading.measured
+        (error,) = heading_errors([heading], T_map_base[None])
+        covariance, systematic = with_heading(
+            tracker.random_covariance(anchor), tracker.systematic(anchor), error
+        )
+        submap = loops.pieces.current
+        path_m = anchor.path_m_at(tracker.track.T_anchor_base)
+        frame = Keyframe(scan, points, T_map_base, path_m, covariance, submap, heading, systematic)
+        loops.add(frame, step, jump)
+        tracker.track.begin_step()
+
+    def _share(self, derivative: Array) -> Systematic:
+        """Share of the odometry in a relative pose of this step, by its derivative (3, 4)."""
+        calibration = self._tracker.prediction.calibration
+        return Systematic(derivative, calibration.parameters, calibration.spans)
