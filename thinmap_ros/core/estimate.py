@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from enum import Enum
 
-from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
 
 
@@ -13,10 +12,6 @@ class Correction:
 
     before: Array
     after: Array
-
-    def applied_to(self, k: int, T: Array) -> Array:
-        """Corrected pose (3,) of a pose T (3,) that was estimated relative to keyframe k."""
-        return se2.compose(self.after[k], se2.between(self.before[k], T))
 
 
 class Placement(Enum):

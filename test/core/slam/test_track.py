@@ -79,8 +79,8 @@ def test_a_new_anchor_changes_nothing_in_the_map():
     track.uncertainty.since_match = covariance
     track.reckoned = DeadReckoning(se2.pose(0.8, 0.6, 0.7), covariance)
     track.T_anchor_update = se2.pose(0.9, 0.4, 0.6)
-    anchor = Anchor(se2.pose(5.0, -2.0, 2.0))
-    new = Anchor(anchor.pose(track.T_anchor_base))
+    anchor = Anchor(T_frame=se2.pose(5.0, -2.0, 2.0))
+    new = Anchor(T_frame=anchor.pose(track.T_anchor_base))
 
     def in_map(anchor):
         yaw = float(anchor.T_map[2])

@@ -90,11 +90,12 @@ class Driver:
         if len(points) >= MIN_POINTS and self.loops.needs_keyframe(self.from_anchor()):
             self.loops.add(frame, Step(STEP), NONE)
         for _ in range(works):
+            T_anchor_base = self.from_anchor()
             correction = self.loops.step()
             if correction is not None:
                 self.corrections.append(correction)
                 anchor = self.loops.keyframes.anchor
-                self.pose = correction.applied_to(anchor, self.pose)
+                self.pose = self.loops.anchor.pose(T_anchor_base)
                 self.covariance = self.loops.keyframes.frames[anchor].covariance
 
     def path_m(self):
@@ -291,11 +292,12 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
         driver.go(truth, works=0)
         for _ in range(4):
             before = sum(counts.values())
+            T_anchor_base = driver.from_anchor()
             correction = driver.loops.step()
             assert sum(counts.values()) - before <= 1
             if correction is not None:
                 driver.corrections.append(correction)
-                driver.pose = correction.applied_to(driver.loops.keyframes.anchor, driver.pose)
+                driver.pose = driver.loops.anchor.pose(T_anchor_base)
     assert driver.corrections
     assert counts['rounds'] > 1
     # All pending work is done after enough steps.

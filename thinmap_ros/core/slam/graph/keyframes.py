@@ -93,27 +93,18 @@ class Step:
         return Step(rotated_covariance(self.covariance, theta), share)
 
 
-@dataclass(frozen=True, eq=False)
 class Anchor:
-    """The last keyframe scan, to which the pose of the robot is relative: its pose T_map (3,).
+    """The last keyframe scan, to which the pose of the robot is relative.
 
-    The origin of the map before the first. covariance (3, 3), systematic (3, 4): those of the pose,
-    map frame; path_m: length of the path up to it; None: there is no path yet. A correction of the
-    keyframes moves it, and thereby whatever is relative to it.
+    The origin of the map before the first. T_map: its pose (3,). A correction of the keyframes
+    moves it, and thereby whatever is relative to it.
     """
 
-    T_map: Array = field(default_factory=lambda: np.zeros(3))
-    covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    systematic: Array = field(default_factory=lambda: np.zeros((3, 4)))
-    path_m: float | None = None
-
-    @staticmethod
-    def at(frame: Keyframe, T_frame: Array) -> 'Anchor':
-        """Anchor at a pose (3,) relative to a keyframe, of which it is known exactly."""
-        T_map = se2.compose(frame.T_map_base, T_frame)
-        lever = T_map[:2] - frame.T_map_base[:2]
-        covariance = propagated_covariance(frame.covariance, lever)
-        return Anchor(T_map, covariance, carried(frame.systematic, lever), frame.path_m)
+    def __init__(self, frame: Keyframe | None = None, T_frame: Array | None = None) -> None:
+        """At a pose (3,) relative to a keyframe, of which it is known exactly; None: at its own."""
+        self._frame = frame
+        origin = np.zeros(3) if frame is None else frame.T_map_base
+        self.T_map = origin if T_frame is None else se2.compose(origin, T_frame)
 
     def pose(self, T_anchor_base: Array) -> Array:
         """Pose T_map_base (3,) of a pose relative to the anchor."""
@@ -125,9 +116,9 @@ class Anchor:
 
     def path_m_at(self, T_anchor_base: Array) -> float:
         """Length of the path, m, along straight lines between keyframes, to a pose (3,)."""
-        if self.path_m is None:
+        if self._frame is None:
             return 0.0
-        return self.path_m + math.hypot(T_anchor_base[0], T_anchor_base[1])
+        return self._frame.path_m + math.hypot(T_anchor_base[0], T_anchor_base[1])
 
     def turned(self, covariance: Array) -> Array:
         """A covariance (3, 3) in the frame of the anchor, given that in the map frame."""
@@ -135,15 +126,24 @@ class Anchor:
 
     def covariance_at(self, T_anchor_base: Array, own: Array) -> Array:
         """Covariance (3, 3), map frame, of a pose whose covariance since the anchor is `own`."""
-        yaw = float(self.T_map[2])
-        lever = (rotation(yaw) @ T_anchor_base)[:2]
-        total = rotated_covariance(own, yaw) + propagated_covariance(self.covariance, lever)
+        total = rotated_covariance(own, float(self.T_map[2]))
+        if self._frame is not None:
+            total = total + propagated_covariance(
+                self._frame.covariance, self._lever(T_anchor_base)
+            )
         return np.asarray(0.5 * (total + total.T))
 
     def systematic_at(self, T_anchor_base: Array, own: Array) -> Array:
         """Derivative (3, 4) by the calibration, map frame, of a pose; own: since the anchor."""
-        R = rotation(float(self.T_map[2]))
-        return np.asarray(R @ own + carried(self.systematic, (R @ T_anchor_base)[:2]))
+        total = rotation(float(self.T_map[2])) @ own
+        if self._frame is not None:
+            total = total + carried(self._frame.systematic, self._lever(T_anchor_base))
+        return np.asarray(total)
+
+    def _lever(self, T_anchor_base: Array) -> Array:
+        """Offset (2,) from the keyframe to a pose (3,) relative to the anchor, map frame."""
+        assert self._frame is not None
+        return self.pose(T_anchor_base)[:2] - self._frame.T_map_base[:2]
 
 
 class Keyframes:

@@ -158,14 +158,14 @@ class LoopClosure:
         """The last keyframe scan, added or not; the origin of the map before the first."""
         keyframes = self.keyframes
         if self._pending is not None:
-            return Anchor.at(self._frame(len(keyframes)), np.zeros(3))
+            return Anchor(self._frame(len(keyframes)))
         if not keyframes.frames:
             return Anchor()
-        return Anchor.at(keyframes.frames[keyframes.anchor], keyframes.T_anchor_last)
+        return Anchor(keyframes.frames[keyframes.anchor], keyframes.T_anchor_last)
 
     def needs_keyframe(self, T_anchor_base: Array) -> bool:
         """Whether a scan at a pose (3,) relative to the anchor becomes the next keyframe."""
-        is_first = self.anchor.path_m is None
+        is_first = self._pending is None and not self.keyframes.frames
         return is_first or self.keyframes.differ(np.zeros(3), T_anchor_base)
 
     def add(self, frame: Keyframe, step: Step, jump: Array) -> None:
