@@ -10,6 +10,8 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
 
 UNKNOWN = -1
+# First row, first column, end row, end column.
+Bounds = tuple[int, int, int, int]
 # map_server's thresholds, in percent.
 FREE_AT_MOST = 25
 OCCUPIED_AT_LEAST = 65
@@ -65,7 +67,28 @@ class GridPatch:
         cells: NDArray[np.int8] = table[self.cells.view(np.uint8)]
         return cells
 
+    def part(self, bounds: Bounds) -> 'GridPatch':
+        """Part of the patch, a view of its cells."""
+        row, col, end_row, end_col = bounds
+        cells = self.cells[row:end_row, col:end_col]
+        return GridPatch(self.frame.with_origin_at(row, col), cells)
+
+    def changes_since(self, before: 'GridPatch') -> Bounds | None:
+        """Bounds of the cells that differ from those of a patch of the same shape; None: none."""
+        return bounds_of(self.cells != before.cells)
+
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Which of the points (N, 2) lie inside, (N,)."""
         cells = self.frame.cells_of(points)
         return np.asarray(np.all((cells >= 0) & (cells < self.shape), axis=1))
+
+
+def bounds_of(chosen: NDArray[np.bool_]) -> Bounds | None:
+    """Bounds of the chosen cells of an array (H, W); None where none is."""
+    rows = np.flatnonzero(chosen.any(axis=1))
+    if not rows.size:
+        return None
+    first = int(rows[0])
+    end = int(rows[-1]) + 1
+    cols = np.flatnonzero(chosen[first:end].any(axis=0))
+    return first, int(cols[0]), end, int(cols[-1]) + 1

@@ -6,67 +6,43 @@ from nav_msgs.msg import MapMetaData, OccupancyGrid
 from rclpy.node import Node
 
 from thinmap_msgs.msg import ProbabilityGrid
-from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.decoding.map_identity import FollowedMap
 
-TRINARY = 'trinary'
-PROBABILITY = 'probability'
-
 
 @dataclass(frozen=True)
-class MapOutputConfig(Config):
-    """How the topic map is published."""
+class _Identity:
+    """Which map it is, and how it is shown; load_ns, corrected_ns, map_id: as in the messages."""
 
-    map_values: str = parameter(
-        TRINARY,
-        'Values of map. trinary: -1 unknown, 0 free, 100 occupied, as slam_toolbox and map_server '
-        'publish them. probability: -1 or the probability of occupancy (%).',
-        choices=(TRINARY, PROBABILITY),
-    )
-    occupied_thresh: float = parameter(
-        0.65,
-        'Probability from which a cell of a trinary map is occupied. Raise it against walls that '
-        'people leave behind, lower it for thin obstacles.',
-        low=0.0,
-        high=1.0,
-    )
-    free_thresh: float = parameter(
-        0.25,
-        'Probability up to which a cell of a trinary map is free. Lower it to show only cells as '
-        'free that many beams have crossed.',
-        low=0.0,
-        high=1.0,
-    )
-    map_update_interval: float = parameter(
-        1.0,
-        'Time between two messages of map (s). Raise it to save CPU and network traffic with '
-        'large maps.',
-        low=0.05,
-        high=3600.0,
-    )
+    load_ns: int
+    corrected_ns: int
+    map_id: int
+    config: MapOutputConfig
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.free_thresh < self.occupied_thresh:
-            expected = f'expected less than occupied_thresh ({self.occupied_thresh})'
-            raise ConfigError(f'free_thresh = {self.free_thresh}: {expected}')
 
-    def shown(self, patch: GridPatch) -> GridPatch:
-        """The patch with the values to publish."""
-        return patch if self.map_values == PROBABILITY else self.trinary(patch)
+@dataclass(frozen=True, eq=False)
+class _Version:
+    """The map at a stamp: cells in percent."""
 
-    def trinary(self, patch: GridPatch) -> GridPatch:
-        """The patch with -1, 0 and 100, in whole percent as map_saver compares them."""
-        limits = (round(100.0 * self.free_thresh), round(100.0 * self.occupied_thresh))
-        return GridPatch(patch.frame, patch.trinary(*limits))
+    identity: _Identity
+    patch: GridPatch
+    stamp_ns: int
+
+    def continues(self, before: '_Version | None') -> bool:
+        """Whether it is the same map as before, with the same rectangle of cells."""
+        return (
+            before is not None
+            and self.identity == before.identity
+            and self.patch.frame == before.patch.frame
+            and self.patch.shape == before.patch.shape
+        )
 
 
 class MapPublishers:
-    """Publishes the map for others, and the exact grid for thinmap's own nodes.
+    """Publishes the map for others, and the exact grid for thinmap's own nodes, when they change.
 
     load_ns: time at which the map was begun or loaded; followed: knows its id.
     """
@@ -80,17 +56,25 @@ class MapPublishers:
         self._metadata = node.create_publisher(MapMetaData, 'map_metadata', qos.LATCHED)
         self._grid = node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
         self._local_grid = node.create_publisher(ProbabilityGrid, 'local_grid', qos.LATCHED)
+        self._published: _Version | None = None
 
     def publish_map(self, grid: CorrectableGrid, stamp_ns: int) -> None:
-        """Publish all of the map."""
-        patch = grid.shown.known_area()
-        message = self.map_message(patch, stamp_ns)
-        self._map.publish(message)
-        self._metadata.publish(message.info)
-        exact = messages.probability_grid_msg(
-            patch, self._frame, stamp_ns, self.load_ns, grid.corrected_ns, self.followed.id
-        )
-        self._grid.publish(exact)
+        """Publish all of the map and of the grid, each if it has changed since the last call."""
+        identity = _Identity(self.load_ns, grid.corrected_ns, self.followed.id, self.config)
+        version = _Version(identity, grid.shown.known_area(), stamp_ns)
+        before = self._published
+        self._published = version
+        if before is None or not version.continues(before):
+            self._publish_map(version)
+            self._publish_grid(version)
+            return
+        changed = version.patch.changes_since(before.patch)
+        if changed is None:
+            return
+        self._publish_grid(version)
+        shown = [self.config.shown(each.patch.part(changed)) for each in (before, version)]
+        if shown[1].changes_since(shown[0]) is not None:
+            self._publish_map(version)
 
     def map_message(self, patch: GridPatch, stamp_ns: int) -> OccupancyGrid:
         """Message of the topic map."""
@@ -103,3 +87,20 @@ class MapPublishers:
             window, self._frame, stamp_ns, self.load_ns, corrected_ns, self.followed.id
         )
         self._local_grid.publish(message)
+
+    def _publish_map(self, version: _Version) -> None:
+        message = self.map_message(version.patch, version.stamp_ns)
+        self._map.publish(message)
+        self._metadata.publish(message.info)
+
+    def _publish_grid(self, version: _Version) -> None:
+        identity = version.identity
+        exact = messages.probability_grid_msg(
+            version.patch,
+            self._frame,
+            version.stamp_ns,
+            identity.load_ns,
+            identity.corrected_ns,
+            identity.map_id,
+        )
+        self._grid.publish(exact)
