@@ -85,7 +85,9 @@ class GridMapperNode(ThinmapNode):
     """/scan or /localized_scan, /pose and /slam_status in; /map, /grid and /local_grid out.
 
     /local_grid follows every scan. /map and /grid are published when they have changed: once in
-    map_update_interval, and at once after a reset, a load and a correction.
+    map_update_interval, and at once after a reset, a load and a correction. As long as every node
+    that subscribes to /map also subscribes to /map_updates, /map is sent only where its size,
+    origin or identity changes, when a subscriber comes, and 10 intervals after an update.
 
     Services save_map, load_map; map and dynamic_map return the present map.
 

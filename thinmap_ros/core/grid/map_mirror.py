@@ -1,9 +1,7 @@
 """Local copy of the grid of another node, assembled from published patches."""
 
-import numpy as np
-
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.tiles import MAX_CELLS
 
 
@@ -28,45 +26,20 @@ class MapMirror:
         if self.patch is None:
             self.patch = window
             return window
-        row, col = _offset(self.patch, window)
+        margins = self.patch.overhang_of(window)
         rows, cols = window.shape
-        if (
-            max(-row - rows, row - self.patch.shape[0]) > rows
-            or max(-col - cols, col - self.patch.shape[1]) > cols
-        ):
+        if max(margins[0], margins[2]) > 2 * rows or max(margins[1], margins[3]) > 2 * cols:
             raise InputError(
                 f'map window at {window.frame}: expected it on or beside the map '
                 f'at {self.patch.frame}'
             )
-        rows_in_all = max(row + rows, self.patch.shape[0]) - min(row, 0)
-        cols_in_all = max(col + cols, self.patch.shape[1]) - min(col, 0)
+        rows_in_all = self.patch.shape[0] + margins[0] + margins[2]
+        cols_in_all = self.patch.shape[1] + margins[1] + margins[3]
         if rows_in_all * cols_in_all > MAX_CELLS:
             raise InputError(
                 f'map window at {window.frame}: a map of {rows_in_all} x {cols_in_all} cells: '
                 f'expected {MAX_CELLS} at most'
             )
-        before = (max(-row, 0), max(-col, 0))
-        after = (max(row + rows - self.patch.shape[0], 0), max(col + cols - self.patch.shape[1], 0))
-        cells = np.pad(
-            self.patch.cells,
-            ((before[0], after[0]), (before[1], after[1])),
-            constant_values=UNKNOWN,
-        )
-        row = row + before[0]
-        col = col + before[1]
-        cells[row : row + rows, col : col + cols] = window.cells
-        self.patch = GridPatch(self.patch.frame.with_origin_at(-before[0], -before[1]), cells)
+        whole = self.patch.padded(margins) if any(margins) else self.patch
+        self.patch = whole.with_part(*whole.offset_of(window), window.cells)
         return self.patch
-
-
-def _offset(whole: GridPatch, window: GridPatch) -> tuple[int, int]:
-    """Row and column of the window's first cell in the whole map."""
-    resolution = whole.frame.resolution
-    col = (window.frame.origin_x - whole.frame.origin_x) / resolution
-    row = (window.frame.origin_y - whole.frame.origin_y) / resolution
-    on_lattice = abs(col - round(col)) < 0.01 and abs(row - round(row)) < 0.01
-    if abs(window.frame.resolution - resolution) > 1e-6 or not on_lattice:
-        raise InputError(
-            f'map window at {window.frame}: expected cells on the lattice of {whole.frame}'
-        )
-    return round(row), round(col)

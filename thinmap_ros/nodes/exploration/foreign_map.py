@@ -9,10 +9,11 @@ from nav_msgs.msg import OccupancyGrid
 
 from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.exploration.live.map_view import occupancy_from_costs, with_update
+from thinmap_ros.core.exploration.live.map_view import occupancy_from_costs
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.decoding.map_updates import updates_topic
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
 
@@ -37,7 +38,7 @@ class ForeignMap:
         self._is_used = is_used
         self._unread: OccupancyGrid | None = None
         self._patch: GridPatch | None = None
-        updates = settings.costmap_updates_topic
+        updates = settings.costmap_updates_topic or updates_topic(node, self.topic)
         subscribe_guarded(node, OccupancyGrid, self.topic, self._on_map, qos.LATCHED)
         subscribe_guarded(node, OccupancyGridUpdate, updates, self._on_update, qos.STREAM)
 
@@ -86,7 +87,7 @@ class ForeignMap:
         cells = np.frombuffer(message.data, dtype=np.int8)
         cells = cells.reshape(message.height, message.width)
         validation.require_occupancy(cells)
-        self._patch = with_update(self._patch, message.y, message.x, cells)
+        self._patch = self._patch.with_part(message.y, message.x, cells)
         self.is_changed = True
 
     def _read(self, message: OccupancyGrid) -> GridPatch:

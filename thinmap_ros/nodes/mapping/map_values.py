@@ -36,8 +36,8 @@ class MapOutputConfig(Config):
     )
     map_update_interval: float = parameter(
         1.0,
-        'Time between two messages of map (s). Raise it to save CPU and network traffic with '
-        'large maps.',
+        'Least time between two messages of map or map_updates (s). Raise it to save CPU and '
+        'network traffic with large maps.',
         low=0.05,
         high=3600.0,
     )
