@@ -11,8 +11,10 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 from support.office_mapping import Mapping
 
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import UNKNOWN
 from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.decoding.map_updates import received_map, received_update
 
 pytestmark = pytest.mark.live
 # By then each cell that the scan shows is as free or as occupied as cells can be.
@@ -27,15 +29,13 @@ def stamp_ns(message):
 
 def replayed(maps, updates):
     """What a subscriber of both topics knows after each message: stamp and patch."""
-    known = None
-    # A whole map has the cells of its stamp, an update those that have changed until its stamp.
+    receiver = MapReceiver()
     for message in sorted([*maps, *updates], key=stamp_ns):
         if isinstance(message, OccupancyGrid):
-            known = messages.grid_from_msg(message)
+            received_map(receiver, message)
         else:
-            cells = np.array(message.data, dtype=np.int8).reshape(message.height, message.width)
-            known = known.with_part(message.y, message.x, cells)
-        yield stamp_ns(message), known
+            received_update(receiver, message)
+        yield stamp_ns(message), receiver.patch
 
 
 def is_the_map(known, patch):

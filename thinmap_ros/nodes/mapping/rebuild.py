@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.map_mirror import MapMirror
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.scan_history import CorrectedPoses, PoseHistory
 from thinmap_ros.core.se2 import Array
@@ -37,7 +37,7 @@ class Rebuilding:
         self._window_ns = 0
         self._stale_ns: int | None = None
         # The newest grid, until it is used with newer windows in it.
-        self._grid: MapMirror | None = None
+        self._grid: MapReceiver | None = None
         self._grid_ns = 0
         self._is_grid_used = False
         self._job: Future[TopologyBuilder] | None = None
@@ -102,7 +102,7 @@ class Rebuilding:
         It is published again only when it changes, and so it is kept until it can be used.
         Raises InputError where the newest window does not fit it.
         """
-        self._grid = MapMirror()
+        self._grid = MapReceiver()
         self._grid.replace(patch)
         self._grid_ns = corrected_ns
         self._is_grid_used = False
