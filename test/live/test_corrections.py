@@ -5,7 +5,8 @@ import signal
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Path
+from map_msgs.msg import OccupancyGridUpdate
+from nav_msgs.msg import OccupancyGrid, Path
 from sensor_msgs.msg import LaserScan
 from support.doctor import Doctor
 from support.slam_room import corridor_ring, scan_in
@@ -13,8 +14,9 @@ from support.slam_room import corridor_ring, scan_in
 from thinmap_msgs.msg import ProbabilityGrid
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core import se2
+from thinmap_ros.core.grid import occupancy
 from thinmap_ros.core.grid.correctable import CorrectableGrid
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.files import sessions
 from thinmap_ros.ros import messages, qos
 
@@ -41,9 +43,12 @@ class Mapping:
 
     def __init__(self, graph):
         self.graph = graph
-        self.by_hand = CorrectableGrid(OccupancyGrid(CONFIG))
+        self.by_hand = CorrectableGrid(occupancy.OccupancyGrid(CONFIG))
         self.maps = graph.heard('grid', ProbabilityGrid, qos.LATCHED)
         self.windows = graph.heard('local_grid', ProbabilityGrid)
+        # Of somebody who follows updates: a whole map comes only where it must.
+        self.whole = graph.heard('map', OccupancyGrid, qos.LATCHED)
+        self.updates = graph.heard('map_updates', OccupancyGridUpdate)
         self._scans = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
         self._poses = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self._paths = graph.node.create_publisher(Path, 'trajectory', qos.LATCHED)
@@ -116,6 +121,11 @@ def test_windows_name_a_correction_when_all_of_the_map_has_undergone_it(graph):
         return any(named_by(shown) == corrected_ns for shown in mapping.maps[-1:])
 
     graph.until(is_corrected, 'the corrected map')
+    corrected = next(shown for shown in mapping.maps if named_by(shown) == corrected_ns)
+    graph.until(
+        lambda: corrected.header.stamp in [shown.header.stamp for shown in mapping.whole],
+        'a whole map of the correction',
+    )
     assert graph.stop('grid_mapper') == 0
 
 
@@ -151,7 +161,7 @@ def test_a_mapper_that_is_killed_meanwhile_resumes_with_the_published_map(graph)
     mapping.start()
     graph.until(lambda: mapping.maps, 'the map, at once')
     known = messages.grid_from_msg(mapping.maps[-1])
-    expected = OccupancyGrid.from_state(shown, CONFIG).known_area()
+    expected = occupancy.OccupancyGrid.from_state(shown, CONFIG).known_area()
     np.testing.assert_array_equal(known.cells, expected.cells)
     # Messages published before discovery are lost.
     mapping.windows.clear()

@@ -1,6 +1,7 @@
 """Parameters of running nodes: changes are accepted, or rejected with a reason."""
 
 import pytest
+from geometry_msgs.msg import Twist
 from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import (
@@ -13,7 +14,7 @@ from support.forks import forked
 from support.timeouts import PATIENCE_S
 
 from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
-from thinmap_ros.ros import qos
+from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
 
@@ -93,7 +94,10 @@ def test_localizer_and_grid_mapper_keep_their_map_while_parameters_change(graph)
     cells = set(maps[-1].data)
     assert -1 in cells and cells - {-1, 0, 100}
     assert change(graph, 'grid_mapper', map_values='trinary', map_update_interval=0.5).successful
-    graph.until(lambda: len(maps) > 3, 'maps at the new rate')
+    # A map is published when it has changed: the robot turns to a part of the room that is new.
+    commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
+    turn = messages.twist_msg(0.0, 0.5)
+    graph.until(lambda: commands.publish(turn) or len(maps) > 3, 'maps at the new rate')
     assert set(maps[-1].data) == {-1, 0, 100}
     known = sum(cell >= 0 for cell in maps[-1].data)
     assert change(graph, 'grid_mapper', occupied_thresh=1.0, free_thresh=0.0).successful

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.belief.model import MissingArea
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.segmentation import find_regions
@@ -51,6 +53,7 @@ _TOPICS = {
     '/ground_truth',
     '/pose',
     '/map',
+    '/map_updates',
     '/topology',
     '/end_nodes',
     '/exploration_status',
@@ -81,6 +84,7 @@ def read(path: Path) -> Recording:
     """Read the outputs from the bag of a run. Raises InputError if a topic is missing."""
     bag = Bag(path)
     recording = Recording()
+    known = MapReceiver()
     for raw in bag.messages(_TOPICS):
         message = bag.decode(raw)
         if raw.topic == '/collisions':
@@ -91,8 +95,8 @@ def read(path: Path) -> Recording:
             recording.true[ns] = decode.pose(message.pose)
         elif raw.topic == '/pose':
             recording.estimated[ns] = decode.pose(message.pose.pose)
-        elif raw.topic == '/map':
-            recording.maps.append((ns, decode.patch(message)))
+        elif raw.topic in ('/map', '/map_updates'):
+            recording.maps += [(ns, patch) for patch in _known_map(known, ns, message)]
         elif raw.topic == '/topology':
             recording.topology = _topology(path, message)
         elif raw.topic == '/end_nodes':
@@ -111,6 +115,17 @@ def read(path: Path) -> Recording:
             f'it has {", ".join(sorted(bag.topics))}'
         )
     return recording
+
+
+def _known_map(known: MapReceiver, ns: int, message: Any) -> list[GridPatch]:
+    """The map after a whole map or an update; empty where that does not change it."""
+    is_new = True
+    if hasattr(message, 'info'):
+        known.replace(decode.patch(message), ns)
+    else:
+        with suppress(InputError):  # of a map that is not in the bag
+            is_new = known.update(ns, *decode.map_update(message))
+    return [known.patch] if is_new and known.patch is not None else []
 
 
 def _topology(path: Path, message: Any) -> TopologicalMap:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
@@ -97,6 +98,21 @@ def patch(message: Any) -> GridPatch:
     return GridPatch(
         frame, np.asarray(message.data, dtype=np.int8).reshape(info.height, info.width)
     )
+
+
+def map_update(message: Any) -> tuple[int, int, NDArray[np.int8]]:
+    """Row, column and cells (H, W) of a map_msgs/OccupancyGridUpdate, of a bag or live.
+
+    Raises InputError where size and data disagree, or cells are out of range.
+    """
+    if len(message.data) != message.width * message.height:
+        raise InputError(
+            f'update of {message.width} x {message.height} cells '
+            f'with {len(message.data)} values: expected a value for each cell'
+        )
+    cells = np.frombuffer(message.data, dtype=np.int8).reshape(message.height, message.width)
+    validation.require_occupancy(cells)
+    return int(message.y), int(message.x), cells
 
 
 def outline(region: Any) -> Array:

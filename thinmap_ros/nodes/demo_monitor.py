@@ -1,12 +1,14 @@
 """Requests an exploration, shows its progress in a bar, and writes its result to a file."""
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
 from action_msgs.msg import GoalStatus
+from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient
 from rclpy.clock import Clock, ClockType
@@ -16,11 +18,14 @@ from rclpy.task import Future
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.files import package_data
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.nodes.exploration.goal_result import GoalResult
 from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.decoding.map_updates import received_map, received_update, updates_topic
 from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
@@ -63,7 +68,10 @@ class DemoMonitorNode(Node):
         self._bar = ProgressBar('area seen')
         self._bar.show(0.0, 'waiting for the nodes')
         self._explore = ActionClient(self, Explore, 'explore')
+        self._map = MapReceiver()
         self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        updates = updates_topic(self, 'map')
+        self.create_subscription(OccupancyGridUpdate, updates, self._on_update, qos.STREAM)
         self.create_timer(_PERIOD_S, self._send_goal, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def close(self) -> None:
@@ -87,7 +95,13 @@ class DemoMonitorNode(Node):
         GoalResult(self, 'explore', future.result(), self._on_result)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        self._coverage = self._coverable.coverage(messages.grid_from_msg(message))
+        self._coverage = self._coverable.coverage(received_map(self._map, message))
+
+    def _on_update(self, message: OccupancyGridUpdate) -> None:
+        with suppress(InputError):  # of a map that has not come yet
+            patch = received_update(self._map, message)
+            if patch is not None:
+                self._coverage = self._coverable.coverage(patch)
 
     def _on_feedback(self, message: Explore.Impl.FeedbackMessage) -> None:
         self._show(message.feedback.status)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
@@ -39,6 +38,7 @@ from thinmap_ros.files import occupancy_maps
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
+from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
@@ -292,7 +292,7 @@ class GlobalLocalizerNode(ThinmapNode):
         self._driver = self._create_driver()
         self.reset_state()
         if not self._settings.node.map_path:
-            subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+            subscribe_to_map(self, 'map', self._on_map)
             subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._odometry.subscribe()
@@ -327,8 +327,8 @@ class GlobalLocalizerNode(ThinmapNode):
         self._driver.close()
         super().close()
 
-    def _on_map(self, message: OccupancyGrid) -> None:
-        self._patch = messages.grid_from_msg(message)
+    def _on_map(self, patch: GridPatch) -> None:
+        self._patch = patch
 
     def _on_topology(self, message: TopologicalMap) -> None:
         self._topology = topology_from_msg(message)

@@ -29,7 +29,8 @@ from thinmap_ros.core.grid.occupancy import (
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
-from thinmap_ros.nodes.mapping.map_output import MapOutputConfig, MapPublishers
+from thinmap_ros.nodes.mapping.map_output import MapPublishers
+from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
 from thinmap_ros.nodes.mapping.scan_pairs import LocatedScan, ScanPairs
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
@@ -83,7 +84,10 @@ class _Settings:
 class GridMapperNode(ThinmapNode):
     """/scan or /localized_scan, /pose and /slam_status in; /map, /grid and /local_grid out.
 
-    /local_grid follows every scan.
+    /local_grid follows every scan. /map and /grid are published when they have changed: once in
+    map_update_interval, and at once after a reset, a load and a correction. As long as every node
+    that subscribes to /map also subscribes to /map_updates, /map is sent only where its size,
+    origin or identity changes, when a subscriber comes, and 10 intervals after an update.
 
     Services save_map, load_map; map and dynamic_map return the present map.
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
+from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.node import Node
@@ -23,6 +24,7 @@ from thinmap_msgs.msg import (
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros import node_main, parameters, qos
+from thinmap_ros.ros.decoding.map_updates import updates_topic
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
@@ -32,6 +34,7 @@ from thinmap_ros.view.rerun_view import View
 
 _TOPICS = {
     'map': (OccupancyGrid, qos.LATCHED),
+    'map_updates': (OccupancyGridUpdate, qos.STREAM),
     'scan': (LaserScan, qos.SENSOR),
     'pose': (PoseWithCovarianceStamped, qos.STREAM),
     'odom': (Odometry, qos.STREAM),
@@ -70,6 +73,7 @@ class RerunViewerNode(Node):
         for topic, (kind, profile) in _TOPICS.items():
             # A topic that all robots share has an absolute name.
             name = f'/{topic}' if topic == 'diagnostics' else topic
+            name = updates_topic(self, 'map') if topic == 'map_updates' else name
             self.create_subscription(kind, name, self._callback(topic), profile)
 
     def close(self) -> None:

@@ -197,6 +197,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._rebuilding.add_pose(stamp_ns, T_map_base)
         if changed:
             self._publish(stamp_ns, again=False)
+        self._add_whole_map(stamp_ns)
         # The local map comes last: a subscriber that receives it has all results of this scan.
         self._output.publish_local_map(self._builder.local_map(), stamp_ns)
 
@@ -204,29 +205,35 @@ class TopologyBuilderNode(ThinmapNode):
         corrected_ns = messages.stamp_ns(message.header.stamp)
         if self._stamp.is_corrected_by(corrected_ns):
             self._rebuilding.correct(corrected_ns, *messages.trajectory_from_msg(message))
+            self._builder = self._rebuilding.start(self._builder)  # its grid may have come first
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
         if not self._is_of_this_map(message):
             return
-        corrected_ns = messages.stamp_ns(message.correction_stamp)
+        stamp_ns = messages.stamp_ns(message.header.stamp)
         patch = messages.grid_from_msg(message)
-        self._regions.add_grid(messages.stamp_ns(message.header.stamp), patch)
-        if self._rebuilding.awaits(corrected_ns):
-            self._builder = self._rebuilding.start(self._builder, patch)
+        self._regions.add_grid(stamp_ns, patch)
+        self._rebuilding.grid(patch, messages.stamp_ns(message.correction_stamp))
+        self._builder = self._rebuilding.start(self._builder)
+        self._add_whole_map(stamp_ns)
+
+    def _add_whole_map(self, stamp_ns: int) -> None:
+        """Update the graph by a new grid: beams may end outside of the windows."""
+        if self._T_map_base is None:
             return
-        # Beams may end outside of the windows.
-        shown = self._rebuilding.with_window(patch, corrected_ns)
-        if shown is None or self._T_map_base is None:
+        shown = self._rebuilding.whole_map()
+        if shown is None:
             return
         with self.diagnostics.time_step('whole map'):
             changed = self._builder.update(shown, self._T_map_base)
         if changed:
-            self._publish(messages.stamp_ns(message.header.stamp), again=False)
+            self._publish(stamp_ns, again=False)
 
     def _publish(self, stamp_ns: int, again: bool = True) -> None:
         self._checkpoint_new_ids()
         if self._output.publish_map(self._builder.map, stamp_ns, again):
             self._route_graph.graph_changed()
+            self._regions.graph_changed()
 
     def _checkpoint_new_ids(self) -> None:
         """Save a checkpoint before new ids are published: other nodes may rely on them."""

@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from thinmap_ros.ros import qos
 
@@ -333,7 +334,15 @@ class NodeDiagnostics:
 
 def publisher_names(node: Node, topic: str) -> list[str]:
     """Full names of the nodes that publish a topic, sorted, one for each publisher."""
-    infos = node.get_publishers_info_by_topic(topic)
+    return _full_names(node.get_publishers_info_by_topic(topic))
+
+
+def subscriber_names(node: Node, topic: str) -> list[str]:
+    """Full names of the nodes that subscribe to a topic, sorted, one for each subscription."""
+    return _full_names(node.get_subscriptions_info_by_topic(topic))
+
+
+def _full_names(infos: list[TopicEndpointInfo]) -> list[str]:
     return sorted(f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos)
 
 

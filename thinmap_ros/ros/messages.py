@@ -17,6 +17,7 @@ from geometry_msgs.msg import (
     TransformStamped,
     Twist,
 )
+from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import MapMetaData, OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
 from sensor_msgs.msg import LaserScan
@@ -27,7 +28,7 @@ from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import Bounds, GridPatch
 from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
@@ -214,6 +215,18 @@ def grid_msg(patch: GridPatch, frame_id: str, ns: int, load_ns: int = 0) -> Occu
     message = OccupancyGrid(header=header(frame_id, ns), info=_map_info(patch, load_ns))
     message.data = _int8_array(patch.cells)
     return message
+
+
+def map_update_msg(
+    patch: GridPatch, changed: Bounds, frame_id: str, ns: int
+) -> OccupancyGridUpdate:
+    """Message with the changed part of a map."""
+    row, col, end_row, end_col = changed
+    update = OccupancyGridUpdate(header=header(frame_id, ns), x=col, y=row)
+    update.width = end_col - col
+    update.height = end_row - row
+    update.data = _int8_array(patch.part(changed).cells)
+    return update
 
 
 def probability_grid_msg(

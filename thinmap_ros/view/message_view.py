@@ -9,6 +9,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -41,12 +42,14 @@ class MessageView:
         self._view = view
         self._laser_pose = laser_pose
         self._namespace = namespace.strip('/')
+        self._map = MapReceiver()
         self._places: dict[int, Array] = {}
         self._T_odom_base: Array | None = None
         self._T_map_odom: Array | None = None
         self._pairs: StampMatcher[Array, Array] = StampMatcher()
         self._takers: dict[str, Callable[[int, Any], None]] = {
             'map': self._on_map,
+            'map_updates': self._on_map_update,
             'scan': self._on_scan,
             'pose': self._on_pose,
             'odom': self._on_odometry,
@@ -75,7 +78,16 @@ class MessageView:
             raise InputError(' '.join(str(error).split())) from error
 
     def _on_map(self, ns: int, message: Any) -> None:
-        self._view.grid(ns, decode.patch(message))
+        self._map.replace(decode.patch(message), ns)
+        self._show_map(ns)
+
+    def _on_map_update(self, ns: int, message: Any) -> None:
+        if self._map.update(ns, *decode.map_update(message)):
+            self._show_map(ns)
+
+    def _show_map(self, ns: int) -> None:
+        if self._map.patch is not None:
+            self._view.grid(ns, self._map.patch)
 
     def _on_scan(self, ns: int, message: Any) -> None:
         T_base_laser = self._laser_pose(message.header.frame_id)

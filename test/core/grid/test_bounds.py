@@ -5,7 +5,7 @@ import pytest
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.map_mirror import MapMirror
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.tiles import TILE
@@ -122,12 +122,12 @@ def on_a_wall(points):
 
 
 def test_windows_that_wander_off_do_not_grow_a_map_without_end():
-    mirror = MapMirror()
+    receiver = MapReceiver()
     window = np.zeros((8 * TILE, 8 * TILE), dtype=np.int8)
 
     def wander():
         for step in range(200):
-            mirror.paste(GridPatch(GridFrame(51.2 * step, 51.2 * step, 0.1), window))
+            receiver.paste(GridPatch(GridFrame(51.2 * step, 51.2 * step, 0.1), window))
 
     with pytest.raises(InputError, match='at most'):
         wander()

@@ -25,11 +25,12 @@ def test_regions_name_the_nodes_of_the_graph(graph):
     graph.start('topology_builder', region_update_period_s=0.2)
     graph.start('markers')
     ns = S
+    # Once, as a mapper publishes a grid that does not change: the graph is newer.
+    grids.publish(messages.probability_grid_msg(patch, 'map', ns))
 
     def is_complete():
         nonlocal ns
         ns += S
-        grids.publish(messages.probability_grid_msg(patch, 'map', ns))
         windows.publish(messages.probability_grid_msg(patch, 'map', ns))
         poses.publish(messages.pose_with_covariance_msg(HERE, np.eye(3), 'map', ns))
         return (

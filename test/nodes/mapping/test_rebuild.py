@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.topology.builder import TopologyBuilder
@@ -38,8 +39,10 @@ def test_the_graph_goes_where_the_grid_has_gone_and_its_nodes_keep_their_ids(fro
     assert before
     moved = POSES + [1.0, 0.0, 0.0]
     rebuilding.correct(9, STAMPS, moved)
-    assert rebuilding.awaits(9) and not rebuilding.awaits(8)
-    builder = rebuilding.result(rebuilding.start(builder, hall(1.0)))
+    rebuilding.grid(hall(), 8)
+    assert rebuilding.result(rebuilding.start(builder)) is builder, 'not the awaited grid'
+    rebuilding.grid(hall(1.0), 9)
+    builder = rebuilding.result(rebuilding.start(builder))
     assert len(builder.map.nodes) == len(before)
     if from_the_start:
         for i, place in before.items():
@@ -54,7 +57,8 @@ def test_between_the_news_and_the_grid_nothing_is_taken_nor_what_is_out_of_date(
     rebuilding.correct(9, STAMPS, POSES)
     rebuilding.window(hall(), 0)
     assert not rebuilding.accepts_window()
-    rebuilding.start(builder, hall())
+    rebuilding.grid(hall(), 9)
+    rebuilding.start(builder)
     assert not rebuilding.accepts_window(), 'cut out before'
     rebuilding.window(hall(), 9)
     assert rebuilding.accepts_window()
@@ -64,7 +68,8 @@ def test_windows_that_come_while_the_graph_is_rebuilt_are_added_to_the_new_one()
     rebuilding = Rebuilding()
     old = built(rebuilding)
     rebuilding.correct(9, STAMPS, POSES)
-    assert rebuilding.start(old, hall()) is old
+    rebuilding.grid(hall(), 9)
+    assert rebuilding.start(old) is old
     closed = hall()
     closed.cells[30:71, 60:] = 100
     rebuilding.window(closed, 9)
@@ -81,10 +86,53 @@ def test_cells_outside_of_the_windows_are_those_of_the_grid():
     built(rebuilding)
     window = GridPatch(GridFrame(3.0, 3.0, 0.1), np.full((20, 20), 100, dtype=np.int8))
     rebuilding.window(window, 0)
-    shown = rebuilding.with_window(hall(), 0)
+    rebuilding.grid(hall(), 0)
+    shown = rebuilding.whole_map()
     assert shown.shape == hall().shape
     assert (shown.cells[30:50, 30:50] == 100).all() and shown.cells[60, 60] == 0
-    assert rebuilding.with_window(hall(), 7) is None, 'of another correction'
+    assert rebuilding.whole_map() is None, 'used'
+    rebuilding.grid(hall(), 7)
+    assert rebuilding.whole_map() is None, 'of another correction'
+
+
+def test_a_grid_that_comes_too_early_is_used_later_with_the_windows_since():
+    rebuilding = Rebuilding()
+    rebuilding.grid(hall(), 0)
+    assert rebuilding.whole_map() is None, 'no window yet'
+    old = built(rebuilding)
+    assert rebuilding.whole_map() is not None
+    # While the graph is rebuilt.
+    rebuilding.correct(9, STAMPS, POSES)
+    rebuilding.grid(hall(), 9)
+    rebuilding.start(old)
+    rebuilding.grid(hall(), 9)
+    for x in (3.0, 5.0):
+        wall = GridPatch(GridFrame(x, 3.0, 0.1), np.full((20, 20), 100, dtype=np.int8))
+        rebuilding.window(wall, 9)
+        assert rebuilding.whole_map() is None
+    rebuilding.result(old)
+    shown = rebuilding.whole_map()
+    assert (shown.cells[30:50, 30:70] == 100).all() and shown.cells[60, 60] == 0
+
+
+def test_a_grid_may_come_before_the_trajectory_that_it_has_undergone():
+    rebuilding = Rebuilding()
+    old = built(rebuilding)
+    rebuilding.grid(hall(), 9)
+    rebuilding.window(hall(), 9)
+    rebuilding.correct(9, STAMPS, POSES)
+    assert rebuilding.result(rebuilding.start(old)) is not old
+    assert rebuilding.accepts_window()
+
+
+def test_a_window_that_does_not_fit_the_grid_is_reported_once():
+    rebuilding = Rebuilding()
+    rebuilding.grid(hall(), 0)
+    off = GridPatch(GridFrame(0.03, 0.0, 0.1), hall().cells)
+    with pytest.raises(InputError, match='lattice'):
+        rebuilding.window(off, 0)
+    rebuilding.window(off, 0)
+    assert rebuilding.accepts_window() and rebuilding.whole_map() is None
 
 
 def test_a_builder_that_is_new_takes_windows_of_a_grid_that_was_corrected_before():
@@ -97,7 +145,8 @@ def test_a_mapper_that_begins_anew_after_a_correction_is_followed():
     rebuilding = Rebuilding()
     builder = built(rebuilding)
     rebuilding.correct(9, STAMPS, POSES)
-    rebuilding.start(builder, hall())
+    rebuilding.grid(hall(), 9)
+    rebuilding.start(builder)
     for corrected_ns in (9, 0):
         rebuilding.window(hall(), corrected_ns)
         assert rebuilding.accepts_window()

@@ -26,7 +26,7 @@ class Driven:
         self.now_ns = 10**9
         self.silent = set()
         self.T = np.zeros(3)
-        node._map._on_map(empty_hall())
+        node._map._on_map(messages.grid_from_msg(empty_hall()))
         node._drive_to((pose(4.0, 0.0, 0.0),))
 
     def step(self, count=1):

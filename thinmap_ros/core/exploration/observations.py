@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from thinmap_ros.core.grid.map_mirror import MapMirror
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -30,7 +30,7 @@ class ObservationBuffer:
     def __init__(self, topology: TopologicalMap) -> None:
         self.topology = topology
         self.is_blind = False
-        self._map = MapMirror()
+        self._map = MapReceiver()
         self._has_local_map = False
         self._pose_matcher: StampMatcher[Scan, Array] = StampMatcher()
         self._mapped_scan_matcher: StampMatcher[tuple[Scan, Array], bool] = StampMatcher()

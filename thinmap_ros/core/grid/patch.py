@@ -6,10 +6,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
 
 UNKNOWN = -1
+# First row, first column, end row, end column.
+Bounds = tuple[int, int, int, int]
+# Rows before, columns before, rows after, columns after.
+Margins = tuple[int, int, int, int]
 # map_server's thresholds, in percent.
 FREE_AT_MOST = 25
 OCCUPIED_AT_LEAST = 65
@@ -65,7 +70,78 @@ class GridPatch:
         cells: NDArray[np.int8] = table[self.cells.view(np.uint8)]
         return cells
 
+    def offset_of(self, other: 'GridPatch') -> tuple[int, int]:
+        """Row and column of the first cell of another patch. Raises InputError off the lattice."""
+        if not self.is_aligned_with(other):
+            raise InputError(
+                f'map window at {other.frame}: expected cells on the lattice of {self.frame}'
+            )
+        row, col = self._in_cells(other)
+        return round(row), round(col)
+
+    def is_aligned_with(self, other: 'GridPatch') -> bool:
+        """Whether the cells of another patch are on the lattice of this one."""
+        row, col = self._in_cells(other)
+        is_even = abs(col - round(col)) < 0.01 and abs(row - round(row)) < 0.01
+        return is_even and abs(other.frame.resolution - self.frame.resolution) <= 1e-6
+
+    def _in_cells(self, other: 'GridPatch') -> tuple[float, float]:
+        col = (other.frame.origin_x - self.frame.origin_x) / self.frame.resolution
+        row = (other.frame.origin_y - self.frame.origin_y) / self.frame.resolution
+        return row, col
+
+    def overhang_of(self, other: 'GridPatch') -> Margins:
+        """Rows and columns of another patch beyond this one. Raises InputError off the lattice."""
+        row, col = self.offset_of(other)
+        beyond_row = row + other.shape[0] - self.shape[0]
+        beyond_col = col + other.shape[1] - self.shape[1]
+        return max(-row, 0), max(-col, 0), max(beyond_row, 0), max(beyond_col, 0)
+
+    def padded(self, margins: Margins) -> 'GridPatch':
+        """The patch with unknown cells around it."""
+        rows, cols, end_rows, end_cols = margins
+        width = ((rows, end_rows), (cols, end_cols))
+        cells = np.pad(self.cells, width, constant_values=UNKNOWN)
+        return GridPatch(self.frame.with_origin_at(-rows, -cols), cells)
+
+    def with_part(self, row: int, col: int, cells: NDArray[np.int8]) -> 'GridPatch':
+        """The patch with cells (H, W) replaced from a row and a column on.
+
+        Raises InputError where they do not lie inside.
+        """
+        rows, cols = cells.shape
+        fits = row >= 0 and col >= 0
+        if not fits or row + rows > self.shape[0] or col + cols > self.shape[1]:
+            raise InputError(
+                f'update of {rows} x {cols} cells at row {row}, column {col}: '
+                f'expected it inside the map of {self.shape[0]} x {self.shape[1]} cells'
+            )
+        replaced = self.cells.copy()
+        replaced[row : row + rows, col : col + cols] = cells
+        return GridPatch(self.frame, replaced)
+
+    def part(self, bounds: Bounds) -> 'GridPatch':
+        """Part of the patch, a view of its cells."""
+        row, col, end_row, end_col = bounds
+        cells = self.cells[row:end_row, col:end_col]
+        return GridPatch(self.frame.with_origin_at(row, col), cells)
+
+    def changes_since(self, before: 'GridPatch') -> Bounds | None:
+        """Bounds of the cells that differ from those of a patch of the same shape; None: none."""
+        return bounds_of(self.cells != before.cells)
+
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Which of the points (N, 2) lie inside, (N,)."""
         cells = self.frame.cells_of(points)
         return np.asarray(np.all((cells >= 0) & (cells < self.shape), axis=1))
+
+
+def bounds_of(chosen: NDArray[np.bool_]) -> Bounds | None:
+    """Bounds of the chosen cells of an array (H, W); None where none is."""
+    rows = np.flatnonzero(chosen.any(axis=1))
+    if not rows.size:
+        return None
+    first = int(rows[0])
+    end = int(rows[-1]) + 1
+    cols = np.flatnonzero(chosen[first:end].any(axis=0))
+    return first, int(cols[0]), end, int(cols[-1]) + 1

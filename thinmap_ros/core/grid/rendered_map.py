@@ -4,10 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import UNKNOWN, Bounds, GridPatch, bounds_of
 from thinmap_ros.core.grid.tiles import TileStore
 
-Bounds = tuple[int, int, int, int]
 _BAND_ROWS = 256  # rendered at once: a large map needs little more memory than its cells
 
 
@@ -61,17 +60,10 @@ class RenderedMap:
         top, left = self._bounds[:2]
         shown = self._percent[odds.astype(np.intp) + self._percent.size // 2]
         self._cells[row - top : end_row - top, col - left : end_col - left] = shown
-        known = shown != UNKNOWN
-        rows = np.flatnonzero(known.any(axis=1))
-        cols = np.flatnonzero(known.any(axis=0))
-        if rows.size:
+        known = bounds_of(shown != UNKNOWN)
+        if known is not None:
             # Known cells stay known: the rectangle only grows.
-            found = (
-                row + int(rows[0]),
-                col + int(cols[0]),
-                row + int(rows[-1]) + 1,
-                col + int(cols[-1]) + 1,
-            )
+            found = (row + known[0], col + known[1], row + known[2], col + known[3])
             self._known = _union(self._known, found)
 
 

@@ -3,16 +3,17 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
 from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid
 
-from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.exploration.live.map_view import occupancy_from_costs, with_update
+from thinmap_ros.core.exploration.live.map_view import occupancy_from_costs
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.logs import decode
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.decoding.map_updates import updates_topic
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
 
@@ -36,8 +37,8 @@ class ForeignMap:
         self._map_frame = map_frame
         self._is_used = is_used
         self._unread: OccupancyGrid | None = None
-        self._patch: GridPatch | None = None
-        updates = settings.costmap_updates_topic
+        self._map = MapReceiver()
+        updates = settings.costmap_updates_topic or updates_topic(node, self.topic)
         subscribe_guarded(node, OccupancyGrid, self.topic, self._on_map, qos.LATCHED)
         subscribe_guarded(node, OccupancyGridUpdate, updates, self._on_update, qos.STREAM)
 
@@ -49,49 +50,37 @@ class ForeignMap:
     def reset(self) -> None:
         """Discard the map."""
         self._unread = None
-        self._patch = None
+        self._map = MapReceiver()
         self.is_changed = False
 
     def patch(self) -> GridPatch | None:
         """The map as occupancy; None before the first. Raises InputError where it is invalid."""
-        message = self._unread
-        self._unread = None
-        if message is not None:
-            self._patch = self._read(message)
-        if self._patch is None:
+        self._read_kept()
+        patch = self._map.patch
+        if patch is None:
             return None
-        patch = occupancy_from_costs(self._patch) if self._settings.is_costmap else self._patch
+        patch = occupancy_from_costs(patch) if self._settings.is_costmap else patch
         return replace(patch, is_replaced=True)
 
     def _on_map(self, message: OccupancyGrid) -> None:
+        self._unread = message
         if self._is_used():
-            self._patch = self._read(message)
-            self._unread = None
-        else:
-            self._unread = message
+            self._read_kept()
         self.is_changed = True
 
     def _on_update(self, message: OccupancyGridUpdate) -> None:
-        if self._unread is not None:
-            self._patch = self._read(self._unread)
-            self._unread = None
-        if self._patch is None:
-            return
+        self._read_kept()
         self._check_frame(message.header.frame_id)
-        if len(message.data) != message.width * message.height:
-            raise InputError(
-                f'update of {message.width} x {message.height} cells '
-                f'with {len(message.data)} values: expected a value for each cell'
-            )
-        cells = np.frombuffer(message.data, dtype=np.int8)
-        cells = cells.reshape(message.height, message.width)
-        validation.require_occupancy(cells)
-        self._patch = with_update(self._patch, message.y, message.x, cells)
-        self.is_changed = True
+        # Stamps of costmaps and of their updates are times of different clocks, or 0.
+        if self._map.update(0, *decode.map_update(message)):
+            self.is_changed = True
 
-    def _read(self, message: OccupancyGrid) -> GridPatch:
-        self._check_frame(message.header.frame_id)
-        return messages.grid_from_msg(message)
+    def _read_kept(self) -> None:
+        message = self._unread
+        self._unread = None
+        if message is not None:
+            self._check_frame(message.header.frame_id)
+            self._map.replace(messages.grid_from_msg(message))
 
     def _check_frame(self, frame_id: str) -> None:
         if frame_id.lstrip('/') not in ('', self._map_frame):

@@ -45,8 +45,9 @@ class ExplorationSettings(Config):
         'name ends in costmap, costs below 100 are free space.',
     )
     costmap_updates_topic: str = parameter(
-        'map_updates',
-        'Updates of parts of that map (map_msgs/OccupancyGridUpdate), where its publisher has any.',
+        '',
+        'Updates of parts of that map (map_msgs/OccupancyGridUpdate), where its publisher has any. '
+        'Empty: costmap_topic with _updates.',
     )
     robot_base_frame: str = parameter(
         '', 'Frame of the robot: another name of base_frame. Empty: base_frame.'

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from nav_msgs.msg import OccupancyGrid
 
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.grid.patch import GridPatch
@@ -15,9 +14,8 @@ from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import Report, read_map
 from thinmap_ros.files.sessions import LOCALIZER
 from thinmap_ros.nodes.localization.config import LocalizationConfig
-from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.subscription import subscribe_guarded
 
 
 class MapSource:
@@ -100,13 +98,13 @@ class MapSource:
         if not self._is_topic:
             return
 
-        def on_map(message: OccupancyGrid) -> None:
+        def on_map(patch: GridPatch) -> None:
             if self.patch is not None and self._first_map_only:
                 return
-            if self.replace(messages.grid_from_msg(message)):
+            if self.replace(patch):
                 changed()
 
-        subscribe_guarded(node, OccupancyGrid, 'map', on_map, qos.LATCHED)
+        subscribe_to_map(node, 'map', on_map)
 
 
 def load_localizer(

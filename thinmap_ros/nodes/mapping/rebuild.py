@@ -5,7 +5,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.grid.map_mirror import MapMirror
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.scan_history import CorrectedPoses, PoseHistory
 from thinmap_ros.core.se2 import Array
@@ -35,6 +36,10 @@ class Rebuilding:
         self._window: GridPatch | None = None
         self._window_ns = 0
         self._stale_ns: int | None = None
+        # The newest grid, until it is used with newer windows in it.
+        self._grid: MapReceiver | None = None
+        self._grid_ns = 0
+        self._is_grid_used = False
         self._job: Future[TopologyBuilder] | None = None
         self._pending: list[tuple[GridPatch, Array]] = []
 
@@ -44,6 +49,7 @@ class Rebuilding:
         self._window_ns = corrected_ns
         if corrected_ns != self._stale_ns:
             self._stale_ns = None
+        self._paste_window()
 
     def accepts_window(self) -> bool:
         """Whether the newest window may be added to the graph."""
@@ -90,32 +96,53 @@ class Rebuilding:
         self._waited = 0
         self._stale_ns = self._window_ns if self._window_ns != corrected_ns else None
 
-    def awaits(self, corrected_ns: int) -> bool:
-        """Whether the grid that has undergone this correction is awaited."""
-        return self._awaited is not None and corrected_ns == self._awaited[0]
+    def grid(self, patch: GridPatch, corrected_ns: int) -> None:
+        """Record a whole grid, and the stamp of the correction that it had undergone.
 
-    def with_window(self, patch: GridPatch, corrected_ns: int) -> GridPatch | None:
-        """A whole grid with the newest window in it, which is newer.
+        It is published again only when it changes, and so it is kept until it can be used.
+        Raises InputError where the newest window does not fit it.
+        """
+        self._grid = MapReceiver()
+        self._grid.replace(patch)
+        self._grid_ns = corrected_ns
+        self._is_grid_used = False
+        self._paste_window()
 
-        None if the two have not undergone the same correction, or the graph is being rebuilt.
+    def _paste_window(self) -> None:
+        """Paste the newest window into a grid that is not used yet: it is newer."""
+        is_outdated = self._is_grid_used or self._window_ns != self._grid_ns
+        if self._grid is None or self._window is None or is_outdated:
+            return
+        try:
+            self._grid.paste(self._window)
+        except InputError:
+            self._is_grid_used = True
+            raise
+
+    def whole_map(self) -> GridPatch | None:
+        """The newest grid with newer windows in it, once.
+
+        None where it has been used, where it and the newest window have not undergone the same
+        correction, and while the graph is being rebuilt.
         """
         is_ready = self._awaited is None and self._job is None
-        if not is_ready or self._window is None or corrected_ns != self._window_ns:
+        is_matched = self._window is not None and self._window_ns == self._grid_ns
+        if self._grid is None or self._is_grid_used or not is_ready or not is_matched:
             return None
-        mirror = MapMirror()
-        mirror.replace(patch)
-        mirror.paste(self._window)
-        return mirror.patch
+        self._is_grid_used = True
+        return self._grid.patch
 
-    def start(self, builder: TopologyBuilder, patch: GridPatch) -> TopologyBuilder:
-        """Begin to rebuild the graph from the grid that has undergone the correction.
+    def start(self, builder: TopologyBuilder) -> TopologyBuilder:
+        """Begin to rebuild the graph, if the newest grid has undergone the awaited correction.
 
         Returns the builder to use until then.
         """
-        if self._awaited is None:
+        patch = None if self._grid is None else self._grid.patch
+        if self._awaited is None or patch is None or self._grid_ns != self._awaited[0]:
             return builder
         _, poses = self._awaited
         self._awaited = None
+        self._is_grid_used = True
         builder = self.result(builder)
         # Of a graph that began elsewhere it is not known from where it was seen: its nodes are
         # searched for where they were.

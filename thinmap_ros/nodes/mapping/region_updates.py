@@ -57,6 +57,7 @@ class RegionUpdates:
         self._config = replace(config.regions, robot_radius_m=robot_radius_m)
         self._tracker = RegionTracker(self._config)
         self._newest: tuple[int, GridPatch] | None = None
+        self._is_graph_newer = False
         self._pending: Future[RegionMap] | None = None
         self._pending_ns = 0
         if config.region_update_period_s > 0.0:
@@ -64,7 +65,7 @@ class RegionUpdates:
             self._publisher = node.create_publisher(RegionArray, 'regions', qos.LATCHED)
             wall = Clock(clock_type=ClockType.STEADY_TIME)
             node.create_active_timer(config.region_update_period_s, self._begin, clock=wall)
-            node.create_active_timer(_POLL_S, self._publish, clock=wall)
+            node.create_active_timer(_POLL_S, self._publish_computed, clock=wall)
 
     @property
     def config(self) -> RegionConfig:
@@ -86,20 +87,32 @@ class RegionUpdates:
         """The newest grid, whose regions are to be published."""
         self._newest = (stamp_ns, patch)
 
-    def _begin(self) -> None:
-        """Begin to compute the regions of the newest grid."""
-        if self._newest is None or self._pending is not None:
-            return
-        self._pending_ns, patch = self._newest
-        self._newest = None
-        self._pending = self._worker.submit(self._tracker.update, patch)
+    def graph_changed(self) -> None:
+        """The graph has other nodes or edges, which are to be published with their regions."""
+        self._is_graph_newer = True
 
-    def _publish(self) -> None:
-        """Publish the regions that were computed, with the nodes and edges of the present graph."""
+    def _begin(self) -> None:
+        """Begin to compute the regions of the newest grid; of the same grid with a new graph."""
+        if self._pending is not None:
+            return
+        if self._newest is not None:
+            self._pending_ns, patch = self._newest
+            self._newest = None
+            self._pending = self._worker.submit(self._tracker.update, patch)
+        elif self._is_graph_newer and self._tracker.regions is not None:
+            self._publish(self._tracker.regions)
+
+    def _publish_computed(self) -> None:
+        """Publish the regions that were computed."""
         if self._pending is None or not self._pending.done():
             return
         regions = self._pending.result()
         self._pending = None
+        self._publish(regions)
+
+    def _publish(self, regions: RegionMap) -> None:
+        """Publish regions with the nodes and edges of the present graph."""
+        self._is_graph_newer = False
         with self._node.diagnostics.time_step('regions published'):
             membership = membership_of(self._topology(), regions)
             message = region_array_msg(membership, self._frame_id, self._pending_ns)

@@ -1,12 +1,11 @@
 """The map that the navigator plans on: thinmap's grid, or the map of another node."""
 
-from nav_msgs.msg import OccupancyGrid
-
 from thinmap_msgs.msg import ProbabilityGrid
-from thinmap_ros.core.grid.map_mirror import MapMirror
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN
+from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
 
@@ -29,11 +28,11 @@ class MapInput:
         """Start to receive maps."""
         subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(node, ProbabilityGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
-        subscribe_guarded(node, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        subscribe_to_map(node, 'map', self._on_map)
 
     def reset(self) -> None:
         """Discard the map."""
-        self._map = MapMirror()
+        self._map = MapReceiver()
         self._has_grid = False
         self._map_id = UNKNOWN
         self.pose_map_id = UNKNOWN
@@ -52,10 +51,10 @@ class MapInput:
 
     def _on_local_grid(self, message: ProbabilityGrid) -> None:
         if UNKNOWN not in (message.map_id, self._map_id) and message.map_id != self._map_id:
-            self._map = MapMirror()
+            self._map = MapReceiver()
         self._map_id = message.map_id
         self._map.paste(messages.grid_from_msg(message))
 
-    def _on_map(self, message: OccupancyGrid) -> None:
+    def _on_map(self, patch: GridPatch) -> None:
         if not self._has_grid:
-            self._map.replace(messages.grid_from_msg(message))
+            self._map.replace(patch)

@@ -5,12 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.live.map_view import (
     MapGraph,
     occupancy_from_costs,
     scan_in_map,
-    with_update,
 )
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -41,17 +39,6 @@ def test_costs_below_lethal_are_free_space():
     cells = np.array([[-1, 0, 1, 50, 98, 99, 100]], dtype=np.int8)
     found = occupancy_from_costs(GridPatch(GridFrame(0.0, 0.0, 0.05), cells))
     assert found.cells.tolist() == [[-1, 0, 0, 0, 0, 0, 100]]
-
-
-def test_an_update_replaces_a_part_and_leaves_the_old_map_alone():
-    patch = crossing()
-    part = np.full((3, 4), -1, dtype=np.int8)
-    found = with_update(patch, 117, 10, part)
-    assert (found.cells[117:, 10:14] == -1).all()
-    assert (found.cells != patch.cells).sum() == 12
-    for row, col in ((118, 10), (0, 117), (-1, 0), (0, -1)):
-        with pytest.raises(InputError, match='update of 3 x 4 cells'):
-            with_update(patch, row, col, part)
 
 
 def test_what_a_map_shows_ends_at_walls_and_at_the_unknown():

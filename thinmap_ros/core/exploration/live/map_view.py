@@ -3,9 +3,7 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
@@ -29,23 +27,6 @@ def occupancy_from_costs(patch: GridPatch) -> GridPatch:
     """
     cells = np.where(patch.cells < 0, UNKNOWN, np.where(patch.cells >= _LETHAL, _LETHAL, 0))
     return GridPatch(patch.frame, cells.astype(np.int8))
-
-
-def with_update(patch: GridPatch, row: int, col: int, cells: NDArray[np.int8]) -> GridPatch:
-    """Map with cells (H, W) replaced from a row and a column on.
-
-    Raises InputError where they do not lie inside the map.
-    """
-    rows, cols = cells.shape
-    fits = row >= 0 and col >= 0
-    if not fits or row + rows > patch.shape[0] or col + cols > patch.shape[1]:
-        raise InputError(
-            f'update of {rows} x {cols} cells at row {row}, column {col}: '
-            f'expected it inside the map of {patch.shape[0]} x {patch.shape[1]} cells'
-        )
-    replaced = patch.cells.copy()
-    replaced[row : row + rows, col : col + cols] = cells
-    return GridPatch(patch.frame, replaced)
 
 
 def scan_in_map(patch: GridPatch, T_map_base: Array, range_m: float, stamp_ns: int) -> Scan:

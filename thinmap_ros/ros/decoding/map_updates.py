@@ -1,0 +1,55 @@
+"""The map of a topic, with its updates on a topic beside it."""
+
+from collections.abc import Callable
+
+from map_msgs.msg import OccupancyGridUpdate
+from nav_msgs.msg import OccupancyGrid
+from rclpy.node import Node
+
+from thinmap_ros.core.grid.map_receiver import MapReceiver
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.logs import decode
+from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
+
+
+def updates_topic(node: Node, topic: str) -> str:
+    """Full name of the topic with the updates of a map, as RViz and costmaps name it.
+
+    It follows the topic of the map, also where that is remapped.
+    """
+    return f'{node.resolve_topic_name(topic)}_updates'
+
+
+def subscribe_to_map(node: ThinmapNode, topic: str, process: Callable[[GridPatch], None]) -> None:
+    """Subscribe to a map and to its updates; process: receives the map whenever it has changed."""
+    receiver = MapReceiver()
+
+    def on_map(message: OccupancyGrid) -> None:
+        process(received_map(receiver, message))
+
+    def on_update(message: OccupancyGridUpdate) -> None:
+        patch = received_update(receiver, message)
+        if patch is not None:
+            process(patch)
+
+    subscribe_guarded(node, OccupancyGrid, topic, on_map, qos.LATCHED)
+    name = updates_topic(node, topic)
+    subscribe_guarded(node, OccupancyGridUpdate, name, on_update, qos.STREAM)
+
+
+def received_map(receiver: MapReceiver, message: OccupancyGrid) -> GridPatch:
+    """The map after a whole one. Raises InputError as `messages.grid_from_msg`."""
+    whole = messages.grid_from_msg(message)
+    receiver.replace(whole, messages.stamp_ns(message.header.stamp))
+    return receiver.patch or whole
+
+
+def received_update(receiver: MapReceiver, message: OccupancyGridUpdate) -> GridPatch | None:
+    """The map after an update; None where it has not changed.
+
+    Raises InputError where the update is invalid or does not fit: the next whole map heals it.
+    """
+    is_new = receiver.update(messages.stamp_ns(message.header.stamp), *decode.map_update(message))
+    return receiver.patch if is_new else None
