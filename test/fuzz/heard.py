@@ -10,6 +10,7 @@ from fuzz.cases import Source, chosen, nothing, tried
 from fuzz.files import strange_value
 from fuzz.strange_messages import CHECKS, made
 from thinmap_ros.core.config import Config
+from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
@@ -24,6 +25,7 @@ from thinmap_ros.view.null_view import NullView
 _COUNT = 10
 _KINDS = sorted(CHECKS, key=lambda kind: kind.__name__)
 _CONFIGS: tuple[type[Config], ...] = (
+    EkfConfig,
     ExplorerConfig,
     GlobalLocalizationConfig,
     LaserOptions,
@@ -33,6 +35,7 @@ _CONFIGS: tuple[type[Config], ...] = (
     TopologyConfig,
 )
 _MADE: dict[type[Config], Any] = {
+    EkfConfig: EkfLocalizer,
     LocalizerConfig: Localizer,
     NavigatorConfig: Navigator,
     OccupancyConfig: OccupancyGrid,

@@ -113,8 +113,15 @@ def with_values(config: AnyConfig, values: Mapping[str, Any]) -> AnyConfig:
     return dataclasses.replace(config, **own)
 
 
-def suggestion(name: str, known: Collection[str]) -> str:
-    """The parameter that was probably meant: in another group, or with a similar name."""
+def suggestion(
+    name: str, known: Collection[str], elsewhere: Mapping[str, str] | None = None
+) -> str:
+    """The parameter that was probably meant: in another group, or with a similar name.
+
+    elsewhere: parameters that exist with another value of `slam` or the like, and that value.
+    """
+    if elsewhere and name in elsewhere:
+        return f' (only with {elsewhere[name]})'
     last = name.split('.')[-1]
     same = [other for other in sorted(known) if other.split('.')[-1] == last]
     likely = same or get_close_matches(name, sorted(known), n=1, cutoff=0.75)

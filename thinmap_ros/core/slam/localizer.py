@@ -9,7 +9,7 @@ accumulated covariance connects the two.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter, parameters_of, part
 from thinmap_ros.core.covariances import rotated_covariance, rotation
-from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
+from thinmap_ros.core.ekf_slam.features import LineFeature
+from thinmap_ros.core.ekf_slam.line_extraction import LineConfig
 from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
@@ -52,6 +53,8 @@ from thinmap_ros.core.slam.motion_model import MotionConfig
 from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction, Prediction
 from thinmap_ros.core.slam.tracking import INLIERS_PER_CONTRADICTION, Tracking
 from thinmap_ros.core.slam.wall_compass import Reference
+from thinmap_ros.core.start import SCAN_MATCHING, StartConfig
+from thinmap_ros.core.topology.graph import TopologicalMap
 
 _SIGMAS = 3.0
 _NO_RETURNS = 'no returns from walls of the map'
@@ -59,8 +62,10 @@ _VIEW_M = 1.0  # path length after which the errors of two matches are independe
 
 
 @dataclass(frozen=True)
-class LocalizerConfig(EkfConfig):
+class LocalizerConfig(StartConfig):
     """Parameters of the localizer and of its parts."""
+
+    of_slam: ClassVar[tuple[str, ...]] = (SCAN_MATCHING,)
 
     lost_threshold: float = parameter(
         4.0,
@@ -71,6 +76,7 @@ class LocalizerConfig(EkfConfig):
         high=1000.0,
     )
     odometry: MotionConfig = part(MotionConfig)
+    lines: LineConfig = part(LineConfig)
     matching: MatchingConfig = part(MatchingConfig)
     local_map: LocalMapConfig = part(LocalMapConfig)
     keyframes: KeyframeConfig = part(KeyframeConfig)
@@ -146,6 +152,14 @@ class Localizer:
     def keyframes(self) -> list[Keyframe]:
         """The keyframes, at their optimized poses."""
         return self._loops.keyframes.frames
+
+    @property
+    def features(self) -> list[LineFeature]:
+        """Line features of the map: none, as it is made of scan points."""
+        return []
+
+    def set_topology(self, topology: TopologicalMap) -> None:
+        """Ignore the topological map, with which only a filter selects its local area."""
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Set the pose (3,) with covariance (3, 3) in the current map.
