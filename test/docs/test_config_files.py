@@ -191,6 +191,16 @@ def test_an_unknown_parameter_comes_with_what_was_probably_meant(declared, name,
         declared('navigator', '-p', f'{name}:=0.5', '-p', 'strict_parameters:=true')
 
 
+@pytest.mark.parametrize(
+    ('node', 'name'),
+    [('localizer', 'lines.range_noise_m'), ('global_localizer', 'range_noise_m')],
+)
+def test_the_noise_of_the_laser_by_an_earlier_name_comes_with_its_name_now(declared, node, name):
+    meant = rf'no parameter {name} \(did you mean laser_range_noise_m\?\); it has'
+    with pytest.raises(ConfigError, match=meant):
+        declared(node, '-p', f'{name}:=0.02', '-p', 'strict_parameters:=true')
+
+
 def test_there_is_a_file_for_each_node_and_no_other():
     files = sorted(path.stem for path in (ROOT / 'config').glob('*.yaml'))
     assert files == sorted([*NODES, 'thinmap'])
@@ -259,9 +269,23 @@ def test_presets_fit_together():
             flat(content[f'/**/{name}']['ros__parameters'])
             for name in ('sim', 'grid_mapper', 'localizer')
         )
-        max_range_m = content['/**']['ros__parameters']['max_range_m']
-        assert localizer['lines.max_range_m'] <= max_range_m <= sim['range_max_m']
+        laser = content['/**']['ros__parameters']
+        max_range_m = laser['max_range_m']
+        assert localizer.get('lines.max_range_m', 0.0) <= max_range_m <= sim['range_max_m']
         reach_m = max(grid['no_return_clear_range_m'], min(max_range_m, 4.0))
         assert grid['local_map_size_m'] >= 2.0 * reach_m
-        searching = content['/**/global_localizer']['ros__parameters']
-        assert searching['range_noise_m'] == localizer['lines.range_noise_m']
+        assert sim['range_noise_m'] <= laser['laser_range_noise_m']
+
+
+def test_range_and_noise_of_a_laser_stand_once_in_a_preset():
+    for preset in PRESETS:
+        sections = yaml.safe_load(preset.read_text())
+        laser = sections['/**']['ros__parameters']
+        assert {'max_range_m', 'laser_range_noise_m'} <= laser.keys()
+        of_nodes = {
+            name: value
+            for section in sections.keys() - {'/**', '/**/sim'}
+            for name, value in flat(sections[section]['ros__parameters']).items()
+        }
+        assert not [name for name in of_nodes if 'range_noise' in name]
+        assert of_nodes.get('lines.max_range_m') != laser['max_range_m']

@@ -31,7 +31,7 @@ def test_a_preset_has_parameters_of_the_nodes_and_no_others(preset: Path) -> Non
     assert parameters.notes == []
     own = parameters.of_node['localizer']
     localizer = parameters.config('localizer', LocalizerConfig())
-    assert localizer.lines.range_noise_m == own['lines.range_noise_m']
+    assert localizer.lines.laser_range_noise_m == own['laser_range_noise_m']
     for node in NODES:
         laser = parameters.config(node, LaserConfig())
         assert laser.max_range_m == own['max_range_m']
@@ -119,6 +119,11 @@ def test_the_localizer_that_is_chosen_decides_which_parameters_it_has(
     assert config.slam == chosen
     own = config.keyframes.angle_rad if chosen == 'scan_matching' else config.association.gate
     assert own in (0.5, 4.0)
+
+
+def test_the_noise_of_the_laser_by_its_earlier_name_comes_with_its_name_now(tmp_path: Path) -> None:
+    (note,) = read(tmp_path, 'localizer:\n  ros__parameters: {lines.range_noise_m: 0.03}\n').notes
+    assert note.endswith('lines.range_noise_m (did you mean laser_range_noise_m?)')
 
 
 @pytest.mark.parametrize(

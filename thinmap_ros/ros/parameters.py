@@ -35,6 +35,7 @@ ROBOT = (
     'laser_pose',
     'zero_is_no_return',
     'max_range_m',
+    'laser_range_noise_m',
     'scan_stamp',
     'map_frame',
     'odom_frame',
