@@ -14,7 +14,8 @@ from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-from thinmap_ros.core.slam.localizers import localizer_class, set_topology
+from thinmap_ros.core.slam.localizers import localizer_class
+from thinmap_ros.core.start import StartConfig
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 
 
@@ -25,7 +26,7 @@ class PipelineConfig:
     scans_per_graph: number of scans between updates of the graph.
     """
 
-    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
+    localizer: StartConfig = field(default_factory=LocalizerConfig)
     grid: OccupancyConfig = field(default_factory=OccupancyConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     topology: TopologyConfig = field(default_factory=TopologyConfig)
@@ -105,7 +106,7 @@ class Pipeline:
         with self._timed('topology'):
             changes = None if self._grid.is_rerendering else self.grid.take_changes()
             if changes is not None and self.topology.update(changes, T_map_base):
-                set_topology(self.localizer, self.topology.map)
+                self.localizer.set_topology(self.topology.map)
         return self.grid.window(T_map_base[0], T_map_base[1], self.config.window.local_map_size_m)
 
     def _rebuild(self, moved: CorrectedPoses) -> None:
@@ -113,7 +114,7 @@ class Pipeline:
         with self._timed('rebuild'):
             self.grid.take_changes()
             self.topology = self.topology.rebuilt(self.grid.known_area(), *moved)
-            set_topology(self.localizer, self.topology.map)
+            self.localizer.set_topology(self.topology.map)
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

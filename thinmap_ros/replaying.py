@@ -19,7 +19,6 @@ from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
@@ -263,7 +262,7 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'loops_closed': result.pipeline.corrections,
         'rebuild_ms': round(1000.0 * float(rebuilds.max(initial=0.0)), 1),
         'ms_per_scan': {name: _spread(1000.0 * seconds) for name, seconds in stages.items()},
-        'features': len(line_features(result.pipeline.localizer)),
+        'features': len(result.pipeline.localizer.features),
         'features_local_median': float(np.median(result.local_features)),
         'rejected': result.pipeline.localizer.rejected,
         'distance': round(float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()), 3),

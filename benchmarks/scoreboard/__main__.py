@@ -18,9 +18,10 @@ from benchmarks.scoreboard.measure import Task, config_of, measure
 from benchmarks.scoreboard.page import page, shortened, worst_tenth
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.reports import report_file, report_of, reports_there
-from thinmap_ros.core.config import parameters_of
+from thinmap_ros.core.config import parameters_of, suggestion
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.localizers import default_config, parameters_elsewhere
+from thinmap_ros.core.start import StartConfig
 from thinmap_ros.evaluation.machine import provenance, write_provenance
 from thinmap_ros.evaluation.parallel_jobs import (
     Failure,
@@ -153,13 +154,17 @@ def _short_names() -> list[str]:
 
 
 def _options(words: list[str]) -> Numbers:
-    """Options of the localizer, each of the type of its default."""
-    defaults = {name: value for name, _, value in parameters_of(LocalizerConfig())}
+    """Options of the localizer that `slam` among them selects, each of the type of its default."""
+    given = [word.partition('=') for word in words]
+    slam = {name: value for name, _, value in given}.get('slam', StartConfig.slam)
+    defaults = {name: value for name, _, value in parameters_of(default_config(slam))}
+    elsewhere = parameters_elsewhere(slam)
     options: Numbers = {}
-    for word in words:
-        name, _, value = word.partition('=')
+    for word, (name, _, value) in zip(words, given, strict=True):
         if name not in defaults:
-            raise ConfigError(f'--set {word}: expected one of {", ".join(sorted(defaults))}')
+            meant = suggestion(name, defaults, elsewhere)
+            expected = ', '.join(sorted(defaults))
+            raise ConfigError(f'--set {word}{meant}: expected one of {expected}')
         kind = type(defaults[name])
         try:
             options[name] = {'true': True, 'false': False}[value] if kind is bool else kind(value)

@@ -19,11 +19,11 @@ from benchmarks.scoreboard.played import (
     simulated_numbers,
 )
 from thinmap_ros.core import se2
-from thinmap_ros.core.config import with_values
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.localizers import config_with
+from thinmap_ros.core.start import StartConfig
 from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
 from thinmap_ros.experiments.slam.logs import laser_of
@@ -179,17 +179,17 @@ def measure_building(case: BuildingCase, options: Numbers, scans_per_graph: int 
     return simulated_numbers(play(_disturbed(pairs, case.run), config, scans_per_graph), truth)
 
 
-def config_of(options: Numbers, start: Array | None = None) -> LocalizerConfig:
+def config_of(options: Numbers, start: Array | None = None) -> StartConfig:
     """Configuration of the localizer by its options, with a start pose (3,) where one is given."""
     if start is None:
-        return with_values(LocalizerConfig(), options)
+        return config_with(options)
     x, y, yaw = start.tolist()
     pose = {'initial_x_m': x, 'initial_y_m': y, 'initial_yaw_rad': yaw}
-    return with_values(LocalizerConfig(), options | pose)
+    return config_with(options | pose)
 
 
 def play(
-    scans: Iterator[tuple[Scan, Array]], config: LocalizerConfig, scans_per_graph: int = 1
+    scans: Iterator[tuple[Scan, Array]], config: StartConfig, scans_per_graph: int = 1
 ) -> Played:
     """All scans with their odometry poses (3,) through localizer, grid and topology.
 

@@ -133,14 +133,19 @@ def test_another_run_beside_it(reports):
 
 
 def test_options_of_the_localizer_have_the_types_of_their_defaults():
-    words = ['slam=ekf_ti', 'initial_x_m=2', 'mode=localization', 'matching.noise_m=0.1']
+    words = ['slam=ekf_ti', 'initial_x_m=2', 'mode=localization', 'association.gate=4']
     options = {
         'slam': 'ekf_ti',
         'initial_x_m': 2.0,
         'mode': 'localization',
-        'matching.noise_m': 0.1,
+        'association.gate': 4.0,
     }
     assert program._options(words) == options
+    assert program._options(['matching.noise_m=0.1']) == {'matching.noise_m': 0.1}
+    with pytest.raises(ConfigError, match=r'association\.gate=4 \(only with slam: ekf_ti or'):
+        program._options(['association.gate=4'])
+    with pytest.raises(ConfigError, match=r'noise_m=0\.1 \(only with slam: scan_matching'):
+        program._options([*words, 'matching.noise_m=0.1'])
     for word in (
         'slan=off',
         'initial_x_m=far',

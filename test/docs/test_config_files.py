@@ -5,12 +5,23 @@ scripts/generate rewrites the files from the declarations.
 
 import json
 import os
+import re
 import textwrap
 
 import pytest
 import rclpy
 import yaml
-from support.node_list import NEEDED, NODES, OF_EVERY_NODE, OWN_WORDS, ROOT, default_of, node_class
+from support.node_list import (
+    NEEDED,
+    NODES,
+    OF_EVERY_NODE,
+    OWN_WORDS,
+    ROOT,
+    VARIANTS,
+    default_of,
+    node_class,
+    variant_text,
+)
 
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.logs.bag_writer import BagWriter
@@ -68,10 +79,21 @@ def flat(values, prefix=''):
     return found
 
 
-def file_text(name, parameters):
+def file_text(name, parameters, others):
     lines = [f'# Parameters of the node {name}, with their defaults:', '#   ros2 run thinmap_ros']
     lines[1] += f' {name} --ros-args --params-file config/{name}.yaml'
-    lines += ['/**:', '  ros__parameters:']
+    lines += ['/**:', '  ros__parameters:', *parameter_lines(parameters)]
+    if others:
+        comment = '    # '
+        text = variant_text(parameters, others)
+        lines += textwrap.wrap(text, 112, initial_indent=comment, subsequent_indent=comment)
+        own = {key: found for key, found in others.items() if key not in parameters}
+        lines += [comment + line[4:] for line in parameter_lines(own)]
+    return '\n'.join(lines) + '\n'
+
+
+def parameter_lines(parameters):
+    lines = []
     group = []
     for parameter, (value, descriptor) in parameters.items():
         *parts, _ = parameter.split('.')
@@ -80,7 +102,11 @@ def file_text(name, parameters):
                 lines.append('  ' * (depth + 2) + f'{part}:')
         group = parts
         lines += described(parameter, value, descriptor, '  ' * (len(parts) + 2))
-    return '\n'.join(lines) + '\n'
+    return lines
+
+
+def variant_arguments(name):
+    return [w for key, value in VARIANTS.get(name, {}).items() for w in ('-p', f'{key}:={value}')]
 
 
 @pytest.mark.parametrize('name', NODES)
@@ -93,7 +119,8 @@ def test_config_file_says_what_the_node_declares(declared, name):
     found = declared(name, *arguments)
     for key in needed:
         found[key] = (default_of(name, key), found[key][1])
-    text = file_text(name, found)
+    variant = variant_arguments(name)
+    text = file_text(name, found, declared(name, *variant) if variant else {})
     if 'THINMAP_WRITE_CONFIG' in os.environ:
         path.write_text(text)
     assert path.read_text() == text, (
@@ -110,6 +137,32 @@ def test_node_takes_its_config_file(declared, tmp_path, name):
     values |= NEEDED.get(name, {})
     (tmp_path / 'given.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
     found = declared(name, '--params-file', str(tmp_path / 'given.yaml'))
+    assert {n: value for n, (value, _) in found.items()} == flat(values)
+
+
+@pytest.mark.parametrize('slam', ['scan_matching', 'ekf_ti', 'ekf_full'])
+def test_the_localizer_takes_what_its_file_shows_for_its_kind(declared, tmp_path, slam):
+    """The comments at the end of the file are the parameters of the filters."""
+    text = (ROOT / 'config' / 'localizer.yaml').read_text()
+    usual, filters = re.split(r'^ +# With slam: .+\n(?: +# .+\n)*? +# .+but:\n', text, flags=re.M)
+    values = yaml.safe_load(usual)['/**']['ros__parameters']
+    if slam != 'scan_matching':
+        head = text[len(usual) : len(text) - len(filters)].replace('\n    #', '')
+        missing = re.search(r'there are no (.+), but:', head)[1].replace(' and ', ', ').split(', ')
+        shown = flat(values)
+        assert all(any(f'{n}.'.startswith(f'{m}.') for n in shown) for m in missing)
+        values = {
+            n: v
+            for n, v in shown.items()
+            if not f'{n}.'.startswith(tuple(f'{m}.' for m in missing))
+        }
+        assert f'slam: {slam}' in head or f'or {slam}' in head
+        values |= flat(yaml.safe_load(filters.replace('    # ', '')))
+        values['slam'] = slam
+    given = tmp_path / 'given.yaml'
+    values['strict_parameters'] = True
+    given.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
+    found = declared('localizer', '--params-file', str(given))
     assert {n: value for n, (value, _) in found.items()} == flat(values)
 
 
@@ -136,6 +189,16 @@ def test_an_unknown_parameter_comes_with_what_was_probably_meant(declared, name,
         ConfigError, match=rf'no parameter {name} \(did you mean {meant}\?\); it has'
     ):
         declared('navigator', '-p', f'{name}:=0.5', '-p', 'strict_parameters:=true')
+
+
+@pytest.mark.parametrize(
+    ('node', 'name'),
+    [('localizer', 'lines.range_noise_m'), ('global_localizer', 'range_noise_m')],
+)
+def test_the_noise_of_the_laser_by_an_earlier_name_comes_with_its_name_now(declared, node, name):
+    meant = rf'no parameter {name} \(did you mean laser_range_noise_m\?\); it has'
+    with pytest.raises(ConfigError, match=meant):
+        declared(node, '-p', f'{name}:=0.02', '-p', 'strict_parameters:=true')
 
 
 def test_there_is_a_file_for_each_node_and_no_other():
@@ -206,9 +269,23 @@ def test_presets_fit_together():
             flat(content[f'/**/{name}']['ros__parameters'])
             for name in ('sim', 'grid_mapper', 'localizer')
         )
-        max_range_m = content['/**']['ros__parameters']['max_range_m']
-        assert localizer['lines.max_range_m'] <= max_range_m <= sim['range_max_m']
+        laser = content['/**']['ros__parameters']
+        max_range_m = laser['max_range_m']
+        assert localizer.get('lines.max_range_m', 0.0) <= max_range_m <= sim['range_max_m']
         reach_m = max(grid['no_return_clear_range_m'], min(max_range_m, 4.0))
         assert grid['local_map_size_m'] >= 2.0 * reach_m
-        searching = content['/**/global_localizer']['ros__parameters']
-        assert searching['range_noise_m'] == localizer['lines.range_noise_m']
+        assert sim['range_noise_m'] <= laser['laser_range_noise_m']
+
+
+def test_range_and_noise_of_a_laser_stand_once_in_a_preset():
+    for preset in PRESETS:
+        sections = yaml.safe_load(preset.read_text())
+        laser = sections['/**']['ros__parameters']
+        assert {'max_range_m', 'laser_range_noise_m'} <= laser.keys()
+        of_nodes = {
+            name: value
+            for section in sections.keys() - {'/**', '/**/sim'}
+            for name, value in flat(sections[section]['ros__parameters']).items()
+        }
+        assert not [name for name in of_nodes if 'range_noise' in name]
+        assert of_nodes.get('lines.max_range_m') != laser['max_range_m']

@@ -11,7 +11,17 @@ import pytest
 import rclpy
 from rclpy.action import get_action_server_names_and_types_by_node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from support.node_list import NEEDED, NODES, OF_EVERY_NODE, OWN_WORDS, ROOT, default_of, node_class
+from support.node_list import (
+    NEEDED,
+    NODES,
+    OF_EVERY_NODE,
+    OWN_WORDS,
+    ROOT,
+    VARIANTS,
+    default_of,
+    node_class,
+    variant_text,
+)
 
 from thinmap_ros.logs.bag_writer import BagWriter
 
@@ -34,9 +44,21 @@ def declared(ros_domain, tmp_path, monkeypatch):
     arguments = [
         word for name in NODES for k, v in NEEDED.get(name, {}).items() for word in rule(name, k, v)
     ]
-    rclpy.init(args=['--ros-args', *arguments])
-    yield lambda name: node_class(name)()
-    rclpy.shutdown()
+
+    def shown(name, show, variant=()):
+        """What is shown of a node, which has other parameters with those of its variant."""
+        words = [word for key, value in variant for word in rule(name, key, value)]
+        rclpy.init(args=['--ros-args', *arguments, *words])
+        try:
+            node = node_class(name)()
+            text = show(name, node)
+            getattr(node, 'close', lambda: None)()
+            node.destroy_node()
+            return text
+        finally:
+            rclpy.shutdown()
+
+    return shown
 
 
 def rule(name, key, value):
@@ -83,7 +105,12 @@ def actions(node):
     return [f'`{name.removeprefix("/")}` (`{types[0]}`)' for name, types in sorted(found)]
 
 
-def parameters(node, name):
+def parameters(name, node):
+    """Rows of the table by the names of the parameters."""
+    return dict(parameter_rows(node, name))
+
+
+def parameter_rows(node, name):
     for key in node._parameters:
         if key in OF_EVERY_NODE or key in OWN_WORDS or key.startswith('qos_overrides'):
             continue
@@ -101,7 +128,7 @@ def parameters(node, name):
         if limits and descriptor.additional_constraints:
             live = descriptor.additional_constraints.removeprefix('at run time ')
         shown = f'`{value}`' if value != '' else ''
-        yield f'| `{key}` | {shown} | {span} | {live} | {descriptor.description} |'
+        yield key, f'| `{key}` | {shown} | {span} | {live} | {descriptor.description} |'
 
 
 def section(name, node):
@@ -113,23 +140,28 @@ def section(name, node):
     for what, found in (('Services', services(node, name)), ('Actions', actions(node))):
         if found:
             lines += [f'{what}: {", ".join(found)}', '']
-    if rows := list(parameters(node, name)):
-        lines += [
-            '| parameter | default | allowed | at run time | what |',
-            '|---|---|---|---|---|',
-            *rows,
-            '',
-        ]
     return lines
+
+
+def parameter_table(rows):
+    head = ['| parameter | default | allowed | at run time | what |', '|---|---|---|---|---|']
+    return [*head, *rows, ''] if rows else []
+
+
+def other_parameters(rows, others):
+    """Table of the parameters that only a variant of the node has; rows, others: by their names."""
+    own = [row for key, row in others.items() if key not in rows]
+    return [variant_text(rows, others, quote='`'), '', *parameter_table(own)]
 
 
 def test_the_page_lists_what_the_nodes_declare(declared):
     lines = [HEAD]
     for name in NODES:
-        node = declared(name)
-        lines += section(name, node)
-        getattr(node, 'close', lambda: None)()
-        node.destroy_node()
+        head, rows = declared(name, lambda *node: (section(*node), parameters(*node)))
+        lines += [*head, *parameter_table(rows.values())]
+        if name in VARIANTS:
+            others = declared(name, parameters, VARIANTS[name].items())
+            lines += other_parameters(rows, others)
     text = '\n'.join(lines)
     if 'THINMAP_WRITE_CONFIG' in os.environ:
         PAGE.write_text(text)

@@ -20,8 +20,7 @@ from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-from thinmap_ros.core.slam.localizers import localizer_class, set_topology
+from thinmap_ros.core.slam.localizers import default_config, localizer_class
 from thinmap_ros.core.topology.builder import TopologyBuilder
 
 _PERIOD_NS = 200_000_000
@@ -121,7 +120,7 @@ def map_and_graph(shared: None, rng: np.random.Generator, folder: Path) -> None:
 
 def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
     drive = Drive(rng, folder)
-    config = LocalizerConfig(slam=str(chosen(rng, ('scan_matching', 'ekf_ti', 'ekf_full'))))
+    config = default_config(str(chosen(rng, ('scan_matching', 'ekf_ti', 'ekf_full'))))
     kind = localizer_class(config)
     localizer = kind(config)
     graph = small_graph()
@@ -136,7 +135,7 @@ def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
             finite(estimate.T_map_base, estimate.covariance)
             assert np.linalg.eigvalsh(estimate.covariance).min() > -1e-6
         if rng.random() < 0.1:
-            set_topology(localizer, graph)
+            localizer.set_topology(graph)
     finite(localizer.optimized_trajectory())
     tried(lambda: kind.from_state(localizer.state(), config))
 

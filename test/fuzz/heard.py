@@ -1,6 +1,5 @@
 """Invalid messages and parameters, at the conversions of the nodes."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,8 @@ import numpy as np
 from fuzz.cases import Source, chosen, nothing, tried
 from fuzz.files import strange_value
 from fuzz.strange_messages import CHECKS, made
-from thinmap_ros.core.config import Config
+from thinmap_ros.core.config import Config, parameters_of, with_values
+from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
@@ -25,6 +25,7 @@ from thinmap_ros.view.null_view import NullView
 _COUNT = 10
 _KINDS = sorted(CHECKS, key=lambda kind: kind.__name__)
 _CONFIGS: tuple[type[Config], ...] = (
+    EkfConfig,
     ExplorerConfig,
     GlobalLocalizationConfig,
     LaserOptions,
@@ -34,6 +35,7 @@ _CONFIGS: tuple[type[Config], ...] = (
     TopologyConfig,
 )
 _MADE: dict[type[Config], Any] = {
+    EkfConfig: EkfLocalizer,
     LocalizerConfig: Localizer,
     NavigatorConfig: Navigator,
     OccupancyConfig: OccupancyGrid,
@@ -72,16 +74,17 @@ def show_messages(shared: None, rng: np.random.Generator, folder: Path) -> None:
 
 def set_parameters(shared: None, rng: np.random.Generator, folder: Path) -> None:
     kind = chosen(rng, _CONFIGS)
-    fields = dataclasses.fields(kind)
+    defaults = kind()
+    declared = list(parameters_of(defaults))
     values: dict[str, Any] = {}
     for _ in range(int(rng.integers(1, 4))):
-        field = chosen(rng, fields)
+        name, field, _ = chosen(rng, declared)
         value = strange_value(rng)
         if isinstance(field.default, float) and rng.random() < 0.5:
             value = field.default * float(chosen(rng, (-1.0, 0.0, 0.01, 0.5, 2.0, 100.0)))
-        values[field.name] = value
+        values[name] = value
     (folder / 'parameters.txt').write_text(f'{kind.__name__} {values}\n')
-    config = tried(lambda: kind(**values))
+    config = tried(lambda: with_values(defaults, values))
     if config is not None and kind in _MADE:
         tried(lambda: _MADE[kind](config))
 

@@ -17,6 +17,7 @@ from support.timeouts import PATIENCE_S
 
 from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import SaveMap
+from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.files import occupancy_maps, package_data, sessions
 from thinmap_ros.files.worlds import read_world
@@ -178,7 +179,7 @@ def test_simulated_log_bag_and_live_graph_agree(graph, tmp_path):
 
 
 def test_the_filter_of_the_paper_gives_the_same_live_and_replayed(graph, tmp_path):
-    config = PipelineConfig(localizer=LocalizerConfig(slam='ekf_ti'))
+    config = PipelineConfig(localizer=EkfConfig(slam='ekf_ti'))
     expected = replay(SimulatedLog(), config)
     assert len(expected.pipeline.localizer.features) > 3
     convert(SimulatedLog(), tmp_path / 'bag')

@@ -141,7 +141,12 @@ def test_what_cannot_be_run_is_reported_in_one_line(ros_domain):
     done = run('localizer', 'grid_mapper', '--ros-args', *strict)
     assert done.returncode == 2 and 'localizer, grid_mapper has no parameter gaet' in done.stderr
     assert len(done.stderr.splitlines()) == 1
-    done = run('localizer', 'grid_mapper', '--ros-args', '-p', 'association.gate:=-1.0')
+    strict = ('-p', 'association.gate:=4.0', '-p', 'strict_parameters:=true')
+    done = run('localizer', 'grid_mapper', '--ros-args', *strict)
+    meant = 'has no parameter association.gate (only with slam: ekf_ti or ekf_full)'
+    assert done.returncode == 2 and meant in done.stderr
+    wrong = ('-p', 'slam:=ekf_ti', '-p', 'association.gate:=-1.0')
+    done = run('localizer', 'grid_mapper', '--ros-args', *wrong)
     assert (
         done.returncode == 2
         and 'association.gate' in done.stderr

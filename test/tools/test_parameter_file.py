@@ -8,6 +8,7 @@ from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.localizers import default_config
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.tools.parameter_file import NodeParameters, read_parameter_file
 
@@ -30,7 +31,7 @@ def test_a_preset_has_parameters_of_the_nodes_and_no_others(preset: Path) -> Non
     assert parameters.notes == []
     own = parameters.of_node['localizer']
     localizer = parameters.config('localizer', LocalizerConfig())
-    assert localizer.lines.range_noise_m == own['lines.range_noise_m']
+    assert localizer.lines.laser_range_noise_m == own['laser_range_noise_m']
     for node in NODES:
         laser = parameters.config(node, LaserConfig())
         assert laser.max_range_m == own['max_range_m']
@@ -92,6 +93,37 @@ def test_a_typing_error_is_noted_with_what_was_meant(tmp_path: Path) -> None:
     assert 'matchng.noise_m (did you mean ' in note and 'matching.noise_m' in note
     with pytest.raises(ConfigError, match=r'matchng\.noise_m'):
         read(tmp_path, text + '    strict_parameters: true\n')
+
+
+@pytest.mark.parametrize(
+    ('slam_of_file', 'option', 'unknown'),
+    [
+        ('', '', 'association.gate (only with slam: ekf_ti or ekf_full)'),
+        ('ekf_ti', '', 'keyframes.angle_rad (only with slam: scan_matching)'),
+        ('ekf_ti', 'scan_matching', 'association.gate (only with slam: ekf_ti or ekf_full)'),
+        ('', 'ekf_full', 'keyframes.angle_rad (only with slam: scan_matching)'),
+    ],
+)
+def test_the_localizer_that_is_chosen_decides_which_parameters_it_has(
+    tmp_path: Path, slam_of_file: str, option: str, unknown: str
+) -> None:
+    path = tmp_path / 'some.yaml'
+    slam = f'slam: {slam_of_file}, ' if slam_of_file else ''
+    values = f'{{{slam}association.gate: 4.0, keyframes.angle_rad: 0.5}}'
+    path.write_text(f'localizer:\n  ros__parameters: {values}\n')
+    parameters = read_parameter_file(path, NODES, option)
+    chosen = option or slam_of_file or 'scan_matching'
+    (note,) = parameters.notes
+    assert note.endswith(f'do not have: {unknown}')
+    config = parameters.config('localizer', default_config(chosen))
+    assert config.slam == chosen
+    own = config.keyframes.angle_rad if chosen == 'scan_matching' else config.association.gate
+    assert own in (0.5, 4.0)
+
+
+def test_the_noise_of_the_laser_by_its_earlier_name_comes_with_its_name_now(tmp_path: Path) -> None:
+    (note,) = read(tmp_path, 'localizer:\n  ros__parameters: {lines.range_noise_m: 0.03}\n').notes
+    assert note.endswith('lines.range_noise_m (did you mean laser_range_noise_m?)')
 
 
 @pytest.mark.parametrize(

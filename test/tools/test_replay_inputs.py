@@ -210,6 +210,23 @@ def test_a_parameter_file_gives_what_options_do_not(tmp_path: Path) -> None:
     assert 'resolution: 0.05' in (tmp_path / 'out' / 'map.yaml').read_text()
 
 
+@pytest.mark.programs
+def test_the_option_slam_comes_before_that_of_the_file(tmp_path: Path) -> None:
+    log = tmp_path / 'log.clf'
+    log.write_text('\n'.join(carmen_lines()) + '\n')
+    file = tmp_path / 'robot.yaml'
+    file.write_text('localizer:\n  ros__parameters: {slam: ekf_ti, association: {gate: 4.0}}\n')
+    done, report = replayed(tmp_path, log, '--params-file', file)
+    assert report['features'] > 0 and 'note' not in done.stderr
+    done, report = replayed(tmp_path, log, '--params-file', file, '--slam', 'scan_matching')
+    assert report['features'] == 0
+    assert 'association.gate (only with slam: ekf_ti or ekf_full)' in done.stderr
+    file.write_text('localizer:\n  ros__parameters: {slam: magic}\n')
+    done = run(log, '-o', tmp_path / 'out', '--params-file', file)
+    assert done.returncode == 2
+    assert "slam = 'magic': expected one of scan_matching, ekf_ti, ekf_full" in done.stderr
+
+
 def pgm_extent(tmp_path: Path) -> bytes:
     return (tmp_path / 'out' / 'map.pgm').read_bytes()
 

@@ -2,8 +2,8 @@
 
 A configuration is composed of others (`part`). Seen from ROS and the command line it is flat:
 parameters of a part have its name before theirs, `matching.noise_m`; those that describe the robot
-(`robot_radius`) have one name everywhere. Fields without `parameter` are fixed: they are set in
-Python only, and are no parameters of nodes.
+(`robot_radius`, `laser_range_noise`) have one name everywhere. Fields without `parameter` are
+fixed: they are set in Python only, and are no parameters of nodes.
 """
 
 import dataclasses
@@ -46,7 +46,7 @@ def parameter(
 
 def robot_radius() -> Any:
     """Declare the field `robot_radius_m`: one name and one default for all parts and nodes."""
-    field = parameter(
+    return _shared(
         0.25,
         'Radius of the robot (m), the same for all nodes. Set it to the distance from the centre '
         'of rotation to the farthest point of the footprint.',
@@ -54,7 +54,17 @@ def robot_radius() -> Any:
         high=5.0,
         safe=SAFE_HIGHER,
     )
-    return dataclasses.field(default=field.default, metadata={**field.metadata, 'shared': True})
+
+
+def laser_range_noise() -> Any:
+    """Declare the field `laser_range_noise_m`: one name and one default for all parts and nodes."""
+    return _shared(
+        0.015,
+        'Standard deviation of a range of the laser (m), the same for all nodes. Set it to the '
+        'noise of the laser; too low, and walls break into pieces.',
+        low=0.0005,
+        high=0.5,
+    )
 
 
 def part(config: type['Config']) -> Any:
@@ -113,8 +123,15 @@ def with_values(config: AnyConfig, values: Mapping[str, Any]) -> AnyConfig:
     return dataclasses.replace(config, **own)
 
 
-def suggestion(name: str, known: Collection[str]) -> str:
-    """The parameter that was probably meant: in another group, or with a similar name."""
+def suggestion(
+    name: str, known: Collection[str], elsewhere: Mapping[str, str] | None = None
+) -> str:
+    """The parameter that was probably meant: in another group, or with a similar name.
+
+    elsewhere: parameters that exist with another value of `slam` or the like, and that value.
+    """
+    if elsewhere and name in elsewhere:
+        return f' (only with {elsewhere[name]})'
     last = name.split('.')[-1]
     same = [other for other in sorted(known) if other.split('.')[-1] == last]
     likely = same or get_close_matches(name, sorted(known), n=1, cutoff=0.75)
@@ -147,6 +164,12 @@ def _part_with(prefix: str, config: AnyConfig, values: Mapping[str, Any]) -> Any
         return with_values(config, own)
     except ConfigError as error:
         raise ConfigError(f'{prefix}.{error}') from error
+
+
+def _shared(default: Any, description: str, **limits: Any) -> Any:
+    """Declare a field that has its own name in every part; limits: as of `parameter`."""
+    field = parameter(default, description, **limits)
+    return dataclasses.field(default=field.default, metadata={**field.metadata, 'shared': True})
 
 
 def _is_shared(field: 'dataclasses.Field[Any]') -> bool:

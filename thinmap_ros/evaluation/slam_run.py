@@ -8,7 +8,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.localizers import config_class
 from thinmap_ros.pipeline import Pipeline, PipelineConfig, PipelineResult
 from thinmap_ros.sim.drives import DriveSample
 
@@ -65,7 +65,8 @@ def run_drive(
     for k, sample in enumerate(samples):
         if run is None:
             x, y, yaw = (float(v) for v in sample.T_world_base)
-            config = LocalizerConfig(slam=slam, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
+            kind = config_class(slam)
+            config = kind(slam=slam, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
             run = Run(Pipeline(PipelineConfig(localizer=config)))
             start = sample
         began = process_time()

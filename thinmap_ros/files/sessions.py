@@ -17,6 +17,7 @@ from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import State
+from thinmap_ros.core.start import StartConfig
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.occupancy_maps import (
@@ -111,8 +112,9 @@ class SessionPart(Generic[Value, PartConfig]):
             raise InputError(f'{file}: {error}') from error
 
 
-def _restore_localizer(state: State, config: LocalizerConfig | None) -> AnyLocalizer:
-    return localizer_class(config or LocalizerConfig()).from_state(state, config)
+def _restore_localizer(state: State, config: StartConfig | None) -> AnyLocalizer:
+    own = config or LocalizerConfig()
+    return localizer_class(own).from_state(state, own)
 
 
 GRID = SessionPart('grid', 'grid_mapper', '.grid.npz', OccupancyGrid.from_state)

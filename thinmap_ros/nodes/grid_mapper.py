@@ -17,7 +17,6 @@ from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.ekf_slam.ekf_localizer import LOCALIZATION, MAPPING
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import (
@@ -27,6 +26,7 @@ from thinmap_ros.core.grid.occupancy import (
     WindowConfig,
 )
 from thinmap_ros.core.snapshot import State
+from thinmap_ros.core.start import LOCALIZATION, MAPPING
 from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.mapping.map_output import MapPublishers

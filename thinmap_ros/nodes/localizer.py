@@ -34,12 +34,12 @@ from thinmap_ros.core.slam.localizer_config import LIVE_PARAMETERS, LocalizerCon
 from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
     adjust,
-    line_features,
+    config_class,
     localizer_class,
-    set_topology,
-    without_effect,
+    parameters_elsewhere,
 )
 from thinmap_ros.core.snapshot import State
+from thinmap_ros.core.start import StartConfig
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.files.sessions import LOCALIZER
@@ -95,7 +95,7 @@ class _PosePublishers:
             )
         )
         header = messages.header(frame, stamp_ns)
-        features = [_feature_msg(feature) for feature in line_features(localizer)]
+        features = [_feature_msg(feature) for feature in localizer.features]
         self._features.publish(LineFeatureArray(header=header, features=features))
         status.header = header
         status.features = len(features)
@@ -215,8 +215,9 @@ class LocalizerNode(ThinmapNode):
 
     def __init__(self) -> None:
         super().__init__('localizer', recovers=True)
+        slam = parameters.given_text(self, 'slam', StartConfig.slam)
         self._config = parameters.declare_config(
-            self, LocalizerConfig, self._on_config, LIVE_PARAMETERS
+            self, config_class(slam), self._on_config, LIVE_PARAMETERS
         )
         self._output = _PosePublishers(self)
         self._laser_transform = LaserTransform(self)
@@ -230,9 +231,7 @@ class LocalizerNode(ThinmapNode):
         )
         self._given = GivenMap(self, self._config)
         self._save_directory = SaveDirectory(self)
-        parameters.reject_unknown(self)
-        for name in without_effect(self._config):
-            self.get_logger().warning(f'{name}: no effect with slam = {self._config.slam}')
+        parameters.reject_unknown(self, parameters_elsewhere(slam))
         warm_up.localizer()
         self._map_ids: _MapIds | None = _MapIds() if self._config.is_mapping else None
         self._begin()
@@ -256,7 +255,7 @@ class LocalizerNode(ThinmapNode):
         self.create_service(LoadMap, 'check_localizer', self._on_check)
         self.create_service(LoadMap, 'load_localizer', self._on_load)
 
-    def _on_config(self, config: LocalizerConfig) -> None:
+    def _on_config(self, config: StartConfig) -> None:
         """Continue in the same map with other parameters."""
         self._config = config
         self._given.config = config
@@ -319,7 +318,7 @@ class LocalizerNode(ThinmapNode):
 
     def _on_topology(self, message: TopologicalMap) -> None:
         self._topology = topology_from_msg(message)
-        set_topology(self._localizer, self._topology)
+        self._localizer.set_topology(self._topology)
 
     def _process(self, ready: list[tuple[Scan, Array]]) -> None:
         if self._relocation is not None:
@@ -371,8 +370,7 @@ class LocalizerNode(ThinmapNode):
         if self._relocation is not None:
             self._relocate_in(self._relocation, patch)
         elif map_id != ids.id and not ids.is_given:
-            kind = localizer_class(self._config)
-            if kind is not Localizer:
+            if not isinstance(self._config, LocalizerConfig):
                 return  # a map of line features cannot be made of a grid
             self.get_logger().warning(
                 'grid is of a map that another localizer has begun: lost in that map until scans '
@@ -420,13 +418,13 @@ class LocalizerNode(ThinmapNode):
                 relocation.map, last, T_odom_base, self._config
             )
         if self._topology is not None:
-            set_topology(self._localizer, self._topology)
+            self._localizer.set_topology(self._topology)
         self._relocation = None
         return [pending]
 
     def _start_again_in(self, patch: GridPatch | None) -> None:
         """Start at the initial pose in the map that is there, or else in a new one."""
-        if patch is not None and isinstance(self._localizer, Localizer):
+        if patch is not None and isinstance(self._config, LocalizerConfig):
             self._localizer = Localizer.in_occupancy_map(patch, self._config)
         elif self._map_ids is not None:
             self._map_ids.load()
@@ -465,8 +463,8 @@ class LocalizerNode(ThinmapNode):
         if self._map_ids is not None:
             self._map_ids.load()
         if self._topology is not None:
-            set_topology(loaded, self._topology)
-        features = line_features(loaded)
+            loaded.set_topology(self._topology)
+        features = loaded.features
         return f'{len(features)} line features loaded' if features else 'local map loaded'
 
     def _publish(self, scan: Scan, estimate: Estimate, step_ms: float) -> None:

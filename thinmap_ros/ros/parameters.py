@@ -1,7 +1,7 @@
 """Declaration of ROS parameters from the Config dataclasses of core, which hold the defaults."""
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Generic, TypeVar
@@ -35,6 +35,7 @@ ROBOT = (
     'laser_pose',
     'zero_is_no_return',
     'max_range_m',
+    'laser_range_noise_m',
     'scan_stamp',
     'map_frame',
     'odom_frame',
@@ -153,6 +154,16 @@ def _accept_integer(node: Node, name: str, default: Any) -> None:
         node._parameter_overrides[name] = Parameter(name, value=float(given.value))
 
 
+def given_text(node: Node, name: str, default: str) -> str:
+    """Text that a node was given for a parameter that decides which others it declares.
+
+    A value of another type is left to the declaration, which rejects it.
+    """
+    given = node._parameter_overrides.get(name)
+    is_text = given is not None and given.type_ == Parameter.Type.STRING
+    return str(given.value) if is_text else default
+
+
 def freeze_clock(node: Node) -> None:
     """Make `use_sim_time` of a node read-only.
 
@@ -218,8 +229,10 @@ def declare_recovery(node: Node) -> float:
     )
 
 
-def reject_unknown(node: Node) -> None:
+def reject_unknown(node: Node, elsewhere: Mapping[str, str] | None = None) -> None:
     """Warn of parameters that were given and that the node does not have.
+
+    elsewhere: as of `suggestion`, those that it has with another value of a parameter.
 
     With `strict_parameters`, and in nodes without it, they are an error. Parameters of the robot
     are accepted by every node, and so are those of other packages that another node takes. Where
@@ -233,22 +246,25 @@ def reject_unknown(node: Node) -> None:
         if not name.startswith('qos_overrides.') and not is_known(name)
     }
     known = {name for name in node._parameters if not name.startswith('qos_overrides')}
+    meant = dict(elsewhere or {})
     shared = _SHARED.get()
     if shared is not None:
         shared.names.append(node.get_name())
         shared.given |= given
         shared.known |= known
+        shared.elsewhere |= meant
         if len(shared.names) < shared.count:
             return
         given = shared.given
         known = shared.known
+        meant = shared.elsewhere
         names = ', '.join(shared.names)
     else:
         names = str(node.get_name())
     unknown = sorted(given - known)
     if not unknown:
         return
-    wrong = ', '.join(name + suggestion(name, known) for name in unknown)
+    wrong = ', '.join(name + suggestion(name, known, meant) for name in unknown)
     if node.has_parameter(STRICT) and not node.get_parameter(STRICT).value:
         node.get_logger().warning(
             f'ignored parameters that node {names} does not have: {wrong}; '
@@ -266,6 +282,7 @@ class _Shared:
     names: list[str] = dataclasses.field(default_factory=list)
     given: set[str] = dataclasses.field(default_factory=set)
     known: set[str] = dataclasses.field(default_factory=set)
+    elsewhere: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
 _SHARED: ContextVar[_Shared | None] = ContextVar('shared', default=None)

@@ -26,9 +26,20 @@ class LaserScannerConfig(Config):
         180.0, 'Angle between the first and the last beam (deg).', low=0.0, high=360.0
     )
     range_min_m: float = parameter(0.05, 'Smallest range (m).', low=0.0, high=10.0)
-    range_max_m: float = parameter(8.0, 'Largest range (m).', low=0.1, high=200.0)
+    range_max_m: float = parameter(
+        8.0,
+        'Largest range (m). What nodes use of it is max_range_m.',
+        low=0.1,
+        high=200.0,
+    )
     scan_rate_hz: float = parameter(5.0, 'Scans per second.', low=0.1, high=20.0)
-    range_noise_m: float = parameter(0.01, 'Standard deviation of a range (m).', low=0.0, high=1.0)
+    range_noise_m: float = parameter(
+        0.01,
+        'True standard deviation of a range (m). What nodes assume is laser_range_noise_m, at '
+        'least as much.',
+        low=0.0,
+        high=1.0,
+    )
     range_resolution_m: float = parameter(0.001, 'Resolution of a range (m).', low=0.0, high=0.1)
     mixed_pixel_ratio: float = parameter(
         0.3, 'Ratio of depth edges with a range in between (mixed pixel).', low=0.0, high=1.0

@@ -7,11 +7,14 @@ from typing import Any, TypeVar
 
 from thinmap_ros.core.config import Config, parameters_of, suggestion, with_values
 from thinmap_ros.core.errors import ConfigError, InputError, quoted
+from thinmap_ros.core.slam.localizers import default_config, parameters_elsewhere
+from thinmap_ros.core.start import StartConfig
 from thinmap_ros.files.package_data import config_file
 from thinmap_ros.files.yaml import read_mapping
 from thinmap_ros.ros.foreign.tables import PACKAGES
 from thinmap_ros.ros.foreign.values import is_known, translated
 
+_LOCALIZER = 'localizer'
 _STRICT = 'strict_parameters'
 _WILDCARDS = ('**', '*')
 _EXPECTED = 'a parameter file: NODE: ros__parameters: NAME: VALUE'
@@ -42,10 +45,11 @@ class NodeParameters:
         return value
 
 
-def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> NodeParameters:
+def read_parameter_file(path: Path, nodes: tuple[str, ...], slam: str = '') -> NodeParameters:
     """Parameters of a file for some nodes, with those of other packages translated.
 
-    Those for all nodes come before those for one. Raises InputError with the file name if it has
+    Those for all nodes come before those for one. slam: value of that parameter of the localizer;
+    empty: that of the file. Raises InputError with the file name if it has
     no parameters for them, and ConfigError, with `strict_parameters`, for those that no node has.
     """
     content = read_mapping(path, _EXPECTED)
@@ -58,6 +62,8 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> NodeParameters:
     if not any(given.values()):
         raise InputError(f'{path}: no parameters of {", ".join(nodes)}: expected {_EXPECTED}')
     own_values = {node: translated(node, values) for node, values in given.items()}
+    if slam and _LOCALIZER in own_values:
+        own_values[_LOCALIZER]['slam'] = slam
     return NodeParameters(own_values, _unknown(path, own_values))
 
 
@@ -84,20 +90,26 @@ def _leaves(values: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
 
 def _unknown(path: Path, given: dict[str, dict[str, Any]]) -> list[str]:
     """Notes on the parameters that none of the nodes has: most of them are typing errors."""
-    known = {name for node in given for name in _names_of(node)}
+    slam = given.get(_LOCALIZER, {}).get('slam', StartConfig.slam)
+    elsewhere = parameters_elsewhere(slam)
+    known = {name for node in given for name in _names_of(node, slam)}
     names = {name for values in given.values() for name in values}
     unknown = sorted(name for name in names - known if not is_known(name))
     if not unknown:
         return []
     nodes = ', '.join(given)
-    wrong = ', '.join(name + suggestion(name, known) for name in unknown)
+    wrong = ', '.join(name + suggestion(name, known, elsewhere) for name in unknown)
     if any(values.get(_STRICT) is True for values in given.values()):
         raise ConfigError(f'{path}: nodes {nodes} have no parameter {wrong}')
     return [f'{path}: ignored parameters that nodes {nodes} do not have: {wrong}']
 
 
-def _names_of(node: str) -> set[str]:
-    """Names of all parameters of a node."""
+def _names_of(node: str, slam: str) -> set[str]:
+    """Names of all parameters of a node; slam: as it is set."""
     file = config_file(node)
     values = read_mapping(file, _EXPECTED)['/**']
-    return {name for name, _ in _flat(file, '/**', values)}
+    names = {name for name, _ in _flat(file, '/**', values)}
+    if node != _LOCALIZER:
+        return names
+    own = {name for name, _, _ in parameters_of(default_config(slam))}
+    return names - parameters_elsewhere(slam).keys() | own

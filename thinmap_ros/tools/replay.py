@@ -18,8 +18,8 @@ from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-from thinmap_ros.core.slam.localizers import line_features
+from thinmap_ros.core.slam.localizers import default_config
+from thinmap_ros.core.start import StartConfig
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs.log import Event, Log, SkippedRecords
@@ -78,7 +78,7 @@ class ReplayView:
         view.grid(ns, pipeline.grid.known_area())
         view.topology(ns, topology)
         view.scalar(ns, 'count', 'nodes', float(len(topology.nodes)))
-        features = line_features(pipeline.localizer)
+        features = pipeline.localizer.features
         ends = np.array([[feature.start, feature.end] for feature in features]).reshape(-1, 2, 2)
         view.lines(ns, ends, np.array([feature.local for feature in features], dtype=bool))
         near = {node for feature in features if feature.local for node in feature.nodes}
@@ -163,12 +163,21 @@ def _interruptible(log: Log) -> Iterator[_InterruptibleLog]:
             signal.signal(number, handler)
 
 
+def _parameters(arguments: argparse.Namespace) -> NodeParameters:
+    """Parameters of the file; `slam` of the command line comes before that of the file."""
+    slam = getattr(arguments, 'slam', '')
+    file = arguments.params_file
+    if file:
+        return read_parameter_file(file, _NODES, slam)
+    return NodeParameters({'localizer': {'slam': slam or StartConfig.slam}})
+
+
 def _config(arguments: argparse.Namespace, parameters: NodeParameters) -> PipelineConfig:
     """Parameters of all stages: those of the command line come before those of a file."""
-    localizer = parameters.config('localizer', LocalizerConfig())
+    slam = parameters.value('localizer', 'slam', StartConfig.slam)
     grid = parameters.config('grid_mapper', OccupancyConfig())
     return PipelineConfig(
-        localizer=cli.config_from(arguments, LocalizerConfig, localizer),
+        localizer=parameters.config('localizer', default_config(slam)),
         grid=cli.config_from(arguments, OccupancyConfig, grid),
         window=parameters.config('grid_mapper', WindowConfig()),
         topology=parameters.config('topology_builder', TopologyConfig()),
@@ -176,8 +185,7 @@ def _config(arguments: argparse.Namespace, parameters: NodeParameters) -> Pipeli
 
 
 def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
-    file = arguments.params_file
-    parameters = read_parameter_file(file, _NODES) if file else NodeParameters()
+    parameters = _parameters(arguments)
     config = _config(arguments, parameters)
     wall = time.perf_counter()
     cpu = time.process_time()
@@ -247,7 +255,7 @@ def main() -> None:
         '--view', action='store_true', help='show it in rerun, until the viewer is closed'
     )
     parser.add_argument('--recording', type=Path, help="file for rerun's recording (.rrd)")
-    cli.add_config(parser, LocalizerConfig, ['slam'])
+    cli.add_config(parser, StartConfig, ['slam'])
     cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_clear_range_m'])
     cli.run(_work, parser)
 

@@ -46,7 +46,7 @@ def test_the_fit_is_the_minimum_that_a_general_solver_finds(rng):
         d = rho * np.cos(phi - x[1]) - x[0]
         off = phi - lines.z[0, 1]
         along = config.bearing_noise_rad * rho * np.sin(off)
-        return d / np.sqrt((config.range_noise_m * np.cos(off)) ** 2 + along**2 + 1e-8)
+        return d / np.sqrt((config.laser_range_noise_m * np.cos(off)) ** 2 + along**2 + 1e-8)
 
     best = least_squares(residuals, [3.9, 0.05], xtol=1e-14, ftol=1e-14, gtol=1e-14)
     np.testing.assert_allclose(lines.z[0], best.x, atol=1e-5)
@@ -57,7 +57,7 @@ def test_the_fit_is_the_minimum_that_a_general_solver_finds(rng):
 
 @pytest.mark.parametrize('mount', [np.zeros(3), np.array([0.5, 0.2, 0.3])])
 def test_the_covariance_is_what_many_scans_show(rng, mount):
-    config = LineConfig(range_noise_m=0.02, bearing_noise_rad=0.002)
+    config = LineConfig(laser_range_noise_m=0.02, bearing_noise_rad=0.002)
     pose = np.array([0.3, -0.4, 0.2])
     exact = scan_in(BOX[1:2], pose, T_base_laser=mount)
     hit = exact.hit

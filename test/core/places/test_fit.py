@@ -4,6 +4,7 @@ Near 1 with smooth walls, lower with small objects.
 """
 
 import numpy as np
+import pytest
 from support.small_floor import OFFICE, START, drive, map_of
 
 from thinmap_ros.core.grid.patch import UNKNOWN
@@ -37,3 +38,9 @@ def test_beams_on_which_the_map_is_silent_are_not_counted():
     explored = OFFICE.copy()
     explored[:, 45:] = UNKNOWN
     assert 0.85 < share_in(explored) <= 1.0
+
+
+@pytest.mark.parametrize(('laser_m', 'beam_m'), [(0.005, 0.02), (0.015, 0.02), (0.03, 0.03)])
+def test_a_beam_is_compared_with_no_less_noise_than_walls_have(laser_m, beam_m):
+    assert GlobalLocalizationConfig(laser_range_noise_m=laser_m).beam_noise_m == beam_m
+    assert GlobalLocalizationConfig().beam_noise_m == 0.02

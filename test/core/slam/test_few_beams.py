@@ -5,14 +5,13 @@ import pytest
 from support.slam_room import ROOM, ranges_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-from thinmap_ros.core.slam.localizers import localizer_class
+from thinmap_ros.core.slam.localizers import config_with, localizer_class
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 
 START = np.array([2.0, 2.0, 0.0])
@@ -74,8 +73,7 @@ def driven(beams, count=10, spoil=None, first=0):
     ],
 )
 def test_a_laser_that_cannot_give_enough_points_is_blind(slam, beams, spoil, said):
-    config = LocalizerConfig(slam=slam, initial_x_m=2.0, initial_y_m=2.0)
-    assert isinstance(config, EkfConfig)
+    config = config_with({'slam': slam, 'initial_x_m': 2.0, 'initial_y_m': 2.0})
     found = reasons(driven(beams, spoil=spoil), localizer_class(config)(config))
     assert all(reason == f'{said}: expected at least 10' for reason in found)
 

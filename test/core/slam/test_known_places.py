@@ -8,13 +8,12 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-from thinmap_ros.core.slam.localizers import localizer_class
+from thinmap_ros.core.slam.localizers import config_with, localizer_class
 
 
 @pytest.mark.parametrize('slam', ['scan_matching', 'ekf_ti'])
 def test_they_enclose_the_walls_that_were_seen(slam):
-    config = LocalizerConfig(slam=slam, initial_x_m=2.0, initial_y_m=2.0)
+    config = config_with({'slam': slam, 'initial_x_m': 2.0, 'initial_y_m': 2.0})
     localizer = localizer_class(config)(config)
     assert localizer.known_places().shape == (0, 2)
     rng = np.random.default_rng(1)

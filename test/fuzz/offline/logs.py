@@ -14,8 +14,9 @@ from fuzz.cases import Source, chosen, damaged_bytes, damaged_text, finite, noth
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.localizers import default_config
 from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.start import StartConfig
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.log import (
     Event,
@@ -151,7 +152,8 @@ def read_parameters(shared: None, rng: np.random.Generator, folder: Path) -> Non
 
     def read() -> None:
         parameters = read_parameter_file(path, ('localizer', 'grid_mapper'))
-        parameters.config('localizer', LocalizerConfig())
+        slam = parameters.value('localizer', 'slam', StartConfig.slam)
+        parameters.config('localizer', default_config(slam))
         parameters.value('localizer', 'laser_pose', '')
 
     tried(read)

@@ -236,8 +236,30 @@ def test_contradicting_parameters_end_the_start_in_words(graph):
     assert 'expected a session_path' in graph.log('localizer')
 
 
-def test_parameters_of_another_localizer_have_no_effect_and_are_named(graph):
-    graph.start('localizer', **{'association.gate': 4.0, 'matching.noise_m': 0.08})
-    text = 'association.gate: no effect with slam = scan_matching'
-    graph.until(lambda: text in graph.log('localizer'), 'a warning')
-    assert 'matching.noise_m' not in graph.log('localizer')
+@pytest.mark.parametrize(
+    ('slam', 'unknown', 'own'),
+    [
+        (
+            'scan_matching',
+            'association.gate (only with slam: ekf_ti or ekf_full)',
+            'matching.noise_m',
+        ),
+        ('ekf_ti', 'matching.noise_m (only with slam: scan_matching)', 'association.gate'),
+    ],
+)
+def test_parameters_of_another_localizer_are_unknown_with_where_they_belong(
+    graph, slam, unknown, own
+):
+    given = {'slam': slam, 'association.gate': 4.0, 'matching.noise_m': 0.08}
+    graph.start('localizer', **given)
+    graph.until(lambda: unknown in graph.log('localizer'), 'a warning')
+    assert 'ignored parameters that node localizer does not have' in graph.log('localizer')
+    assert own not in graph.log('localizer')
+
+
+def test_parameters_of_another_localizer_are_an_error_where_unknown_ones_are(graph):
+    process = graph.start('localizer', **{'association.gate': 4.0, 'strict_parameters': True})
+    assert graph.ended(process) == 2
+    graph.processes.clear()
+    unknown = 'has no parameter association.gate (only with slam: ekf_ti or ekf_full)'
+    assert unknown in graph.log('localizer')

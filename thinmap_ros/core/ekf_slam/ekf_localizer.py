@@ -9,13 +9,13 @@ kidnapped robot is not detected.
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.config import Config, parameter, part
+from thinmap_ros.core.config import part
 from thinmap_ros.core.ekf_slam import feature_map
 from thinmap_ros.core.ekf_slam.association import AssociationConfig
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
@@ -28,11 +28,9 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor, OdometryIncrement, OdometryIncrements
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.start import EKF_FULL, EKF_TI, StartConfig, slam_parameter
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-# Values of the parameter `mode`, as in slam_toolbox.
-MAPPING = 'mapping'
-LOCALIZATION = 'localization'
 _START = np.diag(np.square([1e-4, 1e-4, 1e-4]))  # of the initial pose, which defines the map frame
 _IN_SESSION = np.diag(np.square([0.3, 0.3, 0.15]))  # of the initial pose in a loaded map
 # The filter assumes independent odometry errors and does not calibrate the systematic ones. This
@@ -42,43 +40,16 @@ _SLIP_SIGMAS = 3.0  # a motion within so many sigmas of the noise floor is not p
 
 
 @dataclass(frozen=True)
-class EkfConfig(Config):
-    """Parameters of the filter, and of every localizer."""
+class EkfConfig(StartConfig):
+    """Parameters of the filter and of its parts."""
 
-    slam: str = parameter(
-        'scan_matching',
-        'scan_matching: scan matching with a pose graph; ekf_ti: EKF-SLAM/TI on odometry and line '
-        'features alone; ekf_full: the same with all features in the state.',
-        choices=('scan_matching', 'ekf_ti', 'ekf_full'),
-    )
-    initial_x_m: float = parameter(
-        0.0,
-        'Initial x position in the map (m).',
-        low=-se2.MAX_COORDINATE_M,
-        high=se2.MAX_COORDINATE_M,
-    )
-    initial_y_m: float = parameter(
-        0.0,
-        'Initial y position in the map (m).',
-        low=-se2.MAX_COORDINATE_M,
-        high=se2.MAX_COORDINATE_M,
-    )
-    initial_yaw_rad: float = parameter(0.0, 'Initial heading in the map (rad).')
-    mode: str = parameter(
-        MAPPING,
-        'mapping: scans extend and change the map. localization: the map is given (a session, '
-        'map_file_name or topic map) and does not change.',
-        choices=(MAPPING, LOCALIZATION),
-    )
+    of_slam: ClassVar[tuple[str, ...]] = (EKF_TI, EKF_FULL)
+
+    slam: str = slam_parameter(EKF_TI)
     odometry: OdometryConfig = part(OdometryConfig)
     lines: LineConfig = part(LineConfig)
     association: AssociationConfig = part(AssociationConfig)
     features: FeatureConfig = part(FeatureConfig)
-
-    @property
-    def is_mapping(self) -> bool:
-        """Whether scans change the map."""
-        return self.mode == MAPPING
 
 
 class EkfLocalizer:
@@ -88,7 +59,7 @@ class EkfLocalizer:
     """
 
     def __init__(self, config: EkfConfig | None = None) -> None:
-        self.config = config or EkfConfig(slam='ekf_ti')
+        self.config = config or EkfConfig()
         self._rejected = 0
         self.reset()
 
@@ -98,7 +69,7 @@ class EkfLocalizer:
         start = se2.pose(config.initial_x_m, config.initial_y_m, config.initial_yaw_rad)
         self._filter = CompressedEkf(start, _START)
         self._features = FeatureMap(
-            config.features, config.association, local_areas=config.slam == 'ekf_ti'
+            config.features, config.association, local_areas=config.slam == EKF_TI
         )
         self._odometry = OdometryIncrements()
         self._moved: Array = np.zeros(3)  # motion that the filter has not predicted yet

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.config import Config, laser_range_noise, parameter
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, transform_points, wrap
 from thinmap_ros.jit import kernel
@@ -37,13 +37,7 @@ class LineConfig(Config):
     split_sigmas: smallest distance of a split, in standard deviations of a range.
     """
 
-    range_noise_m: float = parameter(
-        0.015,
-        'Standard deviation of a range (m). Set it to the noise of the laser; too low, and walls '
-        'break into pieces.',
-        low=0.0005,
-        high=0.5,
-    )
+    laser_range_noise_m: float = laser_range_noise()
     bearing_noise_rad: float = parameter(
         0.002,
         'Standard deviation of a bearing (rad). Set it to the noise of the laser.',
@@ -52,8 +46,9 @@ class LineConfig(Config):
     )
     max_range_m: float = parameter(
         20.0,
-        'Points beyond this range are not used for lines (m). Lower it where distant points are '
-        'too sparse to be a wall.',
+        'Points beyond this range are not used for lines (m), nor are those beyond the usable '
+        'range of the laser, max_range_m. Lower it for a laser whose beams are so far apart that '
+        'distant points are too sparse to be a wall.',
         low=1.0,
         high=200.0,
     )
@@ -117,8 +112,8 @@ def extract_lines(scan: Scan, config: LineConfig) -> Lines:
     beams = np.flatnonzero(scan.hit & (scan.ranges_m < config.max_range_m))
     if beams.size < config.min_points:
         return no_lines()
-    split_m = max(config.split_distance_m, config.split_sigmas * config.range_noise_m)
-    sigmas = np.array([config.range_noise_m, config.bearing_noise_rad, split_m])
+    split_m = max(config.split_distance_m, config.split_sigmas * config.laser_range_noise_m)
+    sigmas = np.array([config.laser_range_noise_m, config.bearing_noise_rad, split_m])
     ranges = scan.ranges_m[beams]
     angles = scan.angles_rad[beams]
     x = ranges * np.cos(angles)

@@ -80,8 +80,10 @@ class OccupancyConfig(Config):
     )
     no_return_clear_range_m: float = parameter(
         NO_RETURN_CLEAR_RANGE_M,
-        'Range up to which a beam without return clears cells (m). 0: it clears nothing. A laser '
-        'that often has no return from walls is recognized, and its beams clear nothing either.',
+        'Range up to which a beam without return clears cells (m), at most max_range_m. Lower it '
+        'for a laser that measures walls farther than it sees dark ones. 0: it clears nothing. A '
+        'laser that often has no return from walls is recognized, and its beams clear nothing '
+        'either.',
         low=0.0,
         high=200.0,
     )
@@ -112,8 +114,8 @@ class WindowConfig(Config):
 
     local_map_size_m: float = parameter(
         16.0,
-        'Side length of local_grid, centred on the robot (m). Set it to twice the range of the '
-        'laser; lower: less computing time.',
+        'Side length of local_grid, centred on the robot (m). Twice max_range_m holds all that a '
+        'scan changes; lower: less computing time.',
         low=2.0,
         high=100.0,
     )

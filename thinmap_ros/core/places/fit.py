@@ -34,7 +34,7 @@ def usual_share(
     for _ in range(_TRIALS):
         T = random_pose(places, rng)
         scan = simulated_scan(places, T, like)
-        noisy = scan.ranges_m + rng.normal(0.0, config.range_noise_m, scan.ranges_m.size)
+        noisy = scan.ranges_m + rng.normal(0.0, config.beam_noise_m, scan.ranges_m.size)
         seen = observed_beams(replace(scan, ranges_m=noisy), config)
         noise = (config.map_noise_m, config.map_noise_m, config.heading_noise_rad)
         off = rng.normal(size=3) * noise

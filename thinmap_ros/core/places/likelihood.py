@@ -48,7 +48,7 @@ class Judge:
         self._origin = (places.frame.origin_x, places.frame.origin_y)
         # A wall lies anywhere in its cell, and so does the end of a beam: uniform, twice.
         cells = places.frame.resolution / math.sqrt(6.0)
-        sigma = math.sqrt(config.range_noise_m**2 + config.map_noise_m**2 + cells**2)
+        sigma = math.sqrt(config.beam_noise_m**2 + config.map_noise_m**2 + cells**2)
         self.tolerance = (_SIGMAS * sigma, _SIGMAS * config.heading_noise_rad)
         off = np.arange(256) * NEAR_UNIT_M / sigma
         bell = np.exp(-0.5 * off**2)

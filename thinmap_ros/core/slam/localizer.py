@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.covariances import rotated_covariance
+from thinmap_ros.core.ekf_slam.features import LineFeature
 from thinmap_ros.core.ekf_slam.models import odometry_variances
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.patch import GridPatch
@@ -29,6 +30,7 @@ from thinmap_ros.core.slam.matching import local_map
 from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.slam.tracker import Tracked, Tracker
+from thinmap_ros.core.topology.graph import TopologicalMap
 
 
 class Localizer:
@@ -75,6 +77,14 @@ class Localizer:
     def keyframes(self) -> list[Keyframe]:
         """The keyframes, at their optimized poses."""
         return self._mapping.loops.keyframes.frames
+
+    @property
+    def features(self) -> list[LineFeature]:
+        """Line features of the map: none, as it is made of scan points."""
+        return []
+
+    def set_topology(self, topology: TopologicalMap) -> None:
+        """Ignore the topological map, with which only a filter selects its local area."""
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Set the pose (3,) with covariance (3, 3) in the current map.

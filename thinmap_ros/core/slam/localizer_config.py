@@ -1,19 +1,23 @@
 """Parameters of the localizer and of its parts."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from thinmap_ros.core.config import parameter, parameters_of, part
-from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
+from thinmap_ros.core.ekf_slam.line_extraction import LineConfig
 from thinmap_ros.core.slam.graph.keyframes import KeyframeConfig
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MatchingConfig
 from thinmap_ros.core.slam.motion_model import MotionConfig
+from thinmap_ros.core.start import SCAN_MATCHING, StartConfig
 
 
 @dataclass(frozen=True)
-class LocalizerConfig(EkfConfig):
+class LocalizerConfig(StartConfig):
     """Parameters of the localizer and of its parts."""
+
+    of_slam: ClassVar[tuple[str, ...]] = (SCAN_MATCHING,)
 
     lost_threshold: float = parameter(
         4.0,
@@ -24,6 +28,7 @@ class LocalizerConfig(EkfConfig):
         high=1000.0,
     )
     odometry: MotionConfig = part(MotionConfig)
+    lines: LineConfig = part(LineConfig)
     matching: MatchingConfig = part(MatchingConfig)
     local_map: LocalMapConfig = part(LocalMapConfig)
     keyframes: KeyframeConfig = part(KeyframeConfig)

@@ -8,7 +8,6 @@ import numpy as np
 from thinmap_ros.core.ekf_slam.features import LineFeature
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array, wrap
-from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation import map_errors
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
@@ -76,7 +75,7 @@ class _Glance:
         if k == self.number:
             self.patch = pipeline.grid.known_area()
             self.graph = pipeline.topology.map.copy()
-            self.features = line_features(pipeline.localizer)
+            self.features = pipeline.localizer.features
             self.pose = step.estimate.T_map_base
 
 
@@ -231,7 +230,7 @@ def _path_rows(ti: Run, full: Run) -> list[list[float]]:
 
 
 def _feature_rows(pipeline: Pipeline) -> Rows:
-    found = sorted(line_features(pipeline.localizer), key=lambda feature: feature.id)
+    found = sorted(pipeline.localizer.features, key=lambda feature: feature.id)
     return [[f.id, f.r_m, f.alpha_rad, float(np.hypot(*(f.end - f.start))), f.local] for f in found]
 
 
@@ -261,7 +260,7 @@ def _local_area(glance: _Glance) -> Plot:
 def _paths(ti: Run, full: Run) -> Plot:
     panels = []
     for done, name in ((full, '(a) conventional EKF-SLAM'), (ti, '(b) EKF-SLAM/TI')):
-        features = line_features(done.pipeline.localizer)
+        features = done.pipeline.localizer.features
         odometry = np.array(done.odometry)
         estimate = np.array(done.estimate)
         layers: list[Layer] = [

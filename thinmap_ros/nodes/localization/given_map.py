@@ -6,8 +6,8 @@ from thinmap_msgs.msg import SlamStatus
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer
+from thinmap_ros.core.start import StartConfig
 from thinmap_ros.nodes.localization.amcl_interface import AmclInterface
 from thinmap_ros.nodes.localization.config import GIVEN_COVARIANCE, LocalizationConfig
 from thinmap_ros.nodes.localization.initial_poses import InitialPoses
@@ -26,7 +26,7 @@ class GivenMap:
     config: of the next localizer.
     """
 
-    def __init__(self, node: ThinmapNode, config: LocalizerConfig) -> None:
+    def __init__(self, node: ThinmapNode, config: StartConfig) -> None:
         """Declare the parameters. Raises ConfigError or InputError as `MapSource`."""
         self._node = node
         self.config = config
@@ -121,7 +121,7 @@ class GivenMap:
         return localizer
 
 
-def config_at(config: LocalizerConfig, T_map_base: Array) -> LocalizerConfig:
+def config_at(config: StartConfig, T_map_base: Array) -> StartConfig:
     """The configuration with a start pose (3,)."""
     x, y, yaw = T_map_base.tolist()
     return replace(config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)

@@ -10,6 +10,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
+from thinmap_ros.core.start import StartConfig
 from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import Report, read_map
 from thinmap_ros.files.sessions import LOCALIZER
@@ -27,7 +28,7 @@ class MapSource:
 
     def __init__(
         self,
-        config: LocalizerConfig,
+        config: StartConfig,
         localization: LocalizationConfig,
         session: str,
         report: Report,
@@ -48,7 +49,7 @@ class MapSource:
             if file:
                 raise ConfigError('map_file_name is given: expected mode = localization')
             return
-        if not session and localizer_class(config) is not Localizer:
+        if not session and not isinstance(config, LocalizerConfig):
             raise ConfigError(
                 f'mode = localization with slam = {config.slam}: expected a session_path with its '
                 'line features'
@@ -70,9 +71,9 @@ class MapSource:
         """Whether the map is the one of a file in mode localization."""
         return not self._is_mapping and not self._session and not self._is_topic
 
-    def create_localizer(self, config: LocalizerConfig) -> AnyLocalizer:
+    def create_localizer(self, config: StartConfig) -> AnyLocalizer:
         """A localizer at the configured pose, delocalized if in a given map."""
-        if self.patch is not None:
+        if self.patch is not None and isinstance(config, LocalizerConfig):
             return Localizer.in_occupancy_map(self.patch, config)
         if self._session:
             loaded = load_localizer(self._session, config, report=self._report)
@@ -108,7 +109,7 @@ class MapSource:
 
 
 def load_localizer(
-    path: str, config: LocalizerConfig, folder: Path | None = None, *, report: Report
+    path: str, config: StartConfig, folder: Path | None = None, *, report: Report
 ) -> AnyLocalizer | None:
     """Localizer in the map of a session, or in its grid: any map_server map.
 
@@ -116,7 +117,7 @@ def load_localizer(
     Raises InputError where a file is broken, or the path names no map.
     """
     loaded = LOCALIZER.load_optional(path, config)
-    if loaded is not None or localizer_class(config) is not Localizer:
+    if loaded is not None or not isinstance(config, LocalizerConfig):
         return loaded
     grid = sessions.load_grid(path, None, folder, report)
     return Localizer.in_occupancy_map(grid.known_area(), config)

@@ -32,7 +32,8 @@ class MatchingConfig(Config):
 
     noise_m: float = parameter(
         0.05,
-        'Standard deviation of a scan point around its wall (m). Raise it for a noisy laser or '
+        'Standard deviation of a scan point around its wall (m): by rough walls, cells of the map '
+        'and the bend of a sweep more than by laser_range_noise_m. Raise it for a noisy laser or '
         'rough walls, lower it to trust scans more than odometry.',
         low=0.001,
         high=1.0,
