@@ -28,7 +28,7 @@ from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M
-from thinmap_ros.core.grid.patch import Bounds, GridPatch
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
@@ -218,14 +218,13 @@ def grid_msg(patch: GridPatch, frame_id: str, ns: int, load_ns: int = 0) -> Occu
 
 
 def map_update_msg(
-    patch: GridPatch, changed: Bounds, frame_id: str, ns: int
+    whole: GridPatch, part: GridPatch, frame_id: str, ns: int
 ) -> OccupancyGridUpdate:
-    """Message with the changed part of a map."""
-    row, col, end_row, end_col = changed
+    """Message with the part of a whole map that has changed."""
+    row, col = whole.offset_of(part)
     update = OccupancyGridUpdate(header=header(frame_id, ns), x=col, y=row)
-    update.width = end_col - col
-    update.height = end_row - row
-    update.data = _int8_array(patch.part(changed).cells)
+    update.height, update.width = part.shape
+    update.data = _int8_array(part.cells)
     return update
 
 

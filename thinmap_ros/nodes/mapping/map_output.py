@@ -33,11 +33,11 @@ class MapPublishers:
         """Publish what of map and grid has changed since the last call."""
         identity = MapIdentity(self.load_ns, grid.corrected_ns, self.followed.id, self.config)
         version = MapVersion(identity, grid.shown.known_area(), stamp_ns)
-        before = self._published
-        if before is None or version.differs(before):
-            self._published = version
+        changed = version.changes_since(self._published)
+        self._published = version
+        if changed is not None:
             self._grid.publish(self._grid_message(version.patch, stamp_ns, grid.corrected_ns))
-        self._map.publish(version)
+        self._map.publish(version, changed)
 
     def map_message(self, patch: GridPatch, stamp_ns: int) -> OccupancyGrid:
         """Message of the topic map."""

@@ -7,7 +7,7 @@ from nav_msgs.msg import MapMetaData, OccupancyGrid
 from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
 from rclpy.node import Node
 
-from thinmap_ros.core.grid.patch import GridPatch, Margins
+from thinmap_ros.core.grid.patch import Bounds, GridPatch, Margins
 from thinmap_ros.nodes.mapping.map_version import MapVersion
 from thinmap_ros.ros import diagnostics, messages, qos
 from thinmap_ros.ros.decoding.map_updates import updates_topic
@@ -44,35 +44,51 @@ class MapTopic:
         self._shown: GridPatch | None = None  # what those know who have all messages
         self._calls_behind = 0  # since the newest whole map is out of date
 
-    def publish(self, version: MapVersion) -> None:
-        """Publish what has changed since the last call."""
+    def publish(self, version: MapVersion, changed: Bounds | None) -> None:
+        """Publish what has changed since the last call.
+
+        changed: bounds within the version of all cells that may have; None: none has.
+        """
         before = self._newest
         self._newest = version
-        shown = version.shown()
         if self._shown is None or before is None or not version.extends(before):
-            self._publish_whole(version, shown)
+            self._publish_whole(version, version.shown())
+        elif any(margins := self._shown.overhang_of(version.patch)):
+            self._publish_larger(version, self._shown.padded(_with_room(self._shown, margins)))
         else:
-            self._publish_changes(version, self._shown, shown)
+            self._publish_changes(version, None if changed is None else version.shown(changed))
 
-    def _publish_changes(self, version: MapVersion, before: GridPatch, shown: GridPatch) -> None:
-        needs_whole = self._has_subscriber_of_map_alone()
-        margins = before.overhang_of(shown)
-        if any(margins):
-            wide = before.padded(_with_room(before, margins))
-            self._publish_whole(version, shown if needs_whole else _pasted(wide, shown))
+    def _publish_larger(self, version: MapVersion, wide: GridPatch) -> None:
+        shown = version.shown()
+        if not self._has_subscriber_of_map_alone():
+            shown = wide.with_part(*wide.offset_of(shown), shown.cells)
+        self._publish_whole(version, shown)
+
+    def _publish_changes(self, version: MapVersion, part: GridPatch | None) -> None:
+        changed = None if part is None else self._take_in(part)
+        if self._shown is None or (changed is None and not self._calls_behind):
             return
-        newest = _pasted(before, shown)
-        changed = newest.changes_since(before)
-        if changed is None and not self._calls_behind:
-            return
-        self._shown = newest
         self._calls_behind += 1
-        if needs_whole or self._calls_behind > _CALLS_BEHIND:
-            self._publish_whole(version, shown if needs_whole else newest)
+        if self._has_subscriber_of_map_alone():
+            self._publish_whole(version, version.shown())
+        elif self._calls_behind > _CALLS_BEHIND:
+            self._publish_whole(version, self._shown)
         elif changed is not None:
             self._updates.publish(
-                messages.map_update_msg(newest, changed, self._frame_id, version.stamp_ns)
+                messages.map_update_msg(self._shown, changed, self._frame_id, version.stamp_ns)
             )
+
+    def _take_in(self, part: GridPatch) -> GridPatch | None:
+        """Take a part into what is shown; returns the rectangle that has changed, if any has."""
+        if self._shown is None:
+            return None
+        row, col = self._shown.offset_of(part)
+        rows, cols = part.shape
+        changed = part.changes_since(self._shown.part((row, col, row + rows, col + cols)))
+        if changed is None:
+            return None
+        self._shown = self._shown.with_part(row, col, part.cells)
+        return part.part(changed)
 
     def _has_subscriber_of_map_alone(self) -> bool:
         """Whether a node subscribes to map more often than to map_updates."""
@@ -108,7 +124,3 @@ def _with_room(patch: GridPatch, margins: Margins) -> Margins:
         bottom + rows if bottom else 0,
         right + cols if right else 0,
     )
-
-
-def _pasted(wide: GridPatch, patch: GridPatch) -> GridPatch:
-    return wide.with_part(*wide.offset_of(patch), patch.cells)

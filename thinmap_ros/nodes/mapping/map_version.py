@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import Bounds, GridPatch
 from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
 
 
@@ -30,15 +30,19 @@ class MapVersion:
             return False
         return not any(self.patch.overhang_of(before.patch))
 
-    def differs(self, before: 'MapVersion') -> bool:
-        """Whether anything differs from a version before."""
-        return (
-            self.identity != before.identity
-            or self.patch.frame != before.patch.frame
-            or self.patch.shape != before.patch.shape
-            or self.patch.changes_since(before.patch) is not None
+    def changes_since(self, before: 'MapVersion | None') -> Bounds | None:
+        """Bounds of all cells that differ from a version before; None: nothing differs."""
+        is_same_rectangle = (
+            before is not None
+            and self.identity == before.identity
+            and self.patch.frame == before.patch.frame
+            and self.patch.shape == before.patch.shape
         )
+        if before is None or not is_same_rectangle:
+            return (0, 0, *self.patch.shape)
+        return self.patch.changes_since(before.patch)
 
-    def shown(self) -> GridPatch:
-        """The cells with the values to publish."""
-        return self.identity.config.shown(self.patch)
+    def shown(self, bounds: Bounds | None = None) -> GridPatch:
+        """The cells within bounds, or all, with the values to publish."""
+        part = self.patch if bounds is None else self.patch.part(bounds)
+        return self.identity.config.shown(part)
