@@ -53,7 +53,7 @@ def present(graph):
 
 
 class Following:
-    """A mapper whose only subscriber follows map and map_updates; its clock goes on in steps."""
+    """A mapper whose only subscriber follows map and map_updates; its clock advances in steps."""
 
     def __init__(self, graph):
         self.graph = graph

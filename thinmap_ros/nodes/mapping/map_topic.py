@@ -12,8 +12,8 @@ from thinmap_ros.nodes.mapping.map_version import MapVersion
 from thinmap_ros.ros import diagnostics, messages, qos
 from thinmap_ros.ros.decoding.map_updates import updates_topic
 
-# Calls after which a whole map follows an update, whoever subscribes: an update that was lost, for
-# a reason that no publisher knows, is missing for so long.
+# Calls after which a whole map follows an update: one that was lost, for a reason that no
+# publisher knows, is missing for so long.
 _CALLS_BEHIND = 10
 # Room of a map that grows, a share of its length: it grows again when the room is used up.
 _ROOM = 0.25

@@ -9,6 +9,7 @@ from support.slam_room import ROOM, corridor_ring, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.covariances import inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph import loop_closure as module
+from thinmap_ros.core.slam.graph.consistency import largest_consistent
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Step
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
@@ -219,15 +220,15 @@ def same_correction(loops, number):
 
 def test_matches_that_ask_for_the_same_are_consistent(straight):
     edges = same_correction(straight, 5)
-    straight._requested.extend(edges)
-    assert set(map(id, straight._consistent(list(straight._requested)))) == set(map(id, edges))
+    found = largest_consistent(edges, straight.keyframes.frames)
+    assert set(map(id, found)) == set(map(id, edges))
 
 
 def test_a_false_match_is_left_out_of_consistent_ones(straight):
     edges = same_correction(straight, 5)
     false = edge_to(straight, 3, 16, [3.0, -1.0, 0.4])
-    straight._requested.extend([edges[0], false, *edges[1:]])
-    assert set(map(id, straight._consistent(list(straight._requested)))) == set(map(id, edges))
+    found = largest_consistent([edges[0], false, *edges[1:]], straight.keyframes.frames)
+    assert set(map(id, found)) == set(map(id, edges))
 
 
 @pytest.mark.parametrize(('matches', 'inlier_ratio', 'closes'), [(4, 0.95, True), (4, 0.9, False)])
@@ -258,7 +259,7 @@ def test_matches_that_contradict_each_other_close_nothing(straight, rng):
     for k in range(8):
         off = np.array([3.0 * np.cos(2.0 * k), 3.0 * np.sin(2.0 * k), 0.3 * k])
         straight._requested.append(edge_to(straight, k, 22 - k, off))
-    assert len(straight._consistent(list(straight._requested))) == 1
+    assert len(largest_consistent(straight._requested, straight.keyframes.frames)) == 1
     assert straight.step() is None
     assert straight._optimization is None
     assert not straight.edges
@@ -267,7 +268,7 @@ def test_matches_that_contradict_each_other_close_nothing(straight, rng):
 def test_matches_of_one_keyframe_do_not_confirm_each_other(straight):
     one = same_correction(straight, 1)[0]
     straight._requested.extend([one, replace(one)])
-    assert len(straight._consistent(list(straight._requested))) == 1
+    assert len(largest_consistent(straight._requested, straight.keyframes.frames)) == 1
 
 
 def test_a_step_does_one_match_or_one_round(monkeypatch):

@@ -3,8 +3,6 @@
 A new keyframe is matched with submaps of earlier visits within its covariance along the graph.
 Several mutually consistent matches close a loop. Then the pose graph is optimized, one iteration
 per step.
-Source: Mangelson et al., "Pairwise consistent measurement set maximization for robust multi-robot
-map merging", 2018.
 """
 
 import math
@@ -26,6 +24,7 @@ from thinmap_ros.core.covariances import (
 from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import CHI2
+from thinmap_ros.core.slam.graph.consistency import largest_consistent
 from thinmap_ros.core.slam.graph.keyframes import (
     Anchor,
     Keyframe,
@@ -293,11 +292,11 @@ class LoopClosure:
     def _closing_edges(self) -> list[Edge]:
         """Loop edges that enough matches agree on, within a piece or between two."""
         fewest = self._config.min_consistent_matches
-        consistent = self._consistent(list(self._requested))
+        consistent = largest_consistent(self._requested, self.keyframes.frames)
         evidence = sum(edge.inlier_ratio for edge in consistent)
         if consistent and evidence >= fewest * self._config.min_inlier_ratio:
             return consistent
-        return self.pieces.take_edges(self.keyframes.frames, self._consistent, fewest)
+        return self.pieces.take_edges(self.keyframes.frames, fewest)
 
     def _optimize(self, optimization: _Optimization) -> Correction | None:
         after = next(optimization.rounds, None)
@@ -432,39 +431,6 @@ class LoopClosure:
         off = edge.T_a_b - T
         off[2] = se2.wrap(float(off[2]))
         return float(off @ edge.information @ off)
-
-    def _consistent(self, candidates: list[Edge]) -> list[Edge]:
-        """Largest set of candidates that agree on the same correction (greedy)."""
-        edges = [edge for edge in candidates if edge.b < len(self.keyframes)]
-        if not edges:
-            return []
-        n = len(edges)
-        agree = np.eye(n, dtype=np.bool_)
-        for i in range(n):
-            for j in range(i):
-                agree[i, j] = agree[j, i] = self._are_consistent(edges[i], edges[j])
-        best: list[int] = []
-        for i in range(n):
-            chosen = [i]
-            for j in np.argsort(-agree.sum(axis=0)):
-                if j != i and all(agree[j, k] for k in chosen):
-                    chosen.append(int(j))
-            best = max(best, chosen, key=len)
-        return [edges[i] for i in best] if len({edges[i].b for i in best}) == len(best) else []
-
-    def _are_consistent(self, one: Edge, other: Edge) -> bool:
-        """Whether the loop over two matches and the path between them closes within the gate."""
-        if one.b == other.b:
-            return False
-        frames = self.keyframes.frames
-        T_a_a = se2.between(frames[one.a].T_map_base, frames[other.a].T_map_base)
-        T_b_b = se2.between(frames[one.b].T_map_base, frames[other.b].T_map_base)
-        there = se2.compose(one.T_a_b, T_b_b)
-        back = se2.compose(T_a_a, other.T_a_b)
-        off = se2.pose_difference(there, back)
-        covariance = inverse(one.information) + inverse(other.information)
-        covariance[2, 2] += 1e-6
-        return float(off @ np.linalg.solve(covariance, off)) < CHI2
 
     def _frame(self, k: int) -> Keyframe:
         pending = self._pending

@@ -2,9 +2,10 @@
 
 import math
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph.consistency import largest_consistent
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 
@@ -65,12 +66,7 @@ class Pieces:
         """Add a match of a keyframe in the robot's piece, edge.b, with one in another piece."""
         self._matches.append(edge)
 
-    def take_edges(
-        self,
-        frames: Sequence[Keyframe],
-        largest_consistent: Callable[[list[Edge]], list[Edge]],
-        fewest: int,
-    ) -> list[Edge]:
+    def take_edges(self, frames: Sequence[Keyframe], fewest: int) -> list[Edge]:
         """Loop edges that join the robot's piece with another one; none while too few agree.
 
         fewest: matches, each of another view, that join two pieces.
@@ -80,7 +76,7 @@ class Pieces:
             if self.is_here(frames[edge.b].submap):
                 of_piece[self._piece_of[frames[edge.a].submap]].append(edge)
         for edges in of_piece.values():
-            agreeing = largest_consistent(edges)
+            agreeing = largest_consistent(edges, frames)
             if _count_views([frames[edge.b].T_map_base for edge in agreeing]) >= fewest:
                 self._matches.clear()
                 return agreeing
