@@ -85,6 +85,10 @@ class OdometryCalibration:
         """Number of spans that the parameters were estimated from."""
         return len(self._spans)
 
+    def covariance_of(self, derivative: Array) -> Array:
+        """Covariance (N, N) of what has a derivative (N, 4) by the parameters."""
+        return np.asarray(derivative @ self.covariance @ derivative.T)
+
     def smoothed(self) -> Array:
         """Parameters (N, 4) after each number of spans, as all spans together have them."""
         return self._spans.smoothed()

@@ -123,8 +123,8 @@ class Tracker:
 
     def covariance(self, anchor: Anchor) -> Array:
         """Covariance (3, 3) of the pose, map frame."""
-        by = self.systematic(anchor)
-        total = self.random_covariance(anchor) + by @ self.prediction.calibration.covariance @ by.T
+        systematic = self.prediction.calibration.covariance_of(self.systematic(anchor))
+        total = self.random_covariance(anchor) + systematic
         return np.asarray(0.5 * (total + total.T))
 
     def _is_stationary(self, prediction: Prediction) -> bool:

@@ -168,6 +168,10 @@ class Keyframes:
         """Number of the last added or reused keyframe; -1 before the first."""
         return self._path.last
 
+    def is_step(self, j: int, k: int) -> bool:
+        """Whether keyframe j was the anchor of keyframe k."""
+        return k < len(self.frames) and self.steps[k - 1].a == j
+
     @property
     def T_anchor_last(self) -> Array:  # noqa: N802
         """Pose (3,) of the last keyframe scan relative to its keyframe: 0 unless it reuses one."""

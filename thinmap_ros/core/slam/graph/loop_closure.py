@@ -1,13 +1,11 @@
 """Loop closure: matches keyframes with earlier visits and optimizes the pose graph.
 
 A new keyframe is matched with submaps of earlier visits within its covariance along the graph.
-Several mutually consistent matches close a loop. Then the pose graph is optimized, one iteration
-per step.
+Several mutually consistent matches close a loop. Then the pose graph is optimized.
 """
 
 import math
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +23,7 @@ from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import CHI2
 from thinmap_ros.core.slam.graph.consistency import largest_consistent
+from thinmap_ros.core.slam.graph.keyframe_graph import KeyframeGraph
 from thinmap_ros.core.slam.graph.keyframes import (
     Anchor,
     Keyframe,
@@ -34,13 +33,12 @@ from thinmap_ros.core.slam.graph.keyframes import (
     view_difference_m,
 )
 from thinmap_ros.core.slam.graph.pieces import Pieces
-from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized, rounds
+from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
-_MIN_MOVE_M = 0.1  # smallest move of a keyframe for which the map follows the calibration
 _RECENT = 8  # recent candidates among which consistent ones are searched
 # Scans within which a keyframe is matched. With three matches for each of the scans of a sparse
 # log, and one done at a time, a loop was closed up to 344 scans after its keyframes.
@@ -96,6 +94,10 @@ class LoopClosureConfig(Config):
     search_sigmas: float = 3.0
     max_uncertainty_m: float = 8.0
 
+    def reach_m(self, sigma: float) -> float:
+        """Radius (m) in which keyframes are matched, for a position of uncertainty sigma, m."""
+        return self.search_radius_m + min(self.search_sigmas * sigma, self.max_uncertainty_m)
+
 
 @dataclass(frozen=True, eq=False)
 class _Job:
@@ -115,16 +117,8 @@ class _Pending:
     T_anchor_frame: Array
 
 
-@dataclass(eq=False)
-class _Optimization:
-    """An optimization in progress: its rounds, and the poses (N, 3) after the last one."""
-
-    rounds: Iterator[Array]
-    poses: Array
-
-
 class LoopClosure:
-    """The pose graph of the keyframes, and the search for loop-closure edges."""
+    """The search for edges of the pose graph between keyframes of different visits."""
 
     def __init__(
         self,
@@ -137,14 +131,13 @@ class LoopClosure:
         """calibration: of the odometry, as another part estimates it."""
         self._calibration = calibration
         self.keyframes = Keyframes(keyframes)
-        self.edges: list[Edge] = []
+        self.graph = KeyframeGraph(self.keyframes, calibration)
         self.pieces = Pieces()
         self.adjust(config, matching)
         self._jobs: deque[list[_Job]] = deque([[]], maxlen=_LATEST)  # by the scan that began them
         self._pending: _Pending | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
         self._submaps = Submaps(local_map)
-        self._optimization: _Optimization | None = None
 
     def adjust(self, config: LoopClosureConfig, matching: MatchingConfig) -> None:
         """Search with other parameters from now on; keyframes and edges stay."""
@@ -202,9 +195,9 @@ class LoopClosure:
     def _earlier_visits(self, here: Keyframe) -> list[_Job]:
         """Jobs for the most similar keyframe of each earlier visit, the most similar first."""
         frames = self.keyframes.frames
-        covariance = here.covariance + self._systematic_covariance(here.systematic)
+        covariance = here.covariance + self._calibration.covariance_of(here.systematic)
         spread = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
-        near = self.keyframes.near(here.T_map_base, self._reach_m(spread))
+        near = self.keyframes.near(here.T_map_base, self._config.reach_m(spread))
         near = [j for j in near if self._is_earlier(j, here)]
         if not near:
             return []
@@ -212,7 +205,9 @@ class LoopClosure:
         ranked = []
         for i, (j, covariance) in enumerate(zip(near, covariances, strict=True)):
             sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
-            if math.dist(frames[j].T_map_base[:2], here.T_map_base[:2]) <= self._reach_m(sigma):
+            if math.dist(frames[j].T_map_base[:2], here.T_map_base[:2]) <= self._config.reach_m(
+                sigma
+            ):
                 ranked.append((view_difference_m(frames[j].T_map_base, here.T_map_base), i))
         ranked.sort()
         found: list[_Job] = []
@@ -221,11 +216,6 @@ class LoopClosure:
             if all(abs(path_m - frames[job.j].path_m) > AGAIN_M for job in found):
                 found.append(_Job(near[i], len(frames), covariances[i]))
         return found[: self._config.max_visits]
-
-    def _reach_m(self, sigma: float) -> float:
-        """Radius (m) in which keyframes are matched, for a position of uncertainty sigma, m."""
-        config = self._config
-        return config.search_radius_m + min(config.search_sigmas * sigma, config.max_uncertainty_m)
 
     def _is_earlier(self, j: int, here: Keyframe) -> bool:
         if j == self.keyframes.anchor:  # of another submap: the step is measured again
@@ -239,7 +229,7 @@ class LoopClosure:
         keyframes = self.keyframes
         poses = keyframes.poses()
         anchor = keyframes.anchor
-        covariances, derivatives = keyframes.covariances_from(anchor, poses, self.edges)
+        covariances, derivatives = keyframes.covariances_from(anchor, poses, self.graph.edges)
         step = self._pending.step
         yaw = float(poses[anchor, 2])
         moved = rotation(yaw) @ step.systematic.derivative
@@ -250,17 +240,13 @@ class LoopClosure:
             covariance = propagated_covariance(covariances[j], to_anchor + from_anchor)
             by = moved - carried(derivatives[j], to_anchor + from_anchor)
             covariance = covariance + rotated_covariance(step.covariance, yaw)
-            found.append(covariance + self._systematic_covariance(by))
+            found.append(covariance + self._calibration.covariance_of(by))
         return found
-
-    def _systematic_covariance(self, derivative: Array) -> Array:
-        """Covariance (3, 3) of a pose with a derivative (3, 4) by the calibration."""
-        return np.asarray(derivative @ self._calibration.covariance @ derivative.T)
 
     @property
     def is_busy(self) -> bool:
         """Whether there are pending matches, or an optimization is in progress."""
-        return any(self._jobs) or self._optimization is not None
+        return any(self._jobs) or self.graph.is_moving
 
     def step(self) -> Correction | None:
         """Do one pending match, or one iteration of the optimization; called once per scan.
@@ -269,14 +255,21 @@ class LoopClosure:
         optimization has finished.
         """
         correction = None
-        if self._optimization is not None:
-            correction = self._optimize(self._optimization)
+        if self.graph.is_moving:
+            correction = self._move()
         elif any(self._jobs):
             self._match(next(jobs for jobs in reversed(self._jobs) if jobs).pop(0))
             self._close()
-        elif self._is_calibration_new():
-            self._follow_calibration()
+        else:
+            self.graph.follow_calibration()
         self._jobs.append([])
+        return correction
+
+    def _move(self) -> Correction | None:
+        correction = self.graph.step()
+        if correction is not None:
+            self._submaps.clear()
+            self.pieces.join(self.keyframes.frames, self.graph.edges)
         return correction
 
     def _close(self) -> None:
@@ -286,8 +279,8 @@ class LoopClosure:
         if edges := self._closing_edges():
             self._add_pending()
             self._requested.clear()
-            self.edges += edges
-            self._begin_rounds()
+            self.graph.edges += edges
+            self.graph.optimize()
 
     def _closing_edges(self) -> list[Edge]:
         """Loop edges that enough matches agree on, within a piece or between two."""
@@ -298,77 +291,13 @@ class LoopClosure:
             return consistent
         return self.pieces.take_edges(self.keyframes.frames, fewest)
 
-    def _optimize(self, optimization: _Optimization) -> Correction | None:
-        after = next(optimization.rounds, None)
-        if after is not None:
-            optimization.poses = after
-            return None
-        self._optimization = None
-        poses = optimization.poses
-        # Keyframes that were added during the optimization move with their anchors.
-        for added in self.keyframes.steps[len(poses) - 1 :]:
-            poses = np.vstack([poses, se2.compose(poses[added.a], added.T_a_b)])
-        before = self.keyframes.poses()
-        self.keyframes.move(poses, self.edges)
-        self._submaps.clear()
-        self.pieces.join(self.keyframes.frames, self.edges)
-        return Correction(before, poses)
-
-    def _is_step(self, j: int, k: int) -> bool:
-        """Whether keyframe j was the anchor of keyframe k."""
-        return k < len(self.keyframes) and self.keyframes.steps[k - 1].a == j
-
-    def _begin_rounds(self) -> None:
-        self._calibrate(self._calibration.smoothed())
-        poses = self.keyframes.poses()
-        self._optimization = _Optimization(rounds(poses, self._all_edges), poses)
-
-    def _calibrate(self, parameters: Array) -> None:
-        """Correct the edges by parameters (N, 4) of the calibration."""
-        self.keyframes.calibrate(parameters)
-        self.edges = [edge.calibrated(parameters) for edge in self.edges]
-        self._calibration.applied = parameters[-1]
-
-    def _follow_calibration(self) -> None:
-        """Begin to move the poses by what is newly known of the calibration, and by nothing else.
-
-        The maps of loops that were accepted without an optimization agree within their noise. What
-        remains of their errors is no news: it stays until a loop closes.
-        """
-        parameters = self._calibration.smoothed()
-        poses = self.keyframes.poses()
-        settled = [edge.settled(poses, parameters) for edge in self._all_edges]
-        moving = rounds(poses, settled)
-        moved = next(moving)
-        self._calibration.applied = parameters[-1]
-        last = self.keyframes.anchor
-        if math.dist(moved[last, :2], poses[last, :2]) > _MIN_MOVE_M:
-            self._calibrate(parameters)
-            self._optimization = _Optimization(moving, moved)
-
-    def _is_calibration_new(self) -> bool:
-        """Whether the calibration may move the last keyframe by more than it is uncertain itself.
-
-        The parameters have a random walk: what they are now is not what they were.
-        """
-        if len(self.keyframes) < 2:
-            return False
-        by = self.keyframes.frames[self.keyframes.anchor].systematic[:2]
-        off = by @ (self._calibration.parameters - self._calibration.applied)
-        variance = float(np.trace(by @ self._calibration.covariance @ by.T))
-        return float(off @ off) > max(_MIN_MOVE_M**2, variance)
-
-    @property
-    def _all_edges(self) -> list[Edge]:
-        return self.keyframes.steps + self.edges + self.keyframes.headings
-
     def _match(self, job: _Job) -> None:
         """Match keyframe k, or the pending one, with the submap around j; add the edge."""
         j = job.j
         k = job.k
         here = self._frame(k)
         frames = self.keyframes.frames
-        is_step = self._is_step(j, k)
+        is_step = self.keyframes.is_step(j, k)
         if is_step:
             base, submap = self._submaps.before(frames, j)
         else:
@@ -393,7 +322,7 @@ class LoopClosure:
             self._add_pending()
             self.pieces.add_match(edge)
         elif is_step:
-            self.edges.append(edge)  # the next loop corrects poses that contradict it
+            self.graph.edges.append(edge)  # the next loop corrects poses that contradict it
         elif self._mahalanobis(edge) < CHI2:
             self._confirm(edge)
         else:
@@ -419,11 +348,13 @@ class LoopClosure:
                 covariance = propagated_covariance(covariance + step.covariance, lever)
                 share = step.systematic
                 share = replace(share, derivative=carried(share.derivative, lever))
-                self.edges.append(Edge(anchor, edge.a, T_a_j, inverse(covariance), True, share))
+                self.graph.edges.append(
+                    Edge(anchor, edge.a, T_a_j, inverse(covariance), True, share)
+                )
             self._reuse_keyframe(edge.a)
             return
         self._add_pending()
-        self.edges.append(edge)
+        self.graph.edges.append(edge)
 
     def _mahalanobis(self, edge: Edge) -> float:
         """Squared Mahalanobis distance of an edge from the current poses, by its information."""
@@ -473,5 +404,4 @@ class LoopClosure:
         while self.is_busy:
             self.step()
         self._add_pending()
-        self._calibrate(self._calibration.smoothed())
-        return optimized(self.keyframes.poses(), self._all_edges)
+        return self.graph.optimized()
