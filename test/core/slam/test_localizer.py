@@ -813,7 +813,7 @@ def test_a_state_with_more_hits_than_observations_in_one_cell_is_refused(whole_d
 
 def is_loop_found(localizer):
     """Whether the last keyframes are tied to the first ones round the block."""
-    return any(edge.b - edge.a > 50 for edge in localizer._mapping.loops.graph.edges)
+    return any(edge.b - edge.a > 50 for edge in localizer._map.loops.graph.edges)
 
 
 def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed_well():
@@ -857,7 +857,7 @@ def test_the_path_at_the_end_holds_the_loop_that_is_being_closed_and_the_pose_fo
     localizer = at_start(initial_x_m=3.15, initial_y_m=1.2)
     for scan, odom, _ in drive_round_the_block():
         localizer.step(scan, odom)
-        if is_loop_found(localizer) and localizer._mapping.loops.graph.is_moving:
+        if is_loop_found(localizer) and localizer._map.loops.graph.is_moving:
             break
     before = localizer.pose
     path = localizer.optimized_trajectory()
@@ -874,7 +874,7 @@ def test_the_map_is_rendered_again_the_nearest_part_first(round_the_block):
 
     def known():
         """Which of the former walls are rendered again."""
-        return localizer._mapping.local.map.distances(walls) < 0.1
+        return localizer._map.local.map.distances(walls) < 0.1
 
     localizer.set_pose(localizer.pose, 1e-4 * np.eye(3))
     assert known()[near].mean() > 0.95

@@ -43,10 +43,10 @@ def driven(steps):
 def corrected(localizer, by=CORRECTION):
     """The same localizer after all keyframes were moved, and nothing else."""
     other = deepcopy(localizer)
-    loops = other._mapping.loops
+    loops = other._map.loops
     moved = np.array([se2.compose(by, T) for T in loops.keyframes.poses()])
     loops.keyframes.move(moved, loops.graph.edges)
-    other._mapping.close_loops()
+    other._map.close_loops()
     return other
 
 

@@ -6,9 +6,7 @@ consistent. If scans contradict the local map, a new one is started. A dead-reck
 accumulated covariance connects the two.
 """
 
-from collections.abc import Mapping as State
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +23,12 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-from thinmap_ros.core.slam.mapping import Mapping
+from thinmap_ros.core.slam.localizer_map import LocalizerMap
 from thinmap_ros.core.slam.matching import local_map
 from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.slam.tracker import Tracked, Tracker
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 
@@ -47,7 +46,7 @@ class Localizer:
     def reset(self) -> None:
         """Discard map, path and pose; the next scan starts at the configured initial pose."""
         self._tracker = Tracker(self.config)
-        self._mapping = Mapping(self.config, self._tracker)
+        self._map = LocalizerMap(self.config, self._tracker)
 
     def adjust(self, config: LocalizerConfig) -> None:
         """Continue with other values of `LIVE_PARAMETERS`; map, path and pose stay."""
@@ -58,7 +57,7 @@ class Localizer:
             loop_closure=config.loop_closure,
         )
         self._tracker.adjust(self.config)
-        self._mapping.loops.adjust(config.loop_closure, config.matching)
+        self._map.loops.adjust(config.loop_closure, config.matching)
 
     @property
     def rejected(self) -> int:
@@ -66,17 +65,17 @@ class Localizer:
 
         And of scans that lie too far from the others for one map.
         """
-        return self._rejected + self._tracker.prediction.rejected + self._mapping.local.refused
+        return self._rejected + self._tracker.prediction.rejected + self._map.local.refused
 
     @property
     def pose(self) -> Array:
         """Current pose T_map_base (3,), a copy."""
-        return self._mapping.pose
+        return self._map.pose
 
     @property
     def keyframes(self) -> list[Keyframe]:
         """The keyframes, at their optimized poses."""
-        return self._mapping.loops.keyframes.frames
+        return self._map.loops.keyframes.frames
 
     @property
     def features(self) -> list[LineFeature]:
@@ -96,21 +95,19 @@ class Localizer:
         if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
             self._rejected += 1
             return
-        anchor = self._mapping.loops.anchor
+        anchor = self._map.loops.anchor
         T_map_base = se2.pose(*T_map_base.tolist())
         self._tracker.place(anchor.relative(T_map_base), anchor.turned(covariance))
         self._tracker.track.evidence.place(is_map_given=not self.config.is_mapping)
-        self._mapping.loops.pieces.return_to_published()
-        self._mapping.local.rerender(self.keyframes, T_map_base)
+        self._map.loops.pieces.return_to_published()
+        self._map.local.rerender(self.keyframes, T_map_base)
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> State:
         """The published local map as arrays by name, for `from_state`; without the pose."""
-        return self._mapping.local.published(self.keyframes).state()
+        return self._map.local.published(self.keyframes).state()
 
     @staticmethod
-    def from_state(
-        state: State[str, NDArray[Any]], config: LocalizerConfig | None = None
-    ) -> 'Localizer':
+    def from_state(state: State, config: LocalizerConfig | None = None) -> 'Localizer':
         """Localizer in the local map of a saved `state`, at the configured initial pose.
 
         It is delocalized until scans fit. Raises InputError if the state is invalid.
@@ -121,7 +118,7 @@ class Localizer:
             possible, 'local map: hits: more than observations', 'no more hits than observations'
         )
         localizer = Localizer(config)
-        localizer._mapping.local.map.restore(checked)
+        localizer._map.local.map.restore(checked)
         localizer._start_delocalized(checked)
         return localizer
 
@@ -132,7 +129,7 @@ class Localizer:
         It is delocalized until scans fit.
         """
         localizer = Localizer(config)
-        local = localizer._mapping.local.map
+        local = localizer._map.local.map
         local.add_free_cells(*free_cells(patch, local.config.resolution_m))
         for faces in occupied_surface_points(patch):
             local.add_walls(faces.points, faces.normal)
@@ -168,16 +165,16 @@ class Localizer:
         One step: predict, match, update the pose, update the map, close loops.
         """
         points = surface_points(scan)
-        tracked = self._tracker.step(scan, points, T_odom_base, self._mapping.surroundings)
+        tracked = self._tracker.step(scan, points, T_odom_base, self._map.surroundings)
         evidence = self._tracker.track.evidence
         if not self.config.is_mapping:
             self._detect_loss()
         elif not evidence.is_delocalized:
-            self._mapping.add(scan, points)
+            self._map.add(scan, points)
         elif evidence.needs_submap:
-            self._mapping.start_submap()  # the robot is not where it was placed
-        correction = self._mapping.close_loops()
-        self._mapping.record_pose(scan.stamp_ns)
+            self._map.start_submap()  # the robot is not where it was placed
+        correction = self._map.close_loops()
+        self._map.record_pose(scan.stamp_ns)
         return replace(self._estimate(tracked), correction=correction)
 
     def optimized_trajectory(self) -> Array:
@@ -185,22 +182,22 @@ class Localizer:
 
         Pending matches are done, and the pose is corrected by them.
         """
-        return self._mapping.trajectory()
+        return self._map.trajectory()
 
     def keyframe_trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (N,) in ns and optimized poses (N, 3) of the keyframe scans along the path.
 
         Each other scan keeps its pose relative to the keyframe before it.
         """
-        return self._mapping.loops.keyframes.path()
+        return self._map.loops.keyframes.path()
 
     def known_places(self) -> Array:
         """Places (N, 2) that enclose the published map: cells, and keyframes, m."""
-        return self._mapping.known_places()
+        return self._map.known_places()
 
-    def _start_delocalized(self, given: State[str, NDArray[Any]]) -> None:
+    def _start_delocalized(self, given: State) -> None:
         """Start in a loaded local map: delocalized until scans fit."""
-        self._mapping.local.load(given)
+        self._map.local.load(given)
         track = self._tracker.track
         track.uncertainty.place(track.T_anchor_base, self._tracker.slip_covariance())
         track.evidence.start_delocalized()
@@ -219,10 +216,10 @@ class Localizer:
 
     def _estimate(self, tracked: Tracked) -> Estimate:
         evidence = self._tracker.track.evidence
-        anchor = self._mapping.loops.anchor
+        anchor = self._map.loops.anchor
         T_map_base = self.pose
         covariance = self._tracker.covariance(anchor)
-        is_apart = self._mapping.loops.pieces.is_apart
+        is_apart = self._map.loops.pieces.is_apart
         is_lost = is_apart or evidence.is_lost
         match = tracked.match
         return Estimate(

@@ -22,7 +22,7 @@ from thinmap_ros.core.slam.wall_compass import Reference
 _VIEW_M = 1.0  # path length after which the errors of two matches are independent
 
 
-class Mapping:
+class LocalizerMap:
     """Adds the scans of a tracker to the local map and to the keyframes, and closes loops."""
 
     def __init__(self, config: LocalizerConfig, tracker: Tracker) -> None:
