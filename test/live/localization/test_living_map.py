@@ -91,7 +91,8 @@ def test_a_localizer_that_is_reset_takes_mapper_and_graph_along(graph):
 
 def test_a_localizer_without_memory_stays_lost_in_the_living_map_until_a_pose_is_given(graph):
     robot = Robot(graph)
-    robot.drive_until(lambda: robot.truth and robot.seconds() > 12.0, 'a map')
+    # From 15.2 to 17.1 s the view is like none near the start pose; at 12.1 s it is like a corner.
+    robot.drive_until(lambda: robot.truth and robot.seconds() > 15.6, 'a map')
     graph.stop('localizer', signal.SIGKILL)
     for kept in (graph.folder / 'state').glob('*.localizer.npz'):
         kept.unlink()
