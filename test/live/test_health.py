@@ -141,9 +141,15 @@ def test_a_second_source_of_the_pose_on_tf_is_reported_by_name(graph, is_static)
     else:
         rules = ('__node:=amcl', 'pose:=amcl_pose', 'slam_status:=amcl_status')
         graph.start('localizer', label='amcl', remap=rules, laser_pose='0,0,0', use_sim_time=True)
-    graph.until(lambda: rival in doctor.status('localizer').message, 'the second source')
+    source = '/test_client' if is_static else '/amcl'
+
+    def is_reported():
+        message = doctor.status('localizer').message
+        return rival in message and source in message
+
+    graph.until(is_reported, 'the second source, by its name')
     message = doctor.status('localizer').message
-    assert ('/test_client' if is_static else '/amcl') in message and 'publish_tf: false' in message
+    assert 'publish_tf: false' in message
     assert doctor.level('localizer') == DiagnosticStatus.WARN
     assert '/localizer' not in message
     if is_static:

@@ -343,7 +343,12 @@ def subscriber_names(node: Node, topic: str) -> list[str]:
 
 
 def _full_names(infos: list[TopicEndpointInfo]) -> list[str]:
-    return sorted(f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos)
+    return sorted(map(full_name, infos))
+
+
+def full_name(info: TopicEndpointInfo) -> str:
+    """Full name of the node of a publisher or subscription."""
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
 def _subscribers(node: Node, publisher: Publisher) -> str:

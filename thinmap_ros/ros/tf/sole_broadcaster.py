@@ -6,7 +6,7 @@ from time import monotonic
 from typing import Any
 
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.diagnostics import WARN, publisher_names
+from thinmap_ros.ros.diagnostics import WARN, full_name
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 _RECENT_S = 3.0  # a source that publishes more rarely is one that has ended
@@ -27,7 +27,9 @@ class SoleBroadcaster:
         self._stamps: deque[int] = deque(maxlen=_OWN_STAMPS)
         self._foreign = ''  # the transform, as text
         self._received_s = 0.0
-        self._static_names: set[str] = set()  # publishers of a static one when it arrived
+        self._is_static = False
+        # Publishers of a static one when it arrived, by their ids: names are discovered later.
+        self._static_sources: set[bytes] = set()
         node.diagnostics.add_check(WARN, self._fault)
 
     def add_own(self, stamp_ns: int) -> None:
@@ -44,28 +46,31 @@ class SoleBroadcaster:
             return
         self._foreign = f'{parent} -> {child} on {_topic(is_static)}'
         self._received_s = monotonic()
-        self._static_names = self._others('/tf_static') if is_static else set()
+        self._is_static = is_static
+        self._static_sources = set(self._others('/tf_static')) if is_static else set()
 
     def _fault(self) -> str:
-        is_static = bool(self._static_names)
-        if is_static:
+        others = self._others(_topic(self._is_static))
+        if self._is_static:
             # It was sent once: it is there until one of its possible sources has ended.
-            is_present = self._static_names <= self._others('/tf_static')
+            is_present = self._static_sources <= set(others)
         else:
             is_present = monotonic() - self._received_s < _RECENT_S
         if not self._foreign or not is_present:
             self._foreign = ''
             return ''
-        names = ', '.join(sorted(self._others(_topic(is_static))))
+        names = ', '.join(sorted(set(others.values())))
         return (
             f'{self._foreign}: published by another node, too, one of {names}: '
             'stop it, or set publish_tf: false'
         )
 
-    def _others(self, topic: str) -> set[str]:
+    def _others(self, topic: str) -> dict[bytes, str]:
+        """Full names of the nodes that publish a topic, but for this one, by publisher."""
         own = self._node.get_fully_qualified_name()
-        names = publisher_names(self._node, self._node.resolve_topic_name(topic))
-        return {name for name in names if name != own}
+        infos = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
+        names = {bytes(info.endpoint_gid): full_name(info) for info in infos}
+        return {publisher: name for publisher, name in names.items() if name != own}
 
 
 def _topic(is_static: bool) -> str:
