@@ -12,7 +12,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.tiles import MAX_CELLS
 
 # Updates that may be received before the whole map that they follow: those of some seconds.
-_MOST_KEPT = 50
+_MAX_KEPT_UPDATES = 50
 
 
 class _Update(NamedTuple):
@@ -35,7 +35,7 @@ class MapReceiver:
     def __init__(self) -> None:
         self.patch: GridPatch | None = None
         self._stamp_ns = 0
-        self._updates: deque[_Update] = deque(maxlen=_MOST_KEPT)
+        self._updates: deque[_Update] = deque(maxlen=_MAX_KEPT_UPDATES)
 
     def replace(self, whole: GridPatch, stamp_ns: int = 0) -> None:
         """Replace the copy by a whole map."""

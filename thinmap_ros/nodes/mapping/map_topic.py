@@ -14,7 +14,7 @@ from thinmap_ros.ros.decoding.map_updates import updates_topic
 
 # Calls after which a whole map follows an update: one that was lost, for a reason that no
 # publisher knows, is missing for so long.
-_CALLS_BEHIND = 10
+_MAX_CALLS_BEHIND = 10
 # Room of a map that grows, a share of its length: it grows again when the room is used up.
 _ROOM = 0.25
 
@@ -71,7 +71,7 @@ class MapTopic:
         self._calls_behind += 1
         if self._has_subscriber_of_map_alone():
             self._publish_whole(version, version.shown())
-        elif self._calls_behind > _CALLS_BEHIND:
+        elif self._calls_behind > _MAX_CALLS_BEHIND:
             self._publish_whole(version, self._shown)
         elif changed is not None:
             self._updates.publish(
