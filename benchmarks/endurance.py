@@ -161,7 +161,7 @@ def start_all(world: str, at: np.ndarray, rate: float, seed: int) -> dict[str, p
     found['sim'] = start(
         'sim',
         f'world:={world} {place} real_time_factor:={rate} seed:={seed} '
-        'lockstep:=local_topology wait_for_subscribers:=4',
+        'lockstep:=local_topology wait_for_subscribers:=3',
     )
     return found
 

@@ -66,7 +66,7 @@ def _measured(
         _start(words, f'use_sim_time:=true {start if words[0] in placed else ""}')
         for words in programs
     ]
-    others = [_start(['sim'], 'start:=5.0,2.0,0.0 wait_for_subscribers:=5')]
+    others = [_start(['sim'], 'start:=5.0,2.0,0.0 wait_for_subscribers:=4')]
     if bag is not None:
         others.append(_start(['recorder'], f'use_sim_time:=true bag:={bag}'))
     delays = _Listener()

@@ -51,6 +51,9 @@ _TOPICS = {
 }
 
 
+_SHOWN = [kind for kind in _KINDS if kind.__name__ in _TOPICS]
+
+
 def take_messages(shared: None, rng: np.random.Generator, folder: Path) -> None:
     kind = chosen(rng, _KINDS)
     messages = made(kind, _COUNT, int(rng.integers(2**32)))
@@ -64,7 +67,7 @@ def show_messages(shared: None, rng: np.random.Generator, folder: Path) -> None:
     feed = MessageView(NullView(), lambda frame: np.zeros(3))
     told = []
     for _ in range(3):
-        kind = chosen(rng, _KINDS)
+        kind = chosen(rng, _SHOWN)
         for message in made(kind, 3, int(rng.integers(2**32))):
             told.append(repr(message))
             (folder / 'messages.txt').write_text('\n'.join(told))

@@ -14,11 +14,13 @@ from hypothesis import strategies as st
 from nav_msgs.msg import OccupancyGrid, Odometry
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import ProbabilityGrid, TopologicalMap
+from thinmap_msgs.msg import LocalGrid, LocalizedScan, ProbabilityGrid, TopologicalMap
+from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.topology.flat import FIELDS, topology_from_msg
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.ros import messages
+from thinmap_ros.ros.localized_scan import localized_scan_from_msg
 
 STRANGE = st.sampled_from(
     [
@@ -221,12 +223,40 @@ def probability_grids(draw, ns=10**9):
     return ProbabilityGrid(header=grid.header, info=grid.info, data=grid.data)
 
 
+@st.composite
+def localized_scans(draw, ns=10**9):
+    pose = draw(poses(ns))
+    message = LocalizedScan(header=pose.header, scan=draw(scans(ns)), pose=pose.pose)
+    message.max_range_m = 8.0
+    message.laser_pose.orientation.w = 1.0
+
+    def max_range():
+        message.max_range_m = draw(STRANGE)
+
+    def correction():
+        message.correction_stamp.sec = draw(st.sampled_from([-1, 0, 999, 2**31 - 1]))
+
+    def state():
+        message.status.state = draw(st.integers(0, 255))
+
+    changed(draw, [max_range, correction, state, *pose_setters(draw, message.laser_pose)])
+    return message
+
+
+@st.composite
+def local_grids(draw, ns=10**9):
+    grid = draw(probability_grids(ns))
+    return LocalGrid(header=grid.header, grid=grid, localized=draw(localized_scans(ns)))
+
+
 STRATEGIES = {
     LaserScan: scans,
     Odometry: odometries,
     PoseWithCovarianceStamped: poses,
     OccupancyGrid: grids,
     ProbabilityGrid: probability_grids,
+    LocalizedScan: localized_scans,
+    LocalGrid: local_grids,
     TopologicalMap: topologies,
 }
 
@@ -258,6 +288,17 @@ def check_grid(message):
     assert np.isfinite(patch.frame.as_array()).all() and patch.frame.resolution > 0.0
 
 
+def check_localized_scan(message):
+    found = localized_scan_from_msg(message)
+    assert np.isfinite(found.scan.points_base()).all() and np.isfinite(found.T_map_base).all()
+    assert found.corrected_ns >= 0 and found.placement in Placement
+
+
+def check_local_grid(message):
+    check_grid(message.grid)
+    check_localized_scan(message.localized)
+
+
 def check_topology(message):
     found = topology_from_msg(message)
     assert list(found.nodes) == list(message.node_ids)
@@ -275,6 +316,8 @@ CHECKS = {
     PoseWithCovarianceStamped: check_pose,
     OccupancyGrid: check_grid,
     ProbabilityGrid: check_grid,
+    LocalizedScan: check_localized_scan,
+    LocalGrid: check_local_grid,
     TopologicalMap: check_topology,
 }
 
@@ -308,9 +351,11 @@ def made(kind, count, seed=None):
 
 
 def numbers(message):
-    """All floating point numbers of a message."""
+    """All floating point numbers of a message, but those of scans in it (REP 117)."""
     for name, kind in message.get_fields_and_field_types().items():
         value = getattr(message, name)
+        if isinstance(value, LaserScan):
+            continue
         if hasattr(value, 'get_fields_and_field_types'):
             yield from numbers(value)
         elif 'float' in kind or 'double' in kind:

@@ -256,8 +256,8 @@ def _loaded(*warm: Callable[[], None]) -> Callable[[Path], None]:
 _LOCALIZER = ('initial_x_m:=2.0', 'initial_y_m:=2.0', 'initial_yaw_rad:=0.3')
 
 _localize = _node_case(LocalizerNode, ('odom',), 'pose', _LOCALIZER)
-_map = _node_case(GridMapperNode, ('pose', 'slam_status'), 'local_grid')
-_thin = _node_case(TopologyBuilderNode, ('pose', 'local_grid'), 'local_topology')
+_map = _node_case(GridMapperNode, ('localized_scan',), 'local_grid')
+_thin = _node_case(TopologyBuilderNode, ('local_grid',), 'local_topology')
 
 SOURCES = (
     Source('stream_odometry', nothing, pair_by_stamp),

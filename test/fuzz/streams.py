@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
+from support.localized import local_grid, localized
 from support.slam_room import ROOM, scan_in
 
 from fuzz.cases import chosen
-from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
+from thinmap_msgs.msg import LocalGrid, LocalizedScan, ProbabilityGrid, SlamStatus
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import ROBOT_GRID, OccupancyGrid
 from thinmap_ros.core.se2 import Array
@@ -25,7 +26,7 @@ from thinmap_ros.ros import messages
 STEP_NS = 50_000_000
 STEPS_PER_SCAN = 4
 START_NS = 1000 * SECOND_NS
-TOPICS = ('scan', 'odom', 'pose', 'slam_status', 'local_grid')
+TOPICS = ('scan', 'odom', 'pose', 'slam_status', 'localized_scan', 'local_grid')
 # Longer than any buffer of the past and than the time for which a node waits after a fault.
 GOOD_STEPS = 20 * 20
 _START = se2.pose(2.0, 2.0, 0.3)
@@ -111,11 +112,12 @@ class Stream:
             ('scan', messages.scan_msg(scan, 'laser', 0.2)),
             ('pose', messages.pose_with_covariance_msg(T, 1e-4 * np.eye(3), 'map', ns)),
             ('slam_status', SlamStatus(header=header, state=SlamStatus.TRACKING)),
+            ('localized_scan', localized(scan, T)),
         ]
         if 'local_grid' in self._topics:
             self._grid.add_scan(scan, T)
             window = self._grid.window(float(T[0]), float(T[1]), _WINDOW_M)
-            made.append(('local_grid', messages.probability_grid_msg(window, 'map', ns)))
+            made.append(('local_grid', local_grid(window, T, ns, scan)))
         return made
 
     def _changed(self, k: int, topic: str, message: Any) -> list[Any]:
@@ -125,6 +127,19 @@ class Stream:
                 change = disturbance.change
                 found = [new for old in found for new in change(self._rng, old)]
         return found
+
+
+def _parts(message: Any) -> list[Any]:
+    """What a message consists of: a scan, a pose, a status, a grid."""
+    if isinstance(message, LocalGrid):
+        return [message.grid, *_parts(message.localized)]
+    if isinstance(message, LocalizedScan):
+        return [message, message.scan, message.status]
+    return [message]
+
+
+def _scans(message: Any) -> list[LaserScan]:
+    return [part for part in _parts(message) if isinstance(part, LaserScan)]
 
 
 def _shifted(message: Any, shift_ns: int) -> Any:
@@ -223,20 +238,21 @@ def _numbers(rng: np.random.Generator) -> Change:
     share = float(chosen(rng, (0.01, 0.5, 1.0)))
 
     def change(rng: np.random.Generator, message: Any) -> list[Any]:
-        if isinstance(message, LaserScan):
-            ranges = np.array(message.ranges, dtype=np.float32)
+        part = chosen(rng, _parts(message))
+        if isinstance(part, LaserScan):
+            ranges = np.array(part.ranges, dtype=np.float32)
             ranges[rng.random(ranges.size) < share] = value
-            message.ranges = array('f', ranges.tolist())
-        elif isinstance(message, ProbabilityGrid):
-            message.info.resolution = value if abs(value) < 1e30 else 0.0
-        elif isinstance(message, SlamStatus):
-            message.state = int(rng.integers(256))
+            part.ranges = array('f', ranges.tolist())
+        elif isinstance(part, ProbabilityGrid):
+            part.info.resolution = value if abs(value) < 1e30 else 0.0
+        elif isinstance(part, SlamStatus):
+            part.state = int(rng.integers(256))
         else:
-            pose = message.pose.pose
+            pose = part.pose.pose
             setattr(pose.position, str(rng.choice(['x', 'y', 'z'])), value)
             if rng.random() < 0.3:
                 pose.orientation.w = value
-            message.pose.covariance[int(rng.integers(36))] = value
+            part.pose.covariance[int(rng.integers(36))] = value
         return [message]
 
     return change
@@ -247,11 +263,12 @@ def _sizes(rng: np.random.Generator) -> Change:
     side = int(chosen(rng, (0, 1, 3000, 2**32 - 1)))
 
     def change(_: np.random.Generator, message: Any) -> list[Any]:
-        if isinstance(message, LaserScan):
-            ranges = np.resize(np.array(message.ranges, dtype=np.float32), count)
-            message.ranges = array('f', ranges.tolist())
-        elif isinstance(message, ProbabilityGrid):
-            message.info.width = side
+        for part in _parts(message):
+            if isinstance(part, LaserScan):
+                ranges = np.resize(np.array(part.ranges, dtype=np.float32), count)
+                part.ranges = array('f', ranges.tolist())
+            elif isinstance(part, ProbabilityGrid):
+                part.info.width = side
         return [message]
 
     return change
@@ -263,10 +280,10 @@ def _sparse(rng: np.random.Generator) -> Change:
     value = float(chosen(rng, (np.inf, np.nan, 0.0)))
 
     def change(_: np.random.Generator, message: Any) -> list[Any]:
-        if isinstance(message, LaserScan):
-            ranges = np.full(len(message.ranges), value, dtype=np.float32)
-            ranges[::every] = message.ranges[::every]
-            message.ranges = array('f', ranges.tolist())
+        for scan in _scans(message):
+            ranges = np.full(len(scan.ranges), value, dtype=np.float32)
+            ranges[::every] = scan.ranges[::every]
+            scan.ranges = array('f', ranges.tolist())
         return [message]
 
     return change
@@ -278,9 +295,10 @@ def _jump(rng: np.random.Generator) -> Change:
     jump = rng.uniform(-size_m, size_m, 2)
 
     def change(_: np.random.Generator, message: Any) -> list[Any]:
-        if hasattr(message, 'pose'):
-            message.pose.pose.position.x += float(jump[0])
-            message.pose.pose.position.y += float(jump[1])
+        for part in _parts(message):
+            if hasattr(part, 'pose'):
+                part.pose.pose.position.x += float(jump[0])
+                part.pose.pose.position.y += float(jump[1])
         return [message]
 
     return change
@@ -292,11 +310,11 @@ def _turned_laser(rng: np.random.Generator) -> Change:
     is_mirrored = bool(rng.random() < 0.3)
 
     def change(_: np.random.Generator, message: Any) -> list[Any]:
-        if isinstance(message, LaserScan):
-            ranges = np.array(message.ranges, dtype=np.float32)
+        for scan in _scans(message):
+            ranges = np.array(scan.ranges, dtype=np.float32)
             ranges = ranges[::-1] if is_mirrored else np.roll(ranges, beams)
-            message.ranges = array('f', ranges.tolist())
-        elif isinstance(message, Odometry) and is_mirrored:
+            scan.ranges = array('f', ranges.tolist())
+        if isinstance(message, Odometry) and is_mirrored:
             message.pose.pose.orientation.z *= -1.0
         return [message]
 
@@ -309,8 +327,8 @@ def _angles(rng: np.random.Generator) -> Change:
     factor = float(chosen(rng, (-1.0, 0.0, 0.5, 2.0, 57.3, 1e30, np.nan)))
 
     def change(_: np.random.Generator, message: Any) -> list[Any]:
-        if isinstance(message, LaserScan):
-            setattr(message, name, max(min(factor * getattr(message, name), 1e30), -1e30))
+        for scan in _scans(message):
+            setattr(scan, name, max(min(factor * getattr(scan, name), 1e30), -1e30))
         return [message]
 
     return change
@@ -322,9 +340,9 @@ def _sweep(rng: np.random.Generator) -> Change:
     scan_time_s = float(chosen(rng, (0.0, 0.2, -1.0, np.nan)))
 
     def change(_: np.random.Generator, message: Any) -> list[Any]:
-        if isinstance(message, LaserScan):
-            message.time_increment = period_s / 360.0
-            message.scan_time = scan_time_s
+        for scan in _scans(message):
+            scan.time_increment = period_s / 360.0
+            scan.scan_time = scan_time_s
         return [message]
 
     return change

@@ -21,9 +21,9 @@ from fuzz.runner import Runner, rng_of
 from fuzz.sources import SOURCES
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.logs import carmen
-from thinmap_ros.nodes.mapping import scan_pairs
+from thinmap_ros.nodes import grid_mapper
+from thinmap_ros.nodes.mapping.scan_queue import ScanQueue
 
 ROOT = Path(__file__).resolve().parents[2]
 HOURS_S = 1e9
@@ -161,19 +161,24 @@ def never_ends(self: Any, scan: Any) -> list[Any]:
     return list(self._ready())
 
 
-class NoScanTwice(StampMatcher[Any, Any]):
+class NoScanTwice(ScanQueue):
     """Does not expect a stamp twice."""
 
-    def add_left(self, stamp_ns: int, value: Any) -> tuple[Any, Any] | None:
-        if stamp_ns in self._lefts:
+    def __init__(self) -> None:
+        super().__init__()
+        self._stamps: set[int] = set()
+
+    def add_scan(self, localized: Any) -> None:
+        if localized.scan.stamp_ns in self._stamps:
             raise LookupError('planted')
-        return super().add_left(stamp_ns, value)
+        self._stamps.add(localized.scan.stamp_ns)
+        super().add_scan(localized)
 
 
 # By source: object, attribute and its planted value.
 PLANTED: dict[str, tuple[Any, str, Any]] = {
     'stream_odometry': (ScanOdometrySynchronizer, 'add_scan', never_ends),
-    'stream_mapper': (scan_pairs, 'StampMatcher', NoScanTwice),
+    'stream_mapper': (grid_mapper, 'ScanQueue', NoScanTwice),
 }
 
 

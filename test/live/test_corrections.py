@@ -4,14 +4,13 @@ import signal
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid, Path
-from sensor_msgs.msg import LaserScan
 from support.doctor import Doctor
+from support.localized import localized
 from support.slam_room import corridor_ring, scan_in
 
-from thinmap_msgs.msg import ProbabilityGrid
+from thinmap_msgs.msg import LocalGrid, LocalizedScan, ProbabilityGrid
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid import occupancy
@@ -45,30 +44,27 @@ class Mapping:
         self.graph = graph
         self.by_hand = CorrectableGrid(occupancy.OccupancyGrid(CONFIG))
         self.maps = graph.heard('grid', ProbabilityGrid, qos.LATCHED)
-        self.windows = graph.heard('local_grid', ProbabilityGrid)
+        self.windows = graph.heard('local_grid', LocalGrid)
         # Of somebody who follows updates: a whole map comes only where it must.
         self.whole = graph.heard('map', OccupancyGrid, qos.LATCHED)
         self.updates = graph.heard('map_updates', OccupancyGridUpdate)
-        self._scans = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
-        self._poses = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+        self._scans = graph.node.create_publisher(LocalizedScan, 'localized_scan', qos.STREAM)
+        self._corrected_ns = 0
         self._paths = graph.node.create_publisher(Path, 'trajectory', qos.LATCHED)
         self.start()
 
     def start(self):
         doctor = Doctor(self.graph)
-        self.graph.start(
-            'grid_mapper', laser_pose='0,0,0', recovery_timeout_s=1000.0, resolution_m=0.03
-        )
+        self.graph.start('grid_mapper', recovery_timeout_s=1000.0, resolution_m=0.03)
         keys = [
-            'scan: publishers',
-            'pose: publishers',
+            'localized_scan: publishers',
             'trajectory: publishers',
             'local_grid: subscribers',
         ]
         self.graph.until(
             lambda: (
                 all(doctor.number('grid_mapper', key) for key in keys)
-                and all(p.get_subscription_count() for p in (self._scans, self._poses, self._paths))
+                and all(p.get_subscription_count() for p in (self._scans, self._paths))
             ),
             'the mapper and the test have found each other',
         )
@@ -79,20 +75,17 @@ class Mapping:
         self.windows.clear()
         self.publish(k, T_map_base)
         self.graph.until(lambda: self.windows, 'a local map')
-        return named_by(self.windows[-1])
+        return named_by(self.windows[-1].grid)
 
     def publish(self, k, T_map_base):
-        scan = scan_of(k)
-        covariance = 1e-4 * np.eye(3)
-        pose = messages.pose_with_covariance_msg(T_map_base, covariance, 'map', scan.stamp_ns)
-        self._scans.publish(messages.scan_msg(scan, 'laser', 0.0))
-        self._poses.publish(pose)
+        self._scans.publish(localized(scan_of(k), T_map_base, self._corrected_ns))
 
     def correct(self, k):
         """Correct the poses of the scans before number k to the true ones."""
         stamps = (np.arange(k) + 1) * SECOND_NS
         ns = (k + 1) * SECOND_NS
         self.by_hand.apply_correction(stamps, TRUE[:k], ns)
+        self._corrected_ns = ns
         self._paths.publish(messages.trajectory_msg(stamps.tolist(), TRUE[:k], 'map', ns))
         return ns
 
@@ -168,7 +161,7 @@ def test_a_mapper_that_is_killed_meanwhile_resumes_with_the_published_map(graph)
     graph.until(
         lambda: (
             mapping.publish(COUNT + 1, TRUE[COUNT + 1])
-            or any(named_by(window) == corrected_ns for window in mapping.windows)
+            or any(named_by(window.grid) == corrected_ns for window in mapping.windows)
         ),
         'a local map of the corrected grid, or others would wait for it',
     )

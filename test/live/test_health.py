@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 from support.doctor import Doctor
 from tf2_msgs.msg import TFMessage
 
-from thinmap_msgs.msg import ProbabilityGrid, TopologicalMap
+from thinmap_msgs.msg import LocalGrid, TopologicalMap
 from thinmap_ros.ros import diagnostics, messages, qos
 
 pytestmark = pytest.mark.live
@@ -27,7 +27,7 @@ MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
 def test_nodes_report_rates_step_times_and_silence(graph):
     doctor = Doctor(graph)
     graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)
-    graph.start('sim', start=START, wait_for_subscribers=2)
+    graph.start('sim', start=START, wait_for_subscribers=1)
     nodes = ('localizer', 'grid_mapper', 'topology_builder', 'sim')
     graph.until(
         lambda: all(doctor.level(node) == DiagnosticStatus.OK for node in nodes), 'all is well'
@@ -44,11 +44,11 @@ def test_nodes_report_rates_step_times_and_silence(graph):
             f'step times of {node}',
         )
     graph.until(
-        lambda: doctor.number('topology_builder', 'pose: received') > 0, 'poses are counted'
+        lambda: doctor.number('topology_builder', 'local_grid: received') > 0, 'windows are counted'
     )
     graph.until(lambda: doctor.number('localizer', 'scan: received') > 5, 'more than five scans')
     graph.until(lambda: doctor.number('localizer', 'scan: publishers') == 1, 'the simulation')
-    graph.until(lambda: doctor.number('localizer', 'pose: subscribers') == 2, 'mapper and builder')
+    graph.until(lambda: doctor.number('localizer', 'localized_scan: subscribers') == 1, 'mapper')
     graph.stop('sim')
     graph.until(
         lambda: 'scan: silent for' in doctor.status('localizer').message, 'silence is reported'
@@ -221,13 +221,12 @@ def test_a_localizer_walks_through_its_states(graph):
 
 
 def test_a_node_that_becomes_active_has_what_was_latched(graph):
-    maps = graph.node.create_publisher(ProbabilityGrid, 'local_grid', qos.LATCHED)
-    poses = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+    maps = graph.node.create_publisher(LocalGrid, 'local_grid', qos.LATCHED)
     graphs = graph.heard('local_topology', TopologicalMap, qos.LATCHED)
     graph.start('explorer', autostart=False, laser_pose='0,0,0')
     doctor = Doctor(graph)
-    empty = ProbabilityGrid()
-    empty.info.resolution = -1.0
+    empty = LocalGrid()
+    empty.grid.info.resolution = -1.0
     maps.publish(empty)
     graph.until(lambda: doctor.number('explorer', 'local_grid: received') == 1.0, 'the latched map')
     assert doctor.number('explorer', 'local_grid: rejected') == 0.0
@@ -237,7 +236,7 @@ def test_a_node_that_becomes_active_has_what_was_latched(graph):
     graph.until(
         lambda: doctor.number('explorer', 'local_grid: rejected') == 1.0, 'it is taken, and refused'
     )
-    assert not graphs and poses
+    assert not graphs
 
 
 def test_pause_and_reset(graph):
@@ -246,7 +245,7 @@ def test_pause_and_reset(graph):
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)
-    graph.start('sim', start=START, wait_for_subscribers=2, real_time_factor=4.0)
+    graph.start('sim', start=START, wait_for_subscribers=1, real_time_factor=4.0)
     graph.until(lambda: maps and graphs and graphs[-1].node_ids, 'map and graph')
     assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=True)).success
 

@@ -12,7 +12,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from thinmap_msgs.msg import ProbabilityGrid, SlamStatus, TopologicalMap
+from thinmap_msgs.msg import LocalGrid, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.files import occupancy_maps
 from thinmap_ros.logs.bag import Bag
@@ -64,7 +64,7 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     status = graph.heard('slam_status', SlamStatus)
     scans = graph.heard('scan', LaserScan, qos.SENSOR)
     frames = graph.heard('/tf', TFMessage)
-    local_maps = graph.heard('local_grid', ProbabilityGrid, qos.LATCHED)
+    local_maps = graph.heard('local_grid', LocalGrid, qos.LATCHED)
 
     def links():
         return {(t.header.frame_id, t.child_frame_id) for m in frames for t in m.transforms}
@@ -73,7 +73,7 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     graph.start('grid_mapper', use_sim_time=True)
     graph.start('topology_builder', use_sim_time=True)
     graph.start(
-        'sim', start=START, real_time_factor=4.0, lockstep='local_topology', wait_for_subscribers=3
+        'sim', start=START, real_time_factor=4.0, lockstep='local_topology', wait_for_subscribers=2
     )
     graph.until(
         lambda: len(local_maps) > 8 and poses and status and scans and ('map', 'odom') in links(),
@@ -191,7 +191,7 @@ def test_the_navigator_drives_to_a_goal_and_refuses_one_in_a_wall(graph):
         start=START,
         real_time_factor=8.0,
         lockstep='local_topology',
-        wait_for_subscribers=3,
+        wait_for_subscribers=2,
     )
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graph.until(lambda: maps and is_free(maps[-1], 3.0, 2.0), 'a map that knows the goal')

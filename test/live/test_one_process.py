@@ -92,7 +92,7 @@ def start_robot(graph, name, start, seed):
         initial_x_m=float(x),
         initial_y_m=float(y),
         initial_yaw_rad=0.0,
-        wait_for_subscribers=2,
+        wait_for_subscribers=1,
         real_time_factor=2.0,
         arguments=('sim', 'localizer', 'grid_mapper', 'topology_builder'),
     )

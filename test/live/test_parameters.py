@@ -13,7 +13,7 @@ from rcl_interfaces.srv import (
 from support.forks import forked
 from support.timeouts import PATIENCE_S
 
-from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
+from thinmap_msgs.msg import LocalGrid, SlamStatus
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -79,7 +79,7 @@ def test_the_navigator_changes_its_speed_and_refuses_what_makes_no_sense(graph):
 
 def test_localizer_and_grid_mapper_keep_their_map_while_parameters_change(graph):
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
-    windows = graph.heard('local_grid', ProbabilityGrid, qos.LATCHED)
+    windows = graph.heard('local_grid', LocalGrid, qos.LATCHED)
     states = graph.heard('slam_status', SlamStatus)
     start = {'initial_x_m': 2.0, 'initial_y_m': 2.0}
     graph.start('localizer', use_sim_time=True, **start)

@@ -53,7 +53,7 @@ def drive(graph, x, y, yaw, metres):
         start=f'{x},{y},{yaw}',
         real_time_factor=4.0,
         lockstep='local_topology',
-        wait_for_subscribers=2,
+        wait_for_subscribers=1,
     )
     commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
     forward = Twist()

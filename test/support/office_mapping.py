@@ -2,13 +2,11 @@
 
 from itertools import islice
 
-import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
-from sensor_msgs.msg import LaserScan
 from support.doctor import Doctor
+from support.localized import localized
 
-from thinmap_msgs.msg import ProbabilityGrid
+from thinmap_msgs.msg import LocalGrid, LocalizedScan, ProbabilityGrid, SlamStatus
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.ros import messages, qos
 
@@ -22,17 +20,13 @@ class Mapping:
         self.graph = graph
         self.maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
         self.grids = graph.heard('grid', ProbabilityGrid, qos.LATCHED)
-        self.windows = graph.heard('local_grid', ProbabilityGrid, qos.LATCHED)
+        self.windows = graph.heard('local_grid', LocalGrid, qos.LATCHED)
         self.samples = list(islice(Source().samples('office'), 0, 360, EVERY))
-        self._scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
-        self._pose = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
-        laser = ','.join(f'{v:.6f}' for v in self.samples[0].scan.T_base_laser)
+        self._scan = graph.node.create_publisher(LocalizedScan, 'localized_scan', qos.STREAM)
         self.doctor = Doctor(graph)
-        graph.start('grid_mapper', laser_pose=laser, **parameters)
-        self.wait_for('scan: publishers', 'pose: publishers', 'local_grid: subscribers')
-        graph.until(
-            lambda: all(p.get_subscription_count() for p in (self._scan, self._pose)), 'grid_mapper'
-        )
+        graph.start('grid_mapper', **parameters)
+        self.wait_for('localized_scan: publishers', 'local_grid: subscribers')
+        graph.until(self._scan.get_subscription_count, 'grid_mapper')
 
     def wait_for(self, *keys):
         """Wait until the mapper has found the test: what is published earlier is lost."""
@@ -40,13 +34,8 @@ class Mapping:
             lambda: all(self.doctor.number('grid_mapper', key) for key in keys), 'discovery'
         )
 
-    def publish(self, sample):
-        scan = sample.scan
-        self._scan.publish(messages.scan_msg(scan, 'laser', 0.2))
-        pose = messages.pose_with_covariance_msg(
-            sample.T_world_base, 1e-4 * np.eye(3), 'map', scan.stamp_ns
-        )
-        self._pose.publish(pose)
+    def publish(self, sample, state=SlamStatus.TRACKING):
+        self._scan.publish(localized(sample.scan, sample.T_world_base, state=state))
 
     def add(self, sample):
         """Add a sample, and wait for its window."""

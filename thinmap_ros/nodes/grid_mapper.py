@@ -5,14 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 from nav_msgs.srv import GetMap
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.timer import Timer
-from sensor_msgs.msg import LaserScan
 
+from thinmap_msgs.msg import LocalizedScan as LocalizedScanMsg
 from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
@@ -31,13 +30,13 @@ from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.mapping.map_output import MapPublishers
 from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
-from thinmap_ros.nodes.mapping.scan_pairs import LocatedScan, ScanPairs
+from thinmap_ros.nodes.mapping.scan_queue import ScanQueue
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.diagnostics import ERROR
-from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.localized_scan import LocalizedScan, localized_scan_from_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.session_client import SessionClient
@@ -82,12 +81,13 @@ class _Settings:
 
 
 class GridMapperNode(ThinmapNode):
-    """/scan or /localized_scan, /pose and /slam_status in; /map, /grid and /local_grid out.
+    """/localized_scan in; /map, /grid and /local_grid out.
 
-    /local_grid follows every scan. /map and /grid are published when they have changed: once in
-    map_update_interval, and at once after a reset, a load and a correction. As long as every node
-    that subscribes to /map also subscribes to /map_updates, /map is sent only where its size,
-    origin or identity changes, when a subscriber comes, and 10 intervals after an update.
+    /local_grid follows every scan, and holds it. /map and /grid are published when they have
+    changed: once in map_update_interval, and at once after a reset, a load and a correction. As
+    long as every node that subscribes to /map also subscribes to /map_updates, /map is sent only
+    where its size, origin or identity changes, when a subscriber comes, and 10 intervals after an
+    update.
 
     Services save_map, load_map; map and dynamic_map return the present map.
 
@@ -100,7 +100,6 @@ class GridMapperNode(ThinmapNode):
         super().__init__('grid_mapper', recovers=True)
         self._settings = _Settings.declare(self, self._on_output)
         self._output = MapPublishers(self, self._settings.output)
-        self._laser_transform = LaserTransform(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
         parameters.reject_unknown(self)
@@ -111,12 +110,8 @@ class GridMapperNode(ThinmapNode):
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('map')
         self.diagnostics.add_check(ERROR, lambda: self._fault)
-        # First: of messages that wait together, it is processed before the poses that follow it.
         subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
-        subscribe_guarded(self, SlamStatus, 'slam_status', self._on_status, qos.STREAM)
-        subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
-        subscribe_guarded(self, LaserScan, 'localized_scan', self._on_localized, qos.STREAM)
-        subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        subscribe_guarded(self, LocalizedScanMsg, 'localized_scan', self._on_scan, qos.STREAM)
         # Mapping continues while a map is saved, and waits while one is loaded: no window of the
         # old map reaches the new graph.
         reentrant = ReentrantCallbackGroup()
@@ -143,7 +138,7 @@ class GridMapperNode(ThinmapNode):
 
     def reset_state(self) -> None:
         """Discard the map, or return to the session that the node was started with."""
-        self._pairs = ScanPairs(self)
+        self._scans = ScanQueue()
         self._fault = ''
         self._output.followed = FollowedMap()
         self._output.load_ns = self.get_clock().now().nanoseconds
@@ -185,47 +180,50 @@ class GridMapperNode(ThinmapNode):
         self._replace_grid(grid)
         self._output.followed = FollowedMap(map_id)
 
-    def _on_scan(self, message: LaserScan) -> None:
-        self._add_scan(self._pairs.add_scan(message))
+    def _on_scan(self, message: LocalizedScanMsg) -> None:
+        self._scans.add_scan(localized_scan_from_msg(message))
+        self._add_scans()
 
-    def _on_localized(self, message: LaserScan) -> None:
-        self._add_scan(self._pairs.add_localized_scan(message))
+    def _on_trajectory(self, message: Path) -> None:
+        self._scans.add_trajectory(message)
+        self._add_scans()
 
-    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._add_scan(self._pairs.add_pose(message))
+    def _add_scans(self) -> None:
+        for localized, trajectory in self._scans.ready():
+            if trajectory is not None:
+                self._correct(trajectory)
+            self._add_scan(localized)
+        self.diagnostics.set_drop_total('scans without their trajectory', self._scans.dropped)
 
-    def _on_status(self, message: SlamStatus) -> None:
-        self._add_scan(self._pairs.add_status(message))
-
-    def _add_scan(self, located: LocatedScan | None) -> None:
-        self.diagnostics.set_drop_total('scans and poses without a partner', self._pairs.dropped)
-        if located is None or not self._is_of_this_map(located):
+    def _add_scan(self, localized: LocalizedScan) -> None:
+        scan = localized.scan
+        if not self._is_of_this_map(localized.status):
             return
-        measured = self._laser_transform.to_scan(located.message)
-        scan = replace(measured, drops_out=located.drops_out)
-        T_map_base = located.T_map_base
         if self._stamp.is_restarted_by(scan.stamp_ns):
             self.reset_state()
+        T_map_base = localized.T_map_base
         with self.diagnostics.time_step('map update'):
             mapped = scan if self._settings.mapping else None
-            moved = self._grid.update(mapped, T_map_base, located.placement)
+            moved = self._grid.update(mapped, T_map_base, localized.placement)
             x, y, _ = T_map_base
             window = self._grid.shown.window(x, y, self._settings.local_map_size_m)
         self._stamp.latest_ns = scan.stamp_ns
         if moved is not None:
             self._publish_map()  # before the windows of the corrected map
-        self._output.publish_local_grid(window, scan.stamp_ns, self._grid.corrected_ns)
+        self._output.publish_local_grid(window, self._grid, localized)
         for refusal in self._grid.take_refusals():
-            self.diagnostics.message_rejected('scan', refusal)
-            self.get_logger().warning(f'scan: {refusal}', throttle_duration_sec=WARN_PERIOD_S)
+            self.diagnostics.message_rejected('localized_scan', refusal)
+            self.get_logger().warning(
+                f'localized_scan: {refusal}', throttle_duration_sec=WARN_PERIOD_S
+            )
 
-    def _is_of_this_map(self, located: LocatedScan) -> bool:
+    def _is_of_this_map(self, status: SlamStatus) -> bool:
         """Whether a scan was localized in the map of this node, which follows its localizer's."""
         followed = self._output.followed
-        origin = followed.origin(located.map_id)
-        if origin is Origin.OTHER and located.replaced_map_id == followed.id:
+        origin = followed.origin(status.map_id)
+        if origin is Origin.OTHER and status.replaced_map_id == followed.id:
             self.reset('the localizer was reset')
-            origin = followed.origin(located.map_id)
+            origin = followed.origin(status.map_id)
         is_other = origin is Origin.OTHER
         self._fault = _OTHER_MAP if is_other and self._settings.mapping else ''
         if self._fault:
@@ -241,15 +239,15 @@ class GridMapperNode(ThinmapNode):
         response.map = self._output.map_message(self._grid.shown.known_area(), stamp_ns)
         return response
 
-    def _on_trajectory(self, message: Path) -> None:
+    def _correct(self, trajectory: Path) -> None:
         """A loop was closed: correct the poses at which the scans of the map were made."""
-        corrected_ns = messages.stamp_ns(message.header.stamp)
+        corrected_ns = messages.stamp_ns(trajectory.header.stamp)
         if not self._stamp.is_corrected_by(corrected_ns):
             # A latched trajectory from before this map, which follows it or is a new one.
             self._grid.corrected_ns = corrected_ns
             return
         with self.diagnostics.time_step('map correction'):
-            stamps_ns, poses = messages.trajectory_from_msg(message)
+            stamps_ns, poses = messages.trajectory_from_msg(trajectory)
             is_corrected = self._grid.apply_correction(stamps_ns, poses, since_ns=corrected_ns)
         if not is_corrected:
             self.get_logger().warning('loop closed, but a loaded map is not corrected')

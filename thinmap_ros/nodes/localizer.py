@@ -14,6 +14,7 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.msg import (
     LineFeature,
     LineFeatureArray,
+    LocalizedScan,
     ProbabilityGrid,
     SlamStatus,
     TopologicalMap,
@@ -54,6 +55,7 @@ from thinmap_ros.ros.decoding.map_identity import UNKNOWN, new_map_id
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.localized_scan import localized_scan_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
@@ -74,20 +76,26 @@ _HEALTH = {
 
 
 class _PosePublishers:
-    """Publishes poses with their status, line features, and corrected trajectories."""
+    """Publishes poses with their scan and status, line features, and corrected trajectories."""
 
     def __init__(self, node: Node) -> None:
         self.map_frame = parameters.declare_map_frame(node)
         self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
         self._features = node.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
-        self._scan = node.create_publisher(LaserScan, 'localized_scan', qos.STREAM)
+        self._scan = node.create_publisher(LocalizedScan, 'localized_scan', qos.STREAM)
         self._status = node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
         self._trajectory = node.create_publisher(Path, 'trajectory', qos.LATCHED)
+        self._corrected_ns = 0
+
+    def reset(self) -> None:
+        """The poses that follow are those of another map, which has not been corrected."""
+        self._corrected_ns = 0
 
     def publish_estimate(
-        self, stamp_ns: int, estimate: Estimate, localizer: AnyLocalizer, status: SlamStatus
+        self, scan: Scan, estimate: Estimate, localizer: AnyLocalizer, status: SlamStatus
     ) -> None:
         """Publish an estimate; status: with its state and step time, the rest is filled in."""
+        stamp_ns = scan.stamp_ns
         frame = self.map_frame
         self._pose.publish(
             messages.pose_with_covariance_msg(
@@ -105,13 +113,11 @@ class _PosePublishers:
         status.rejected = localizer.rejected
         status.inlier_ratio = estimate.inlier_ratio
         self._status.publish(status)
-
-    def publish_scan(self, message: LaserScan) -> None:
-        """Publish a scan as it was localized: at one instant, and NaN where it did not measure."""
-        self._scan.publish(message)
+        self._scan.publish(localized_scan_msg(scan, estimate, status, frame, self._corrected_ns))
 
     def publish_trajectory(self, stamp_ns: int, stamps_ns: list[int], poses: Array) -> None:
         """Publish the corrected poses (N, 3) of the keyframes, with their stamps."""
+        self._corrected_ns = stamp_ns
         self._trajectory.publish(
             messages.trajectory_msg(stamps_ns, poses, self.map_frame, stamp_ns)
         )
@@ -204,7 +210,7 @@ class _Relocation:
 class LocalizerNode(ThinmapNode):
     """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out.
 
-    /trajectory after a loop closure.
+    /localized_scan with all that a mapper needs of a scan; /trajectory after a loop closure.
 
     Services ~/pause, ~/reset, save_localizer, load_localizer, and check_localizer, which reads a
     saved map without replacing the present one. In a given map it is lost until
@@ -268,6 +274,7 @@ class LocalizerNode(ThinmapNode):
         """
         if self._map_ids is not None:
             self._map_ids.begin()
+        self._output.reset()
         self._begin()
 
     def _begin(self) -> None:
@@ -472,7 +479,6 @@ class LocalizerNode(ThinmapNode):
         self.diagnostics.record_step_time('localizer', step_ms)
         self.diagnostics.set_state(*_health(state, estimate))
         if estimate.correction is not None:
-            # Before the first pose that follows from it.
             stamps, poses = self._localizer.keyframe_trajectory()
             self._output.publish_trajectory(scan.stamp_ns, stamps.tolist(), poses)
             self.get_logger().info(f'loop closed: {len(poses)} keyframe poses corrected')
@@ -487,8 +493,7 @@ class LocalizerNode(ThinmapNode):
         )
         if self._map_ids is not None:
             self._map_ids.fill_in(status)
-        self._output.publish_scan(self._laser_transform.to_message(scan))
-        self._output.publish_estimate(scan.stamp_ns, estimate, self._localizer, status)
+        self._output.publish_estimate(scan, estimate, self._localizer, status)
 
 
 def _state_of(estimate: Estimate) -> int:

@@ -1,20 +1,17 @@
 """The topological map: the cells of the grid that change are thinned and merged into the graph."""
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 from rclpy.node import Node
 
-from thinmap_msgs.msg import ProbabilityGrid
+from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
-from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.tracker import FIELDS as REGION_FIELDS
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
@@ -26,6 +23,7 @@ from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN, FollowedMap, Origin
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.localized_scan import mapped_scan_from_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
@@ -87,7 +85,7 @@ class _TopologyPublishers:
 
 
 class TopologyBuilderNode(ThinmapNode):
-    """/local_grid, /grid and /pose in; /local_topology, /topology and /regions out.
+    """/local_grid and /grid in; /local_topology, /topology and /regions out.
 
     Services save_topology, load_topology and check_topology, which reads a saved graph without
     replacing the present one. A graph is published when it has changed, /local_topology for each
@@ -114,8 +112,7 @@ class TopologyBuilderNode(ThinmapNode):
         warm_up.topology_builder()
         subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
-        subscribe_guarded(self, ProbabilityGrid, 'local_grid', self._on_local_grid, qos.STREAM)
-        subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        subscribe_guarded(self, LocalGrid, 'local_grid', self._on_local_grid, qos.STREAM)
         self.create_service(SaveMap, 'save_topology', self._on_save)
         self.create_service(LoadMap, 'check_topology', self._on_check)
         self.create_service(LoadMap, 'load_topology', self._on_load)
@@ -142,13 +139,12 @@ class TopologyBuilderNode(ThinmapNode):
         self._regions.reset(tracker)
         self._stamp.restore(latest_ns)
         self._builder = builder
-        self._rebuilding = Rebuilding(from_the_start=False)
+        self._rebuilding = Rebuilding(from_the_start=False, restored_ns=latest_ns)
         self._publish(latest_ns)
 
     def reset_state(self) -> None:
         """Discard the graph, or return to the session that the node was started with."""
         self._output.followed = FollowedMap()
-        self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._newest_saved_id = 0
         self._T_map_base: Array | None = None
         self._rebuilding = Rebuilding(from_the_start=not self._session)
@@ -169,32 +165,18 @@ class TopologyBuilderNode(ThinmapNode):
             self._output.followed.origin(message.map_id)
         return origin is not Origin.STALE
 
-    def _on_local_grid(self, message: ProbabilityGrid) -> None:
-        if not self._is_of_this_map(message):
+    def _on_local_grid(self, message: LocalGrid) -> None:
+        if not self._is_of_this_map(message.grid):
             return
-        stamp_ns = messages.stamp_ns(message.header.stamp)
-        patch = messages.grid_from_msg(message)
-        self._rebuilding.window(patch, messages.stamp_ns(message.correction_stamp))
-        self._process(stamp_ns, self._matcher.add_left(stamp_ns, patch))
-
-    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        stamp_ns = messages.stamp_ns(message.header.stamp)
-        pair = self._matcher.add_right(stamp_ns, messages.pose_from_msg(message.pose.pose))
-        self._process(stamp_ns, pair)
-
-    def _process(self, stamp_ns: int, pair: tuple[GridPatch, Array] | None) -> None:
-        dropped = self._matcher.dropped
-        self.diagnostics.set_drop_total('local maps and poses without a partner', dropped)
-        if pair is None:
-            return
+        mapped = mapped_scan_from_msg(message)
+        stamp_ns = mapped.localized.scan.stamp_ns
         if self._stamp.is_restarted_by(stamp_ns):
             self.reset_state()
+        self._rebuilding.window(mapped)
         self._stamp.latest_ns = stamp_ns
-        window, T_map_base = pair
-        self._T_map_base = T_map_base
+        self._T_map_base = mapped.localized.T_map_base
         with self.diagnostics.time_step('graph update'):
-            self._builder, changed = self._rebuilding.update(self._builder, window, T_map_base)
-        self._rebuilding.add_pose(stamp_ns, T_map_base)
+            self._builder, changed = self._rebuilding.update(self._builder)
         if changed:
             self._publish(stamp_ns, again=False)
         self._add_whole_map(stamp_ns)
@@ -203,9 +185,8 @@ class TopologyBuilderNode(ThinmapNode):
 
     def _on_trajectory(self, message: Path) -> None:
         corrected_ns = messages.stamp_ns(message.header.stamp)
-        if self._stamp.is_corrected_by(corrected_ns):
-            self._rebuilding.correct(corrected_ns, *messages.trajectory_from_msg(message))
-            self._builder = self._rebuilding.start(self._builder)  # its grid may have come first
+        self._rebuilding.correct(corrected_ns, *messages.trajectory_from_msg(message))
+        self._builder = self._rebuilding.start(self._builder)
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
         if not self._is_of_this_map(message):
@@ -274,7 +255,6 @@ class TopologyBuilderNode(ThinmapNode):
         self._builder = loaded
         self._output.followed.leave()
         self._regions.reset(regions)
-        self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)
         self._publish(self.get_clock().now().nanoseconds)
         return f'graph of {len(loaded.map.nodes)} nodes' if path else 'graph reset'

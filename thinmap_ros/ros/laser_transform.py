@@ -40,7 +40,6 @@ class LaserTransform:
         self._fixed = Mount(parse_laser_pose(str(given)), upside_down=False) if given else None
         self._transforms = StaticTransforms()
         self._mounts: dict[str, Mount] = {}
-        self._frame_id = ''  # of the last scan
         self._changes: dict[str, str] = {}
         if isinstance(node, ThinmapNode):
             node.diagnostics.add_check(WARN, lambda: '; '.join(self._changes.values()))
@@ -54,8 +53,7 @@ class LaserTransform:
 
         Raises InputError where the pose is unknown or the message is no scan.
         """
-        self._frame_id = message.header.frame_id
-        mount = self._mount(self._frame_id)
+        mount = self._mount(message.header.frame_id)
         if mount is None:
             raise InputError(
                 f'scan in frame {quoted(message.header.frame_id)}: no static transform from '
@@ -64,13 +62,6 @@ class LaserTransform:
             )
         scan = messages.scan_from_msg(message, mount.T_base_laser, self._laser)
         return mount.apply(scan)
-
-    def to_message(self, scan: Scan) -> LaserScan:
-        """Message of a scan of the laser whose scan was converted last, as its driver orders it."""
-        mount = self._mount(self._frame_id)
-        # Turned over twice, the beams are in their first order.
-        ordered = scan if mount is None else mount.apply(scan)
-        return messages.scan_msg(ordered, self._frame_id, scan.scan_time_s)
 
     def pose(self, frame_id: str) -> Array | None:
         """T_base_laser (3,) of a laser frame; None until it is known."""

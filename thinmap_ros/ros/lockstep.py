@@ -6,13 +6,13 @@ from typing import Any
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
-from thinmap_msgs.msg import LocalizationStatus, ProbabilityGrid, TopologicalMap
+from thinmap_msgs.msg import LocalGrid, LocalizationStatus, TopologicalMap
 from thinmap_ros.ros import messages, qos
 
 NONE = 'none'
 _TYPES: dict[str, Any] = {
     'pose': PoseWithCovarianceStamped,
-    'local_grid': ProbabilityGrid,
+    'local_grid': LocalGrid,
     'local_topology': TopologicalMap,
     'localization_status': LocalizationStatus,
 }

@@ -22,6 +22,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from sensor_msgs.msg import LaserScan
 
+from thinmap_msgs.msg import LocalizedScan
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.ros.diagnostics import WARN
@@ -29,8 +30,9 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 WARN_PERIOD_S = 5.0  # between two warnings of the same kind
 _TIMEOUT_S = 3.0
+_SCANS = (LaserScan, LocalizedScan)
 # Data of one sensor: those of two mixed are of none. Positions of two odometries jump.
-_SOLE_SOURCE = (LaserScan, Odometry)
+_SOLE_SOURCE = (*_SCANS, Odometry)
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 
@@ -63,7 +65,7 @@ class _GuardedSubscription:
         self._node = node
         self._topic = topic
         self._process = process
-        self._is_scan = kind is LaserScan
+        self._is_scan = kind in _SCANS
         self._is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._latched_message: Any = None
         self._logged_s = -WARN_PERIOD_S

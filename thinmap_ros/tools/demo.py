@@ -29,7 +29,7 @@ from thinmap_ros.view import report_page
 _PATIENCE_S = 20.0
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'explorer', 'navigator', 'recorder')
 # Subscribers of /scan: simulated time waits for all of them.
-_SCAN_LISTENERS = 5
+_SCAN_LISTENERS = 4
 _SLEEP_S = 0.05
 
 

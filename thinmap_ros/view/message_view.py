@@ -13,7 +13,6 @@ from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs import decode
@@ -22,6 +21,7 @@ from thinmap_ros.logs.frames.laser_mount import StaticTransforms
 from thinmap_ros.view import palette
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
+from thinmap_ros.view.stamp_matcher import StampMatcher
 
 _TF_STATIC = '/tf_static'
 _MEDIAN = re.compile(r'median (\d+\.\d+) ms')

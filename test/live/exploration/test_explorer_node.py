@@ -9,18 +9,18 @@ from itertools import count
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav2_msgs.action import NavigateToPose
 from rclpy.action import ActionClient, ActionServer
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from support.forks import forked
+from support.localized import local_grid
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import (
     EndNodeArray,
     ExplorationStatus,
+    LocalGrid,
     ProbabilityGrid,
     SlamStatus,
     TopologicalMap,
@@ -84,9 +84,7 @@ class Robot:
         self.end_nodes = graph.heard('end_nodes', EndNodeArray, qos.LATCHED)
         self.map = self.node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
         self.graph_map = self.node.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
-        self.pose = self.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
-        self.scan = self.node.create_publisher(LaserScan, 'scan', qos.STREAM)
-        self.slam = self.node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
+        self.window = self.node.create_publisher(LocalGrid, 'local_grid', qos.STREAM)
         self.clock = self.node.create_publisher(Clock, '/clock', qos.STREAM)
         self.node.create_timer(SPEAK_S, self.speak)
         self.knows(40)
@@ -104,10 +102,10 @@ class Robot:
         self.driver = ActionServer(self.node, NavigateToPose, 'navigate_to_pose', refuse)
 
     def knows(self, cols):
-        patch = room(cols)
-        self.map.publish(messages.probability_grid_msg(patch, 'map', 0))
+        self.patch = room(cols)
+        self.map.publish(messages.probability_grid_msg(self.patch, 'map', 0))
         self.graph_map.publish(
-            messages.topology_msg(build(patch, (2.0, 2.0), TopologyConfig()), 'map', 0)
+            messages.topology_msg(build(self.patch, (2.0, 2.0), TopologyConfig()), 'map', 0)
         )
 
     def speak(self):
@@ -118,11 +116,8 @@ class Robot:
         )
         scan = Scan.create(ns, ranges, -0.5 * math.pi, math.pi / 180.0, 0.05, 8.0)
         if self.hears_scans:
-            self.scan.publish(messages.scan_msg(scan, 'laser', 0.2))
-            self.pose.publish(messages.pose_with_covariance_msg(AT, np.zeros((3, 3)), 'map', ns))
-        self.slam.publish(
-            SlamStatus(state=SlamStatus.TRACKING if self.is_tracked else SlamStatus.LOST)
-        )
+            state = SlamStatus.TRACKING if self.is_tracked else SlamStatus.LOST
+            self.window.publish(local_grid(self.patch, AT, ns, scan, state))
 
     def explores(self, **goal):
         """Final status of an exploration, and whether it succeeded."""
@@ -159,6 +154,7 @@ def test_it_reports_why_it_ended(robot):
     robot.is_tracked = False
     assert robot.explores() == (ExplorationStatus.LOCALIZATION_LOST, GoalStatus.STATUS_ABORTED)
     robot.is_tracked = True
+    robot.speak()  # the state comes with a scan
     robot.hears_scans = False
     assert robot.explores() == (ExplorationStatus.SENSOR_TIMEOUT, GoalStatus.STATUS_ABORTED)
     robot.hears_scans = True

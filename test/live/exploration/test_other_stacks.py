@@ -59,7 +59,7 @@ class Exploration:
         x, y, theta = self.start.split(',')
         at = {'initial_x_m': float(x), 'initial_y_m': float(y), 'initial_yaw_rad': float(theta)}
         self.graph.start('thinmap', arguments=names, use_sim_time=True, **at)
-        self._start_sim('local_topology', 3)
+        self._start_sim('local_topology', 2)
 
     def _start_sim(self, lockstep, subscribers):
         self.graph.start(

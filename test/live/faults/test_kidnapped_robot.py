@@ -84,7 +84,7 @@ def test_a_robot_is_localized_in_a_saved_map_and_after_kidnapping(graph, tmp_pat
             else {}
         )
         graph.start(name, use_sim_time=True, **start)
-    start_sim(graph, START, 2)
+    start_sim(graph, START, 1)
     robot.drive_until(lambda: robot.seconds() > 30.0, 'a map of the room')
     saved = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
     assert saved.success and '.slam.npz' in saved.message, saved.message
@@ -97,7 +97,7 @@ def test_a_robot_is_localized_in_a_saved_map_and_after_kidnapping(graph, tmp_pat
     for name in NODES:
         graph.start(name, use_sim_time=True, session_path=str(stem))
     graph.start('global_localizer', use_sim_time=True, start_automatically=True)
-    start_sim(graph, ELSEWHERE, 3)
+    start_sim(graph, ELSEWHERE, 2)
     robot.drive_until(robot.is_right, 'the place where it was switched on')
     assert robot.states()[0] == SlamStatus.LOST
     found_s = robot.seconds()

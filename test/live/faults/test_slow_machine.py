@@ -51,7 +51,7 @@ def test_old_scans_are_dropped_and_counted_and_the_delay_does_not_grow(no_shared
     graphs = graph.heard('local_topology', TopologicalMap)
     start = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.9}
     process = graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **start)
-    graph.start('sim', start='2.0,2.0,0.9', wait_for_subscribers=3, real_time_factor=RATE)
+    graph.start('sim', start='2.0,2.0,0.9', wait_for_subscribers=2, real_time_factor=RATE)
     # Discovery of the scans' publisher may take longer than that of the poses'.
     graph.until(
         lambda: len(poses) > 20 and graphs and scans, 'poses and graphs, before it becomes slow'

@@ -10,8 +10,9 @@ from nav_msgs.srv import GetMap
 from sensor_msgs.msg import LaserScan
 from support.carmen_log import BEAMS, box_ranges
 from support.doctor import Doctor
+from support.localized import localized
 
-from thinmap_msgs.msg import ProbabilityGrid
+from thinmap_msgs.msg import LocalGrid, LocalizedScan
 from thinmap_ros.core import se2
 from thinmap_ros.ros import messages, qos
 
@@ -29,7 +30,7 @@ class Robot:
         node = graph.node
         self.publishers = [
             node.create_publisher(Odometry, 'odom', qos.STREAM),
-            node.create_publisher(PoseWithCovarianceStamped, 'given_pose', qos.STREAM),
+            node.create_publisher(LocalizedScan, 'given_scan', qos.STREAM),
             node.create_publisher(LaserScan, 'scan', qos.SENSOR),
         ]
         self.stamp_ns = 100_000_000_000
@@ -52,21 +53,21 @@ class Robot:
         self.stamp_ns += PERIOD_NS
         self.steps += 1
         odometry = Odometry()
-        pose = PoseWithCovarianceStamped()
         scan = LaserScan()
-        for message, frame in ((odometry, 'odom'), (pose, 'map'), (scan, 'laser')):
+        for message, frame in ((odometry, 'odom'), (scan, 'laser')):
             message.header.stamp = messages.time_msg(self.stamp_ns)
             message.header.frame_id = frame
         odometry.child_frame_id = 'base_link'
-        for message in (odometry, pose):
-            message.pose.pose = messages.pose_msg(se2.pose(self.x + wild_m, wild_m, 0.0))
+        T = se2.pose(self.x + wild_m, wild_m, 0.0)
+        odometry.pose.pose = messages.pose_msg(T)
         scan.angle_min = -np.pi / 2
         scan.angle_increment = np.pi / (BEAMS - 1)
         scan.angle_max = np.pi / 2
         scan.range_min = 0.05
         scan.range_max = 20.0
         scan.ranges = box_ranges(self.x, 0.0).astype(np.float32)
-        for publisher, message in zip(self.publishers, (odometry, pose, scan), strict=True):
+        given = localized(messages.scan_from_msg(scan, np.zeros(3)), T)
+        for publisher, message in zip(self.publishers, (odometry, given, scan), strict=True):
             publisher.publish(message)
 
 
@@ -77,12 +78,11 @@ def since(heard, ns):
 def test_one_pose_kilometres_away_ends_neither_map_nor_localizer(graph):
     doctor = Doctor(graph)
     robot = Robot(graph)
-    windows = graph.heard('local_grid', ProbabilityGrid)
+    windows = graph.heard('local_grid', LocalGrid)
     poses = graph.heard('pose', PoseWithCovarianceStamped)
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graph.start('localizer', laser_pose='0,0,0')
-    given = ('pose:=given_pose', 'slam_status:=given_status')
-    graph.start('grid_mapper', given, laser_pose='0,0,0')
+    graph.start('grid_mapper', ('localized_scan:=given_scan',))
 
     def mapped(ns):
         robot.step_in_time()
@@ -100,7 +100,9 @@ def test_one_pose_kilometres_away_ends_neither_map_nor_localizer(graph):
     assert abs(newest.pose.pose.position.y) < 0.2
     later = graph.call(GetMap, 'dynamic_map', GetMap.Request()).map.info
     assert (later.width, later.height) == pytest.approx((before.width, before.height), abs=10)
-    graph.until(lambda: doctor.number('grid_mapper', 'scan: rejected') == 1, 'the scan is counted')
+    graph.until(
+        lambda: doctor.number('grid_mapper', 'localized_scan: rejected') == 1, 'the scan is counted'
+    )
     assert 'map of' in graph.log('grid_mapper')
     dropped = 'dropped: invalid scans or odometry'
 

@@ -33,7 +33,7 @@ class Robot:
             'sim',
             remap=graph.paced(),
             start=START,
-            wait_for_subscribers=2,
+            wait_for_subscribers=1,
             real_time_factor=4.0,
             lockstep='local_topology',
             lockstep_timeout_s=2.0,

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from support.doctor import Doctor
+from support.localized import local_grid
 
-from thinmap_msgs.msg import ProbabilityGrid, TopologicalMap
+from thinmap_msgs.msg import LocalGrid, TopologicalMap
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.stamps import SECOND_NS
@@ -23,30 +23,22 @@ def corridor(length_m):
 
 
 class Scans:
-    """Windows of a map with the robot's pose, a second apart, each until the builder has it."""
+    """Windows of a map with the robot's scan, a second apart, each until the builder has it."""
 
     def __init__(self, graph):
         self._graph = graph
         self._doctor = Doctor(graph)
-        self._windows = graph.node.create_publisher(ProbabilityGrid, 'local_grid', qos.STREAM)
-        self._poses = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
-        graph.until(
-            lambda: self._windows.get_subscription_count() and self._poses.get_subscription_count(),
-            'a builder that listens',
-        )
+        self._windows = graph.node.create_publisher(LocalGrid, 'local_grid', qos.STREAM)
+        graph.until(self._windows.get_subscription_count, 'a builder that listens')
         self.count = 0
 
     def add(self, patch, number):
         for _ in range(number):
             self.count += 1
             ns = self.count * SECOND_NS
-            self._windows.publish(messages.probability_grid_msg(patch, 'map', ns))
-            self._poses.publish(messages.pose_with_covariance_msg(HERE, np.eye(3), 'map', ns))
-        received = [f'{topic}: received' for topic in ('local_grid', 'pose')]
+            self._windows.publish(local_grid(patch, HERE, ns))
         self._graph.until(
-            lambda: all(
-                self._doctor.number('topology_builder', key) == self.count for key in received
-            ),
+            lambda: self._doctor.number('topology_builder', 'local_grid: received') == self.count,
             'scans that are processed',
         )
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from core.regions.floors import office, patch_of
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from support.localized import local_grid
 from visualization_msgs.msg import MarkerArray
 
-from thinmap_msgs.msg import ProbabilityGrid, Region, RegionArray, TopologicalMap
+from thinmap_msgs.msg import LocalGrid, ProbabilityGrid, Region, RegionArray, TopologicalMap
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -17,8 +17,7 @@ HERE = np.array([3.0, 3.2, 0.0])
 def test_regions_name_the_nodes_of_the_graph(graph):
     patch = patch_of(office())
     grids = graph.node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
-    windows = graph.node.create_publisher(ProbabilityGrid, 'local_grid', qos.LATCHED)
-    poses = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
+    windows = graph.node.create_publisher(LocalGrid, 'local_grid', qos.LATCHED)
     heard = graph.heard('regions', RegionArray, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     markers = graph.heard('regions_markers', MarkerArray, qos.LATCHED)
@@ -31,8 +30,7 @@ def test_regions_name_the_nodes_of_the_graph(graph):
     def is_complete():
         nonlocal ns
         ns += S
-        windows.publish(messages.probability_grid_msg(patch, 'map', ns))
-        poses.publish(messages.pose_with_covariance_msg(HERE, np.eye(3), 'map', ns))
+        windows.publish(local_grid(patch, HERE, ns))
         return (
             graphs
             and heard

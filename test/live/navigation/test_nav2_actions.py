@@ -274,7 +274,7 @@ def test_the_robot_reaches_its_goal_with_odometry_by_tf_and_without_any(graph, s
         'sim',
         remap=('odom:=unheard', '/tf:=/tf' if source == 'tf' else '/tf:=/unheard_tf'),
         start=START,
-        wait_for_subscribers=3,
+        wait_for_subscribers=2,
         real_time_factor=2.0,
     )
     goal = pose_at(3.0, 2.6)

@@ -103,7 +103,7 @@ def test_its_sequence_of_calls_drives_the_simulated_robot(graph):
         # Commands that arrive late on a busy machine turn the robot too far: half as far as at 8.
         real_time_factor=4.0,
         lockstep='local_topology',
-        wait_for_subscribers=3,
+        wait_for_subscribers=2,
     )
     commander.set_initial_pose(pose_at(2.0, 2.0, 0.9))
     commander.wait_until_active('localizer', 'bt_navigator')

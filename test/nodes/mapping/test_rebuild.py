@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from support.localized import local_grid
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.nodes.mapping.rebuild import Rebuilding
+from thinmap_ros.ros.localized_scan import mapped_scan_from_msg
 
 POSES = np.array([[4.0 + 0.5 * k, 5.0, 0.0] for k in range(5)])
 STAMPS = np.arange(1, 6)
@@ -21,13 +23,19 @@ def hall(shift_m=0.0):
     return GridPatch(GridFrame(shift_m, 0.0, 0.1), cells)
 
 
+def window(patch, corrected_ns, stamp_ns=10, is_rerendering=False, T_map_base=POSES[-1]):
+    message = local_grid(patch, T_map_base, stamp_ns)
+    message.grid.correction_stamp.nanosec = corrected_ns
+    message.is_rerendering = is_rerendering
+    return mapped_scan_from_msg(message)
+
+
 def built(rebuilding):
     builder = TopologyBuilder()
     for stamp, T in zip(STAMPS.tolist(), POSES, strict=True):
-        rebuilding.window(hall(), 0)
+        rebuilding.window(window(hall(), 0, stamp, T_map_base=T))
         assert rebuilding.accepts_window()
         builder.update(hall(), T)
-        rebuilding.add_pose(stamp, T)
     return builder
 
 
@@ -51,16 +59,17 @@ def test_the_graph_goes_where_the_grid_has_gone_and_its_nodes_keep_their_ids(fro
             )
 
 
-def test_between_the_news_and_the_grid_nothing_is_taken_nor_what_is_out_of_date():
+def test_nothing_is_taken_while_the_grid_is_rendered_again_nor_what_is_out_of_date():
     rebuilding = Rebuilding()
     builder = built(rebuilding)
     rebuilding.correct(9, STAMPS, POSES)
-    rebuilding.window(hall(), 0)
+    rebuilding.window(window(hall(), 0, 9, is_rerendering=True))
     assert not rebuilding.accepts_window()
     rebuilding.grid(hall(), 9)
     rebuilding.start(builder)
+    rebuilding.window(window(hall(), 0, 8))
     assert not rebuilding.accepts_window(), 'cut out before'
-    rebuilding.window(hall(), 9)
+    rebuilding.window(window(hall(), 9))
     assert rebuilding.accepts_window()
 
 
@@ -72,8 +81,8 @@ def test_windows_that_come_while_the_graph_is_rebuilt_are_added_to_the_new_one()
     assert rebuilding.start(old) is old
     closed = hall()
     closed.cells[30:71, 60:] = 100
-    rebuilding.window(closed, 9)
-    builder, _ = rebuilding.update(old, closed, POSES[-1])
+    rebuilding.window(window(closed, 9))
+    builder, _ = rebuilding.update(old)
     builder = rebuilding.result(builder)
     assert builder is not old
     assert max(node.x for node in builder.map.nodes.values()) < 6.0
@@ -84,8 +93,8 @@ def test_windows_that_come_while_the_graph_is_rebuilt_are_added_to_the_new_one()
 def test_cells_outside_of_the_windows_are_those_of_the_grid():
     rebuilding = Rebuilding()
     built(rebuilding)
-    window = GridPatch(GridFrame(3.0, 3.0, 0.1), np.full((20, 20), 100, dtype=np.int8))
-    rebuilding.window(window, 0)
+    wall = GridPatch(GridFrame(3.0, 3.0, 0.1), np.full((20, 20), 100, dtype=np.int8))
+    rebuilding.window(window(wall, 0))
     rebuilding.grid(hall(), 0)
     shown = rebuilding.whole_map()
     assert shown.shape == hall().shape
@@ -108,7 +117,7 @@ def test_a_grid_that_comes_too_early_is_used_later_with_the_windows_since():
     rebuilding.grid(hall(), 9)
     for x in (3.0, 5.0):
         wall = GridPatch(GridFrame(x, 3.0, 0.1), np.full((20, 20), 100, dtype=np.int8))
-        rebuilding.window(wall, 9)
+        rebuilding.window(window(wall, 9))
         assert rebuilding.whole_map() is None
     rebuilding.result(old)
     shown = rebuilding.whole_map()
@@ -119,7 +128,8 @@ def test_a_grid_may_come_before_the_trajectory_that_it_has_undergone():
     rebuilding = Rebuilding()
     old = built(rebuilding)
     rebuilding.grid(hall(), 9)
-    rebuilding.window(hall(), 9)
+    rebuilding.window(window(hall(), 9))
+    assert not rebuilding.accepts_window()
     rebuilding.correct(9, STAMPS, POSES)
     assert rebuilding.result(rebuilding.start(old)) is not old
     assert rebuilding.accepts_window()
@@ -130,14 +140,14 @@ def test_a_window_that_does_not_fit_the_grid_is_reported_once():
     rebuilding.grid(hall(), 0)
     off = GridPatch(GridFrame(0.03, 0.0, 0.1), hall().cells)
     with pytest.raises(InputError, match='lattice'):
-        rebuilding.window(off, 0)
-    rebuilding.window(off, 0)
+        rebuilding.window(window(off, 0))
+    rebuilding.window(window(off, 0))
     assert rebuilding.accepts_window() and rebuilding.whole_map() is None
 
 
 def test_a_builder_that_is_new_takes_windows_of_a_grid_that_was_corrected_before():
     rebuilding = Rebuilding()
-    rebuilding.window(hall(), 7)
+    rebuilding.window(window(hall(), 7))
     assert rebuilding.accepts_window()
 
 
@@ -148,13 +158,18 @@ def test_a_mapper_that_begins_anew_after_a_correction_is_followed():
     rebuilding.grid(hall(), 9)
     rebuilding.start(builder)
     for corrected_ns in (9, 0):
-        rebuilding.window(hall(), corrected_ns)
+        rebuilding.window(window(hall(), corrected_ns))
         assert rebuilding.accepts_window()
 
 
-def test_a_grid_that_never_comes_is_not_waited_for_for_ever():
-    rebuilding = Rebuilding()
-    built(rebuilding)
+@pytest.mark.parametrize('checkpoint_ns', [8, 9])
+def test_a_graph_of_a_checkpoint_follows_the_corrections_since(checkpoint_ns):
+    rebuilding = Rebuilding(from_the_start=False, restored_ns=checkpoint_ns)
+    old = TopologyBuilder()
     rebuilding.correct(9, STAMPS, POSES)
-    rebuilding.window(hall(), 9)
-    assert any(rebuilding.accepts_window() for _ in range(2000))
+    rebuilding.grid(hall(), 9)
+    rebuilding.window(window(hall(), 9))
+    assert rebuilding.accepts_window() == (checkpoint_ns == 9)
+    builder, _ = rebuilding.update(old)
+    assert (rebuilding.result(builder) is old) == (checkpoint_ns == 9)
+    assert rebuilding.accepts_window()

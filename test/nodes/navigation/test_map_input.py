@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.localized import local_grid
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -9,9 +10,12 @@ from thinmap_ros.nodes.navigation.map_input import MapInput
 from thinmap_ros.ros import messages
 
 
+def patch(side):
+    return GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((side, side), dtype=np.int8))
+
+
 def grid(side, map_id):
-    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((side, side), dtype=np.int8))
-    return messages.probability_grid_msg(patch, 'map', 0, map_id=map_id)
+    return messages.probability_grid_msg(patch(side), 'map', 0, map_id=map_id)
 
 
 @pytest.mark.parametrize(
@@ -30,5 +34,5 @@ def test_a_pose_in_another_map_is_a_reason_to_stop(grid_id, pose_id, stops):
 def test_a_window_of_another_map_is_not_pasted_into_the_old_one(map_id, side):
     map_input = MapInput()
     map_input._on_grid(grid(20, 7))
-    map_input._on_local_grid(grid(10, map_id))
+    map_input._on_local_grid(local_grid(patch(10), np.zeros(3), 0, map_id=map_id))
     assert map_input.patch.shape == (side, side)

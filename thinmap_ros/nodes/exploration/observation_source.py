@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import ProbabilityGrid, SlamStatus, TopologicalMap
+from thinmap_msgs.msg import LocalGrid, ProbabilityGrid, TopologicalMap
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.live.map_view import MapGraph
 from thinmap_ros.core.exploration.mission import InputWatchdog
-from thinmap_ros.core.exploration.observations import Observation, ObservationBuffer
+from thinmap_ros.core.exploration.observations import Observation
+from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
@@ -22,6 +22,7 @@ from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.localized_scan import mapped_scan_from_msg
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 _LOOK_PERIOD_S = 0.5
@@ -60,8 +61,8 @@ class _GridPublisher:
 class ObservationSource:
     """Makes observations of what is published.
 
-    Where somebody publishes grid, a scan is an observation with the pose of its stamp, and with the
-    local grid of its stamp where that is published. Else each new map is one, with the pose of TF.
+    Where somebody publishes grid, each local grid is an observation with its scan. Else each new
+    map is one, with the pose of TF.
     watchdog: notices inputs that are missing.
     """
 
@@ -75,7 +76,6 @@ class ObservationSource:
     ) -> None:
         """on_observation: receives each observation; its graph is complete after `with_graph`."""
         self._node = node
-        self._laser_transform = frames.laser_transform
         self._on_observation = on_observation
         self._graph_config = TopologyConfig(robot_radius_m=robot_radius_m)
         self._grids = _GridPublisher(node)
@@ -85,17 +85,16 @@ class ObservationSource:
         self.reset()
         subscribe_guarded(node, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
-        subscribe_guarded(node, ProbabilityGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
-        subscribe_guarded(node, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        subscribe_guarded(node, LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
         subscribe_guarded(node, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        subscribe_guarded(node, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         node.create_active_timer(_LOOK_PERIOD_S, self._look)
 
     def reset(self) -> None:
         """Discard map, graph and scans."""
         self._grids.followed = FollowedMap()
         self.watchdog = InputWatchdog()
-        self._buffer = ObservationBuffer(Topology())
+        self._topology = Topology()
+        self._mapped = MapReceiver()
         self._graph = MapGraph(self._graph_config)
         self._view.reset()
         self._map.reset()
@@ -116,44 +115,35 @@ class ObservationSource:
     # Inputs.
 
     def _on_topology(self, message: TopologicalMap) -> None:
-        self._buffer.topology = topology_from_msg(message)
+        self._topology = topology_from_msg(message)
         self._topologies.message_received()
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
         self._grids.received(message)
-        self._buffer.replace_map(messages.grid_from_msg(message))
+        self._mapped.replace(messages.grid_from_msg(message))
 
-    def _on_local_grid(self, message: ProbabilityGrid) -> None:
-        self._grids.received(message)
-        stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._process(self._buffer.add_local_map(stamp_ns, messages.grid_from_msg(message)))
-
-    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        if self._uses_foreign_map():
-            return
-        stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._process(self._buffer.add_pose(stamp_ns, messages.pose_from_msg(message.pose.pose)))
+    def _on_local_grid(self, message: LocalGrid) -> None:
+        self._grids.received(message.grid)
+        now_s = self._node.elapsed_time.now_s()
+        self.watchdog.add_tracking(messages.is_lost(message.localized.status), now_s)
+        mapped = mapped_scan_from_msg(message)
+        self._mapped.paste(mapped.window)
+        localized = mapped.localized
+        if localized.is_blind:
+            return  # ignored: a blind scan observes nothing
+        self.watchdog.awaited = InputWatchdog.awaited
+        self.watchdog.add_scan(now_s)
+        patch = self._mapped.patch
+        if patch is not None:
+            self._on_observation(
+                Observation(self._topology, patch, localized.scan, localized.T_map_base)
+            )
 
     def _on_scan(self, message: LaserScan) -> None:
         if self._uses_foreign_map():
             self._view.add_scan(message)
-            return
-        scan = self._laser_transform.to_scan(message)
-        if scan.is_blind or self._buffer.is_blind:
-            return  # ignored: a blind scan observes nothing
-        self.watchdog.awaited = InputWatchdog.awaited
-        self.watchdog.add_scan(self._node.elapsed_time.now_s())
-        self._process(self._buffer.add_scan(scan))
-
-    def _on_slam_status(self, message: SlamStatus) -> None:
-        self._buffer.is_blind = message.state in (SlamStatus.BLIND, SlamStatus.MISALIGNED)
-        self.watchdog.add_tracking(messages.is_lost(message), self._node.elapsed_time.now_s())
 
     # Outputs.
-
-    def _process(self, observation: Observation | None) -> None:
-        if observation is not None:
-            self._on_observation(observation)
 
     def _look(self) -> None:
         """Make an observation of a new map; of an old one if there is none for a long time."""
@@ -175,7 +165,7 @@ class ObservationSource:
         self._map.is_changed = False
         self.watchdog.awaited = f'new map on {self._map.topic}'
         self.watchdog.add_scan(now_s)
-        self._process(observation)
+        self._on_observation(observation)
 
     def _observe(self) -> Observation | None:
         patch = self._map.patch()
@@ -183,4 +173,4 @@ class ObservationSource:
             return None
         now_ns = int(self._node.get_clock().now().nanoseconds)
         scan, T_map_base = self._view.look(patch, now_ns)
-        return Observation(self._buffer.topology, patch, scan, T_map_base)
+        return Observation(self._topology, patch, scan, T_map_base)

@@ -3,7 +3,7 @@
 from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 
-from thinmap_msgs.msg import ProbabilityGrid
+from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.nodes.mapping.map_topic import MapTopic
@@ -11,6 +11,7 @@ from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
 from thinmap_ros.nodes.mapping.map_version import MapIdentity, MapVersion
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.decoding.map_identity import FollowedMap
+from thinmap_ros.ros.localized_scan import LocalizedScan
 
 
 class MapPublishers:
@@ -26,7 +27,7 @@ class MapPublishers:
         self.followed = FollowedMap()
         self._map = MapTopic(node, self._frame)
         self._grid = node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
-        self._local_grid = node.create_publisher(ProbabilityGrid, 'local_grid', qos.LATCHED)
+        self._local_grid = node.create_publisher(LocalGrid, 'local_grid', qos.LATCHED)
         self._published: MapVersion | None = None
 
     def publish_map(self, grid: CorrectableGrid, stamp_ns: int) -> None:
@@ -44,9 +45,19 @@ class MapPublishers:
         shown = self.config.shown(patch)
         return messages.grid_msg(shown, self._frame, stamp_ns, self.load_ns)
 
-    def publish_local_grid(self, window: GridPatch, stamp_ns: int, corrected_ns: int) -> None:
-        """Publish the part of the grid that a scan has changed."""
-        self._local_grid.publish(self._grid_message(window, stamp_ns, corrected_ns))
+    def publish_local_grid(
+        self, window: GridPatch, grid: CorrectableGrid, localized: LocalizedScan
+    ) -> None:
+        """Publish the part of a grid that a scan has changed, and the scan."""
+        cells = self._grid_message(window, localized.scan.stamp_ns, grid.corrected_ns)
+        self._local_grid.publish(
+            LocalGrid(
+                header=cells.header,
+                localized=localized.message,
+                grid=cells,
+                is_rerendering=grid.is_rerendering,
+            )
+        )
 
     def _grid_message(self, patch: GridPatch, stamp_ns: int, corrected_ns: int) -> ProbabilityGrid:
         return messages.probability_grid_msg(

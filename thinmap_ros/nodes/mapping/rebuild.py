@@ -1,6 +1,7 @@
 """A topological map rebuilt after a loop closure, whose grid and poses come one after the other."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,65 +12,81 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.scan_history import CorrectedPoses, PoseHistory
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.ros.localized_scan import MappedScan
 
-# Windows after which a grid that does not come is awaited no longer. A re-rendering takes some tens
-# of windows, in a large building some hundreds.
-_PATIENCE = 1000
+
+class _Correction(NamedTuple):
+    """A trajectory: the scans of these stamps (M,) were made at poses (M, 3)."""
+
+    ns: int
+    stamps_ns: NDArray[np.int64]
+    poses: Array
 
 
 class Rebuilding:
-    """What is needed for it: where the robot has been, and which correction the grid has undergone.
+    """The graph follows the corrections of its grid.
 
-    Between a correction and the grid that has undergone it the graph accepts no windows, nor after
-    that any that were cut out of the grid before. The graph is rebuilt in a thread, so that no scan
+    While a grid is rendered again, the graph accepts no windows, nor later those of a grid that has
+    undergone another correction than the graph. The graph is rebuilt in a thread, so that no scan
     waits; windows that come meanwhile are added to the new graph.
     """
 
-    def __init__(self, from_the_start: bool = True) -> None:
-        """from_the_start: whether the graph begins here: all poses of it will be known."""
+    def __init__(self, from_the_start: bool = True, restored_ns: int | None = None) -> None:
+        """from_the_start: whether the graph begins here: all poses of it will be known.
+
+        restored_ns: stamp of a checkpoint, which follows all corrections until then.
+        """
         self._past: PoseHistory[None] | None = PoseHistory() if from_the_start else None
-        # Stamp of the correction whose grid is awaited, and the poses that came with it.
-        self._awaited: tuple[int, Array] | None = None
-        self._waited = 0
-        # The newest window, and stamps of the corrections that its grid,
-        # and one that is out of date, had undergone.
-        self._window: GridPatch | None = None
-        self._window_ns = 0
-        self._stale_ns: int | None = None
+        self._restored_ns = restored_ns
+        # Of the correction that the graph follows: None until there is a window.
+        self._corrected_ns: int | None = None
+        self._correction: _Correction | None = None
+        self._newest: MappedScan | None = None
         # The newest grid, until it is used with newer windows in it.
         self._grid: MapReceiver | None = None
         self._grid_ns = 0
         self._is_grid_used = False
         self._job: Future[TopologyBuilder] | None = None
-        self._pending: list[tuple[GridPatch, Array]] = []
+        self._pending: list[MappedScan] = []
 
-    def window(self, window: GridPatch, corrected_ns: int) -> None:
-        """Record a window, and the stamp of the correction that its grid had undergone."""
-        self._window = window
-        self._window_ns = corrected_ns
-        if corrected_ns != self._stale_ns:
-            self._stale_ns = None
+    def window(self, mapped: MappedScan) -> None:
+        """Record a window and its scan. Raises InputError where it does not fit the grid."""
+        self._newest = mapped
+        localized = mapped.localized
+        if self._past is not None:
+            self._past.add_pose(localized.scan.stamp_ns, localized.T_map_base, None)
+        self._adopt(mapped)
         self._paste_window()
+
+    def _adopt(self, mapped: MappedScan) -> None:
+        """Learn which correction the graph follows, from a window of its grid."""
+        if self._corrected_ns is None:
+            is_newer = self._restored_ns is not None and mapped.corrected_ns > self._restored_ns
+            self._corrected_ns = 0 if is_newer else mapped.corrected_ns
+        elif mapped.corrected_ns < self._corrected_ns <= mapped.localized.scan.stamp_ns:
+            # The mapper was restarted: its grid knows of no correction.
+            self._corrected_ns = mapped.corrected_ns
 
     def accepts_window(self) -> bool:
         """Whether the newest window may be added to the graph."""
-        if self._awaited is not None:
-            self._waited += 1
-            self._awaited = None if self._waited > _PATIENCE else self._awaited
-        return self._awaited is None and self._window_ns != self._stale_ns
+        mapped = self._newest
+        return (
+            mapped is not None
+            and not mapped.is_rerendering
+            and mapped.corrected_ns == self._corrected_ns
+        )
 
-    def update(
-        self, builder: TopologyBuilder, window: GridPatch, T_map_base: Array
-    ) -> tuple[TopologyBuilder, bool]:
-        """Update the graph by the newest window, at the robot's pose (3,).
+    def update(self, builder: TopologyBuilder) -> tuple[TopologyBuilder, bool]:
+        """Update the graph by the newest window.
 
         Returns the builder to use from now on, and whether its map changed.
         """
-        if not self.accepts_window():
+        builder = self.start(builder)
+        if self._newest is None or not self.accepts_window():
             return builder, False
         if self._job is None:
-            return builder, builder.update(window, T_map_base)
-        self._pending.append((window, T_map_base))
+            return builder, _updated(builder, self._newest)
+        self._pending.append(self._newest)
         return (self.result(builder), True) if self._job.done() else (builder, False)
 
     def result(self, builder: TopologyBuilder) -> TopologyBuilder:
@@ -78,23 +95,14 @@ class Rebuilding:
             return builder
         rebuilt = self._job.result()
         self._job = None
-        for window, T_map_base in self._pending:
-            rebuilt.update(window, T_map_base)
+        for mapped in self._pending:
+            _updated(rebuilt, mapped)
         self._pending = []
         return rebuilt
 
-    def add_pose(self, stamp_ns: int, T_map_base: Array) -> None:
-        """Add the pose (3,) of a scan."""
-        if self._past is not None:
-            self._past.add_pose(stamp_ns, T_map_base, None)
-
     def correct(self, corrected_ns: int, stamps_ns: NDArray[np.int64], poses: Array) -> None:
-        """Follow a correction: the scans of these stamps (M,) were made at poses (M, 3)."""
-        if self._past is not None:
-            self._past.apply_correction(stamps_ns, poses, since_ns=corrected_ns)
-        self._awaited = (corrected_ns, poses)
-        self._waited = 0
-        self._stale_ns = self._window_ns if self._window_ns != corrected_ns else None
+        """Record a correction: the scans of these stamps (M,) were made at poses (M, 3)."""
+        self._correction = _Correction(corrected_ns, stamps_ns, poses)
 
     def grid(self, patch: GridPatch, corrected_ns: int) -> None:
         """Record a whole grid, and the stamp of the correction that it had undergone.
@@ -110,11 +118,12 @@ class Rebuilding:
 
     def _paste_window(self) -> None:
         """Paste the newest window into a grid that is not used yet: it is newer."""
-        is_outdated = self._is_grid_used or self._window_ns != self._grid_ns
-        if self._grid is None or self._window is None or is_outdated:
+        if self._grid is None or self._is_grid_used or self._newest is None:
+            return
+        if self._newest.corrected_ns != self._grid_ns:
             return
         try:
-            self._grid.paste(self._window)
+            self._grid.paste(self._newest.window)
         except InputError:
             self._is_grid_used = True
             raise
@@ -123,33 +132,42 @@ class Rebuilding:
         """The newest grid with newer windows in it, once.
 
         None where it has been used, where it and the newest window have not undergone the same
-        correction, and while the graph is being rebuilt.
+        correction, and while grid or graph is being rebuilt.
         """
-        is_ready = self._awaited is None and self._job is None
-        is_matched = self._window is not None and self._window_ns == self._grid_ns
-        if self._grid is None or self._is_grid_used or not is_ready or not is_matched:
+        is_ready = self._job is None and self.accepts_window()
+        if self._grid is None or self._is_grid_used or not is_ready:
+            return None
+        if self._grid_ns != self._corrected_ns:
             return None
         self._is_grid_used = True
         return self._grid.patch
 
     def start(self, builder: TopologyBuilder) -> TopologyBuilder:
-        """Begin to rebuild the graph, if the newest grid has undergone the awaited correction.
+        """Begin to rebuild the graph, if there is a grid of a newer correction.
 
         Returns the builder to use until then.
         """
+        found = self._correction
         patch = None if self._grid is None else self._grid.patch
-        if self._awaited is None or patch is None or self._grid_ns != self._awaited[0]:
+        if found is None or patch is None or self._corrected_ns is None:
             return builder
-        _, poses = self._awaited
-        self._awaited = None
+        if not self._corrected_ns < found.ns == self._grid_ns:
+            return builder
+        self._corrected_ns = found.ns
         self._is_grid_used = True
         builder = self.result(builder)
         # Of a graph that began elsewhere it is not known from where it was seen: its nodes are
         # searched for where they were.
-        moved = CorrectedPoses(poses, poses)
+        moved = CorrectedPoses(found.poses, found.poses)
         if self._past is not None:
+            self._past.apply_correction(found.stamps_ns, found.poses, since_ns=found.ns)
             moved = self._past.accept_corrections()
         thread = ThreadPoolExecutor(max_workers=1)
         self._job = thread.submit(builder.rebuilt, patch, *moved)
         thread.shutdown(wait=False)
         return builder
+
+
+def _updated(builder: TopologyBuilder, mapped: MappedScan) -> bool:
+    """Update a graph by a window; returns whether its map changed."""
+    return builder.update(mapped.window, mapped.localized.T_map_base)

@@ -1,12 +1,13 @@
 """The map that the navigator plans on: thinmap's grid, or the map of another node."""
 
-from thinmap_msgs.msg import ProbabilityGrid
+from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN
 from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.localized_scan import mapped_scan_from_msg
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 
@@ -27,7 +28,7 @@ class MapInput:
     def subscribe(self, node: ThinmapNode) -> None:
         """Start to receive maps."""
         subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
-        subscribe_guarded(node, ProbabilityGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
+        subscribe_guarded(node, LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
         subscribe_to_map(node, 'map', self._on_map)
 
     def reset(self) -> None:
@@ -49,11 +50,13 @@ class MapInput:
         self._map_id = message.map_id
         self._map.replace(messages.grid_from_msg(message))
 
-    def _on_local_grid(self, message: ProbabilityGrid) -> None:
-        if UNKNOWN not in (message.map_id, self._map_id) and message.map_id != self._map_id:
+    def _on_local_grid(self, message: LocalGrid) -> None:
+        mapped = mapped_scan_from_msg(message)
+        map_id = message.grid.map_id
+        if UNKNOWN not in (map_id, self._map_id) and map_id != self._map_id:
             self._map = MapReceiver()
-        self._map_id = message.map_id
-        self._map.paste(messages.grid_from_msg(message))
+        self._map_id = map_id
+        self._map.paste(mapped.window)
 
     def _on_map(self, patch: GridPatch) -> None:
         if not self._has_grid:

@@ -55,7 +55,6 @@ SLAM_TOOLBOX = Package(
             'base_frame',
             'base_footprint',
             'localizer/base_frame',
-            'grid_mapper/base_frame',
             note='default base_link',
         ),
         _row('scan_topic', '/scan', note=f'{_REMAP}: `-r scan:=/front/scan`'),
@@ -89,7 +88,6 @@ SLAM_TOOLBOX = Package(
         _row(
             'max_laser_range',
             '20.0',
-            'grid_mapper/max_range_m',
             'localizer/max_range_m',
         ),
         _row('min_laser_range', '0.0', note='no: range_min of the scan'),

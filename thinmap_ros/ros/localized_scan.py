@@ -1,0 +1,116 @@
+"""Scans with the pose that the localizer found for them, from it to the mapper and beyond."""
+
+from dataclasses import dataclass, replace
+
+from geometry_msgs.msg import PoseWithCovariance
+
+from thinmap_msgs.msg import LocalGrid, SlamStatus
+from thinmap_msgs.msg import LocalizedScan as LocalizedScanMsg
+from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.core.estimate import Estimate, Placement
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import LaserConfig, Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.logs import decode
+from thinmap_ros.ros import messages
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizedScan:
+    """A scan, the pose T_map_base (3,) at which it was made, and the message with both.
+
+    corrected_ns: stamp of the newest trajectory that the pose follows; 0: none yet.
+    """
+
+    scan: Scan
+    T_map_base: Array
+    corrected_ns: int
+    message: LocalizedScanMsg
+
+    @property
+    def status(self) -> SlamStatus:
+        """Status of the localizer after the scan."""
+        return self.message.status
+
+    @property
+    def placement(self) -> Placement:
+        """Where the scan belongs: nowhere if the robot is lost, or the laser shows nothing."""
+        if self.status.state == SlamStatus.MAPPING_APART:
+            return Placement.APART
+        if self.status.state != SlamStatus.TRACKING:
+            return Placement.NOWHERE
+        return Placement.OPEN if self.status.is_contradicted else Placement.MAP
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether the laser shows nothing of what is around the robot."""
+        is_useless = self.status.state in (SlamStatus.BLIND, SlamStatus.MISALIGNED)
+        return bool(is_useless or self.scan.is_blind)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedScan:
+    """A scan, and the window of the map that contains it.
+
+    corrected_ns: stamp of the newest trajectory that all of the map follows; is_rerendering:
+    whether a newer one has not reached all of it.
+    """
+
+    localized: LocalizedScan
+    window: GridPatch
+    corrected_ns: int
+    is_rerendering: bool
+
+
+def localized_scan_msg(
+    scan: Scan, estimate: Estimate, status: SlamStatus, frame_id: str, corrected_ns: int = 0
+) -> LocalizedScanMsg:
+    """Message of a scan, its estimate and its status; corrected_ns as in `LocalizedScan`."""
+    T_map_base = messages.pose_with_covariance_msg(
+        estimate.T_map_base, estimate.covariance, frame_id, scan.stamp_ns
+    )
+    return LocalizedScanMsg(
+        header=T_map_base.header,
+        scan=messages.scan_msg(scan, '', scan.scan_time_s),
+        max_range_m=scan.max_range_m,
+        zero_is_no_return=scan.zero_is_no_return,
+        laser_pose=messages.pose_msg(scan.T_base_laser),
+        pose=PoseWithCovariance(pose=T_map_base.pose.pose, covariance=T_map_base.pose.covariance),
+        status=status,
+        correction_stamp=messages.time_msg(corrected_ns),
+    )
+
+
+def localized_scan_from_msg(message: LocalizedScanMsg) -> LocalizedScan:
+    """Scan of a message. Raises InputError where scan, pose or a stamp is invalid."""
+    scan = decode.scan(
+        message.scan,
+        messages.stamp_ns(message.header.stamp),
+        messages.pose_from_msg(message.laser_pose),
+        _laser(message),
+    )
+    return LocalizedScan(
+        replace(scan, drops_out=message.status.no_return_is_unknown),
+        messages.pose_from_msg(message.pose.pose),
+        messages.stamp_ns(message.correction_stamp),
+        message,
+    )
+
+
+def mapped_scan_from_msg(message: LocalGrid) -> MappedScan:
+    """Scan and window of a message. Raises InputError where one of them is invalid."""
+    return MappedScan(
+        localized_scan_from_msg(message.localized),
+        messages.grid_from_msg(message.grid),
+        messages.stamp_ns(message.grid.correction_stamp),
+        message.is_rerendering,
+    )
+
+
+def _laser(message: LocalizedScanMsg) -> LaserConfig:
+    try:
+        return LaserConfig(
+            max_range_m=message.max_range_m, zero_is_no_return=message.zero_is_no_return
+        )
+    except ConfigError as error:
+        raise InputError(str(error)) from error
