@@ -34,14 +34,14 @@ HALVES = ('a', 'b')
 def make_halves(logs: Path, name: str, folder: Path) -> None:
     """Make the pieces NAME.a and NAME.b of the halves of a log.
 
-    The truth is the trajectory of the whole log after all corrections.
+    The truth is the trajectory of the whole log after all corrections, where the robot is in the
+    published map.
     """
     if all((folder / f'{name}.{half}.npz').exists() for half in HALVES):
         return
     paths = (logs / name / 'log.clf.gz', logs / name / 'log.clf')
     pairs = list(paired_scans(open_log(next(path for path in paths if path.exists()))))
-    _, poses = _mapped(pairs)
-    truth = {scan.stamp_ns: T for (scan, _), T in zip(pairs, poses, strict=True)}
+    _, truth = _mapped(pairs)
     middle = len(pairs) // 2
     for half, some in zip(HALVES, (pairs[:middle], pairs[middle:]), strict=True):
         pipeline, _ = _mapped(some)
@@ -78,13 +78,16 @@ def explored(
     return pipeline, dict(zip(loop.log.stamps_ns, loop.log.true_poses, strict=True))
 
 
-def _mapped(pairs: Iterable[tuple[Scan, Array]]) -> tuple[Pipeline, Array]:
-    """Map scans with their odometry; returns the corrected poses (N, 3), too."""
+def _mapped(pairs: Iterable[tuple[Scan, Array]]) -> tuple[Pipeline, dict[int, Array]]:
+    """Map scans with their odometry; returns the corrected poses (3,) by stamp, too."""
     pipeline = Pipeline(PipelineConfig(scans_per_graph=_SCANS_PER_GRAPH))
+    stamps = []
     for scan, T_odom_base in pairs:
-        pipeline.step(scan, T_odom_base)
+        estimate = pipeline.step(scan, T_odom_base).estimate
+        stamps.append(None if estimate.is_mapping_apart else scan.stamp_ns)
     pipeline.finish()
-    return pipeline, pipeline.localizer.optimized_trajectory()
+    poses = pipeline.localizer.optimized_trajectory()
+    return pipeline, {s: T for s, T in zip(stamps, poses, strict=True) if s is not None}
 
 
 def _recorded(name: str, pipeline: Pipeline, truth: dict[int, Array]) -> RecordedPiece:

@@ -48,12 +48,8 @@ def decide(
 def recognize(
     query: MapPiece, known: MapPiece, join_odds: float = JOIN_ODDS, seed: int = 0
 ) -> Decision:
-    """Look for all views of a piece in a map, one after the other, until it is joined."""
+    """Look for all views of a piece in a map, and decide by all of them."""
     recognition = Recognition(known, seed)
-    decision = decide(recognition, query, known, join_odds)
     for view in query.views:
         recognition.add(view, query.landmarks.around(view))
-        decision = decide(recognition, query, known, join_odds)
-        if decision.is_joined:
-            break
-    return decision
+    return decide(recognition, query, known, join_odds)

@@ -43,7 +43,7 @@ def agree(T: Array, T_predicted: Array, path_m: float) -> bool:
 
 
 def are_same(poses: Array, T: Array) -> NDArray[np.bool_]:
-    """Which poses (N, 3) a view does not tell from another one (3,)."""
+    """Which poses (N, 3) a view does not tell from another one, (3,) or (N, 3)."""
     off = np.abs(poses - T)
     is_near = off[:, :2].max(axis=1) <= SAME_M
     return np.asarray(is_near & (np.abs(se2.wrap(off[:, 2])) <= SAME_RAD))

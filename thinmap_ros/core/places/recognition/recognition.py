@@ -67,6 +67,13 @@ class Hypothesis:
         if log_ratio > 0.0:
             self.poses[view.number] = T_map_view
 
+    def meets(self, other: 'Hypothesis') -> bool:
+        """Whether both place a view alike: they are one place, from which one of them departed."""
+        shared = list(self.poses.keys() & other.poses.keys())
+        poses = np.array([self.poses[k] for k in shared]).reshape(-1, 3)
+        others = np.array([other.poses[k] for k in shared]).reshape(-1, 3)
+        return bool(are_same(poses, others).any())
+
     def predicted(self, view: View, views: Sequence[View]) -> tuple[Array, float]:
         """Pose T_map_view (3,) by the nearest view along the path, and the path between both, m.
 
@@ -115,7 +122,7 @@ class Recognition:
             self._judge_by(view, hypothesis)
         for T_map_view in found:
             self._propose(view, T_map_view)
-        self._prune(view)
+        self._prune()
 
     def correct(self, poses: Array) -> None:
         """Follow a correction of the piece: its keyframes are at these poses (N, 3) now."""
@@ -163,15 +170,12 @@ class Recognition:
                 hypothesis.found.add(view.number)
         hypothesis.record(view, T, evidence, by_search)
 
-    def _prune(self, view: View) -> None:
-        """Keep the best hypotheses, those that place a view apart from each other."""
+    def _prune(self) -> None:
+        """Keep the best hypotheses, each of another place."""
         kept: list[Hypothesis] = []
-        places = np.empty((0, 3))
         for hypothesis in sorted(self.hypotheses, key=lambda each: -each.evidence):
-            T = hypothesis.predicted(view, self.views)[0]
-            if not are_same(places, T).any():
+            if not any(hypothesis.meets(better) for better in kept):
                 kept.append(hypothesis)
-                places = np.vstack([places, T])
         self.hypotheses = kept[:_MAX_HYPOTHESES]
 
     def _transform(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
