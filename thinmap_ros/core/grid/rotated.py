@@ -1,4 +1,4 @@
-"""Maps whose rows are not parallel to the x axis, as map_server files may have."""
+"""Maps at a pose: with rows that are not parallel to the x axis, or laid over another map."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,42 @@ def aligned_patch(
             f'map rotated by {T_map_origin[2]:.3f} rad: {rows} x {cols} cells: '
             f'expected {max_cells} at most'
         )
+    return GridPatch(frame, _resampled(T_map_origin, resolution_m, cells, frame, (rows, cols)))
+
+
+def overlaid(base: GridPatch, other: GridPatch, T_base_other: Array) -> GridPatch:
+    """A map with what another one knows besides, whose frame has a pose (3,) in it.
+
+    The cells are those of the base, which may be larger or smaller than those of the other map.
+    Raises InputError where the map would have more than MAX_CELLS cells.
+    """
+    corner = np.array([other.frame.origin_x, other.frame.origin_y, 0.0])
+    T_base_origin = se2.compose(T_base_other, corner)
+    cell_m = base.frame.resolution
+    own, shape = _bounds(T_base_origin, other.frame.resolution, other.shape)
+    rows_cols = base.frame.cells_of(np.array([[own.origin_x, own.origin_y]]))[0]
+    ends = rows_cols + np.ceil(np.array(shape) * own.resolution / cell_m).astype(int) + 1
+    before = np.maximum(-rows_cols, 0)
+    after = np.maximum(ends - base.shape, 0)
+    rows, cols = (base.shape + before + after).tolist()
+    if rows * cols > MAX_CELLS:
+        raise InputError(f'joined map: {rows} x {cols} cells: expected {MAX_CELLS} at most')
+    padded = base.padded((int(before[0]), int(before[1]), int(after[0]), int(after[1])))
+    laid = _resampled(
+        T_base_origin, other.frame.resolution, other.cells, padded.frame, padded.shape
+    )
+    return GridPatch(padded.frame, np.where(padded.cells == UNKNOWN, laid, padded.cells))
+
+
+def _resampled(
+    T_map_origin: Array,
+    resolution_m: float,
+    cells: NDArray[np.int8],
+    frame: GridFrame,
+    shape: tuple[int, int],
+) -> NDArray[np.int8]:
+    """Cells (H, W) at a pose (3,) on the lattice of another frame; see `aligned_patch`."""
+    rows, cols = shape
     resampled = np.full((rows, cols), UNKNOWN, dtype=np.int8)
     for row in range(rows):  # one at a time: a large map needs little more memory than its cells
         new_cells = np.column_stack([np.full(cols, row), np.arange(cols)])
@@ -41,7 +77,7 @@ def aligned_patch(
     centres = (occupied[:, ::-1].astype(np.float64) + 0.5) * resolution_m
     centres = se2.transform_points(T_map_origin, centres)
     resampled[tuple(frame.cells_of(centres).T)] = cells[tuple(occupied.T)]
-    return GridPatch(frame, resampled)
+    return resampled
 
 
 def _bounds(

@@ -22,6 +22,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
+from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizer_map import LocalizerMap
 from thinmap_ros.core.slam.matching import local_map
@@ -76,6 +77,11 @@ class Localizer:
     def keyframes(self) -> list[Keyframe]:
         """The keyframes, at their optimized poses."""
         return self._map.loops.keyframes.frames
+
+    @property
+    def edges(self) -> list[Edge]:
+        """Edges of the pose graph between the keyframes: their steps, and those of loops."""
+        return [*self._map.loops.keyframes.steps, *self._map.loops.graph.edges]
 
     @property
     def features(self) -> list[LineFeature]:

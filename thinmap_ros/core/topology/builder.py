@@ -21,7 +21,14 @@ from thinmap_ros.core.topology.layers.lattice import Cells, Lattice
 from thinmap_ros.core.topology.layers.stack import Layers, Span
 from thinmap_ros.core.topology.registry import Changes, Registry
 
-__all__ = ['TopologyBuilder', 'TopologyConfig', 'build', 'build_again', 'build_along']
+__all__ = [
+    'TopologyBuilder',
+    'TopologyConfig',
+    'build',
+    'build_again',
+    'build_along',
+    'moved_map',
+]
 
 _OFF_LATTICE = 1e-3  # of a cell: windows farther off do not belong to the same grid
 
@@ -140,7 +147,7 @@ class TopologyBuilder:
         builder = TopologyBuilder(self.config)
         if self._layers is None or self._registry is None or self._frame is None:
             return builder
-        moved = _moved(self._registry.map, before, after)
+        moved = moved_map(self._registry.map, before, after)
         robot_xy = self._frame.centres_of(self._layers.robot_places())
         robot_xy = _moved_points(robot_xy, before, after)
         places = patch.frame.cells_of(robot_xy)
@@ -151,6 +158,29 @@ class TopologyBuilder:
             Registry(patch.frame, self.config, moved, self._registry.next_id),
         )
         return builder
+
+    @staticmethod
+    def continued(
+        patch: GridPatch,
+        predecessor: TopologicalMap,
+        next_id: int,
+        config: TopologyConfig | None = None,
+    ) -> 'TopologyBuilder':
+        """Builder with the map of a grid whose ids continue those of another map of the place.
+
+        predecessor: its nodes at the places where they are now; a part of the grid without any of
+        them is not published. next_id: smallest number that no node or edge has had.
+        """
+        builder = TopologyBuilder(config)
+        xy = np.array([node.position for node in predecessor.nodes.values()]).reshape(-1, 2)
+        registry = Registry(patch.frame, builder.config, predecessor, next_id)
+        builder._fill(patch, patch.frame, patch.frame.cells_of(xy), registry)
+        return builder
+
+    @property
+    def next_id(self) -> int:
+        """Smallest number that no node or edge has had."""
+        return 1 if self._registry is None else self._registry.next_id
 
     def skip_ids(self, count: int) -> None:
         """Never assign the next so many ids: another builder may have assigned them meanwhile."""
@@ -257,8 +287,11 @@ def _moved_points(points: Array, before: Array, after: Array) -> Array:
     return moved
 
 
-def _moved(topology: TopologicalMap, before: Array, after: Array) -> TopologicalMap:
-    """The map with its nodes moved, and the middle of each edge as its path."""
+def moved_map(topology: TopologicalMap, before: Array, after: Array) -> TopologicalMap:
+    """The map with its nodes moved as the nearest of poses (N, 3) was.
+
+    The path of each edge is its middle alone.
+    """
     nodes = list(topology.nodes.values())
     xy = _moved_points(np.array([n.position for n in nodes]).reshape(-1, 2), before, after)
     edges = list(topology.edges.values())

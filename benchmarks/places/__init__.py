@@ -1,0 +1,1 @@
+"""Place recognition between pieces of maps, and joining them."""

@@ -1,0 +1,1 @@
+"""Place recognition: whether two pieces of map show the same place."""

@@ -1,0 +1,217 @@
+"""Whether a growing piece of map lies in another one: hypotheses, and the posterior odds of them.
+
+Each view of the piece is looked for in the whole map. What is found is a hypothesis. Each is judged
+by all views. "None of these places" is a hypothesis, too: its odds follow from the number of poses
+that the map has. Maps bend: a hypothesis has a pose for each view, near to the one that the next
+view along the path predicts. This is pairwise consistency along the path: Mangelson et al.,
+"Pairwise consistent measurement set maximization for robust multi-robot map merging", 2018.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.covariances import inverse
+from thinmap_ros.core.places.recognition.drift import SAME_M, SAME_RAD, agree, are_same
+from thinmap_ros.core.places.recognition.evidence import Evidence, ViewJudge
+from thinmap_ros.core.places.recognition.landmarks import Landmarks
+from thinmap_ros.core.places.recognition.piece import MapPiece
+from thinmap_ros.core.places.recognition.views import SPACING_M, WINDOW_M, View
+from thinmap_ros.core.se2 import Array
+
+# Of one view. Neighbouring views are not independent, and the model may be wrong: with twice as
+# much a foreign pair of maps was joined, with half as much a real building was not.
+_MAX_LOG_RATIO = 6.0
+_INDEPENDENT = SPACING_M / WINDOW_M  # share of a view that is in no other one
+# How often a search over the whole map leads to the right place, and again to a wrong one.
+_FOUND_AGAIN = 0.9
+_WRONG_AGAIN = 0.05
+_FOUND_BY_SEARCH = math.log(_FOUND_AGAIN / _WRONG_AGAIN)
+_NOT_FOUND_BY_SEARCH = math.log((1.0 - _FOUND_AGAIN) / (1.0 - _WRONG_AGAIN))
+_MIN_FOUND = 2  # views whose searches lead to a hypothesis that is accepted
+_PLACES_OF_A_VIEW = 3
+_MAX_HYPOTHESES = 12
+_MAX_VIEWS = 20  # by which a new hypothesis is judged: bounds the time of a view
+_NOISE = np.diag([0.05**2, 0.05**2, 0.01**2])  # of a match, besides that of its points
+
+
+@dataclass(eq=False)
+class Hypothesis:
+    """A place of the piece in the map, as a pose T_map_view (3,) for each view that supports it.
+
+    first: number of the view whose search led here first; found: those whose search led here;
+    evidence_of: each view, without the evidence of the search; log_ratios: with it, limited.
+    """
+
+    first: int
+    poses: dict[int, Array] = field(default_factory=dict)
+    evidence_of: dict[int, Evidence] = field(default_factory=dict)
+    log_ratios: dict[int, float] = field(default_factory=dict)
+    found: set[int] = field(default_factory=set)
+
+    @property
+    def evidence(self) -> float:
+        """Sum of the log likelihood ratios of the views, as far as these are independent."""
+        return _INDEPENDENT * sum(self.log_ratios.values())
+
+    def record(
+        self, view: View, T_map_view: Array, evidence: Evidence, by_search: float = 0.0
+    ) -> None:
+        """Record the evidence of a view for a pose (3,) in the map, and that of its search."""
+        log_ratio = evidence.log_ratio + by_search
+        self.log_ratios[view.number] = min(max(log_ratio, -_MAX_LOG_RATIO), _MAX_LOG_RATIO)
+        self.evidence_of[view.number] = evidence
+        if log_ratio > 0.0:
+            self.poses[view.number] = T_map_view
+
+    def meets(self, other: 'Hypothesis') -> bool:
+        """Whether both place a view alike: they are one place, from which one of them departed."""
+        shared = list(self.poses.keys() & other.poses.keys())
+        poses = np.array([self.poses[k] for k in shared]).reshape(-1, 3)
+        others = np.array([other.poses[k] for k in shared]).reshape(-1, 3)
+        return bool(are_same(poses, others).any())
+
+    def predicted(self, view: View, views: Sequence[View]) -> tuple[Array, float]:
+        """Pose T_map_view (3,) by the nearest view along the path, and the path between both, m.
+
+        views: all of the piece, by number.
+        """
+        anchor = min(self.poses, key=lambda k: abs(views[k].path_m - view.path_m))
+        T_anchor_view = se2.between(views[anchor].T_piece_view, view.T_piece_view)
+        path_m = abs(views[anchor].path_m - view.path_m)
+        return se2.compose(self.poses[anchor], T_anchor_view), path_m
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where a piece lies in a map: T_map_piece (3,) with covariance (3, 3), and the log odds.
+
+    hypothesis: the place of each view.
+    """
+
+    T_map_piece: Array
+    covariance: Array
+    log_odds: float
+    hypothesis: Hypothesis
+
+
+class Recognition:
+    """Looks for a growing piece of map in another one, view by view."""
+
+    def __init__(self, known: MapPiece, seed: int = 0) -> None:
+        """known: the map in which the piece is looked for; it stays as it is."""
+        self._known = known
+        self._judge = ViewJudge(known, np.random.default_rng(seed))
+        self._log_alternatives = log_alternatives(known)
+        self.views: list[View] = []
+        self.hypotheses: list[Hypothesis] = []
+        self._found: list[Array] = []  # poses (N, 3) by the search for each view
+
+    def add(self, view: View, landmarks: Landmarks) -> None:
+        """Look for the next view of the piece; landmarks: around the view, in its frame.
+
+        The time is bounded. Views are numbered in their order.
+        """
+        self.views.append(view)
+        found = self._known.find(view, landmarks, _PLACES_OF_A_VIEW)
+        self._found.append(found)
+        for hypothesis in self.hypotheses:
+            self._judge_by(view, hypothesis)
+        for T_map_view in found:
+            self._propose(view, T_map_view)
+        self._prune()
+
+    def correct(self, poses: Array) -> None:
+        """Follow a correction of the piece: its keyframes are at these poses (N, 3) now."""
+        self.views = [view.moved(poses[view.frames[1]]) for view in self.views]
+
+    def placement(self) -> Placement | None:
+        """The most likely place, and its odds against all others and none; None without one."""
+        if not self.hypotheses:
+            return None
+        best = self.hypotheses[0]
+        logs = [other.evidence - self._log_alternatives for other in self.hypotheses]
+        log_odds = logs[0] - float(np.logaddexp.reduce([0.0, *logs[1:]]))
+        if len(best.found) < _MIN_FOUND:
+            log_odds = min(log_odds, 0.0)
+        return Placement(*self._transform(best), log_odds, best)
+
+    def _propose(self, view: View, T_map_view: Array) -> None:
+        """Make a place where a view was found a hypothesis, or evidence for one."""
+        evidence = self._judge.evidence(view, T_map_view)
+        if evidence.log_ratio <= 0.0:
+            return
+        for hypothesis in self.hypotheses:
+            if agree(T_map_view, *hypothesis.predicted(view, self.views)):
+                if evidence.found > hypothesis.evidence_of[view.number].found:
+                    hypothesis.found.add(view.number)
+                    by_search = 0.0 if hypothesis.first == view.number else _FOUND_BY_SEARCH
+                    hypothesis.record(view, T_map_view, evidence, by_search)
+                return
+        hypothesis = Hypothesis(view.number)
+        hypothesis.record(view, T_map_view, evidence)
+        hypothesis.found.add(view.number)
+        for other in reversed(self.views[-1 - _MAX_VIEWS : -1]):
+            self._judge_by(other, hypothesis)
+        self.hypotheses.append(hypothesis)
+
+    def _judge_by(self, view: View, hypothesis: Hypothesis) -> None:
+        """Add the evidence of a view for a hypothesis, at the best pose within the drift."""
+        predicted, path_m = hypothesis.predicted(view, self.views)
+        T, evidence = self._judge.best_near(view, predicted, path_m)
+        by_search = 0.0
+        if evidence.found > 0.0:
+            is_found = any(agree(found, T, 0.0) for found in self._found[view.number])
+            by_search = _FOUND_BY_SEARCH if is_found else _NOT_FOUND_BY_SEARCH
+            if is_found:
+                hypothesis.found.add(view.number)
+        hypothesis.record(view, T, evidence, by_search)
+
+    def _prune(self) -> None:
+        """Keep the best hypotheses, each of another place."""
+        kept: list[Hypothesis] = []
+        for hypothesis in sorted(self.hypotheses, key=lambda each: -each.evidence):
+            if not any(hypothesis.meets(better) for better in kept):
+                kept.append(hypothesis)
+        self.hypotheses = kept[:_MAX_HYPOTHESES]
+
+    def _transform(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
+        """T_map_piece (3,) by the view with the most evidence, and its covariance (3, 3)."""
+        best = max(hypothesis.poses, key=lambda k: hypothesis.evidence_of[k].log_ratio)
+        view = self.views[best]
+        T, information, _ = self._known.field.refined(view, hypothesis.poses[best])
+        covariance = inverse(information + np.eye(3)) + _NOISE
+        return se2.compose(T, se2.invert(view.T_piece_view)), covariance
+
+
+def log_alternatives(known: MapPiece) -> float:
+    """Log of the number of poses in a map that a view tells apart."""
+    squares = max(known.free_area_m2 / SAME_M**2, 1.0)
+    return math.log(squares * 2.0 * math.pi / SAME_RAD)
+
+
+def log_odds_back(
+    query: MapPiece, known: MapPiece, views: Sequence[View], hypothesis: Hypothesis, seed: int = 0
+) -> float:
+    """Log odds of a hypothesis by the views of the map in the piece: the other way round.
+
+    views: of the piece, by number. What a piece shows may fit into a richer map by chance. The
+    richer map does not fit into the piece then.
+    """
+    numbers = list(hypothesis.poses)
+    places = np.array([hypothesis.poses[number] for number in numbers])
+    judge = ViewJudge(query, np.random.default_rng(seed))
+    own = Hypothesis(0)
+    for view in known.views:
+        away = np.hypot(*(places[:, :2] - view.T_piece_view[:2]).T)
+        nearest = int(away.argmin())
+        if away[nearest] > WINDOW_M:
+            continue
+        T_query_found = views[numbers[nearest]].T_piece_view
+        T_query_map = se2.compose(T_query_found, se2.invert(places[nearest]))
+        T, evidence = judge.best_near(view, se2.compose(T_query_map, view.T_piece_view), 0.0)
+        own.record(view, T, evidence)
+    return own.evidence - log_alternatives(query)

@@ -1,0 +1,1 @@
+"""Joining of two pieces of map whose relative place has been recognized."""

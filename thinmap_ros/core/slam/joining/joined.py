@@ -1,0 +1,139 @@
+"""One map of two pieces: one pose graph, one grid, one topological map whose ids continue."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.covariances import inverse, propagated_covariance, rotated_covariance
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.rotated import overlaid
+from thinmap_ros.core.places.recognition.recognition import Placement
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph.keyframes import Keyframe
+from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
+from thinmap_ros.core.slam.joining.links import match_keyframes, placed_keyframes
+from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
+from thinmap_ros.core.topology.builder import TopologyBuilder, moved_map
+from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.joining import Ids, join_topologies
+
+_ORIGIN = np.zeros((1, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class JoinConfig:
+    """Configurations of the joined grid and topological map."""
+
+    grid: OccupancyConfig | None = None
+    topology: TopologyConfig | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedMap:
+    """The map of two pieces, in the frame of the first.
+
+    T_first_second (3,): frame of the second piece; ids: of the nodes of the second piece in the
+    map, by their own; links: number of edges between keyframes of both.
+    """
+
+    piece: SlamPiece
+    grid: OccupancyGrid
+    topology: TopologyBuilder
+    T_first_second: Array
+    ids: Ids
+    links: int
+
+
+def join(
+    first: SlamPiece, second: SlamPiece, placement: Placement, config: JoinConfig | None = None
+) -> JoinedMap:
+    """Join two pieces, given where the second lies in the first.
+
+    If both have edges, all keyframes are optimized together, and the grid is rendered from their
+    scans. Otherwise both stay rigid.
+    """
+    config = config or JoinConfig()
+    priors = placed_keyframes(second, placement.hypothesis)
+    links = _found(match_keyframes(first.frames, second.frames, priors))
+    if first.is_rigid or second.is_rigid:
+        return _joined_rigidly(first, second, placement.T_map_piece, links, config)
+    return _optimized_together(first, second, placement.T_map_piece, links, config)
+
+
+def _found(links: Iterable[Edge | None]) -> list[Edge]:
+    return [link for link in links if link is not None]
+
+
+def _optimized_together(
+    first: SlamPiece, second: SlamPiece, T: Array, links: Sequence[Edge], config: JoinConfig
+) -> JoinedMap:
+    count = len(first.frames)
+    poses = np.vstack([first.poses, [se2.compose(T, own) for own in second.poses]])
+    frames = _at([*first.frames, *second.frames], _bent(poses, first, second, links))
+    # Again, where the other keyframes are now: those of the views alone left a third more error.
+    nearby = enumerate(frame.T_map_base for frame in frames[count:])
+    links = _found(match_keyframes(frames[:count], frames[count:], nearby))
+    poses = _bent(poses, first, second, links)
+    frames = _at(frames, poses)
+    grid = OccupancyGrid(config.grid, first.patch.frame)
+    for frame in frames:
+        grid.add_scan(frame.scan, frame.T_map_base)
+    patch = grid.known_area()
+    topology, ids = join_topologies(
+        patch,
+        moved_map(first.graph, first.poses, poses[:count]),
+        moved_map(second.graph, second.poses, poses[count:]),
+        first.next_id,
+        config.topology,
+    )
+    edges = _all_edges(first, second, links)
+    piece = SlamPiece(frames, edges, patch, topology.map, topology.next_id)
+    nearest = links[0].b if links else 0
+    T_joined = se2.compose(poses[count + nearest], se2.invert(second.poses[nearest]))
+    return JoinedMap(piece, grid, topology, T_joined, ids, len(links))
+
+
+def _all_edges(first: SlamPiece, second: SlamPiece, links: Sequence[Edge]) -> list[Edge]:
+    """Edges of both pieces and between them; keyframes of the second count after the first."""
+    count = len(first.frames)
+    shifted = [replace(edge, a=edge.a + count, b=edge.b + count) for edge in second.edges]
+    return [*first.edges, *shifted, *(replace(link, b=link.b + count) for link in links)]
+
+
+def _bent(poses: Array, first: SlamPiece, second: SlamPiece, links: Sequence[Edge]) -> Array:
+    """Poses (N, 3) of all keyframes after an optimization."""
+    return optimized(poses, _all_edges(first, second, links))
+
+
+def _at(frames: Sequence[Keyframe], poses: Array) -> list[Keyframe]:
+    return [replace(frame, T_map_base=T) for frame, T in zip(frames, poses, strict=True)]
+
+
+def _joined_rigidly(
+    first: SlamPiece, second: SlamPiece, T: Array, links: Sequence[Edge], config: JoinConfig
+) -> JoinedMap:
+    bodies = [_between_bodies(link, first, second) for link in links]
+    T = optimized(np.vstack([np.zeros(3), T]), bodies)[1]
+    patch = overlaid(first.patch, second.patch, T)
+    topology, ids = join_topologies(
+        patch,
+        moved_map(first.graph, _ORIGIN, _ORIGIN),
+        moved_map(second.graph, _ORIGIN, T[None]),
+        first.next_id,
+        config.topology,
+    )
+    piece = SlamPiece.of_bare_map(patch, topology.map, topology.next_id)
+    grid = OccupancyGrid.from_patch(patch, config.grid)
+    return JoinedMap(piece, grid, topology, T, ids, len(links))
+
+
+def _between_bodies(link: Edge, first: SlamPiece, second: SlamPiece) -> Edge:
+    """A link as an edge from the frame of the first piece to that of the second."""
+    T_first_a = first.poses[link.a]
+    T_first_b = se2.compose(T_first_a, link.T_a_b)
+    T_first_second = se2.compose(T_first_b, se2.invert(second.poses[link.b]))
+    covariance = rotated_covariance(inverse(link.information), float(T_first_a[2]))
+    covariance = propagated_covariance(covariance, T_first_second[:2] - T_first_b[:2])
+    return Edge(0, 1, T_first_second, inverse(covariance), robust=True)
