@@ -1,17 +1,51 @@
 """Result of one localizer step."""
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
 from thinmap_ros.core.se2 import Array
 
+MAX_ODDS = 1e12  # that are told apart
+
+
+@dataclass(frozen=True)
+class Apart:
+    """A piece of map that is apart: path length, m, and log odds of its most likely place."""
+
+    path_m: float
+    log_odds: float
+
+    @property
+    def odds(self) -> float:
+        """Odds of the most likely place, at most MAX_ODDS; 0 without one."""
+        return math.exp(min(self.log_odds, math.log(MAX_ODDS)))
+
+
+@dataclass(frozen=True, eq=False)
+class Join:
+    """A piece of map that was apart and is joined with the published map.
+
+    T (3,): where the frame in which it was made lies in the map; log_odds: of its place; path_m:
+    length of its path; links: number of matches between both.
+    """
+
+    T: Array
+    log_odds: float
+    path_m: float
+    links: int
+
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Poses (N, 3) of the keyframes before and after the pose graph was optimized."""
+    """Poses (N, 3) of the keyframes before and after the pose graph was optimized.
+
+    join: the piece that was joined, if its place was recognized.
+    """
 
     before: Array
     after: Array
+    join: Join | None = None
 
 
 class Placement(Enum):
@@ -37,8 +71,7 @@ class Estimate:
     while the robot stands still). n_features, n_local_features: features in the map, and in the
     local area. inlier_ratio: share of the scan points in known space that fit the map.
     is_lost: the place in the map is unknown; the covariance is accordingly large.
-    is_mapping_apart: lost, and what the robot sees is mapped as a piece of its own, which a loop
-    closure joins with the map.
+    apart: the piece of map that the robot is in; None if that is the published map.
     is_contradicted: scans contradict the map, and whether the robot is lost is not yet decided.
     blind_reason: why the laser does not confirm the pose, which follows the odometry; '': it does.
     odometry_discontinuity: description of an odometry jump since the previous scan; '': none.
@@ -58,13 +91,18 @@ class Estimate:
     n_local_features: int = 0
     inlier_ratio: float = 0.0
     is_lost: bool = False
-    is_mapping_apart: bool = False
+    apart: Apart | None = None
     is_contradicted: bool = False
     blind_reason: str = ''
     odometry_discontinuity: str = ''
     mount_fault: str = ''
     correction: Correction | None = None
     scan_information: Array | None = None
+
+    @property
+    def is_mapping_apart(self) -> bool:
+        """Whether the robot is lost, and maps a piece of its own until its place is known."""
+        return self.apart is not None
 
     @property
     def placement(self) -> Placement:

@@ -1,5 +1,6 @@
 """The pose of the robot: each scan, with the odometry at its stamp, is a step of the localizer."""
 
+import math
 from dataclasses import dataclass, field
 from time import monotonic, perf_counter
 
@@ -24,7 +25,7 @@ from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
@@ -67,11 +68,6 @@ _HEALTH = {
     SlamStatus.TRACKING: (OK, 'tracking'),
     SlamStatus.LOST: (ERROR, 'lost: scans contradict the map'),
     SlamStatus.NO_MAP: (ERROR, 'no map: waits for topic map; dead reckoning'),
-    SlamStatus.MAPPING_APART: (
-        ERROR,
-        'lost: maps a piece apart until its place in the map is known: expected a pose on '
-        'initialpose, or a way through known places',
-    ),
 }
 
 
@@ -112,6 +108,9 @@ class _PosePublishers:
         status.matched = estimate.matched_lines
         status.rejected = localizer.rejected
         status.inlier_ratio = estimate.inlier_ratio
+        if estimate.apart is not None:
+            status.apart_m = estimate.apart.path_m
+            status.join_odds = estimate.apart.odds
         self._status.publish(status)
         self._scan.publish(localized_scan_msg(scan, estimate, status, frame, self._corrected_ns))
 
@@ -481,7 +480,7 @@ class LocalizerNode(ThinmapNode):
         if estimate.correction is not None:
             stamps, poses = self._localizer.keyframe_trajectory()
             self._output.publish_trajectory(scan.stamp_ns, stamps.tolist(), poses)
-            self.get_logger().info(f'loop closed: {len(poses)} keyframe poses corrected')
+            self.get_logger().info(_correction_line(estimate.correction, len(poses)))
         if state != SlamStatus.NO_MAP:
             self._broadcaster.update(estimate.T_map_odom)
         self._given.publish(scan.stamp_ns, estimate, state)
@@ -513,7 +512,32 @@ def _health(state: int, estimate: Estimate) -> tuple[bytes, str]:
         return ERROR, f'laser blind ({estimate.blind_reason}): dead reckoning'
     if state == SlamStatus.MISALIGNED:
         return ERROR, f'laser misaligned: {estimate.mount_fault}'
+    if estimate.apart is not None and state == SlamStatus.MAPPING_APART:
+        return ERROR, (
+            f'lost: maps a piece apart, {estimate.apart.path_m:.0f} m, best odds '
+            f'{_odds(estimate.apart.odds)}: expected a way through known places, or a pose on '
+            'initialpose'
+        )
     return _HEALTH[state]
+
+
+def _correction_line(correction: Correction, poses: int) -> str:
+    join = correction.join
+    if join is None:
+        return f'loop closed: {poses} keyframe poses corrected'
+    x, y, yaw = join.T.tolist()
+    return (
+        f'a piece of map of {join.path_m:.0f} m is joined: moved by x {x:.2f} m, y {y:.2f} m, '
+        f'yaw {yaw:.3f} rad, odds {_odds(math.exp(join.log_odds))}, {join.links} matches; {poses} '
+        'keyframe poses corrected'
+    )
+
+
+def _odds(odds: float) -> str:
+    """Odds as people say them: 12:1, or 1:30."""
+    if odds <= 0.0:
+        return 'none'
+    return f'{odds:.3g}:1' if odds >= 1.0 else f'1:{1.0 / odds:.3g}'
 
 
 def _feature_msg(feature: Feature) -> LineFeature:

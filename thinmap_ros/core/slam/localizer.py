@@ -225,8 +225,8 @@ class Localizer:
         anchor = self._map.loops.anchor
         T_map_base = self.pose
         covariance = self._tracker.covariance(anchor)
-        is_apart = self._map.loops.pieces.is_apart
-        is_lost = is_apart or evidence.is_lost
+        apart = self._map.atlas.apart
+        is_lost = apart is not None or evidence.is_lost
         match = tracked.match
         return Estimate(
             T_map_base,
@@ -234,7 +234,7 @@ class Localizer:
             se2.compose(T_map_base, se2.invert(self._tracker.prediction.T_odom_base)),
             inlier_ratio=0.0 if match is None else match.inlier_ratio,
             is_lost=is_lost,
-            is_mapping_apart=is_apart,
+            apart=apart,
             is_contradicted=self.config.is_mapping and not evidence.agrees,
             blind_reason=tracked.blind_reason,
             odometry_discontinuity=tracked.discontinuity,

@@ -1,6 +1,7 @@
 """The map of the localizer: its local map, keyframes, pose graph and trajectory."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.active_map import ActiveMap
+from thinmap_ros.core.slam.atlas import Atlas
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, Step, heading_errors, with_heading
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Systematic
@@ -33,6 +35,7 @@ class LocalizerMap:
         self.loops = LoopClosure(
             config.loop_closure, config.keyframes, config.matching, config.local_map, calibration
         )
+        self.atlas = Atlas(self.loops)
         self.local = ActiveMap(config.local_map, self.loops.pieces)
         self._path = KeyframeTrajectory()
 
@@ -68,6 +71,8 @@ class LocalizerMap:
             return
         if track.evidence.needs_submap:
             self.start_submap()
+        elif track.evidence.forbids_mapping:
+            return
         self._correct_heading(scan)
         if not self.local.add_scan(points, scan.T_base_laser, self.pose):
             # No building is that large: the pose is wrong, or was.
@@ -91,7 +96,10 @@ class LocalizerMap:
 
     def close_loops(self) -> Correction | None:
         """Do one step of loop closure; the local map follows its correction."""
+        self.atlas.step(self._config.loop_closure.join_odds)
         correction = self.loops.step()
+        if correction is not None:
+            correction = replace(correction, join=self.atlas.take_join())
         self.local.follow(self.loops.keyframes, self.pose)
         return correction
 

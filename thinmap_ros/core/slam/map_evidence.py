@@ -31,6 +31,7 @@ class MapEvidence:
         self.level = 0.0
         self._seen_through = 0.0
         self._before_look = 0.0  # the same before the present look
+        self._is_foreign = False  # whether the last scan may be one of another place
         self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
         self.is_unconfirmed = False  # after a scan without a match, until one fits
         self.adjust(lost_threshold, least_fit)
@@ -44,6 +45,20 @@ class MapEvidence:
     def agrees(self) -> bool:
         """Whether there is no evidence against the map."""
         return self.level == 0.0 and self._seen_through == 0.0
+
+    @property
+    def forbids_mapping(self) -> bool:
+        """Whether the last scan may show another place than the map does.
+
+        A map that such scans change soon agrees with them, wherever the robot is. A scan that fits
+        shows this place, with people or furniture.
+        """
+        return self._is_foreign
+
+    @property
+    def _is_grave(self) -> bool:
+        """Whether the evidence is more than half of what makes the robot lost."""
+        return 2.0 * max(self.level, self._seen_through) > self._lost_evidence
 
     @property
     def is_lost(self) -> bool:
@@ -66,9 +81,13 @@ class MapEvidence:
         if match is None:
             self.is_unconfirmed = True
             return
-        if match.inlier_ratio >= self._least_fit:
+        fits = match.inlier_ratio >= self._least_fit
+        if fits:
             self.is_unconfirmed = False
-        more = match.contradiction_ratio - match.inlier_ratio / INLIERS_PER_CONTRADICTION
+        more = match.contradiction_ratio
+        if fits or not self._is_grave:  # a third of the points fit anywhere
+            more -= match.inlier_ratio / INLIERS_PER_CONTRADICTION
+        self._is_foreign = not fits and (more > 0.0 or self._is_grave)
         self.level = max(self.level + more, 0.0)
         if not is_stationary:
             self._end_look(self._seen_through)
@@ -107,5 +126,6 @@ class MapEvidence:
     def start_submap(self) -> None:
         """Start a new local map, which no scan contradicts."""
         self.level = 0.0
+        self._is_foreign = False
         self._end_look(0.0)
         self.is_delocalized = False

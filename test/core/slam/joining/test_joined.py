@@ -138,7 +138,8 @@ def test_keyframes_are_matched_one_at_a_time(drives):
     """A caller does one match, and another one later."""
     first, second, _ = drives
     placement = placed(piece_of(first), piece_of(second))
-    priors = list(placed_keyframes(piece_of(second), placement.hypothesis))
+    query = piece_of(second)
+    priors = list(placed_keyframes(query.frames, query.places.views, placement.hypothesis))
     frames = (first.piece.keyframes, second.piece.keyframes)
     matching = match_keyframes(*frames, priors)
     link = next(link for link in matching if link is not None)

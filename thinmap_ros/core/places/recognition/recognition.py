@@ -103,7 +103,7 @@ class Recognition:
 
     def __init__(self, known: MapPiece, seed: int = 0) -> None:
         """known: the map in which the piece is looked for; it stays as it is."""
-        self._known = known
+        self.known = known
         self._judge = ViewJudge(known, np.random.default_rng(seed))
         self._log_alternatives = log_alternatives(known)
         self.views: list[View] = []
@@ -116,7 +116,7 @@ class Recognition:
         The time is bounded. Views are numbered in their order.
         """
         self.views.append(view)
-        found = self._known.find(view, landmarks, _PLACES_OF_A_VIEW)
+        found = self.known.find(view, landmarks, _PLACES_OF_A_VIEW)
         self._found.append(found)
         for hypothesis in self.hypotheses:
             self._judge_by(view, hypothesis)
@@ -182,7 +182,7 @@ class Recognition:
         """T_map_piece (3,) by the view with the most evidence, and its covariance (3, 3)."""
         best = max(hypothesis.poses, key=lambda k: hypothesis.evidence_of[k].log_ratio)
         view = self.views[best]
-        T, information, _ = self._known.field.refined(view, hypothesis.poses[best])
+        T, information, _ = self.known.field.refined(view, hypothesis.poses[best])
         covariance = inverse(information + np.eye(3)) + _NOISE
         return se2.compose(T, se2.invert(view.T_piece_view)), covariance
 

@@ -42,10 +42,10 @@ class KeyframeGraph:
         """Whether an optimization is in progress."""
         return self._optimization is not None
 
-    def optimize(self) -> None:
-        """Begin an optimization."""
+    def optimize(self, start: Array | None = None) -> None:
+        """Begin an optimization, at poses (N, 3); None: at the present ones."""
         self._calibrate(self._calibration.smoothed())
-        poses = self._keyframes.poses()
+        poses = self._keyframes.poses() if start is None else start
         self._optimization = _Optimization(rounds(poses, self._all_edges), poses)
 
     def optimized(self) -> Array:

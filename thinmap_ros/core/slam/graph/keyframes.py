@@ -8,7 +8,7 @@ graph", 2013.
 
 import heapq
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -33,6 +33,7 @@ from thinmap_ros.jit import inlined, kernel
 
 _BUCKET_M = 4.0
 _NO_COVARIANCE = np.zeros((3, 3))
+_DETACHED = 1e-9 * np.eye(3)  # information of a step that says nothing
 _NO_DERIVATIVE = np.zeros((3, 4))
 _UNMEASURED = (0.0, math.inf, 0.0, 0.0, 0.0, 0.0, 0.0)  # row of a heading
 _RADIAN_M = 1.0  # distance that changes the view of a scan as much as a rotation by a radian
@@ -190,6 +191,15 @@ class Keyframes:
         self._buckets.insert(number, float(frame.T_map_base[0]), float(frame.T_map_base[1]))
         self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
         return number
+
+    def detach(self, numbers: Container[int]) -> None:
+        """Forget the steps to keyframes from others: they do not say how these lie."""
+        self.steps = [
+            replace(step, information=_DETACHED)
+            if step.b in numbers and step.a not in numbers
+            else step
+            for step in self.steps
+        ]
 
     def reuse(self, number: int, frame: Keyframe) -> None:
         """Reuse an earlier keyframe with nearly the same view (reduced pose graph)."""

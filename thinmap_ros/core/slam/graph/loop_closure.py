@@ -6,6 +6,7 @@ Several mutually consistent matches close a loop. Then the pose graph is optimiz
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from thinmap_ros.core.covariances import (
     rotation,
 )
 from thinmap_ros.core.estimate import Correction
+from thinmap_ros.core.places.recognition.decision import JOIN_ODDS
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import CHI2
 from thinmap_ros.core.slam.graph.consistency import largest_consistent
@@ -89,6 +91,13 @@ class LoopClosureConfig(Config):
         'to close loops earlier.',
         low=1,
         high=_RECENT,
+    )
+    join_odds: float = parameter(
+        JOIN_ODDS,
+        'Odds of its place with which a piece of map that is apart is joined with the published '
+        'map. Raise it where parts of the building look alike; joins then come later.',
+        low=10.0,
+        high=1e12,
     )
     max_visits: int = 3
     search_sigmas: float = 3.0
@@ -281,6 +290,26 @@ class LoopClosure:
             self._requested.clear()
             self.graph.edges += edges
             self.graph.optimize()
+
+    def join(self, T: Array, edges: Sequence[Edge]) -> None:
+        """Begin to join the robot's piece with another one, by edges between both.
+
+        T (3,): where the map frame of the robot's piece lies in that of the other.
+        """
+        self._add_pending()
+        self._requested.clear()
+        frames = self.keyframes.frames
+        here = [k for k, frame in enumerate(frames) if self.pieces.is_here(frame.submap)]
+        poses = self.keyframes.poses()
+        poses[here] = [se2.compose(T, own) for own in poses[here]]
+        self.keyframes.detach(set(here))
+        self.graph.edges += edges
+        self.graph.optimize(poses)
+
+    @property
+    def min_consistent_matches(self) -> int:
+        """Number of matches that agree on a loop."""
+        return self._config.min_consistent_matches
 
     def _closing_edges(self) -> list[Edge]:
         """Loop edges that enough matches agree on, within a piece or between two."""

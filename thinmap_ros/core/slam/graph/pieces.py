@@ -34,6 +34,11 @@ class Pieces:
         return len(self._piece_of) - 1
 
     @property
+    def piece(self) -> int:
+        """Number of the piece that the robot is in."""
+        return self._piece_of[-1]
+
+    @property
     def is_apart(self) -> bool:
         """Whether the place of the robot in the published map is unknown."""
         return self._piece_of[-1] != _PUBLISHED
@@ -77,7 +82,8 @@ class Pieces:
                 of_piece[self._piece_of[frames[edge.a].submap]].append(edge)
         for edges in of_piece.values():
             agreeing = largest_consistent(edges, frames)
-            if _count_views([frames[edge.b].T_map_base for edge in agreeing]) >= fewest:
+            along_path = sorted(edge.b for edge in agreeing)
+            if _count_views([frames[b].T_map_base for b in along_path]) >= fewest:
                 self._matches.clear()
                 return agreeing
         return []

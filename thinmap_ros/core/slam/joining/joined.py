@@ -55,7 +55,7 @@ def join(
     scans. Otherwise both stay rigid.
     """
     config = config or JoinConfig()
-    priors = placed_keyframes(second, placement.hypothesis)
+    priors = placed_keyframes(second.frames, second.places.views, placement.hypothesis)
     links = _found(match_keyframes(first.frames, second.frames, priors))
     if first.is_rigid or second.is_rigid:
         return _joined_rigidly(first, second, placement.T_map_piece, links, config)

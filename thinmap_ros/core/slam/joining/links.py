@@ -15,7 +15,6 @@ from thinmap_ros.core.slam.graph.keyframes import Keyframe, view_difference_m
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.graph.submaps import Submaps
-from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 
@@ -29,11 +28,13 @@ Prior = tuple[int, Array]
 """A keyframe by its number, and its predicted pose (3,) in the known piece."""
 
 
-def placed_keyframes(query: SlamPiece, hypothesis: Hypothesis) -> Iterator[Prior]:
-    """Keyframes of the views that a hypothesis places."""
-    views = [query.places.views[number] for number in sorted(hypothesis.poses)]
-    for k, frame in enumerate(query.frames):
-        around = [view for view in views if view.frames[0] <= k <= view.frames[2]]
+def placed_keyframes(
+    query: Sequence[Keyframe], views: Sequence[View], hypothesis: Hypothesis
+) -> Iterator[Prior]:
+    """Keyframes of the views that a hypothesis places; views: all of the piece, by number."""
+    placed = [views[number] for number in sorted(hypothesis.poses)]
+    for k, frame in enumerate(query):
+        around = [view for view in placed if view.frames[0] <= k <= view.frames[2]]
         if around:
             view = min(around, key=lambda each: abs(each.frames[1] - k))
             yield k, _pose_by(view, hypothesis, frame)

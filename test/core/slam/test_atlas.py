@@ -1,0 +1,50 @@
+"""A robot that was carried off maps a piece apart, and joins it where it recognizes the place."""
+
+import math
+
+import numpy as np
+from support.carried_robot import carried
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.places.recognition.decision import JOIN_ODDS
+from thinmap_ros.core.slam.localizer import Localizer
+
+
+def localized(moments):
+    """Each moment's estimate with the error of its position, m."""
+    localizer = Localizer()
+    T_world_map = None
+    found = []
+    for moment in moments:
+        if T_world_map is None:
+            T_world_map = moment.T_world_base
+        estimate = localizer.step(moment.scan, moment.T_odom_base)
+        T_world_base = se2.compose(T_world_map, estimate.T_map_base)
+        off_m = float(np.hypot(*(T_world_base - moment.T_world_base)[:2]))
+        found.append((moment.drive, estimate, off_m))
+    return found
+
+
+def is_mapped(estimate):
+    return not (estimate.is_lost or estimate.is_contradicted)
+
+
+def test_a_robot_that_was_carried_off_joins_its_map_where_it_is():
+    found = localized(carried((1, 0, 60.0), (1, 3, 70.0)))
+    later = [(estimate, off_m) for drive, estimate, off_m in found if drive == 1]
+    assert any(estimate.is_mapping_apart for estimate, _ in later)
+    assert all(off_m < 0.5 for estimate, off_m in later if is_mapped(estimate))
+    last, off_m = later[-1]
+    assert is_mapped(last) and off_m < 0.1
+    joins = [e.correction.join for e, _ in later if e.correction is not None]
+    assert len(joins) == 1
+    assert joins[0].log_odds > math.log(JOIN_ODDS) and joins[0].links > 10
+    assert 15.0 < joins[0].path_m < 70.0
+
+
+def test_a_robot_that_was_carried_into_another_building_stays_apart():
+    found = localized(carried((3, 0, 60.0), (4, 1, 60.0)))
+    _, last, _ = found[-1]
+    assert last.apart is not None
+    assert last.apart.path_m > 40.0 and last.apart.log_odds < math.log(JOIN_ODDS)
+    assert all(estimate.correction is None for drive, estimate, _ in found if drive == 1)
