@@ -16,7 +16,9 @@ from thinmap_ros.files.merging import NotTheSamePlaceError, merge_maps, read_pie
 from thinmap_ros.files.occupancy_maps import write_map
 from thinmap_ros.files.sessions import GRID, LOCALIZER, REGIONS, TOPOLOGY
 
-FIRST, SECOND, THIRD = ((1, 1), (1, 2), (1, 3))
+FIRST = (1, 1)
+SECOND = (1, 2)
+THIRD = (1, 3)
 FOREIGN = (11, 1)
 
 
