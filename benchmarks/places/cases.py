@@ -3,11 +3,13 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
+from scipy.spatial import cKDTree
+
 from benchmarks.places.make import HALVES, make_exploration, make_halves
 from benchmarks.places.recorded import RecordedPiece
 
 LOGS = ('fhw', 'intel_raw', 'aces_raw', 'csail_raw')
-# Two starts of a building share ground, but those that APART names.
 EXPLORATIONS = (
     ('kth/50052748', 0),
     ('kth/50052748', 1),
@@ -25,12 +27,10 @@ EXPLORATIONS = (
     ('dungeon/d1336', 0),
     ('dungeon/d1407', 0),
 )
-APART = {
-    ('kth_50052748.s0', 'kth_50052748.s9'),
-    ('kth_50052748.s1', 'kth_50052748.s9'),
-    ('kth_50037764_PLAN1.s0', 'kth_50037764_PLAN1.s6'),
-}
 _EXPLORATION_S = 500.0
+_NEAR_M = 2.0
+_APART_M = 8.0  # range of the simulated laser
+_MIN_SHARED = 30  # keyframes: 20 m of path, which recognition needs
 Pairs = list[tuple[RecordedPiece, RecordedPiece]]
 
 
@@ -46,19 +46,27 @@ def recorded(folder: Path, data: Path, count: int | None) -> list[RecordedPiece]
 
 
 def with_shared_ground(pieces: Iterable[RecordedPiece]) -> Pairs:
-    """Ordered pairs of one building that share ground."""
+    """Ordered pairs that share enough ground."""
     return [pair for pair in _ordered(pieces) if is_shared(*pair)]
 
 
 def without_shared_ground(pieces: Iterable[RecordedPiece]) -> Pairs:
-    """Ordered pairs of two buildings, or of two parts of one."""
-    return [pair for pair in _ordered(pieces) if not is_shared(*pair)]
+    """Ordered pairs of two buildings, or of two parts of one that are not in sight."""
+    return [pair for pair in _ordered(pieces) if not _count_near(*pair, _APART_M)]
 
 
 def is_shared(known: RecordedPiece, query: RecordedPiece) -> bool:
-    """Whether two pieces share ground."""
-    names = (min(known.name, query.name), max(known.name, query.name))
-    return known.building == query.building and names not in APART
+    """Whether two pieces share enough ground, by the truth."""
+    return _count_near(known, query, _NEAR_M) >= _MIN_SHARED
+
+
+def _count_near(known: RecordedPiece, query: RecordedPiece, near_m: float) -> int:
+    """Keyframes of the query that are near one of the known piece, by the truth."""
+    if known.building != query.building:
+        return 0
+    places = [piece.truth[~np.isnan(piece.truth[:, 0]), :2] for piece in (known, query)]
+    away, _ = cKDTree(places[0]).query(places[1])
+    return int(np.count_nonzero(away < near_m))
 
 
 def _ordered(pieces: Iterable[RecordedPiece]) -> Pairs:
