@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.core.topology.thinning import thin
     from thinmap_ros.evaluation.exploration_run import explore
     from thinmap_ros.files.graphs import write_graph
+    from thinmap_ros.files.merging import MergedMap, merge_maps
     from thinmap_ros.files.occupancy_maps import read_map, write_map
     from thinmap_ros.files.package_data import world_path
     from thinmap_ros.files.worlds import read_world
@@ -39,6 +40,7 @@ __all__ = [
     'GlobalLocalizer',
     'GridPatch',
     'InputError',
+    'MergedMap',
     'OccupancyGrid',
     'Pipeline',
     'PipelineConfig',
@@ -49,6 +51,7 @@ __all__ = [
     'World',
     'build_topology',
     'explore',
+    'merge_maps',
     'open_log',
     'paired_scans',
     'read_map',
@@ -77,6 +80,8 @@ _PLACES = {
     'OccupancyGrid': 'core.grid.occupancy.OccupancyGrid',
     'read_map': 'files.occupancy_maps.read_map',
     'write_map': 'files.occupancy_maps.write_map',
+    'MergedMap': 'files.merging.MergedMap',
+    'merge_maps': 'files.merging.merge_maps',
     # topological maps
     'TopologicalMap': 'core.topology.graph.TopologicalMap',
     'TopologyConfig': 'core.topology.config.TopologyConfig',

@@ -26,6 +26,7 @@ PROGRAMS = {
         'tools.compare_exploration', 'exploration strategies on worlds and starts, in one table'
     ),
     'map_to_graph': _Program('tools.map_to_graph', 'a map_server map into a route graph'),
+    'merge_sessions': _Program('tools.merge_sessions', 'maps of one place into one session'),
     'carmen_to_bag': _Program('tools.carmen_to_bag', 'a CARMEN log into a bag'),
     'bag_repair': _Program('tools.bag_repair', 'a damaged bag (MCAP) into a whole one'),
     'experiment': _Program('tools.experiment', "the papers' figures and tables"),
@@ -34,6 +35,8 @@ PROGRAMS = {
     'demo': _Program('tools.demo', 'a simulated robot explores a room on a live ROS 2 graph', True),
     'nodes': _Program('nodes.thinmap', 'ROS 2 nodes in one process', True),
 }
+
+_SHORT = {'merge': 'merge_sessions'}
 
 
 def _usage() -> str:
@@ -50,6 +53,7 @@ def _usage() -> str:
             *lines,
             '',
             'thinmap SUBCOMMAND --help lists the arguments of a subcommand.',
+            *(f'thinmap {short} is short for {name}.' for short, name in _SHORT.items()),
         ]
     )
 
@@ -78,7 +82,7 @@ def main() -> None:
     arguments = sys.argv[1:]
     if not arguments:
         _fail('expected a subcommand: thinmap --help lists them')
-    name = arguments[0]
+    name = _SHORT.get(arguments[0], arguments[0])
     if name in ('-h', '--help'):
         print(_usage())
     elif name == '--version':

@@ -7,6 +7,7 @@ from support.driven_pieces import driven_piece
 from thinmap_ros.core import se2
 from thinmap_ros.core.places.recognition import constellation_kernels
 from thinmap_ros.core.places.recognition.constellations import ConstellationIndex
+from thinmap_ros.core.places.recognition.drift import SAME_M, SAME_RAD
 from thinmap_ros.core.places.recognition.landmarks import (
     Landmarks,
     landmarks_around,
@@ -45,7 +46,7 @@ def test_candidates_differ(rng):
     found = ConstellationIndex(landmarks).candidates(seen_from(landmarks, np.zeros(3), rng, 30.0))
     for k, T in enumerate(found):
         off = np.abs(found[:k] - T)
-        assert not ((off[:, :2] < 0.6).all(axis=1) & (off[:, 2] < 0.2)).any()
+        assert not ((off[:, :2] < SAME_M).all(axis=1) & (off[:, 2] < SAME_RAD)).any()
 
 
 def test_few_landmarks_make_no_candidates(rng):

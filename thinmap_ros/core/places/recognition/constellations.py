@@ -5,11 +5,11 @@ import math
 import numpy as np
 
 from thinmap_ros.core.places.recognition import constellation_kernels
+from thinmap_ros.core.places.recognition.drift import SAME_M, SAME_RAD
 from thinmap_ros.core.places.recognition.landmarks import Landmarks
 from thinmap_ros.core.se2 import Array, wrap
 
-_BIN_M = 0.6  # of votes
-_HEADING_BINS = 48  # of a turn
+_HEADING_BINS = math.ceil(2.0 * math.pi / SAME_RAD)
 _CANDIDATES = 60
 
 
@@ -47,7 +47,7 @@ def _peaks(poses: Array, weights: Array) -> Array:
     for T in means[np.argsort(-votes, kind='stable')]:
         off = np.abs(kept - T)
         turn = np.abs(wrap(off[:, 2])) * _HEADING_BINS / (2.0 * math.pi)
-        if np.any((off[:, :2].max(axis=1) <= _BIN_M) & (turn <= 2.0)):
+        if np.any((off[:, :2].max(axis=1) <= SAME_M) & (turn <= 2.0)):
             continue
         kept = np.vstack([kept, T])
         if len(kept) == _CANDIDATES:
@@ -57,7 +57,7 @@ def _peaks(poses: Array, weights: Array) -> Array:
 
 def _counted(poses: Array, weights: Array) -> tuple[Array, Array]:
     """Votes (B,) of each bin and its 26 neighbours, and weighted mean poses (B, 3) of the bins."""
-    cells = np.floor(poses[:, :2] / _BIN_M).astype(np.int64)
+    cells = np.floor(poses[:, :2] / SAME_M).astype(np.int64)
     cells -= cells.min(axis=0) - 1
     turns = np.floor((poses[:, 2] / (2.0 * math.pi) + 0.5) * _HEADING_BINS).astype(np.int64)
     width, height = (cells.max(axis=0) + 2).tolist()

@@ -143,23 +143,6 @@ def refine_all(
     return found, means
 
 
-@kernel
-def mean_weights(field: FieldArrays, poses: Array, walls: Array, width: float) -> Array:
-    """Mean weights (N,) of wall points (M, 2) at poses (N, 3); width: of the loss, m."""
-    found = np.empty(len(poses))
-    for k in range(len(poses)):
-        c = math.cos(poses[k, 2])
-        s = math.sin(poses[k, 2])
-        total = 0.0
-        for i in range(len(walls)):
-            x = poses[k, 0] + c * walls[i, 0] - s * walls[i, 1] - field.origin_x
-            y = poses[k, 1] + s * walls[i, 0] + c * walls[i, 1] - field.origin_y
-            away, _, _ = _distance_at(field, x / field.cell_m, y / field.cell_m)
-            total += _weight(away, width / field.cell_m)
-        found[k] = total / max(len(walls), 1)
-    return found
-
-
 @inlined
 def _state_at(field: FieldArrays, x: float, y: float) -> tuple[int, float]:
     """State of the cell at (x, y), m from the origin, and its distance to a wall in cells."""

@@ -14,8 +14,6 @@ from thinmap_ros.core.places.recognition.wall_field import WallField
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-_STARTS = 400  # candidates that are refined
-
 
 class MapPiece:
     """A piece of map in which views of another one are looked for, or whose views these are.
@@ -62,7 +60,7 @@ class MapPiece:
         poses = self.index.candidates(landmarks)
         if not len(poses):
             return poses
-        rough, fits = self.field.refined_widely(view, self.field.best_starts(view, poses, _STARTS))
+        rough, fits = self.field.refined_widely(view, poses)
         kept = _distinct(rough[np.argsort(-fits, kind='stable')], count)
         return np.array([self.field.refined(view, T)[0] for T in kept])
 

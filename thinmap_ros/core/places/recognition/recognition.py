@@ -31,7 +31,6 @@ _FOUND_AGAIN = 0.9
 _WRONG_AGAIN = 0.05
 _FOUND_BY_SEARCH = math.log(_FOUND_AGAIN / _WRONG_AGAIN)
 _NOT_FOUND_BY_SEARCH = math.log((1.0 - _FOUND_AGAIN) / (1.0 - _WRONG_AGAIN))
-_MIN_FOUND = 2  # views whose searches lead to a hypothesis that is accepted
 _PLACES_OF_A_VIEW = 3
 _MAX_HYPOTHESES = 12
 _MAX_VIEWS = 20  # by which a new hypothesis is judged: bounds the time of a view
@@ -42,15 +41,14 @@ _NOISE = np.diag([0.05**2, 0.05**2, 0.01**2])  # of a match, besides that of its
 class Hypothesis:
     """A place of the piece in the map, as a pose T_map_view (3,) for each view that supports it.
 
-    first: number of the view whose search led here first; found: those whose search led here;
-    evidence_of: each view, without the evidence of the search; log_ratios: with it, limited.
+    first: number of the view whose search led here first; evidence_of: each view, without the
+    evidence of the search; log_ratios: with it, limited.
     """
 
     first: int
     poses: dict[int, Array] = field(default_factory=dict)
     evidence_of: dict[int, Evidence] = field(default_factory=dict)
     log_ratios: dict[int, float] = field(default_factory=dict)
-    found: set[int] = field(default_factory=set)
 
     @property
     def evidence(self) -> float:
@@ -135,8 +133,6 @@ class Recognition:
         best = self.hypotheses[0]
         logs = [other.evidence - self._log_alternatives for other in self.hypotheses]
         log_odds = logs[0] - float(np.logaddexp.reduce([0.0, *logs[1:]]))
-        if len(best.found) < _MIN_FOUND:
-            log_odds = min(log_odds, 0.0)
         return Placement(*self._transform(best), log_odds, best)
 
     def _propose(self, view: View, T_map_view: Array) -> None:
@@ -147,13 +143,11 @@ class Recognition:
         for hypothesis in self.hypotheses:
             if agree(T_map_view, *hypothesis.predicted(view, self.views)):
                 if evidence.found > hypothesis.evidence_of[view.number].found:
-                    hypothesis.found.add(view.number)
                     by_search = 0.0 if hypothesis.first == view.number else _FOUND_BY_SEARCH
                     hypothesis.record(view, T_map_view, evidence, by_search)
                 return
         hypothesis = Hypothesis(view.number)
         hypothesis.record(view, T_map_view, evidence)
-        hypothesis.found.add(view.number)
         for other in reversed(self.views[-1 - _MAX_VIEWS : -1]):
             self._judge_by(other, hypothesis)
         self.hypotheses.append(hypothesis)
@@ -166,8 +160,6 @@ class Recognition:
         if evidence.found > 0.0:
             is_found = any(agree(found, T, 0.0) for found in self._found[view.number])
             by_search = _FOUND_BY_SEARCH if is_found else _NOT_FOUND_BY_SEARCH
-            if is_found:
-                hypothesis.found.add(view.number)
         hypothesis.record(view, T, evidence, by_search)
 
     def _prune(self) -> None:

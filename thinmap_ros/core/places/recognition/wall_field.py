@@ -51,12 +51,6 @@ class WallField:
         xy = self._standing[rng.integers(len(self._standing), size=count)]
         return np.column_stack([xy, rng.uniform(-np.pi, np.pi, count)])
 
-    def best_starts(self, view: View, poses: Array, count: int) -> Array:
-        """The poses (M, 3) from which a view has the most walls near those of the map."""
-        walls = thinned(view.walls)[::2]
-        fits = field_kernels.mean_weights(self._arrays, poses, walls, float(_WIDE[0]))
-        return poses[np.argsort(-fits, kind='stable')[:count]]
-
     def refined_widely(self, view: View, poses: Array) -> tuple[Array, Array]:
         """Poses (N, 3) of a view moved to walls up to half a metre away; how well it fits (N,)."""
         return field_kernels.refine_all(self._arrays, poses, thinned(view.walls), _WIDE)

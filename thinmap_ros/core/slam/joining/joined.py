@@ -20,6 +20,7 @@ from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.joining import Ids, join_topologies
 
 _ORIGIN = np.zeros((1, 3))
+_MAX_RIGID_LINKS = 100  # for one transform; more take time
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +56,12 @@ def join(
     scans. Otherwise both stay rigid.
     """
     config = config or JoinConfig()
-    priors = placed_keyframes(second.frames, second.places.views, placement.hypothesis)
+    is_rigid = first.is_rigid or second.is_rigid
+    priors = list(placed_keyframes(second.frames, second.places.views, placement.hypothesis))
+    if is_rigid:
+        priors = priors[:: 1 + len(priors) // _MAX_RIGID_LINKS]
     links = _found(match_keyframes(first.frames, second.frames, priors))
-    if first.is_rigid or second.is_rigid:
+    if is_rigid:
         return _joined_rigidly(first, second, placement.T_map_piece, links, config)
     return _optimized_together(first, second, placement.T_map_piece, links, config)
 

@@ -16,7 +16,7 @@ from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.graph.submaps import Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
-from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
+from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS, Matcher, MatchingConfig
 
 _CONFIG = LoopClosureConfig()
 _OWN = np.diag(np.square([_CONFIG.noise_m, _CONFIG.noise_m, _CONFIG.noise_rad]))
@@ -52,11 +52,11 @@ def match_keyframes(
     submaps = Submaps(LocalMapConfig())
     poses = np.array([frame.T_map_base for frame in known]).reshape(-1, 3)
     for k, prior in priors:
+        frame = query[k]
         j = _nearest(poses, prior)
-        if j is None:
+        if j is None or len(frame.points) < MIN_POINTS:
             continue
         base, submap = submaps.around(known, j, math.inf)
-        frame = query[k]
         match = matcher.match(
             frame.points, frame.scan.T_base_laser, submap, se2.between(base, prior), _PRIOR
         )

@@ -1,0 +1,160 @@
+"""Saved maps of one place merged into one session."""
+
+import math
+
+import numpy as np
+import pytest
+from support.driven_pieces import driven_piece, true_transform
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.regions.tracker import RegionTracker
+from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.files import sessions
+from thinmap_ros.files.merging import NotTheSamePlaceError, merge_maps, read_piece, write_ids
+from thinmap_ros.files.occupancy_maps import write_map
+from thinmap_ros.files.sessions import GRID, LOCALIZER, REGIONS, TOPOLOGY
+
+FIRST = (1, 1)
+SECOND = (1, 2)
+THIRD = (1, 3)
+FOREIGN = (11, 1)
+
+
+def save_session(path, drive):
+    piece = driven_piece(*drive).piece
+    sessions.save_grid(str(path), OccupancyGrid.from_patch(piece.patch))
+    builder = TopologyBuilder.continued(piece.patch, piece.graph, 5000)
+    TOPOLOGY.save(str(path), builder)
+    regions = RegionTracker()
+    regions.update(piece.patch)
+    REGIONS.save(str(path), regions)
+    return str(path)
+
+
+def save_yaml(path, drive):
+    return str(write_map(path, driven_piece(*drive).piece.patch))
+
+
+def require_right(join, drive):
+    off = se2.between(true_transform(driven_piece(*FIRST), driven_piece(*drive)), join.T_merged_map)
+    assert np.hypot(off[0], off[1]) < 0.1
+    assert abs(off[2]) < 0.01
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('maps')
+    save_session(folder / 'first', FIRST)
+    save_session(folder / 'second', SECOND)
+    save_yaml(folder / 'third', THIRD)
+    save_yaml(folder / 'foreign', FOREIGN)
+    return folder
+
+
+def test_two_sessions_become_one_with_the_ids_of_the_first(folder, tmp_path):
+    paths = [str(folder / 'first'), str(folder / 'second')]
+    merged = merge_maps(paths)
+    out = str(tmp_path / 'both')
+    merged.save(out)
+    (join,) = merged.joins
+    require_right(join, SECOND)
+    assert join.log_odds > math.log(1e5)
+    grid = sessions.load_grid(out)
+    assert grid.known_area().free.sum() > GRID.load(paths[0]).known_area().free.sum()
+    graph = sessions.load_topology(out).map
+    before = TOPOLOGY.load(paths[0]).map
+    assert len(graph.nodes.keys() & before.nodes.keys()) >= 0.7 * len(before.nodes)
+    fresh = graph.nodes.keys() - before.nodes.keys()
+    assert min(fresh) >= 5000
+    assert set(join.ids.values()) <= set(graph.nodes)
+    regions = REGIONS.load(out)
+    regions.update(grid.known_area())
+    earlier = REGIONS.load(paths[0]).update(GRID.load(paths[0]).known_area())
+    assert earlier.regions.keys() & regions.regions.regions.keys()
+
+
+def test_sessions_and_maps_of_other_programs_are_mixed(folder, tmp_path):
+    paths = [str(folder / name) for name in ('first', 'third.yaml', 'second')]
+    merged = merge_maps(paths)
+    for join in merged.joins:
+        require_right(join, THIRD if join.path.endswith('third.yaml') else SECOND)
+    assert {join.path for join in merged.joins} == set(paths[1:])
+    write_ids(tmp_path / 'ids.csv', merged)
+    lines = (tmp_path / 'ids.csv').read_text().splitlines()
+    assert lines[0] == 'map,id,merged_id'
+    assert len(lines) == 1 + sum(len(join.ids) for join in merged.joins)
+
+
+def test_a_foreign_map_is_refused(folder):
+    foreign = str(folder / 'foreign.yaml')
+    with pytest.raises(
+        NotTheSamePlaceError, match=r'foreign.yaml: not the same place \(log odds -'
+    ):
+        merge_maps([str(folder / 'first'), foreign])
+    with pytest.raises(NotTheSamePlaceError, match='foreign'):
+        merge_maps([str(folder / 'first'), foreign, str(folder / 'second')])
+
+
+def test_join_odds_that_no_map_reaches_join_none(folder):
+    paths = [str(folder / 'first'), str(folder / 'second')]
+    with pytest.raises(NotTheSamePlaceError) as error:
+        merge_maps(paths, join_odds=1e300)
+    assert error.value.log_odds > math.log(1e5)
+
+
+@pytest.mark.parametrize(
+    ('paths', 'match'),
+    [
+        (['first'], 'expected two different maps or more'),
+        (['first', 'first'], 'expected two different maps or more'),
+        (['first', 'missing'], 'missing.yaml: No such file'),
+    ],
+)
+def test_wrong_paths_are_one_line(folder, paths, match):
+    with pytest.raises(InputError, match=match) as error:
+        merge_maps([str(folder / path) for path in paths])
+    assert '\n' not in str(error.value)
+
+
+def test_wrong_odds_are_one_line(folder):
+    with pytest.raises(InputError, match=r'join odds 0\.5: expected more than 1'):
+        merge_maps([str(folder / 'first'), str(folder / 'second')], join_odds=0.5)
+
+
+def test_files_of_other_programs_stay(folder, tmp_path):
+    merged = merge_maps([str(folder / 'first'), str(folder / 'second')])
+    (tmp_path / 'both.yaml').write_text('of another program')
+    with pytest.raises(InputError, match=r'both\.yaml: exists'):
+        merged.save(str(tmp_path / 'both'))
+    assert [path.name for path in tmp_path.iterdir()] == ['both.yaml']
+
+
+def test_parts_of_an_earlier_session_are_renamed(folder, tmp_path):
+    """They belong to another map: a localizer would be lost with its old local map."""
+    from thinmap_ros.core.slam.localizer import Localizer
+
+    merged = merge_maps([str(folder / 'first'), str(folder / 'second')])
+    out = str(tmp_path / 'both')
+    LOCALIZER.save(out, Localizer())
+    lines = merged.save(out)
+    assert not LOCALIZER.exists(out)
+    assert any('renamed' in line for line in lines)
+
+
+def test_progress_is_reported(folder):
+    shown = []
+    merge_maps(
+        [str(folder / 'first'), str(folder / 'second')],
+        progress=lambda share, text: shown.append((share, text)),
+    )
+    assert [share for share, _ in shown] == [0.0, 0.0]
+    assert 'joining' in shown[-1][1]
+
+
+def test_a_piece_of_a_session_continues_its_ids(folder):
+    piece = read_piece(str(folder / 'first'))
+    assert piece.next_id == TOPOLOGY.load(str(folder / 'first')).next_id
+    assert piece.is_rigid
+    assert len(piece.frames) > 50

@@ -1,0 +1,76 @@
+"""The program merge_sessions: a session of maps of one place, or one line and nothing written."""
+
+import re
+
+import pytest
+from PIL import Image
+from support.driven_pieces import driven_piece
+
+from thinmap_ros.files import sessions
+from thinmap_ros.files.occupancy_maps import write_map
+from thinmap_ros.tools import merge_sessions
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('maps')
+    for name, drive in (('a', (2, 1)), ('b', (2, 2)), ('foreign', (12, 1))):
+        write_map(folder / name, driven_piece(*drive).piece.patch)
+    return folder
+
+
+def run(monkeypatch, *words):
+    monkeypatch.setattr('sys.argv', ['merge_sessions', *map(str, words)])
+    try:
+        merge_sessions.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def test_transform_odds_and_ids_are_printed(folder, tmp_path, monkeypatch, capsys):
+    out = tmp_path / 'both'
+    options = ('--picture', tmp_path / 'both.png', '--ids', tmp_path / 'ids.csv', '--quiet')
+    assert run(monkeypatch, folder / 'a.yaml', folder / 'b.yaml', '-o', out, *options) == 0
+    written, joined, kept = capsys.readouterr().out.splitlines()
+    assert written == f'{out}.pgm, .yaml and .grid.npz, .topology.npz and .regions.npz'
+    number = r'-?\d+\.\d+'
+    assert re.fullmatch(
+        rf'{re.escape(str(folder))}/b.yaml: at {number}, {number} m, {number} deg '
+        rf'\(sigma {number}, {number} m, {number} deg\), log odds {number}, \d+ matches; '
+        r'\d+ of \d+ nodes in the map',
+        joined,
+    )
+    assert re.fullmatch(rf'{re.escape(str(folder))}/a.yaml: \d+ of \d+ nodes keep their ids', kept)
+    assert Image.open(tmp_path / 'both.png').width > 1000
+    assert (tmp_path / 'ids.csv').read_text().startswith('map,id,merged_id\n')
+    sessions.require_session(str(out))
+
+
+def test_another_place_ends_with_1_and_one_line(folder, tmp_path, monkeypatch, capsys):
+    words = (folder / 'a.yaml', folder / 'foreign.yaml', '-o', tmp_path / 'out', '--quiet')
+    assert run(monkeypatch, *words) == 1
+    printed = capsys.readouterr()
+    assert printed.out == ''
+    (line,) = printed.err.splitlines()
+    assert re.fullmatch(r'.*/foreign\.yaml: not the same place \(log odds -(\d+\.\d|inf)\)', line)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('words', 'expected'),
+    [
+        (('a.yaml', 'missing.yaml', '-o', 'out'), 'missing.yaml: No such file or directory'),
+        (('a.yaml', '-o', 'out'), 'expected two different maps or more'),
+        (('a.yaml', 'b.yaml', '-o', 'out', '--picture', 'x.jpg'), 'x.jpg: expected a name that'),
+        (('a.yaml', 'b.yaml', '-o', 'out', '--join-odds', '0'), 'join odds 0: expected more'),
+    ],
+)
+def test_wrong_arguments_are_one_line(folder, monkeypatch, capsys, words, expected):
+    monkeypatch.chdir(folder)
+    before = sorted(folder.iterdir())
+    assert run(monkeypatch, *words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('merge_sessions: error: ')
+    assert expected in line
+    assert sorted(folder.iterdir()) == before

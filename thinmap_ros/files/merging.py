@@ -1,0 +1,184 @@
+"""Merges saved maps: sessions and map_server maps of one place into one session."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from thinmap_ros.core.errors import InputError, ThinmapError
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.places.recognition.decision import JOIN_ODDS, recognize
+from thinmap_ros.core.regions.tracker import RegionTracker
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.joining.joined import JoinedMap, join
+from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
+from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
+from thinmap_ros.files import sessions
+from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.files.occupancy_maps import Report, read_map, warn
+from thinmap_ros.files.sessions import EXPLORATION, GRID, LOCALIZER, REGIONS, TOPOLOGY
+
+MIN_MAPS = 2
+
+
+class NotTheSamePlaceError(ThinmapError):
+    """Maps do not show the same place; log_odds: that one lies in the others."""
+
+    def __init__(self, path: str, log_odds: float) -> None:
+        super().__init__(f'{path}: not the same place (log odds {log_odds:.1f})')
+        self.log_odds = log_odds
+
+
+@dataclass(frozen=True, eq=False)
+class MapJoin:
+    """How a map was joined: pose T_merged_map (3,) with covariance (3, 3), and log odds.
+
+    ids: of its nodes in the merged map, by their own; nodes: number of its nodes; links: matches of
+    its scans with those of the other maps.
+    """
+
+    path: str
+    T_merged_map: Array
+    covariance: Array
+    log_odds: float
+    ids: dict[int, int]
+    nodes: int
+    links: int
+
+
+@dataclass(frozen=True, eq=False)
+class MergedMap:
+    """The map of several, in the frame of the first of them.
+
+    maps: these, by path; joins: of all but the first, in the order in which they were joined.
+    """
+
+    grid: OccupancyGrid
+    topology: TopologyBuilder
+    regions: RegionTracker
+    maps: dict[str, SlamPiece]
+    joins: list[MapJoin]
+
+    def save(self, path: str) -> list[str]:
+        """Write a session, all files or none; returns what was written, a line each.
+
+        What an earlier session of that name has besides is renamed. Raises InputError where a file
+        of another program would be replaced, OSError where the disk is full.
+        """
+        sessions.require_own_files(path, GRID)
+        with (
+            atomic_write(TOPOLOGY.file(path)) as topology,
+            atomic_write(REGIONS.file(path)) as regions,
+        ):
+            TOPOLOGY.write(topology, self.topology)
+            REGIONS.write(regions, self.regions)
+            grid = sessions.save_grid(path, self.grid)
+        lines = [f'{grid}, {TOPOLOGY.ending} and {REGIONS.ending}']
+        lines += [part.archive(path) for part in (LOCALIZER, EXPLORATION)]
+        return [line for line in lines if line]
+
+
+def merge_maps(
+    paths: Sequence[str],
+    join_odds: float = JOIN_ODDS,
+    report: Report = warn,
+    progress: Callable[[float, str], None] = lambda _share, _text: None,
+) -> MergedMap:
+    """Merge sessions and map_server maps (YAML files) of one place, in the frame of the first.
+
+    join_odds: from which a map is joined, at most one false join in so many. report: receives lines
+    on maps that are read; progress: the share of the work that is done, and what is done next.
+    Raises InputError where a map cannot be read, NotTheSamePlaceError where one has no place in the
+    others: each must show some 20 m of path through what another one shows.
+    """
+    if len(paths) < MIN_MAPS or len(set(paths)) < len(paths):
+        raise InputError(f'{" ".join(paths)}: expected two different maps or more')
+    if not join_odds > 1.0:
+        raise InputError(f'join odds {join_odds:g}: expected more than 1')
+    maps = {path: read_piece(path, report) for path in paths}
+    merging = _Merging(maps, join_odds, progress)
+    while merging.waiting:
+        merging.join_next()
+    regions = REGIONS.load_optional(paths[0]) or RegionTracker()
+    regions.update(merging.known.patch)
+    return MergedMap(merging.grid, merging.topology, regions, maps, merging.joins)
+
+
+class _Merging:
+    """The map so far, and the maps that wait until they have a place in it."""
+
+    def __init__(
+        self,
+        maps: dict[str, SlamPiece],
+        join_odds: float,
+        progress: Callable[[float, str], None],
+    ) -> None:
+        first, *self.waiting = maps
+        self._maps = maps
+        self._join_odds = join_odds
+        self._progress = progress
+        self.known = maps[first]
+        self.grid = OccupancyGrid()
+        self.topology = TopologyBuilder()
+        self.joins: list[MapJoin] = []
+
+    def join_next(self) -> None:
+        """Join a map that waits. Raises NotTheSamePlaceError if none has a place."""
+        best = ('', -float('inf'))
+        for path in self.waiting:
+            share = len(self.joins) / (len(self._maps) - 1)
+            self._progress(share, f'{path}: looking for its place')
+            query = self._maps[path]
+            decision = recognize(query.places, self.known.places, self._join_odds)
+            if decision.is_joined and decision.placement is not None:
+                self._progress(share, f'{path}: joining')
+                joined = join(self.known, query, decision.placement)
+                self._add(path, joined, decision.placement.covariance, decision.log_odds)
+                return
+            best = max(best, (path, decision.log_odds), key=lambda each: each[1])
+        raise NotTheSamePlaceError(best[0] or self.waiting[0], best[1])
+
+    def _add(self, path: str, joined: JoinedMap, covariance: Array, log_odds: float) -> None:
+        nodes = len(self._maps[path].graph.nodes)
+        self.joins.append(
+            MapJoin(
+                path,
+                joined.T_first_second,
+                covariance,
+                log_odds,
+                joined.ids,
+                nodes,
+                joined.links,
+            )
+        )
+        self.waiting.remove(path)
+        self.known = joined.piece
+        self.grid = joined.grid
+        self.topology = joined.topology
+
+
+def read_piece(path: str, report: Report = warn) -> SlamPiece:
+    """Read a session, or a map_server map by its YAML file, as a piece of map.
+
+    A map without a topological map gets one. Its keyframes are drawn from the grid.
+    Raises InputError where a file is missing or broken.
+    """
+    if GRID.exists(path):
+        patch = GRID.load(path).known_area()
+    else:
+        description = sessions.stem_of(path)
+        patch = read_map(
+            description.with_name(f'{description.name}.yaml'), report=report, keeps_unknown=True
+        )
+    if TOPOLOGY.exists(path):
+        builder = sessions.load_topology(path)
+        return SlamPiece.of_bare_map(patch, builder.map, builder.next_id)
+    return SlamPiece.of_bare_map(patch, build(patch, None, TopologyConfig()))
+
+
+def write_ids(path: Path, merged: MergedMap) -> None:
+    """Write a CSV file with a line for each node of all maps but the first: map, id, merged id."""
+    rows = [
+        f'{joined.path},{own},{new}' for joined in merged.joins for own, new in joined.ids.items()
+    ]
+    with atomic_write(path) as aside:
+        aside.write_text('\n'.join(['map,id,merged_id', *rows, '']), encoding='utf-8')

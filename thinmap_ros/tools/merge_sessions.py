@@ -1,0 +1,96 @@
+"""Merge sessions and map_server maps of one place into one session, in the frame of the first."""
+
+import thinmap_ros.startup  # isort: skip  # noqa: F401  before all other modules
+import argparse
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.places.recognition.decision import JOIN_ODDS
+from thinmap_ros.files.merging import (
+    MapJoin,
+    MergedMap,
+    NotTheSamePlaceError,
+    merge_maps,
+    write_ids,
+)
+from thinmap_ros.files.sessions import GRID, require_own_files
+from thinmap_ros.tools import cli
+from thinmap_ros.view.merged_figure import merged_figure
+from thinmap_ros.view.progress_bar import ProgressBar
+
+_NOT_THE_SAME_PLACE = 1
+
+
+def _describe(joined: MapJoin) -> str:
+    x, y, theta = joined.T_merged_map.tolist()
+    sigmas = np.sqrt(np.diag(joined.covariance)).tolist()
+    return (
+        f'{joined.path}: at {x:.3f}, {y:.3f} m, {math.degrees(theta):.2f} deg '
+        f'(sigma {sigmas[0]:.3f}, {sigmas[1]:.3f} m, {math.degrees(sigmas[2]):.2f} deg), '
+        f'log odds {joined.log_odds:.1f}, {joined.links} matches; '
+        f'{len(joined.ids)} of {joined.nodes} nodes in the map'
+    )
+
+
+def _print_ids(first: str, merged: MergedMap) -> None:
+    own = merged.maps[first].graph.nodes
+    there = merged.topology.map.nodes
+    print(f'{first}: {len(own.keys() & there.keys())} of {len(own)} nodes keep their ids')
+
+
+def _merge(arguments: argparse.Namespace) -> MergedMap:
+    with ProgressBar('merge_sessions', arguments.quiet) as bar:
+        try:
+            return merge_maps(arguments.maps, arguments.join_odds, progress=bar.show)
+        except NotTheSamePlaceError as error:
+            bar.close()
+            print(error, file=sys.stderr)
+            sys.exit(_NOT_THE_SAME_PLACE)
+
+
+def _work(arguments: argparse.Namespace) -> None:
+    require_own_files(arguments.out, GRID)  # report a wrong name before the work
+    if arguments.picture is not None and arguments.picture.suffix != '.png':
+        raise InputError(f'{arguments.picture}: expected a name that ends in .png')
+    merged = _merge(arguments)
+    for line in merged.save(arguments.out):
+        print(line)
+    for joined in merged.joins:
+        print(_describe(joined))
+    _print_ids(arguments.maps[0], merged)
+    if arguments.ids is not None:
+        write_ids(arguments.ids, merged)
+    if arguments.picture is not None:
+        shown = [(Path(path).name, one.patch, one.graph) for path, one in merged.maps.items()]
+        joined_map = (Path(arguments.out).name, merged.grid.known_area(), merged.topology.map)
+        merged_figure(arguments.picture, [*shown, joined_map])
+
+
+def main() -> None:
+    """Run the program."""
+    parser = argparse.ArgumentParser(
+        prog='merge_sessions',
+        description=__doc__,
+        epilog='Ends with 1, and writes nothing, if a map does not show the same place.',
+    )
+    parser.add_argument(
+        'maps', nargs='+', metavar='MAP', help='session (path STEM) or map_server YAML file'
+    )
+    parser.add_argument('-o', '--out', required=True, help='path STEM of the merged session')
+    odds_help = (
+        'odds from which a map is joined: of false joins, at most one in so many. Raise it for '
+        f'buildings with similar floors, lower it if maps overlap little (default {JOIN_ODDS:g})'
+    )
+    parser.add_argument('--join-odds', type=float, default=JOIN_ODDS, help=odds_help)
+    parser.add_argument('--picture', type=Path, help='FILE.png: the maps, and the merged one')
+    parser.add_argument('--ids', type=Path, help='FILE.csv: ids of nodes in the merged map')
+    parser.add_argument('--quiet', action='store_true', help='no progress bar')
+    cli.run(_work, parser)
+
+
+if __name__ == '__main__':
+    main()
