@@ -79,8 +79,7 @@ def test_a_file_of_slam_toolbox_is_translated(tmp_path: Path, key: str) -> None:
     grid = parameters.config('grid_mapper', OccupancyConfig())
     localizer = parameters.config('localizer', LocalizerConfig())
     assert grid.resolution_m == 0.07
-    for node in ('localizer', 'grid_mapper'):
-        assert parameters.config(node, LaserConfig()).max_range_m == 9.0
+    assert parameters.config('localizer', LaserConfig()).max_range_m == 9.0
     assert localizer.loop_closure.search_radius_m == 4.0
     assert parameters.value('localizer', 'base_frame', '') == 'base_footprint'
     (note,) = parameters.notes
