@@ -45,15 +45,16 @@ class CorrectableGrid:
         self.corrected_ns = corrected_ns
         self._drops_out = False
         self._refusals: list[str] = []
-        self._history: PoseHistory[StoredScan] | None = PoseHistory() if keeps_scans else None
+        history: PoseHistory[StoredScan] = PoseHistory()
+        for scan, T_scan in scans:
+            history.add_pose(scan.stamp_ns, T_scan, StoredScan.of(scan, grid.config))
+        self._history = history if keeps_scans else None
         self._open: list[tuple[Scan, Array]] = []  # with the poses (3,) at which they were made
         self._apart: PoseHistory[StoredScan] | None = None
         self._is_joined = False  # whether a correction has come since the last scan that is apart
         self._pending_ns: int | None = None
         self._rerendering: Rerendering | None = None
         self._T_map_base = np.zeros(3)  # pose of the robot
-        for scan, T_scan in scans if self._history is not None else ():
-            self._history.add_pose(scan.stamp_ns, T_scan, StoredScan.of(scan, grid.config))
 
     @property
     def is_rerendering(self) -> bool:
