@@ -23,7 +23,7 @@ _NO_RETURN = 65535
 _BELOW_RANGE_MIN = 65534
 _INVALID = 65533
 _MAX_NUMBER = 65532
-_MAX_UNIT_MM = 65535
+_MAX_UNIT_MM = 1000  # for ranges up to 65 km, and shorter ones to a metre
 # First angle, increment, least and greatest range, mount (3,), usable range, two truth values.
 _LOW = (-math.inf, -math.inf, 0.0, 0.0, *[-MAX_MOUNT_OFFSET_M] * 2, -math.inf, 0.0, 0.0, 0.0)
 _HIGH = (*[math.inf] * 4, *[MAX_MOUNT_OFFSET_M] * 2, math.inf, math.inf, 1.0, 1.0)

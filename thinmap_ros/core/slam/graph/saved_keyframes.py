@@ -19,7 +19,7 @@ from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 from thinmap_ros.core.slam.wall_compass import Heading, Reference
-from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_ID, Field, Fields, State
+from thinmap_ros.core.snapshot import MAX_COORDINATE_M, Field, Fields, State
 
 MAX_KEYFRAMES = 1 << 16  # 45 km of new ground
 MAX_EDGES = 1 << 18
@@ -44,7 +44,7 @@ FIELDS: Fields = {
     ),
     'path_m': Field(np.float32, ('n',), 0.0, _MAX_VALUE),
     'covariances': Field(np.float32, ('n', 6), -_MAX_VALUE, _MAX_VALUE),
-    'submaps': Field(np.int32, ('n',), 0, MAX_ID),
+    'submaps': Field(np.int32, ('n',), 0, MAX_KEYFRAMES),
     'headings': Field(np.float32, ('n', 3), _LOW_HEADING, _HIGH_HEADING, nan=True),
     'step_from': Field(np.int32, ('s',), 0, MAX_KEYFRAMES),
     'step_poses': Field(np.float32, ('s', 3), _LOW_POSE, _HIGH_POSE),
