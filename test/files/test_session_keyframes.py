@@ -1,7 +1,7 @@
 """A loaded session with keyframes is corrected as a map that has never been saved."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,23 +37,26 @@ def run(localizer: Localizer, grid: CorrectableGrid, steps: list[Step]) -> int:
 
 @dataclass(eq=False)
 class Half:
-    """The first half of a lap, saved; and the steps of the second, with more of the first."""
+    """The first half of a lap, saved; its steps, and those of the second half."""
 
     stem: str
     localizer: Localizer
     grid: OccupancyGrid
-    truths: dict[int, Array]
+    first: list[Step]
     rest: list[Step]
 
-    def config(self, mode: str = LocalizerConfig.mode) -> LocalizerConfig:
-        """At the pose at which the first half ended."""
-        x, y, yaw = self.localizer.pose.tolist()
+    def config(
+        self, mode: str = LocalizerConfig.mode, T_map_base: Array | None = None
+    ) -> LocalizerConfig:
+        """At a pose (3,), or at that at which the first half ended."""
+        x, y, yaw = (self.localizer.pose if T_map_base is None else T_map_base).tolist()
         return LocalizerConfig(mode=mode, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
 
     def errors(self, localizer: Localizer) -> Array:
         """Distances (N,) of the keyframes of the first half from their true places, m."""
         frames = self.localizer.keyframes
-        truths = np.array([self.truths[frame.scan.stamp_ns] for frame in frames])
+        places = {scan.stamp_ns: truth for scan, _, truth in self.first}
+        truths = np.array([places[frame.scan.stamp_ns] for frame in frames])
         poses = np.array([frame.T_map_base for frame in localizer.keyframes[: len(frames)]])
         return np.asarray(np.hypot(*(poses - truths)[:, :2].T))
 
@@ -69,8 +72,7 @@ def half(tmp_path_factory: pytest.TempPathFactory) -> Half:
     stem = str(tmp_path_factory.mktemp('session') / 'block')
     sessions.save_grid(stem, grid.shown)
     save_localizer(stem, localizer)
-    truths = {scan.stamp_ns: truth for scan, _, truth in steps}
-    return Half(stem, localizer, grid.shown, truths, steps[middle:])
+    return Half(stem, localizer, grid.shown, steps[:middle], steps[middle:])
 
 
 def wall_cells(grid: OccupancyGrid) -> int:
@@ -140,6 +142,26 @@ def test_a_session_that_is_continued_is_saved_with_all_keyframes(
     assert stamps == list(range(1, len(stamps) + 1))
     # The part that was driven later is bound to the part that was loaded.
     assert any(edge.a < len(half.localizer.keyframes) <= edge.b for edge in again.edges)
+
+
+def test_a_robot_that_starts_elsewhere_is_bound_to_the_keyframes_there(half: Half) -> None:
+    """And not to the last one, which it has not come from."""
+    there = 20
+    frame = half.localizer.keyframes[there]
+    localizer = load_localizer(half.stem, half.config(T_map_base=frame.T_map_base))
+    assert isinstance(localizer, Localizer)
+    steps = [step for step in half.first if step[0].stamp_ns >= frame.scan.stamp_ns]
+    later = steps[-1][0].stamp_ns
+    again = [(replace(scan, stamp_ns=later + scan.stamp_ns), *rest) for scan, *rest in steps[:80]]
+    run(localizer, CorrectableGrid(OccupancyGrid()), again)
+    loaded = len(half.localizer.keyframes)
+    keyframes = localizer.saved_keyframes()
+    assert keyframes is not None
+    own = [*keyframes.steps[loaded - 1 :], *(e for e in keyframes.edges if e.b >= loaded)]
+    assert own
+    for edge in own:
+        places = [keyframes.frames[k].T_map_base[:2] for k in (edge.a, edge.b)]
+        assert math.dist(*places) < 3.0
 
 
 def test_localization_reads_no_keyframes(half: Half) -> None:
