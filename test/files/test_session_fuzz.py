@@ -110,9 +110,9 @@ MAY_BE_NEGATIVE = {
     'localizer': {'tiles'},
     'exploration': set[str](),
 }
-# Counts of a byte each, for which any value is valid.
-MAY_BE_ANY = {'localizer': {'seen'}, 'topology': {'states'}}
-MAY_BE_NAN = {'localizer': {'spans'}, 'exploration': {'tracks'}}
+# Counts of a byte each, and numbers of ranges, for which any value is valid.
+MAY_BE_ANY = {'localizer': {'seen'}, 'topology': {'states'}, 'keyframes': {'ranges'}}
+MAY_BE_NAN = {'localizer': {'spans'}, 'exploration': {'tracks'}, 'keyframes': {'headings'}}
 
 
 def label(kind: str) -> bytes:

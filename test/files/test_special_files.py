@@ -55,6 +55,7 @@ READERS = {
     'room.grid.npz': lambda path: sessions.load_grid(str(path)),
     'room.yaml': lambda path: sessions.load_grid(str(path)),
     'room.topology.npz': lambda path: sessions.load_topology(str(path)),
+    'room.keyframes.npz': lambda path: sessions.KEYFRAMES.load(str(path)),
     'room.slam.npz': lambda path: sessions.LOCALIZER.load(str(path)),
     'room.exploration.npz': lambda path: sessions.EXPLORATION.load_optional(str(path)),
     'some.clf': lambda path: list(open_log(path).events()),

@@ -13,6 +13,7 @@ import numpy as np
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
 
+from thinmap_ros.core.errors import counted
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
@@ -157,7 +158,7 @@ def check(path: Path, out: Path) -> str:
     bag = Bag(out)
     assert not bag.is_truncated
     messages = list(bag.messages())
-    assert said.startswith(f'{out}: {len(messages)} messages on ')
+    assert said.startswith(f'{out}: {counted(len(messages), "message")} on ')
     out.unlink()
     return 'repaired' if read_code == 0 else 'repaired, not to be replayed'
 

@@ -11,7 +11,9 @@ import numpy as np
 from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files.worlds import read_world
@@ -23,7 +25,7 @@ State = dict[str, np.ndarray]
 Work = Callable[[Any, Any], object]
 LONGEST = 500
 STEPS = 4
-KINDS = ('topology', 'exploration', 'localizer', 'grid')
+KINDS = ('topology', 'exploration', 'localizer', 'keyframes', 'grid')
 
 
 class Explored:
@@ -43,10 +45,13 @@ class Explored:
         self.loop.log_poses = noted  # type: ignore[method-assign]
         self.loop.run(observable_cells(world, start, 0.3, 8.0), 40.0, lambda seconds, share: None)
         pipeline = self.loop.pipeline
+        keyframes = pipeline.localizer.saved_keyframes()  # type: ignore[union-attr]
+        assert keyframes is not None
         self.states: dict[str, State] = {
             'topology': pipeline.topology.state(),
             'exploration': self.loop.strategy.state(),  # type: ignore[attr-defined]
             'localizer': pipeline.localizer.state(),
+            'keyframes': keyframes.state(),
             'grid': pipeline.grid.state(),
         }
 
@@ -75,6 +80,22 @@ class Explored:
         localizer = Localizer.from_state(state, self.loop.pipeline.localizer.config)
         localizer.set_pose(self.scans[-STEPS][1], 1e-4 * np.eye(3))
         return localizer.step
+
+    def _use_keyframes(self, state: State) -> Work:
+        keyframes = SavedKeyframes.from_state(state)
+        config = self.loop.pipeline.localizer.config
+        localizer = Localizer.from_state(self.states['localizer'], config, keyframes)
+        localizer.set_pose(self.scans[-STEPS][1], 1e-4 * np.eye(3))
+        grid = CorrectableGrid(OccupancyGrid(), scans=keyframes.scans)
+        work = localizer.step
+
+        def step(scan: Any, T: Any) -> None:
+            work(scan, T)
+            grid.update(scan, T)
+
+        localizer.optimized_trajectory()
+        grid.apply_correction(*localizer.keyframe_trajectory(), self.scans[-STEPS][0].stamp_ns)
+        return step
 
     def _use_grid(self, state: State) -> Work:
         grid = OccupancyGrid.from_state(state)

@@ -178,7 +178,7 @@ def test_past_errors_are_not_reported_first(ros_domain, monkeypatch):
         now[0] += 10.5
         told.count_drops('scan: gaps between the stamps', 1)
         message = told._status(now[0]).message
-        assert message == '1 messages rejected or dropped: scan: gaps between the stamps'
+        assert message == '1 message rejected or dropped: scan: gaps between the stamps'
         # The count is reported permanently.
         values = {pair.key: pair.value for pair in told._status(now[0]).values}
         assert values['odom: rejected'] == '1'

@@ -18,6 +18,7 @@ from support.timeouts import PATIENCE_S
 from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.files import occupancy_maps, package_data, sessions
 from thinmap_ros.files.worlds import read_world
@@ -34,6 +35,7 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.tools.carmen_to_bag import convert
 
 pytestmark = pytest.mark.live
+MAPPERS = ('localizer', 'grid_mapper', 'topology_builder')
 # The test subscribes to the poses, too, and the player to the local graph.
 CONNECTIONS = {
     'bag_player': {'scan: subscribers': 1, 'odom: subscribers': 1, 'local_topology: publishers': 1},
@@ -105,11 +107,13 @@ class LoopLog:
 
     is_sorted = True
 
-    def __init__(self):
+    def __init__(self, first=0, end=None):
+        """first, end: of the scans, all without them."""
         self.skipped = SkippedRecords()
+        self.steps = list(drive_round_the_block())[first:end]
 
     def events(self):
-        for scan, odom, _ in drive_round_the_block():
+        for scan, odom, _ in self.steps:
             yield OdometryEvent(scan.stamp_ns, odom)
             yield ScanEvent(scan)
 
@@ -134,12 +138,14 @@ def connections(doctor):
     }
 
 
-def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
+def play(graph, bag, count, poses, **own):
+    """Play a bag of a number of scans into nodes until there are the poses of all.
+
+    poses: list of the messages; own: parameters by the name of the node.
+    """
     doctor = Doctor(graph)
-    poses = graph.heard('pose', PoseWithCovarianceStamped)
     resume = graph.client(SetBool, '/bag_player/pause')
-    own = {'localizer': localizer, 'grid_mapper': {'resolution_m': 0.1}}
-    for name in ('localizer', 'grid_mapper', 'topology_builder'):
+    for name in MAPPERS:
         graph.start(name, use_sim_time=True, **own.get(name, {}))
     player = graph.start(
         'bag_player',
@@ -153,10 +159,14 @@ def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
     wanted = {f'{n}: {t}': c for n, topics in CONNECTIONS.items() for t, c in topics.items()}
     graph.until(lambda: connections(doctor) == wanted, f'connections {wanted}')
     assert graph.call(SetBool, resume.srv_name, SetBool.Request(data=False)).success
-    graph.until(
-        lambda: player.poll() == 0 and len(poses) == len(expected.poses), 'a pose for each scan'
-    )
+    graph.until(lambda: player.poll() == 0 and len(poses) == count, 'a pose for each scan')
     assert 'continuing without it' not in graph.log('bag_player')
+
+
+def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
+    own = {'localizer': localizer, 'grid_mapper': {'resolution_m': 0.1}}
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    play(graph, bag, len(expected.poses), poses, **own)
     assert [messages.stamp_ns(pose.header.stamp) for pose in poses] == expected.stamps_ns
     live = np.array([messages.pose_from_msg(pose.pose.pose) for pose in poses])
     assert np.abs(live - expected.poses).max() <= 1e-9
@@ -218,6 +228,65 @@ def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, 
     offline = expected.pipeline.topology.map
     # The map is that of the grid. Ids depend on the windows, which are other ones offline.
     assert places(live) == places(offline)
+
+
+def errors(stem, truths):
+    """Distances (N,) of the first keyframes of a session from their true places (N, 2)."""
+    poses = [frame.T_map_base[:2] for frame in sessions.KEYFRAMES.load(stem).frames]
+    return np.hypot(*(np.array(poses[: len(truths)]) - truths).T)
+
+
+def test_a_loop_that_closes_in_a_loaded_session_corrects_it(graph, tmp_path):
+    """The first half of a lap is saved, and the nodes are started again for the second."""
+    halves = LoopLog(end=420), LoopLog(first=420)
+    for name, half in zip(('one', 'two'), halves, strict=True):
+        convert(half, tmp_path / name)
+    stem = str(tmp_path / 'block')
+    keyframes = graph.heard('trajectory', Path, qos.LATCHED)
+    start = {'initial_x_m': 3.0, 'initial_y_m': 1.2}
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    play(graph, tmp_path / 'one', 420, poses, localizer=start)
+
+    def save():
+        return graph.call(SaveMap, 'save_map', SaveMap.Request(path=stem))
+
+    graph.until(lambda: 'block.slam.npz and .keyframes.npz' in save().message, 'all parts')
+    x, y, yaw = messages.pose_from_msg(poses[-1].pose.pose).tolist()
+    for name in MAPPERS:
+        assert graph.stop(name) == 0
+    before = sessions.KEYFRAMES.load(stem).frames
+    offline = LocalizerConfig(**start)
+    replayed = replay(halves[0], PipelineConfig(localizer=offline)).pipeline.localizer
+    truth_at = {scan.stamp_ns: truth[:2] for scan, _, truth in halves[0].steps}
+    truths = np.array([truth_at[frame.scan.stamp_ns] for frame in replayed.keyframes])
+    assert len(truths) == len(before)
+    drifted = errors(stem, truths)
+    keyframes.clear()
+    poses.clear()
+    graph.processes.pop('bag_player')
+    there = {'initial_x_m': x, 'initial_y_m': y, 'initial_yaw_rad': yaw}
+    own = {name: {'session_path': stem} for name in MAPPERS}
+    own['localizer'] |= there
+    play(graph, tmp_path / 'two', len(halves[1].steps), poses, **own)
+    for name in MAPPERS:
+        assert 'not corrected' not in graph.log(name)
+    assert save().success
+    assert drifted.max() > 0.5 and errors(stem, truths).max() < 0.95 * drifted.max()
+    # The mapper has drawn the loaded scans again where the localizer has them now.
+    stamps, corrected = messages.trajectory_from_msg(keyframes[-1])
+    assert stamps[: len(before)].tolist() == list(range(1, len(before) + 1))
+    saved = sessions.KEYFRAMES.load(stem)
+    np.testing.assert_allclose(
+        corrected[: len(before)],
+        [frame.T_map_base for frame in saved.frames[: len(before)]],
+        atol=1e-6,
+    )
+    grid = sessions.load_grid(stem)
+    again = OccupancyGrid(grid.config, grid.frame)
+    for scan, T_map_base in sessions.load_scans(stem):
+        again.add_scan(scan, T_map_base)
+    walls = [each.known_area().occupied.sum() for each in (grid, again)]
+    assert walls[0] < 1.25 * walls[1], 'each wall once'
 
 
 def test_real_log_bag_and_live_graph_agree(graph, shared_data, tmp_path):

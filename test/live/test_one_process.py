@@ -139,11 +139,12 @@ def test_what_cannot_be_run_is_reported_in_one_line(ros_domain):
     assert done.returncode == 2 and done.stderr.startswith('error: pilot')
     strict = ('-p', 'gaet:=1.0', '-p', 'strict_parameters:=true')
     done = run('localizer', 'grid_mapper', '--ros-args', *strict)
-    assert done.returncode == 2 and 'localizer, grid_mapper has no parameter gaet' in done.stderr
+    unknown = 'nodes localizer, grid_mapper have no parameter gaet'
+    assert done.returncode == 2 and unknown in done.stderr
     assert len(done.stderr.splitlines()) == 1
     strict = ('-p', 'association.gate:=4.0', '-p', 'strict_parameters:=true')
     done = run('localizer', 'grid_mapper', '--ros-args', *strict)
-    meant = 'has no parameter association.gate (only with slam: ekf_ti or ekf_full)'
+    meant = 'have no parameter association.gate (only with slam: ekf_ti or ekf_full)'
     assert done.returncode == 2 and meant in done.stderr
     wrong = ('-p', 'slam:=ekf_ti', '-p', 'association.gate:=-1.0')
     done = run('localizer', 'grid_mapper', '--ros-args', *wrong)

@@ -105,7 +105,7 @@ def test_the_program(tmp_path: Path) -> None:
     log = log_of(tmp_path, [flaser('5.0', 1), 'FLASER broken\n', flaser('6.0', 2)])
     done = run(log.path, tmp_path / 'bag', '--offset-m', 0.3)
     assert done.returncode == 0, done.stderr
-    assert '2 scans, 1 lines skipped' in done.stdout and f'{log.path}:2' in done.stdout
+    assert '2 scans, 1 line skipped' in done.stdout and f'{log.path}:2' in done.stdout
     events = list(BagLog(tmp_path / 'bag').events())
     assert [e.scan.T_base_laser[0] for e in events if not isinstance(e, OdometryEvent)] == [
         0.3,

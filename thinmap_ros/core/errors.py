@@ -21,6 +21,11 @@ class ConfigError(ThinmapError):
     """A parameter outside its range: the message names it, the value, and what was expected."""
 
 
+def counted(count: int, noun: str) -> str:
+    """A number and its noun, which gets an s unless there is one: 1 line, 2 lines."""
+    return f'{count} {noun}{"" if count == 1 else "s"}'
+
+
 def quoted(value: object) -> str:
     """Quote a foreign value in an error message: its `repr`, one line, at most 200 characters."""
     return one_line(_QUOTE.repr(value))

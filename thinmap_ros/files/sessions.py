@@ -5,7 +5,7 @@ same grid as a map_server map, STEM.pgm and STEM.yaml.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -14,6 +14,10 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.tracker import RegionTracker
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
+from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import State
@@ -123,8 +127,13 @@ TOPOLOGY = SessionPart('topology', 'topology_builder', '.topology.npz', Topology
 REGIONS = SessionPart('regions', 'topology_builder', '.regions.npz', RegionTracker.from_state)
 # Line features or local map, by the configured localizer.
 LOCALIZER = SessionPart('localizer', 'localizer', '.slam.npz', _restore_localizer)
+# Of the local map: `save_localizer` and `load_localizer` write and read both files.
+KEYFRAMES = SessionPart('keyframes', 'localizer', '.keyframes.npz', SavedKeyframes.from_state)
 EXPLORATION = SessionPart('exploration', 'explorer', '.exploration.npz', Explorer.from_state)
-PARTS: tuple[SessionPart[Any, Any], ...] = (GRID, TOPOLOGY, REGIONS, LOCALIZER, EXPLORATION)
+_OF_MAP: tuple[SessionPart[Any, Any], ...] = (GRID, TOPOLOGY, REGIONS, LOCALIZER, KEYFRAMES)
+PARTS = (*_OF_MAP, EXPLORATION)
+# Parts that are saved, and archived, with that of the same node.
+_BESIDE: dict[str, SessionPart[Any, Any]] = {TOPOLOGY.name: REGIONS, LOCALIZER.name: KEYFRAMES}
 _FILE_ENDINGS = (*(part.ending for part in PARTS), _MAP_ENDING, _IMAGE_ENDING)
 # Of all files that a session may consist of, or that are archived when it is saved.
 ENDINGS = (*_FILE_ENDINGS, *(part.ending + _ARCHIVED for part in PARTS))
@@ -157,7 +166,7 @@ def require_own_files(path: str, part: SessionPart[Any, Any]) -> None:
     With the grid, the files of all parts are checked, and the map beside it.
     """
     stem = stem_of(path)
-    for each in PARTS if part is GRID else (part,):
+    for each in PARTS if part is GRID else saved_with(part):
         for ending in (each.ending, each.ending + _ARCHIVED):
             file = _with_ending(stem, ending)
             if _exists(file) and not is_snapshot(file):
@@ -168,6 +177,12 @@ def require_own_files(path: str, part: SessionPart[Any, Any]) -> None:
     for file in (description, _with_ending(stem, _IMAGE_ENDING)):
         if _exists(file) and not is_own_map(description):
             raise _foreign_error(file)
+
+
+def saved_with(part: SessionPart[Any, Any]) -> tuple[SessionPart[Any, Any], ...]:
+    """The part, and the one that its node saves beside it."""
+    beside = _BESIDE.get(part.name)
+    return (part,) if beside is None else (part, beside)
 
 
 def _foreign_error(file: Path) -> InputError:
@@ -207,6 +222,51 @@ def load_grid(
     if not _exists(description):
         raise InputError(f'{stem}: neither {GRID.file(path).name} nor {description.name} exists')
     return OccupancyGrid.from_patch(read_map(description, folder, report), config)
+
+
+def load_scans(path: str) -> list[tuple[Scan, Array]]:
+    """Scans of the keyframes, with their poses (3,), that STEM.grid.npz can be rendered from.
+
+    None where the session has no keyframes, or the map is that of an image. Raises InputError as
+    `SessionPart.load`.
+    """
+    keyframes = KEYFRAMES.load_optional(path) if GRID.exists(path) else None
+    return [] if keyframes is None else keyframes.scans
+
+
+def save_localizer(path: str, localizer: AnyLocalizer) -> str:
+    """Write STEM.slam.npz, and STEM.keyframes.npz of a map that is made of keyframes.
+
+    The keyframes of an earlier session are archived otherwise. Returns what was written. Raises
+    OSError.
+    """
+    keyframes = localizer.saved_keyframes() if isinstance(localizer, Localizer) else None
+    # Neither file takes its name before both are written.
+    with atomic_write(LOCALIZER.file(path)) as aside:
+        LOCALIZER.write(aside, localizer)
+        if keyframes is None:
+            archived = KEYFRAMES.archive(path)
+            return f'{LOCALIZER.file(path)}{f": {archived}" if archived else ""}'
+        KEYFRAMES.save(path, keyframes)
+    return f'{LOCALIZER.file(path)} and {KEYFRAMES.ending}'
+
+
+def load_localizer(path: str, config: StartConfig) -> AnyLocalizer | None:
+    """Localizer in the map of a session; None where it has no map of the localizer.
+
+    One that maps by scan matching has the keyframes of the session, if there are any.
+    Raises InputError as `SessionPart.load`.
+    """
+    if not LOCALIZER.exists(path):
+        return None
+    if not (isinstance(config, LocalizerConfig) and config.is_mapping):
+        return LOCALIZER.load(path, config)
+    keyframes = KEYFRAMES.load_optional(path)
+
+    def restore(state: State, own: StartConfig | None) -> AnyLocalizer:
+        return Localizer.from_state(state, config, keyframes)
+
+    return replace(LOCALIZER, restore=restore).load(path, config)
 
 
 def load_topology(path: str, config: TopologyConfig | None = None) -> TopologyBuilder:

@@ -10,7 +10,7 @@ from rosbags.interfaces import Qos
 from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core import validation
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.limits import LOGS
@@ -38,7 +38,7 @@ from thinmap_ros.logs.storage import McapStorage, RawMessage, SqliteStorage, Sto
 
 _SCAN = 'sensor_msgs/msg/LaserScan'
 _ODOMETRY = 'nav_msgs/msg/Odometry'
-_EXPECTED = 'a rosbag2 folder, an MCAP or SQLite file, or a ROS 1 bag'
+EXPECTED = 'a rosbag2 folder, an MCAP or SQLite file, or a ROS 1 bag'
 _ZSTD = b'\x28\xb5\x2f\xfd'  # begin of a message that is compressed by itself
 _MAX_WARNINGS = 8
 _USUAL_TOPICS = {_SCAN: '/scan', _ODOMETRY: '/odom'}
@@ -53,9 +53,9 @@ class Bag:
     def __init__(self, path: Path) -> None:
         """Open a bag. Raises InputError with the file name if it has no intact message."""
         if not path.exists():
-            raise InputError(f'{path}: no such file or folder: expected {_EXPECTED}')
+            raise InputError(f'{path}: no such file or folder: expected {EXPECTED}')
         if not is_bag(path):
-            raise InputError(f'{path}: expected {_EXPECTED}')
+            raise InputError(f'{path}: expected {EXPECTED}')
         self.path = path
         self.topics: dict[str, str] = {}
         self.offers: dict[str, list[Qos]] = {}
@@ -69,7 +69,7 @@ class Bag:
         except OSError as error:
             raise InputError(f'{error.filename or path}: {error.strerror or error}') from error
         if self.damage and not any(storage.has_messages for storage in self._storages):
-            raise InputError(f'{path}: {self.damage}: no intact message: expected {_EXPECTED}')
+            raise InputError(f'{path}: {self.damage}: no intact message: expected {EXPECTED}')
 
     @property
     def is_truncated(self) -> bool:
@@ -83,7 +83,7 @@ class Bag:
         if self._files.without_metadata:
             words.append(self._files.without_metadata)
         if self._unreadable:
-            words.append(f'{self._unreadable} messages that cannot be decompressed')
+            words.append(f'{counted(self._unreadable, "message")} that cannot be decompressed')
         return '; '.join(words[:_MAX_WARNINGS])
 
     @property

@@ -38,6 +38,7 @@ from thinmap_ros.logs.log import (
 
 _SCAN_KEYWORDS = (b'FLASER', b'ROBOTLASER1')
 _KEYWORDS = (b'ODOM', *_SCAN_KEYWORDS)  # other lines are not read
+_SUFFIXES = ('.log', '.clf', '.log.gz', '.clf.gz')
 _SAMPLE_BYTES = 1 << 22
 _TOO_LONG = (
     f'expected at most {LOGS.lines} lines, and {LOGS.file_ratio} times the bytes of a gzip file: '
@@ -266,6 +267,11 @@ class CarmenLog:
                 T_base_laser,
                 self.laser,
             )
+
+
+def is_carmen(path: Path) -> bool:
+    """Whether a path has the name of a CARMEN log, or scan lines at its beginning."""
+    return path.name.lower().endswith(_SUFFIXES) or bool(CarmenLog(path)._beginning()[0])
 
 
 def _beam_counts(lines: list[bytes]) -> set[bytes]:

@@ -4,14 +4,12 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.logs.bag import BagLog
-from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
-from thinmap_ros.logs.formats import is_bag
+from thinmap_ros.logs.carmen import LaserOptions
 from thinmap_ros.logs.log import Event, Log, OdometryEvent
+from thinmap_ros.logs.log_format import LogOptions, format_of
 from thinmap_ros.logs.order.clock_jumps import ClockJumpError, ClockJumps
 from thinmap_ros.logs.order.stamp_order import by_stamp
 
@@ -31,31 +29,27 @@ def open_log(
     odom_frame: str = '',
     laser_config: LaserConfig | None = None,
 ) -> Log:
-    """Return the log of a path: a rosbag2 folder or file, a ROS 1 bag, or else a CARMEN log.
+    """Return the log of a path, by the first of the formats in `logs.readers` that opens it.
 
     laser describes the laser of a CARMEN log; T_base_laser (3,): the laser on the robot, None for
     that of the log; laser_config: parameters of the laser. For a bag: scan_topic and
     odometry_topic, empty for the only topic of their type; base_frame and odom_frame, empty for
     those of the bag; odometry_source: topic, tf or none, empty for topic, or tf without one. The
-    log is read when its events are. Raises InputError for a source that a CARMEN log does not have.
+    log is read when its events are. Raises InputError for a path of no known format, and for a
+    source that a CARMEN log does not have.
     """
+    options = LogOptions(
+        laser or LaserOptions(),
+        scan_topic,
+        odometry_topic,
+        T_base_laser,
+        base_frame,
+        odometry_source,
+        odom_frame,
+        laser_config or LaserConfig(),
+    )
     path = Path(path)
-    if is_bag(path):
-        return BagLog(
-            path,
-            scan_topic,
-            odometry_topic,
-            T_base_laser,
-            base_frame,
-            odometry_source,
-            odom_frame,
-            laser_config or LaserConfig(),
-        )
-    if odometry_source not in ('', 'topic'):
-        raise InputError(
-            f'{path}: odometry source {odometry_source}: a CARMEN log has its own odometry'
-        )
-    return CarmenLog(path, laser or LaserOptions(), T_base_laser, laser_config or LaserConfig())
+    return format_of(path).log(path, options)
 
 
 def recording_events(log: Log) -> Iterator[Event]:

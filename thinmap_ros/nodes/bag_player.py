@@ -16,7 +16,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from thinmap_ros.core import validation
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.core.errors import ConfigError, InputError, counted
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.playback import Playback, is_scan
 from thinmap_ros.logs.storage import RawMessage
@@ -136,7 +136,8 @@ class BagPlayerNode(Node):
             publisher.wait_for_all_acked(Duration(seconds=_SECONDS.acknowledge))
         counts = sorted(self._sent.items())
         parts = ', '.join(f'{topic} {count}' for topic, count in counts) or 'nothing'
-        self.get_logger().info(f'{self._config.bag}: {self._sent.total()} messages sent: {parts}')
+        total = counted(self._sent.total(), 'message')
+        self.get_logger().info(f'{self._config.bag}: {total} sent: {parts}')
 
     def _on_config(self, config: BagPlayerConfig) -> None:
         self._config = config
@@ -252,7 +253,7 @@ class BagPlayerNode(Node):
         taken = self._playback.step()
         for message in taken:
             self._send(message)
-        return f'{len(taken)} messages, up to {self._where()}'
+        return f'{counted(len(taken), "message")}, up to {self._where()}'
 
     def _where(self) -> str:
         return f'{self._playback.clock_ns / 1e9:.3f} s'

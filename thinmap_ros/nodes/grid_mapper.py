@@ -145,17 +145,18 @@ class GridMapperNode(ThinmapNode):
         has_map = self._session or self._stamp.latest_ns is not None
         self._stamp.latest_ns = None
         if self._session:
-            grid = self._load_grid(self._session)
-            self._grid = CorrectableGrid(grid, keeps_scans=False)
+            self._grid = self._load_map(self._session)
         else:
             self._grid = CorrectableGrid(OccupancyGrid(self._settings.grid))
         if has_map:
             self._stamp.latest_ns = self.get_clock().now().nanoseconds
             self._publish_map()
 
-    def _load_grid(self, path: str, folder: pathlib.Path | None = None) -> OccupancyGrid:
-        report = self.get_logger().warning
-        return sessions.load_grid(path, self._settings.grid, folder, report)
+    def _load_map(self, path: str, folder: pathlib.Path | None = None) -> CorrectableGrid:
+        """The map of a session, or any map_server map; corrected if the session has keyframes."""
+        grid = sessions.load_grid(path, self._settings.grid, folder, self.get_logger().warning)
+        scans = sessions.load_scans(path) if self._settings.mapping else []
+        return CorrectableGrid(grid, keeps_scans=bool(scans), scans=scans)
 
     def _state(self) -> State | None:
         if self._stamp.latest_ns is None:
@@ -177,7 +178,7 @@ class GridMapperNode(ThinmapNode):
                 f'map with {grid.frame.resolution} m a cell: expected {expected_m} m (resolution_m)'
             )
         self._stamp.restore(latest_ns)
-        self._replace_grid(grid)
+        self._replace_grid(CorrectableGrid(grid, keeps_scans=False))
         self._output.followed = FollowedMap(map_id)
 
     def _on_scan(self, message: LocalizedScanMsg) -> None:
@@ -250,12 +251,14 @@ class GridMapperNode(ThinmapNode):
             stamps_ns, poses = messages.trajectory_from_msg(trajectory)
             is_corrected = self._grid.apply_correction(stamps_ns, poses, since_ns=corrected_ns)
         if not is_corrected:
-            self.get_logger().warning('loop closed, but a loaded map is not corrected')
+            self.get_logger().warning(
+                'loop closed, but a map that was loaded without keyframes is not corrected'
+            )
             self._publish_map()
 
-    def _replace_grid(self, grid: OccupancyGrid) -> None:
-        corrected_ns = self._grid.corrected_ns
-        self._grid = CorrectableGrid(grid, keeps_scans=False, corrected_ns=corrected_ns)
+    def _replace_grid(self, grid: CorrectableGrid) -> None:
+        grid.corrected_ns = self._grid.corrected_ns
+        self._grid = grid
         self._output.followed.leave()
         self._output.load_ns = self.get_clock().now().nanoseconds
         self._stamp.latest_ns = self._stamp.latest_ns or self._output.load_ns
@@ -288,7 +291,7 @@ class GridMapperNode(ThinmapNode):
         """Load grid and graph, or neither."""
         try:
             path = self._save_directory.resolve(request.path)
-            grid = self._load_grid(path, self._save_directory.path)
+            grid = self._load_map(path, self._save_directory.path)
             result = await self._session_client.load(path, lambda: self._replace_grid(grid))
         except ThinmapError as error:
             response.success = False

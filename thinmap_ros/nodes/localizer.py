@@ -44,7 +44,7 @@ from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.start import StartConfig
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
-from thinmap_ros.files.sessions import LOCALIZER
+from thinmap_ros.files.sessions import LOCALIZER, save_localizer
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.logs.frames.bag_odometry import NONE
 from thinmap_ros.nodes.localization.given_map import GivenMap, config_at
@@ -438,7 +438,7 @@ class LocalizerNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve_for_saving(request.path, LOCALIZER)
-            return f'saved {LOCALIZER.save(path, self._localizer)}'
+            return f'saved {save_localizer(path, self._localizer)}'
 
         return fill_response(response, save)
 

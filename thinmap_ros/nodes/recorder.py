@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.files import package_data
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.bag_writer import BagWriter
@@ -62,7 +62,7 @@ class RecorderNode(Node):
             for message in self._early:
                 self._write(*message, self.get_clock().now().nanoseconds)
             self._writer.close()
-        self.get_logger().info(f'{self._path}: {self._written} messages')
+        self.get_logger().info(f'{self._path}: {counted(self._written, "message")}')
 
     def _discover_topics(self) -> None:
         for topic, types in self.get_topic_names_and_types():

@@ -14,7 +14,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
+from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_scans, load_topology
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.mapping.rebuild import Rebuilding
 from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
@@ -147,7 +147,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._output.followed = FollowedMap()
         self._newest_saved_id = 0
         self._T_map_base: Array | None = None
-        self._rebuilding = Rebuilding(from_the_start=not self._session)
+        self._rebuilding = _rebuilding_in(self._session)
         if self._session:
             self._builder = load_topology(self._session, self._config)
             self._regions.reset(REGIONS.load_optional(self._session, self._regions.config))
@@ -255,9 +255,18 @@ class TopologyBuilderNode(ThinmapNode):
         self._builder = loaded
         self._output.followed.leave()
         self._regions.reset(regions)
-        self._rebuilding = Rebuilding(from_the_start=not path)
+        self._rebuilding = _rebuilding_in(self._save_directory.resolve(path) if path else '')
         self._publish(self.get_clock().now().nanoseconds)
         return f'graph of {len(loaded.map.nodes)} nodes' if path else 'graph reset'
+
+
+def _rebuilding_in(session: str) -> Rebuilding:
+    """For the graph of a session, which was made where its keyframes are; or for a new graph."""
+    scans = load_scans(session) if session else []
+    rebuilding = Rebuilding(from_the_start=not session or bool(scans))
+    for scan, T_map_base in scans:
+        rebuilding.add_pose(scan.stamp_ns, T_map_base)
+    return rebuilding
 
 
 def main() -> None:

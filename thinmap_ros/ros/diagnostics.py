@@ -17,6 +17,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from thinmap_ros.core.errors import counted
 from thinmap_ros.ros import qos
 
 _PERIOD_S = 1.0
@@ -116,7 +117,9 @@ class MessageStatistics:
     def new_faults(self) -> str:
         """Rejections and drops since the last diagnostics, in words; '' for none."""
         count = self._faults - self._published_faults
-        return f'{count} messages rejected or dropped: {self._recent_reasons()}' if count else ''
+        if not count:
+            return ''
+        return f'{counted(count, "message")} rejected or dropped: {self._recent_reasons()}'
 
     def values(self, now_s: float) -> dict[str, str]:
         """All counts, in a fixed order."""

@@ -258,20 +258,24 @@ def reject_unknown(node: Node, elsewhere: Mapping[str, str] | None = None) -> No
         given = shared.given
         known = shared.known
         meant = shared.elsewhere
-        names = ', '.join(shared.names)
+        names = shared.names
     else:
-        names = str(node.get_name())
+        names = [str(node.get_name())]
     unknown = sorted(given - known)
     if not unknown:
         return
     wrong = ', '.join(name + suggestion(name, known, meant) for name in unknown)
+    nodes = ', '.join(names)
+    is_one = len(names) == 1
     if node.has_parameter(STRICT) and not node.get_parameter(STRICT).value:
+        lack = f'node {nodes} does not have' if is_one else f'nodes {nodes} do not have'
         node.get_logger().warning(
-            f'ignored parameters that node {names} does not have: {wrong}; '
-            f'{STRICT}: true makes them an error'
+            f'ignored parameters that {lack}: {wrong}; {STRICT}: true makes them an error'
         )
         return
-    raise ConfigError(f'node {names} has no parameter {wrong}; it has: {", ".join(sorted(known))}')
+    lack = f'node {nodes} has' if is_one else f'nodes {nodes} have'
+    has = 'it has' if is_one else 'they have'
+    raise ConfigError(f'{lack} no parameter {wrong}; {has}: {", ".join(sorted(known))}')
 
 
 @dataclasses.dataclass

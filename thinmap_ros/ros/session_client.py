@@ -10,7 +10,14 @@ from rclpy.node import Node
 
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core.errors import ThinmapError
-from thinmap_ros.files.sessions import EXPLORATION, LOCALIZER, TOPOLOGY, SessionPart, stem_of
+from thinmap_ros.files.sessions import (
+    EXPLORATION,
+    LOCALIZER,
+    TOPOLOGY,
+    SessionPart,
+    saved_with,
+    stem_of,
+)
 from thinmap_ros.ros.services import call
 
 Part = SessionPart[Any, Any]
@@ -88,7 +95,7 @@ class SessionClient:
         if answer is not None:
             return PartResult(answer.success, answer.message)
         try:
-            archived = part.archive(stem) if archives else ''
+            archived = _archived(part, stem) if archives else ''
         except (ThinmapError, OSError) as error:
             return PartResult(False, str(error))
         absent = _absent(part)
@@ -99,6 +106,11 @@ class SessionClient:
         if answer is None:
             return PartResult(True, _absent(part))
         return PartResult(answer.success, answer.message)
+
+
+def _archived(part: Part, stem: str) -> str:
+    done = [each.archive(stem) for each in saved_with(part)]
+    return ', '.join(text for text in done if text)
 
 
 def _absent(part: Part) -> str:

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.logs.bag_directory import bag_files, mcap_files_in
 from thinmap_ros.logs.bag_writer import temporary_bag
 from thinmap_ros.logs.formats import is_mcap, refuse_foreign
@@ -33,12 +33,13 @@ def _has_compressed_messages(bag: Path) -> bool:
 
 def describe_repair(found: RepairReport) -> str:
     """Describe the repair in one line."""
-    parts = [f'{sum(found.counts.values())} messages on {len(found.counts)} topics']
+    messages = counted(sum(found.counts.values()), 'message')
+    parts = [f'{messages} on {counted(len(found.counts), "topic")}']
     if found.first_ns is not None:
         parts[0] += f', {(found.last_ns - found.first_ns) / 1e9:.1f} s'
     parts.extend(f'{file.name}: {damage}' for file, damage in found.damage.items() if damage)
     if found.unreadable:
-        parts.append(f'{found.unreadable} messages that cannot be decompressed')
+        parts.append(f'{counted(found.unreadable, "message")} that cannot be decompressed')
     return '; '.join(parts)
 
 

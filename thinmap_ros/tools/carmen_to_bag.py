@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from thinmap_ros.core.errors import counted
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.logs.encode import BagObjects
@@ -51,11 +52,11 @@ def _work(arguments: argparse.Namespace) -> None:
     log = CarmenLog(arguments.log, cli.config_from(arguments, LaserOptions))
     scans = convert(log, arguments.bag)
     skipped = (
-        f', {log.skipped.count} lines skipped (first: {log.skipped.first})'
+        f', {counted(log.skipped.count, "line")} skipped (first: {log.skipped.first})'
         if log.skipped.count
         else ''
     )
-    print(f'{arguments.bag}: {scans} scans{skipped}')
+    print(f'{arguments.bag}: {counted(scans, "scan")}{skipped}')
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ from thinmap_ros.logs.carmen import LaserOptions
 from thinmap_ros.logs.frames.bag_odometry import SOURCES
 from thinmap_ros.logs.frames.laser_mount import parse_laser_pose
 from thinmap_ros.logs.log import Log
+from thinmap_ros.logs.log_format import known_formats
 from thinmap_ros.tools.parameter_file import NodeParameters
 
 BAD_INPUT = 2
@@ -142,9 +143,7 @@ def config_from(
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Add the log, and options for its laser pose, topics and frames."""
-    parser.add_argument(
-        'log', type=Path, help='CARMEN log (plain or gzip), rosbag2 folder or file, or ROS 1 bag'
-    )
+    parser.add_argument('log', type=Path, help=f'the log: {known_formats()}')
     carmen = parser.add_argument_group('laser of a CARMEN log', 'Only --offset-m applies to bags.')
     add_config(carmen, LaserOptions)
     parser.add_argument(

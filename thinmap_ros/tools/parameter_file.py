@@ -98,10 +98,13 @@ def _unknown(path: Path, given: dict[str, dict[str, Any]]) -> list[str]:
     if not unknown:
         return []
     nodes = ', '.join(given)
+    is_one = len(given) == 1
     wrong = ', '.join(name + suggestion(name, known, elsewhere) for name in unknown)
     if any(values.get(_STRICT) is True for values in given.values()):
-        raise ConfigError(f'{path}: nodes {nodes} have no parameter {wrong}')
-    return [f'{path}: ignored parameters that nodes {nodes} do not have: {wrong}']
+        has = f'node {nodes} has' if is_one else f'nodes {nodes} have'
+        raise ConfigError(f'{path}: {has} no parameter {wrong}')
+    lack = f'node {nodes} does not have' if is_one else f'nodes {nodes} do not have'
+    return [f'{path}: ignored parameters that {lack}: {wrong}']
 
 
 def _names_of(node: str, slam: str) -> set[str]:

@@ -434,3 +434,27 @@ def test_what_was_mapped_apart_is_dropped_if_the_robot_is_placed_without_it():
         occupied_after([MAP, APART, APART, APART, MAP], correct_at=3)[0]
         == occupied_after([MAP, NOWHERE, NOWHERE, NOWHERE, MAP])[0]
     )
+
+
+def test_saved_scans_of_a_laser_that_dropped_out_clear_nothing_once_they_are_rendered():
+    """Before the laser has proved again that it does; and those of before the save stay so."""
+    rng = np.random.default_rng(7)
+    saved = [
+        (replace(dropped(SCANS[k], rng), drops_out=True, stamp_ns=k + 1), TRUE[k])
+        for k in range(20)
+    ]
+    clean = OccupancyGrid()
+    for scan, T in saved:
+        clean.add_scan(scan, T)
+    loaded = OccupancyGrid.from_state(clean.state())
+    grid = CorrectableGrid(loaded, scans=saved)
+    assert grid.shown is loaded, 'until the first correction'
+    stamps = np.arange(20) + 1
+    assert grid.apply_correction(stamps, TRUE[:20] + [0.0, 0.5, 0.0], 100)
+    grid.finish()
+    shown = grid.shown.known_area()
+    assert shown.free.sum() == pytest.approx(clean.known_area().free.sum(), rel=0.05)
+    moved = OccupancyGrid()
+    for scan, T in saved:
+        moved.add_scan(scan, T + [0.0, 0.5, 0.0])
+    assert (shown.cells == moved.known_area().cells).mean() > 0.999

@@ -1,5 +1,8 @@
 """Occupancy grid that is corrected after loop closures, and once a laser proves to drop out."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,14 +30,25 @@ class CorrectableGrid:
     """
 
     def __init__(
-        self, grid: OccupancyGrid, keeps_scans: bool = True, corrected_ns: int = 0
+        self,
+        grid: OccupancyGrid,
+        keeps_scans: bool = True,
+        corrected_ns: int = 0,
+        scans: Sequence[tuple[Scan, Array]] = (),
     ) -> None:
-        """Start with a grid. If keeps_scans is False, it is never corrected."""
+        """Start with a grid. If keeps_scans is False, it is never corrected.
+
+        scans: with poses (3,), from which a grid that is not empty can be rendered. It is shown as
+        it is until the first correction.
+        """
         self.shown = grid
         self.corrected_ns = corrected_ns
         self._drops_out = False
         self._refusals: list[str] = []
-        self._history: PoseHistory[StoredScan] | None = PoseHistory() if keeps_scans else None
+        history: PoseHistory[StoredScan] = PoseHistory()
+        for scan, T_scan in scans:
+            history.add_pose(scan.stamp_ns, T_scan, StoredScan.of(scan, grid.config))
+        self._history = history if keeps_scans else None
         self._open: list[tuple[Scan, Array]] = []  # with the poses (3,) at which they were made
         self._apart: PoseHistory[StoredScan] | None = None
         self._is_joined = False  # whether a correction has come since the last scan that is apart
@@ -118,7 +132,7 @@ class CorrectableGrid:
         if self._apart is None:
             self._apart = PoseHistory()
         self._is_joined = False
-        kept = StoredScan.of(scan, self.shown.config)
+        kept = self._stored(scan)
         self._apart.add_pose(scan.stamp_ns, T_map_base, kept)
 
     def _end_apart(self) -> None:
@@ -156,10 +170,14 @@ class CorrectableGrid:
             return
         if self._history is None:
             return
-        kept = StoredScan.of(scan, self.shown.config)
+        kept = self._stored(scan)
         self._history.add_pose(scan.stamp_ns, T_map_base, kept)
         if self._rerendering is not None:
             self._rerendering.add_scan(kept, T_map_base)
+
+    def _stored(self, scan: Scan) -> StoredScan:
+        """The scan of a laser of which it is found out later whether it drops out."""
+        return StoredScan.of(replace(scan, drops_out=False), self.shown.config)
 
     def _render_slice(self) -> CorrectedPoses | None:
         if self._history is None or self._pending_ns is None:

@@ -127,7 +127,7 @@ class Rerendering:
         """Start with the stored scans at their poses (N, 3).
 
         like: a grid with the same cells and configuration; T_map_base (3,): pose of the robot;
-        drops_out: of the laser, as is known now, for all scans.
+        drops_out: of the laser, as is known now, for all scans; those that have it, keep it.
         """
         self._drops_out = drops_out
         self.grid = OccupancyGrid(like.config, like.frame)
@@ -166,7 +166,7 @@ class Rerendering:
                 break
             task = self._queue.pop()
             try:
-                scan = replace(task.scan, drops_out=self._drops_out)
+                scan = replace(task.scan, drops_out=self._drops_out or task.scan.drops_out)
                 self.grid.add_scan(scan, task.T_map_base)
             except InputError as error:
                 refusals.append(str(error))

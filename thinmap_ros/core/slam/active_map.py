@@ -28,12 +28,23 @@ class ActiveMap:
         self.map = LocalMap(config)
         self.refused = 0  # scans that lie too far from the others for one map
         self._loaded: Mapping[str, NDArray[Any]] | None = None
+        self._loaded_keyframes = 0  # whose scans are in the loaded cells
         self._pending: list[int] = []
         self._revision = 0
 
-    def load(self, given: Mapping[str, NDArray[Any]]) -> None:
-        """Set the cells of a `LocalMap.state` with which every re-rendered map starts."""
+    def load(self, given: Mapping[str, NDArray[Any]], keyframes: int) -> None:
+        """Set the cells of a `LocalMap.state` with which every re-rendered map starts.
+
+        keyframes: number of the first keyframes that these cells are made of, 0 if they are not
+        known. Otherwise a corrected map is rendered from the keyframes alone.
+        """
         self._loaded = given
+        self._loaded_keyframes = keyframes
+
+    @property
+    def is_of_keyframes(self) -> bool:
+        """Whether all of the published map can be rendered from keyframes."""
+        return self._loaded is None or self._loaded_keyframes > 0
 
     def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> bool:
         """Add surface points (N, 5), robot frame, of a scan at a pose (3,).
@@ -53,7 +64,10 @@ class ActiveMap:
         places = np.array([frame.T_map_base for frame in keyframes]).reshape(-1, 3)[:, :2]
         away = np.hypot(*(places - T_map_base[:2]).T)
         order = np.argsort(-away).tolist()
-        self._pending = [k for k in order if self._pieces.is_here(keyframes[k].submap)]
+        first = self._first_rendered
+        self._pending = [
+            k for k in order if k >= first and self._pieces.is_here(keyframes[k].submap)
+        ]
         self._render(keyframes, self._render_first)
 
     def follow(self, keyframes: Keyframes, T_map_base: Array) -> None:
@@ -68,7 +82,7 @@ class ActiveMap:
         if not self._pieces.is_apart:
             return self.map
         rendered = self._empty(is_published=True)
-        for frame in keyframes:
+        for frame in keyframes[self._first_rendered :]:
             if self._pieces.is_published(frame.submap):
                 with suppress(InputError):  # counted when it was added
                     rendered.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
@@ -80,9 +94,16 @@ class ActiveMap:
             frame = keyframes[self._pending.pop()]
             self._add(frame.points, frame.scan.T_base_laser, frame.T_map_base)
 
+    @property
+    def _first_rendered(self) -> int:
+        """Number of the first keyframe that is not in the loaded cells."""
+        return 0 if self._revision else self._loaded_keyframes
+
     def _empty(self, is_published: bool) -> LocalMap:
+        """An empty map, or the loaded cells, as long as they follow the keyframes."""
         empty = LocalMap(self._config)
-        if is_published and self._loaded is not None:
+        is_corrected = self._loaded_keyframes > 0 and self._revision > 0
+        if is_published and self._loaded is not None and not is_corrected:
             empty.restore(self._loaded)
         return empty
 

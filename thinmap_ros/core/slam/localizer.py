@@ -23,6 +23,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizer_map import LocalizerMap
 from thinmap_ros.core.slam.matching import local_map
@@ -101,22 +102,32 @@ class Localizer:
         if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
             self._rejected += 1
             return
-        anchor = self._map.loops.anchor
         T_map_base = se2.pose(*T_map_base.tolist())
-        self._tracker.place(anchor.relative(T_map_base), anchor.turned(covariance))
+        self._map.place(T_map_base, covariance)
         self._tracker.track.evidence.place(is_map_given=not self.config.is_mapping)
-        self._map.loops.pieces.return_to_published()
         self._map.local.rerender(self.keyframes, T_map_base)
 
     def state(self) -> State:
         """The published local map as arrays by name, for `from_state`; without the pose."""
         return self._map.local.published(self.keyframes).state()
 
+    def saved_keyframes(self) -> SavedKeyframes | None:
+        """The keyframes of the published map, for `from_state`.
+
+        None without any, and if the map began with cells that are not made of keyframes.
+        """
+        return self._map.loops.saved() if self._map.local.is_of_keyframes else None
+
     @staticmethod
-    def from_state(state: State, config: LocalizerConfig | None = None) -> 'Localizer':
+    def from_state(
+        state: State,
+        config: LocalizerConfig | None = None,
+        keyframes: SavedKeyframes | None = None,
+    ) -> 'Localizer':
         """Localizer in the local map of a saved `state`, at the configured initial pose.
 
-        It is delocalized until scans fit. Raises InputError if the state is invalid.
+        keyframes: those of that map, with which it is corrected like a map that has never been
+        saved. It is delocalized until scans fit. Raises InputError if the state is invalid.
         """
         checked = snapshot.validate(state, local_map.FIELDS, 'local map')
         possible = bool((checked['hits'] <= checked['seen']).all())
@@ -125,7 +136,7 @@ class Localizer:
         )
         localizer = Localizer(config)
         localizer._map.local.map.restore(checked)
-        localizer._start_delocalized(checked)
+        localizer._start_delocalized(checked, keyframes)
         return localizer
 
     @staticmethod
@@ -201,12 +212,12 @@ class Localizer:
         """Places (N, 2) that enclose the published map: cells, and keyframes, m."""
         return self._map.known_places()
 
-    def _start_delocalized(self, given: State) -> None:
+    def _start_delocalized(self, given: State, keyframes: SavedKeyframes | None = None) -> None:
         """Start in a loaded local map: delocalized until scans fit."""
-        self._map.local.load(given)
-        track = self._tracker.track
-        track.uncertainty.place(track.T_anchor_base, self._tracker.slip_covariance())
-        track.evidence.start_delocalized()
+        start = self.pose
+        self._map.load(given, keyframes)
+        self._map.place(start, self._tracker.slip_covariance())
+        self._tracker.track.evidence.start_delocalized()
 
     def _detect_loss(self) -> None:
         """In a map that does not change, the robot is delocalized if scans contradict it.

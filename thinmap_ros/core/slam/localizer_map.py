@@ -14,12 +14,14 @@ from thinmap_ros.core.slam.atlas import Atlas
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, Step, heading_errors, with_heading
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Systematic
+from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
 from thinmap_ros.core.slam.heading import HeadingCorrection
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS
 from thinmap_ros.core.slam.tracker import Surroundings, Tracker
 from thinmap_ros.core.slam.wall_compass import Reference
+from thinmap_ros.core.snapshot import State
 
 _VIEW_M = 1.0  # path length after which the errors of two matches are independent
 
@@ -55,6 +57,19 @@ class LocalizerMap:
     def pose(self) -> Array:
         """Current pose T_map_base (3,)."""
         return self.loops.anchor.pose(self._tracker.track.T_anchor_base)
+
+    def load(self, given: State, keyframes: SavedKeyframes | None) -> None:
+        """Begin with the cells of a `LocalMap.state`, and the keyframes that they are made of."""
+        if keyframes is not None:
+            self.loops.load(keyframes)
+        self.local.load(given, len(self.loops.keyframes))
+
+    def place(self, T_map_base: Array, covariance: Array) -> None:
+        """Place the robot at a given pose (3,) with covariance (3, 3) in the published map."""
+        self.loops.pieces.return_to_published()
+        self.loops.return_to(T_map_base)
+        anchor = self.loops.anchor
+        self._tracker.place(anchor.relative(T_map_base), anchor.turned(covariance))
 
     def add(self, scan: Scan, points: Array) -> None:
         """Add a scan with surface points (N, 5) if the robot has moved far enough since the last.

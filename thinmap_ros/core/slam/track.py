@@ -61,8 +61,9 @@ class Track:
         return None if update is None else se2.between(update, self.T_anchor_base)
 
     def place(self, T_anchor_base: Array, covariance: Array) -> None:
-        """Set the pose (3,) with covariance (3, 3)."""
+        """Set the pose (3,) with covariance (3, 3), relative to any anchor, without any motion."""
         self.T_anchor_base = T_anchor_base
+        self.T_anchor_update = None
         self.uncertainty.place(T_anchor_base, covariance)
         self.reckoned = DeadReckoning(T_anchor_base, self.uncertainty.since_match)
 

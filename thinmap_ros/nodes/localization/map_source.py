@@ -13,7 +13,6 @@ from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.start import StartConfig
 from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import Report, read_map
-from thinmap_ros.files.sessions import LOCALIZER
 from thinmap_ros.nodes.localization.config import LocalizationConfig
 from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -116,7 +115,7 @@ def load_localizer(
     folder, report: as in `read_map`. None: no map that this localizer can use.
     Raises InputError where a file is broken, or the path names no map.
     """
-    loaded = LOCALIZER.load_optional(path, config)
+    loaded = sessions.load_localizer(path, config)
     if loaded is not None or not isinstance(config, LocalizerConfig):
         return loaded
     grid = sessions.load_grid(path, None, folder, report)

@@ -52,11 +52,14 @@ class Rebuilding:
     def window(self, mapped: MappedScan) -> None:
         """Record a window and its scan. Raises InputError where it does not fit the grid."""
         self._newest = mapped
-        localized = mapped.localized
-        if self._past is not None:
-            self._past.add_pose(localized.scan.stamp_ns, localized.T_map_base, None)
+        self.add_pose(mapped.localized.scan.stamp_ns, mapped.localized.T_map_base)
         self._adopt(mapped)
         self._paste_window()
+
+    def add_pose(self, stamp_ns: int, T_map_base: Array) -> None:
+        """Add the pose (3,) of a scan from which the graph was made."""
+        if self._past is not None:
+            self._past.add_pose(stamp_ns, T_map_base, None)
 
     def _adopt(self, mapped: MappedScan) -> None:
         """Learn which correction the graph follows, from a window of its grid."""

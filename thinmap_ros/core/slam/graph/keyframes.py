@@ -208,6 +208,21 @@ class Keyframes:
         offset = se2.between(earlier.T_map_base, frame.T_map_base)
         self._path.add(frame.scan.stamp_ns, number, offset)
 
+    def load(self, frames: Sequence[Keyframe], steps: Sequence[Edge]) -> None:
+        """Begin with saved keyframes, and the step to each but the first."""
+        self.frames = list(frames)
+        self.steps = list(steps)
+        for number, frame in enumerate(frames):
+            self._buckets.insert(number, float(frame.T_map_base[0]), float(frame.T_map_base[1]))
+            self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
+
+    def return_to(self, number: int) -> None:
+        """Make a keyframe the anchor that the robot has come to by no known motion."""
+        frame = self.frames[number]
+        path_m = max(each.path_m for each in self.frames)
+        self.frames[number] = replace(frame, path_m=path_m)
+        self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
+
     @property
     def headings(self) -> list[Edge]:
         """Measured headings as edges from the first keyframe, whose heading defines the map's."""

@@ -36,6 +36,7 @@ from thinmap_ros.core.slam.graph.keyframes import (
 )
 from thinmap_ros.core.slam.graph.pieces import Pieces
 from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
@@ -163,6 +164,34 @@ class LoopClosure:
         if not keyframes.frames:
             return Anchor()
         return Anchor(keyframes.frames[keyframes.anchor], keyframes.T_anchor_last)
+
+    def load(self, saved: SavedKeyframes) -> None:
+        """Begin with the saved keyframes of a map."""
+        self.keyframes.load(saved.frames, saved.steps)
+        self.graph.edges = list(saved.edges)
+        self.pieces.load(1 + max(frame.submap for frame in saved.frames))
+
+    def saved(self) -> SavedKeyframes | None:
+        """The keyframes of the published map, without a pending one; None if there are none."""
+        frames = self.keyframes.frames
+        is_saved = [self.pieces.is_published(frame.submap) for frame in frames]
+        if not any(is_saved):
+            return None
+        steps = self.keyframes.steps
+        return SavedKeyframes.of(frames, steps, self.graph.edges, is_saved, self._calibration)
+
+    def return_to(self, T_map_base: Array) -> None:
+        """Make the keyframe of the published map nearest to a given pose (3,) the anchor.
+
+        The robot has come there by no known motion.
+        """
+        self._add_pending()
+        frames = self.keyframes.frames
+        published = [k for k, frame in enumerate(frames) if self.pieces.is_published(frame.submap)]
+        if published:
+            self.keyframes.return_to(
+                min(published, key=lambda k: view_difference_m(frames[k].T_map_base, T_map_base))
+            )
 
     def needs_keyframe(self, T_anchor_base: Array) -> bool:
         """Whether a scan at a pose (3,) relative to the anchor becomes the next keyframe."""

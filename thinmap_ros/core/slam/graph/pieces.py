@@ -43,6 +43,10 @@ class Pieces:
         """Whether the place of the robot in the published map is unknown."""
         return self._piece_of[-1] != _PUBLISHED
 
+    def load(self, submaps: int) -> None:
+        """Begin a submap of the published map, after a number of others of it."""
+        self._piece_of = [_PUBLISHED] * (submaps + 1)
+
     def begin(self) -> None:
         """Begin a submap, apart from all others."""
         self._piece_of.append(len(self._piece_of))

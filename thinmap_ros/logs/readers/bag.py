@@ -1,0 +1,24 @@
+"""Bags as logs: rosbag2 folders, MCAP and SQLite files, and ROS 1 bags."""
+
+from pathlib import Path
+
+from thinmap_ros.logs.bag import EXPECTED, BagLog
+from thinmap_ros.logs.formats import is_bag
+from thinmap_ros.logs.log import Log
+from thinmap_ros.logs.log_format import LogFormat, LogOptions
+
+
+def _log(path: Path, options: LogOptions) -> Log:
+    return BagLog(
+        path,
+        options.scan_topic,
+        options.odometry_topic,
+        options.T_base_laser,
+        options.base_frame,
+        options.odometry_source,
+        options.odom_frame,
+        options.laser,
+    )
+
+
+FORMAT = LogFormat(EXPECTED, is_bag, _log)
