@@ -213,6 +213,9 @@ def place(tmp_path: Path) -> Path:
     (tmp_path / 'maps').mkdir()
     occupancy_maps.write_map(tmp_path / 'maps' / 'office', patch)
     occupancy_maps.write_map(tmp_path / 'office', patch)
+    _, floor, _ = read_world(package_data.world_path('office'))
+    for name in ('maps/east', 'maps/west', 'other_program'):
+        occupancy_maps.write_map(tmp_path / name, floor)
     _write_scripts(tmp_path / 'scripts')
     return tmp_path
 
