@@ -10,6 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.regions.tracker import RegionTracker
+from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files import sessions
 from thinmap_ros.files.merging import NotTheSamePlaceError, merge_maps, read_piece, write_ids
@@ -31,6 +32,12 @@ def save_session(path, drive):
     regions.update(piece.patch)
     REGIONS.save(str(path), regions)
     return str(path)
+
+
+def save_keyframes(path, drive):
+    driven = driven_piece(*drive)
+    frames = list(driven.piece.keyframes)
+    sessions.KEYFRAMES.save(path, SavedKeyframes(frames, driven.edges, []))
 
 
 def save_yaml(path, drive):
@@ -85,6 +92,18 @@ def test_sessions_and_maps_of_other_programs_are_mixed(folder, tmp_path):
     lines = (tmp_path / 'ids.csv').read_text().splitlines()
     assert lines[0] == 'map,id,merged_id'
     assert len(lines) == 1 + sum(len(join.ids) for join in merged.joins)
+
+
+def test_sessions_with_keyframes_are_bent_until_they_agree(tmp_path):
+    paths = [save_session(tmp_path / f'{drive}', drive) for drive in (FIRST, SECOND)]
+    for path, drive in zip(paths, (FIRST, SECOND), strict=True):
+        assert read_piece(path).is_rigid
+        save_keyframes(path, drive)
+        assert not read_piece(path).is_rigid
+    merged = merge_maps(paths)
+    require_right(merged.joins[0], SECOND)
+    merged.save(str(tmp_path / 'both'))
+    assert not sessions.KEYFRAMES.exists(str(tmp_path / 'both'))
 
 
 def test_a_foreign_map_is_refused(folder):

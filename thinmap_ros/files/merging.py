@@ -15,7 +15,7 @@ from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, b
 from thinmap_ros.files import sessions
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.occupancy_maps import Report, read_map, warn
-from thinmap_ros.files.sessions import EXPLORATION, GRID, LOCALIZER, REGIONS, TOPOLOGY
+from thinmap_ros.files.sessions import EXPLORATION, GRID, KEYFRAMES, LOCALIZER, REGIONS, TOPOLOGY
 
 MIN_MAPS = 2
 
@@ -159,7 +159,8 @@ class _Merging:
 def read_piece(path: str, report: Report = warn) -> SlamPiece:
     """Read a session, or a map_server map by its YAML file, as a piece of map.
 
-    A map without a topological map gets one. Its keyframes are drawn from the grid.
+    A map without a topological map gets one. Keyframes of a map that has none are drawn from its
+    grid; such a map stays rigid.
     Raises InputError where a file is missing or broken.
     """
     if GRID.exists(path):
@@ -171,6 +172,10 @@ def read_piece(path: str, report: Report = warn) -> SlamPiece:
         )
     if TOPOLOGY.exists(path):
         builder = sessions.load_topology(path)
+        saved = KEYFRAMES.load_optional(path) if GRID.exists(path) else None
+        if saved is not None:
+            edges = [*saved.steps, *saved.edges]
+            return SlamPiece(saved.frames, edges, patch, builder.map, builder.next_id)
         return SlamPiece.of_bare_map(patch, builder.map, builder.next_id)
     return SlamPiece.of_bare_map(patch, build(patch, None, TopologyConfig()))
 
