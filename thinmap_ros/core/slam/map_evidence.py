@@ -1,6 +1,5 @@
 """Evidence against the map: scans agree with it, the robot is lost, or it is delocalized."""
 
-from thinmap_ros.core.places.recognition.views import WINDOW_M
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 
 # Inliers for each contradicting point with which a match overrides the odometry.
@@ -34,9 +33,6 @@ class MapEvidence:
         self._before_look = 0.0  # the same before the present look
         self._is_foreign = False  # whether the last scan may be one of another place
         self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
-        self._to_confirm_m = 0.0  # path over which they have to
-        self._unconfirmed_m = 0.0  # and what is left of it
-        self._delocalized_m = 0.0  # path since the start in a loaded map
         self.is_unconfirmed = False  # after a scan without a match, until one fits
         self.adjust(lost_threshold, least_fit)
 
@@ -49,11 +45,6 @@ class MapEvidence:
     def agrees(self) -> bool:
         """Whether there is no evidence against the map."""
         return self.level == 0.0 and self._seen_through == 0.0
-
-    @property
-    def permits_mapping(self) -> bool:
-        """Whether scans agree with the map, at a pose that they have confirmed."""
-        return self.agrees and not self.is_delocalized
 
     @property
     def forbids_mapping(self) -> bool:
@@ -77,20 +68,15 @@ class MapEvidence:
     @property
     def needs_submap(self) -> bool:
         """Whether the evidence against the map, or against a given pose, reaches the threshold."""
-        is_late = self._to_confirm_m > 0.0 and self._delocalized_m > 2.0 * self._to_confirm_m
-        return is_late or max(self.level, self._seen_through) >= self._lost_evidence
+        return max(self.level, self._seen_through) >= self._lost_evidence
 
     def update(
-        self,
-        match: Match | None,
-        seen_through: float = 0.0,
-        is_stationary: bool = False,
-        moved_m: float = 0.0,
+        self, match: Match | None, seen_through: float = 0.0, is_stationary: bool = False
     ) -> None:
         """Update the evidence by a match; None (no match was possible) leaves it unchanged.
 
         seen_through: ratio of returns behind walls of the map; is_stationary: whether the scan is
-        of the same look as the last one, and no evidence of its own; moved_m: path since then.
+        of the same look as the last one, and no evidence of its own.
         """
         if match is None:
             self.is_unconfirmed = True
@@ -108,11 +94,7 @@ class MapEvidence:
         self._seen_through = max(self._before_look + seen_through - _SEEN_THROUGH, 0.0)
         if self.is_delocalized:
             self.level = min(self.level, self._lost_evidence)
-            self._delocalized_m += moved_m
-            is_confirming = self.agrees and fits
-            left_m = self._unconfirmed_m - moved_m if is_confirming else self._to_confirm_m
-            self._unconfirmed_m = max(left_m, 0.0)
-            self.is_delocalized = not is_confirming or self._unconfirmed_m > 0.0
+            self.is_delocalized = not self.agrees or match.inlier_ratio < self._least_fit
 
     def _end_look(self, seen_through: float) -> None:
         """Set the evidence of walls that were seen through before the present look."""
@@ -126,20 +108,13 @@ class MapEvidence:
         fits. Outside of the map no scan contradicts it.
         """
         self.is_delocalized = True
-        self._to_confirm_m = self._unconfirmed_m = 0.0
         self.is_unconfirmed = False
         self.level = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
         self._end_look(0.0)
 
-    def start_delocalized(self, is_map_given: bool = False) -> None:
-        """Start in a loaded map, at an unconfirmed pose; is_map_given: the map does not change.
-
-        Scans have to fit over the path of a view before the robot maps: one fits somewhere by
-        chance, and a map that is changed by it soon agrees. After twice that path it is lost.
-        """
+    def start_delocalized(self) -> None:
+        """Start in a loaded map, at an unconfirmed pose."""
         self.is_delocalized = True
-        self._to_confirm_m = self._unconfirmed_m = 0.0 if is_map_given else WINDOW_M
-        self._delocalized_m = 0.0
         self.level = self._loaded_evidence
 
     def lose(self) -> None:
@@ -154,4 +129,3 @@ class MapEvidence:
         self._is_foreign = False
         self._end_look(0.0)
         self.is_delocalized = False
-        self._to_confirm_m = 0.0
