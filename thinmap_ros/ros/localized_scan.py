@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovariance
 
 from thinmap_msgs.msg import LocalGrid, SlamStatus
@@ -82,7 +83,12 @@ def localized_scan_msg(
 
 
 def localized_scan_from_msg(message: LocalizedScanMsg) -> LocalizedScan:
-    """Scan of a message. Raises InputError where scan, pose or a stamp is invalid."""
+    """Scan of a message.
+
+    Raises InputError where scan, pose or a stamp is invalid, and where a number that is no range is
+    not finite.
+    """
+    _require_finite(message)
     scan = decode.scan(
         message.scan,
         messages.stamp_ns(message.header.stamp),
@@ -105,6 +111,19 @@ def mapped_scan_from_msg(message: LocalGrid) -> MappedScan:
         messages.stamp_ns(message.grid.correction_stamp),
         message.is_rerendering,
     )
+
+
+def _require_finite(message: LocalizedScanMsg) -> None:
+    """Raise InputError unless poses, covariance and status are finite: others receive them, too."""
+    status = message.status
+    numbers = [*message.pose.covariance, status.inlier_ratio, status.step_time_ms]
+    numbers += [status.apart_m, status.join_odds]
+    for pose in (message.pose.pose, message.laser_pose):
+        at = pose.position
+        turn = pose.orientation
+        numbers += [at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w]
+    if not np.isfinite(numbers).all():
+        raise InputError('localized scan: a number is not finite: expected a pose, and its status')
 
 
 def _laser(message: LocalizedScanMsg) -> LaserConfig:

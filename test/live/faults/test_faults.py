@@ -541,6 +541,7 @@ def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
     before = {file.name: file.read_bytes() for file in stem.parent.iterdir()}
     assert sorted(before) == [
         'room.grid.npz',
+        'room.keyframes.npz',
         'room.pgm',
         'room.regions.npz',
         'room.slam.npz',
