@@ -1,4 +1,4 @@
-"""Tables of place recognition: joined or not, how far off, after which path, at which cost."""
+"""Tables of place recognition: joined or not, with which error, after which path, at which cost."""
 
 import math
 import time

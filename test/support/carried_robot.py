@@ -1,4 +1,4 @@
-"""Scans and odometry of a robot that is carried off, unnoticed by its wheels."""
+"""Scans and odometry of a kidnapped robot: its wheels notice nothing."""
 
 from dataclasses import replace
 from typing import NamedTuple

@@ -6,7 +6,7 @@ from enum import Enum
 
 from thinmap_ros.core.se2 import Array
 
-MAX_ODDS = 1e12  # that are told apart
+MAX_ODDS = 1e12  # higher ones are reported as this
 
 
 @dataclass(frozen=True)

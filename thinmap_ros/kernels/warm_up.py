@@ -85,6 +85,31 @@ def localizer() -> None:
     # A revisit needs covariances along the graph.
     step = Edge(0, 1, np.zeros(3), np.eye(3), False)
     covariances_from(0, np.zeros((2, 3)), [step], np.ones((2, 6)))
+    topology_builder()
+    _recognize()
+
+
+def _recognize() -> None:
+    """Warm up place recognition: a room is looked for in itself."""
+    from thinmap_ros.core.places.recognition.piece import MapPiece
+    from thinmap_ros.core.places.recognition.recognition import Recognition, log_odds_back
+    from thinmap_ros.core.slam.graph.keyframes import Keyframe
+    from thinmap_ros.core.slam.matching.surface import surface_points
+    from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
+
+    frames = [
+        Keyframe(scan, surface_points(scan), T_map_base, 0.0, np.zeros((3, 3)), submap=0)
+        for scan, T_map_base in _drive()
+    ]
+    places = ((1.0, 1.0), (3.0, 1.0), (2.0, 3.0))
+    nodes = [Node(i, NodeKind.BRANCH, x, y, 0.8) for i, (x, y) in enumerate(places, 1)]
+    room = MapPiece(frames, _room(), TopologicalMap(nodes, []))
+    recognition = Recognition(room)
+    for _ in range(2):  # the second one is judged by the hypothesis of the first
+        for view in room.views:
+            recognition.add(view, room.landmarks.around(view))
+    for hypothesis in recognition.hypotheses:
+        log_odds_back(room, room, recognition.views, hypothesis)
 
 
 def _sense() -> None:

@@ -1,4 +1,4 @@
-"""A robot that was carried off maps a piece apart, and joins it where it recognizes the place."""
+"""A kidnapped robot maps a piece apart, and joins it where it recognizes the place."""
 
 import math
 

@@ -48,7 +48,7 @@ def test_views_come_as_the_piece_grows(frames):
 
 
 def test_a_view_does_not_reach_over_a_gap(frames):
-    """After known ground, which makes no keyframes, the path goes on elsewhere."""
+    """After known ground, which makes no keyframes, the path continues elsewhere."""
     moved = [
         replace(frame, T_map_base=frame.T_map_base + (50.0, 0.0, 0.0)) for frame in frames[30:]
     ]

@@ -16,7 +16,7 @@ from thinmap_ros.core.topology.graph import Edge, TopologicalMap
 
 _BEAMS = 360
 _SPACING_M = 0.7  # of path, as of keyframes
-_INSIDE = 1e-6  # of a cell: a ray ends on the border of the cell that it enters
+_INSIDE = 1e-6  # of a cell: a ray ends on the edge of the cell that it enters
 
 
 @dataclass(frozen=True, eq=False)
