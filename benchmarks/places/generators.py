@@ -74,13 +74,13 @@ def _generators(there: MapPiece, own: MapPiece) -> dict[str, Generator]:
     voronoi = build_voronoi(there.patch)
     own_voronoi = landmarks_of(build_voronoi(own.patch))
     nodes = there.landmarks.xy
-    spots = there.field.random_poses(len(nodes), np.random.default_rng(0))[:, :2]
+    places = there.field.random_poses(len(nodes), np.random.default_rng(0))[:, :2]
     none = Landmarks(np.empty((0, 2)), np.empty(0))
     return {
         'pairs of branch nodes': lambda view: there.index.candidates(own.landmarks.around(view)),
         'branch nodes, thinning': _at(nodes, own.landmarks),
         'branch nodes, Voronoi': _at(landmarks_of(voronoi).xy, own_voronoi),
-        'random places, as many as nodes': _at(spots, none),
+        'random places, as many as nodes': _at(places, none),
     }
 
 

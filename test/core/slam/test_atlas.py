@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 from support.carried_robot import carried
 
 from thinmap_ros.core import se2
@@ -48,3 +49,11 @@ def test_a_robot_that_was_carried_into_another_building_stays_apart():
     assert last.apart is not None
     assert last.apart.path_m > 40.0 and last.apart.log_odds < math.log(JOIN_ODDS)
     assert all(estimate.correction is None for drive, estimate, _ in found if drive == 1)
+
+
+@pytest.mark.parametrize('drives', [((3, 0, 30.0), (4, 1, 5.0)), ((2, 0, 25.0), (5, 1, 5.0))])
+def test_scans_of_another_place_do_not_change_the_map_until_it_agrees_with_them(drives):
+    """Neither those that contradict it, nor, once there is much evidence, those that fit badly."""
+    found = localized(carried(*drives))
+    later = [estimate for drive, estimate, _ in found if drive == 1]
+    assert later[-1].is_mapping_apart

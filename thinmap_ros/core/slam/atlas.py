@@ -86,6 +86,7 @@ class _Search:
         self._next = 0  # keyframe that is looked at next
         self._recognition: Recognition | None = None
         self._matching: _Matching | None = None
+        self._revision: int | None = None
 
     @property
     def apart(self) -> Apart:
@@ -94,9 +95,12 @@ class _Search:
 
     def is_outdated(self, loops: LoopClosure) -> bool:
         """Whether the robot is in another piece, or one of the two was bent by a correction."""
+        if self._piece != loops.pieces.piece:
+            return True
+        is_corrected = self._revision != loops.keyframes.revision
+        self._revision = loops.keyframes.revision
         frames = loops.keyframes.frames
-        is_bent = self._known.is_bent(frames) or self._query.is_bent(frames)
-        return self._piece != loops.pieces.piece or is_bent
+        return is_corrected and (self._known.is_bent(frames) or self._query.is_bent(frames))
 
     def step(self, loops: LoopClosure, join_odds: float) -> Join | None:
         """Do one of: add keyframes, look for a view, match a keyframe, join both."""
@@ -107,6 +111,8 @@ class _Search:
             for _ in range(min(_KEYFRAMES_PER_SCAN, len(self._waiting))):
                 number = self._waiting.popleft()
                 self._known.add(number, frames[number])
+            if not self._waiting:
+                self._known.end_path()
         elif self._has_view:
             self._look(join_odds)
         else:

@@ -22,10 +22,18 @@ class MapPiece:
     """
 
     def __init__(
-        self, keyframes: Sequence[PlacedScan], patch: GridPatch, graph: TopologicalMap
+        self,
+        keyframes: Sequence[PlacedScan],
+        patch: GridPatch,
+        graph: TopologicalMap,
+        views: list[View] | None = None,
     ) -> None:
-        """keyframes: in the order of the path; all in the frame of the piece."""
+        """keyframes: in the order of the path; all in the frame of the piece.
+
+        views: along the keyframes, if they are made already.
+        """
         self.keyframes = keyframes
+        self._views = views
         self.patch = patch
         self.graph = graph
 
@@ -53,7 +61,7 @@ class MapPiece:
     @cached_property
     def views(self) -> list[View]:
         """Views along its keyframes."""
-        return views_of(self.keyframes)
+        return views_of(self.keyframes) if self._views is None else self._views
 
     def find(self, view: View, landmarks: Landmarks, count: int) -> Array:
         """The best places, distinct poses (N, 3), of a view of another piece with its landmarks."""

@@ -62,7 +62,7 @@ class GrowingPiece:
 
     def map_piece(self) -> MapPiece:
         """The piece as it is now."""
-        return MapPiece(self.frames, self._grid.known_area(), self._topology.map)
+        return MapPiece(self.frames, self._grid.known_area(), self._topology.map, self.views)
 
     def landmarks(self, view: View) -> Landmarks:
         """Landmarks around a view of this piece."""
