@@ -25,11 +25,11 @@ COMMANDS = [(0.3, 0.4)] * 60 + [(0.8, 0.0)] * 200 + [(0.0, -1.0)] * 40 + [(-0.3,
 
 
 @pytest.fixture(scope='module')
-def office(tmp_path_factory):
+def lab(tmp_path_factory):
     """World, start, and the first 25 s of an exploration in a file."""
-    folder = tmp_path_factory.mktemp('office')
-    numbers = record_drive('office', folder, folder / 'office.npz', 25.0)
-    return *world_of('office', folder), folder / 'office.npz', numbers
+    folder = tmp_path_factory.mktemp('lab')
+    numbers = record_drive('lab', folder, folder / 'lab.npz', 25.0)
+    return *world_of('lab', folder), folder / 'lab.npz', numbers
 
 
 def driven(simulation):
@@ -45,8 +45,8 @@ def driven(simulation):
 
 @pytest.mark.parametrize('robot', ['2dx', '3at'])
 @pytest.mark.parametrize('seed', [0, 5])
-def test_a_replay_has_the_odometry_of_a_live_simulation_with_its_seed(office, robot, seed):
-    world, start, _, _ = office
+def test_a_replay_has_the_odometry_of_a_live_simulation_with_its_seed(lab, robot, seed):
+    world, start, _, _ = lab
     recorded = RecordedSimulation(world, start, PRESETS[robot], LASERS['lms200'], 0)
     scans = [scan for scan, _, _ in driven(recorded)]
     assert recorded.robot.collisions > 0
@@ -61,8 +61,8 @@ def test_a_replay_has_the_odometry_of_a_live_simulation_with_its_seed(office, ro
         assert sample.scan.angle_increment_rad == scan.angle_increment_rad
 
 
-def test_a_recording_is_the_exploration_by_the_true_pose(office):
-    world, start, path, numbers = office
+def test_a_recording_is_the_exploration_by_the_true_pose(lab):
+    world, start, path, numbers = lab
     samples = list(read_recording(path).replay(PRESETS['2dx'], 0))
     assert numbers['scans'] == len(samples)
     loop, _ = explore(world, start, Options(speed_m_s=0.5, time_limit_s=25.0))
@@ -71,9 +71,9 @@ def test_a_recording_is_the_exploration_by_the_true_pose(office):
     assert numbers['distance_m'] > 3.0
 
 
-def test_a_damaged_or_missing_recording_is_named(office, tmp_path):
-    _, _, path, _ = office
-    damaged = tmp_path / 'office.npz'
+def test_a_damaged_or_missing_recording_is_named(lab, tmp_path):
+    _, _, path, _ = lab
+    damaged = tmp_path / 'lab.npz'
     damaged.write_bytes(path.read_bytes()[:1000])
     for file in (damaged, tmp_path / 'nowhere.npz'):
         with pytest.raises(InputError, match=str(file)):
@@ -196,7 +196,7 @@ def called(*words):
 @pytest.fixture
 def small_board(monkeypatch, tmp_path):
     """A board of one small world; the folder for its results."""
-    cases = [LoopCase('office', 1, 'turtlebot3'), DriveCase('office', 1), DriveCase('office', 2)]
+    cases = [LoopCase('lab', 1, 'turtlebot3'), DriveCase('lab', 1), DriveCase('lab', 2)]
     monkeypatch.setattr(board_run, 'board_cases', lambda logs: cases)
     return tmp_path / 'out'
 
@@ -206,9 +206,9 @@ def test_a_small_board_is_resumed(small_board, capsys):
     words = ['-o', small_board, '--processes', 1, '--quiet']
     assert called(*words, '--only', 'drive_*_1') == 0
     assert '[1 of 2 cases]' in (small_board / 'slam.md').read_text()
-    assert (small_board / 'drives' / 'office.npz').exists()
+    assert (small_board / 'drives' / 'lab.npz').exists()
     results = small_board / 'board'
-    kept = results / 'drive_office.odometry_1.json'
+    kept = results / 'drive_lab.odometry_1.json'
     first = json.loads(kept.read_text())
     assert first['scans'] > 100
     assert first['live_m'] < 0.2
@@ -216,18 +216,18 @@ def test_a_small_board_is_resumed(small_board, capsys):
     capsys.readouterr()
     assert called(*words) == 0
     text = (small_board / 'slam.md').read_text()
-    assert '| 98765 (drive_office.odometry_1) | **missed** |' in text
+    assert '| 98765 (drive_lab.odometry_1) | **missed** |' in text
     assert capsys.readouterr().out.splitlines()[2] in text
     assert '| closed loop, other lasers' in text
-    second = json.loads((results / 'drive_office.odometry_2.json').read_text())
+    second = json.loads((results / 'drive_lab.odometry_2.json').read_text())
     assert second['scans'] == first['scans']
     assert second['live_m'] != first['live_m']
-    loop = json.loads((results / 'loop_office.turtlebot3_1.json').read_text())
+    loop = json.loads((results / 'loop_lab.turtlebot3_1.json').read_text())
     assert loop['coverage'] > 0.9
     assert loop['live_m'] < 0.2
     cases = (small_board / 'slam.md').read_text()
-    assert '| drive_office.odometry_1 |' in cases
-    assert '| loop_office.turtlebot3_1 |' in cases
+    assert '| drive_lab.odometry_1 |' in cases
+    assert '| loop_lab.turtlebot3_1 |' in cases
     # Other options need another folder with the same recordings; two folders are compared.
     assert called(*words, '--set', 'slam=ekf_ti') == 2
     assert 'other options' in capsys.readouterr().err
@@ -236,7 +236,7 @@ def test_a_small_board_is_resumed(small_board, capsys):
     assert called(*other, '--processes', 1, '--quiet') == 0
     assert not (small_board / 'other' / 'drives').exists()
     text = (small_board / 'other' / 'slam.md').read_text()
-    assert '| 98765 (drive_office.odometry_1) |' in text
+    assert '| 98765 (drive_lab.odometry_1) |' in text
     assert (
         '## Comparison with another run (2 of 2 cases)'
         in (small_board / 'other/slam.md').read_text()

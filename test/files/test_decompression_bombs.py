@@ -168,7 +168,9 @@ def png(width: int, height: int, *extra: bytes) -> bytes:
     """A PNG of one colour, 1 bit per pixel, with the highest compression."""
     row = b'\0' + (width + 7) // 8 * b'\xff'
     packer = zlib.compressobj(9)
-    rows = b''.join(packer.compress(row) for _ in range(height)) + packer.flush()
+    block = min(height, 1 + 2**20 // len(row))  # rows that are packed at once
+    rows = b''.join(packer.compress(block * row) for _ in range(height // block))
+    rows += packer.compress(height % block * row) + packer.flush()
     header = chunk(b'IHDR', struct.pack('>IIBBBBB', width, height, 1, 0, 0, 0, 0))
     return (
         b'\x89PNG\r\n\x1a\n' + header + b''.join(extra) + chunk(b'IDAT', rows) + chunk(b'IEND', b'')

@@ -9,16 +9,16 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
+from threading import Thread
 from typing import Any, Protocol, TypeVar
 
 from tqdm import tqdm
 
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
-from thinmap_ros.evaluation.processes import end_with_parent
 from thinmap_ros.files.atomic import read_text, write_text
 
 Report = dict[str, Any]
@@ -107,7 +107,7 @@ def _on_cores(
     # No pool: one process that the system kills would end all jobs of a pool. Also, the peak memory
     # of a process is that of its job.
     waiting = list(reversed(jobs))
-    running: dict[Connection, tuple[AnyJob, SpawnProcess]] = {}
+    running: dict[Connection, tuple[AnyJob, ForkServerProcess]] = {}
     try:
         while waiting or running:
             while waiting and len(running) < max(processes, 1):
@@ -124,8 +124,9 @@ def _on_cores(
             process.join()
 
 
-def _started(work: Callable[[AnyJob], Report], job: AnyJob) -> tuple[Connection, SpawnProcess]:
-    context = get_context('spawn')
+def _started(work: Callable[[AnyJob], Report], job: AnyJob) -> tuple[Connection, ForkServerProcess]:
+    context = get_context('forkserver')
+    context.set_forkserver_preload([work.__module__])  # imported once, not by each job
     here, there = context.Pipe(duplex=False)
     process = context.Process(target=_send, args=(there, work, job), daemon=True)
     process.start()
@@ -134,13 +135,21 @@ def _started(work: Callable[[AnyJob], Report], job: AnyJob) -> tuple[Connection,
 
 
 def _send(connection: Connection, work: Callable[[AnyJob], Report], job: AnyJob) -> None:
-    end_with_parent()
+    Thread(target=_end_with_program, daemon=True).start()
     # Ctrl-C goes to all processes of a terminal; the parent ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     connection.send(_attempted(work, job))
 
 
-def _received(connection: Connection, process: SpawnProcess) -> Report | Failure:
+def _end_with_program() -> None:
+    """End this process when the program does: its parent, the fork server, waits for its jobs."""
+    program = parent_process()
+    assert program is not None
+    program.join()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _received(connection: Connection, process: ForkServerProcess) -> Report | Failure:
     outcome: Report | Failure | None = None
     with suppress(EOFError):  # of a process that was killed
         outcome = connection.recv()
