@@ -210,7 +210,10 @@ def write_outputs(
     regions = find_regions(patch, RegionConfig(robot_radius_m=robot_radius_m))
     graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
     release_compiler_pages()  # before matplotlib is loaded
-    summary_figure(folder / 'summary.png', patch, topology, poses, title=title, regions=regions)
+    apart = pipeline.localizer.apart_points()
+    summary_figure(
+        folder / 'summary.png', patch, topology, poses, title=title, regions=regions, apart=apart
+    )
     report = _report(result, poses, seconds)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
     return report

@@ -352,6 +352,50 @@ def test_regions_are_shown_in_the_colour_of_their_kind():
         feed.show('regions', stamped(regions=[region], doors=[]))
 
 
+def localized(state, x):
+    """LocalizedScan of three beams, 2 m long, at a pose."""
+    upright = plain(x=0.0, y=0.0, z=0.0, w=1.0)
+    beams = plain(
+        ranges=[2.0, 2.0, 2.0],
+        angle_min=-0.5,
+        angle_max=0.5,
+        angle_increment=0.5,
+        range_min=0.1,
+        range_max=10.0,
+        time_increment=0.0,
+        scan_time=0.1,
+    )
+    return stamped(
+        scan=beams,
+        laser_pose=plain(position=plain(x=0.1, y=0.0, z=0.0), orientation=upright),
+        pose=plain(pose=plain(position=plain(x=x, y=0.0, z=0.0), orientation=upright)),
+        status=plain(state=state, MAPPING_APART=5),
+    )
+
+
+def test_scans_of_a_piece_apart_are_shown_until_it_is_joined():
+    shown = []
+
+    class Pieces(NullView):
+        def apart(self, ns, points):
+            shown.append(points)
+
+    feed = MessageView(Pieces(), lambda frame: None)
+    for state, x in ((0, 0.0), (5, 1.0), (5, 1.2), (5, 2.0), (0, 3.0), (0, 4.0)):
+        feed.show('localized_scan', localized(state, x))
+    assert [len(points) for points in shown] == [3, 6, 0]
+    assert shown[1][[1, 4]] == pytest.approx(np.array([[3.1, 0.0], [4.1, 0.0]]))
+
+
+@needs_rerun
+def test_a_piece_apart_is_pale_in_the_recording(tmp_path):
+    view = View(tmp_path / 'a.rrd')
+    view.apart(START, np.array([[1.0, 2.0], [3.0, 4.0]]))
+    view.close()
+    ((_, row),) = read_back(tmp_path / 'a.rrd')[0]['/map/apart']
+    assert np.ravel(row['Points3D:positions']).tolist()[:2] == [1.0, 2.0]
+
+
 @needs_rerun
 def test_regions_are_closed_lines(tmp_path):
     view = View(tmp_path / 'a.rrd')

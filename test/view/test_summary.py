@@ -105,6 +105,14 @@ def test_a_strip_is_shown_with_space_around_it():
     assert top - bottom == pytest.approx(300.0 * 1.2 / 7.0) and bottom + top == pytest.approx(1.0)
 
 
+def test_pieces_whose_place_is_unknown_are_shown_beside_the_map(picture):
+    apart = np.array([[20.0, 3.0], [20.0, 4.0]])
+    summary_figure(picture, room(60, 80), TopologicalMap(), np.zeros((1, 3)), apart=apart)
+    _, found = colours(picture)
+    assert hexed(palette.APART) in found
+    assert shown_area(room(60, 80), apart) == pytest.approx((0.0, 20.0, 0.0, 6.0))
+
+
 def test_titles_are_one_line():
     assert shortened('two\nlines') == 'two lines'
     assert len(shortened(200 * 'x')) == 70

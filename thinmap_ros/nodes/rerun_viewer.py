@@ -17,6 +17,7 @@ from thinmap_msgs.msg import (
     EndNodeArray,
     ExplorationStatus,
     LineFeatureArray,
+    LocalizedScan,
     RegionArray,
     SlamStatus,
     TopologicalMap,
@@ -46,6 +47,7 @@ _TOPICS = {
     'plan': (PathMsg, qos.LATCHED),
     'exploration_status': (ExplorationStatus, qos.LATCHED),
     'slam_status': (SlamStatus, qos.STREAM),
+    'localized_scan': (LocalizedScan, qos.STREAM),
     'localization_samples': (PoseArray, qos.LATCHED),
     'diagnostics': (DiagnosticArray, qos.STREAM),
 }

@@ -47,7 +47,15 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
     poses = np.array(log.poses)
     true_poses = np.array(log.true_poses)
     summary_figure(
-        folder / 'summary.png', patch, topology, poses, true_poses, title, regions, hidden
+        folder / 'summary.png',
+        patch,
+        topology,
+        poses,
+        true_poses,
+        title,
+        regions,
+        hidden,
+        apart=pipeline.localizer.apart_points(),
     )
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
     report_page.write(folder, title, report, cli.command_line())

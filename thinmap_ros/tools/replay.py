@@ -76,6 +76,7 @@ class ReplayView:
         view = self._view
         topology = pipeline.topology.map
         view.grid(ns, pipeline.grid.known_area())
+        view.apart(ns, pipeline.localizer.apart_points())
         view.topology(ns, topology)
         view.scalar(ns, 'count', 'nodes', float(len(topology.nodes)))
         features = pipeline.localizer.features

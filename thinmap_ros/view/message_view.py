@@ -25,7 +25,36 @@ from thinmap_ros.view.stamp_matcher import StampMatcher
 
 _TF_STATIC = '/tf_static'
 _MEDIAN = re.compile(r'median (\d+\.\d+) ms')
+_APART_STEP_M = 0.5
 _STEPS = {'map update', 'graph update', 'explorer', 'global localization'}
+
+
+class _ApartScans:
+    """Points of the scans of a piece of map that is apart, a step between them.
+
+    points (N, 2): where dead reckoning puts them, m; none once the piece is joined.
+    """
+
+    def __init__(self) -> None:
+        self.points = np.empty((0, 2))
+        self._last: Array | None = None
+
+    def update(self, message: Any) -> bool:
+        """Add the scan of a LocalizedScan, or forget all; returns whether the points changed."""
+        if message.status.state != message.status.MAPPING_APART:
+            was_apart = self._last is not None
+            self.points = np.empty((0, 2))
+            self._last = None
+            return was_apart
+        T_map_base = _pose(message.pose.pose)
+        if self._last is not None and np.hypot(*(T_map_base - self._last)[:2]) < _APART_STEP_M:
+            return False
+        self._last = T_map_base
+        ns = decode.stamp_ns(message)
+        scan = decode.scan(message.scan, ns, decode.pose(message.laser_pose))
+        here = se2.transform_points(T_map_base, scan.points_base())
+        self.points = np.vstack([self.points, here])
+        return True
 
 
 class MessageView:
@@ -46,6 +75,7 @@ class MessageView:
         self._places: dict[int, Array] = {}
         self._T_odom_base: Array | None = None
         self._T_map_odom: Array | None = None
+        self._apart = _ApartScans()
         self._pairs: StampMatcher[Array, Array] = StampMatcher()
         self._takers: dict[str, Callable[[int, Any], None]] = {
             'map': self._on_map,
@@ -61,6 +91,7 @@ class MessageView:
             'plan': self._on_plan,
             'exploration_status': self._on_exploration,
             'slam_status': self._on_slam,
+            'localized_scan': self._on_localized_scan,
             'localization_samples': self._on_samples,
             'diagnostics': self._on_diagnostics,
         }
@@ -176,6 +207,10 @@ class MessageView:
         self._view.scalar(ns, 'count', 'features', float(message.features))
         self._view.scalar(ns, 'count', 'local features', float(message.local_features))
         self._view.scalar(ns, 'count', 'matched lines', float(message.matched))
+
+    def _on_localized_scan(self, ns: int, message: Any) -> None:
+        if self._apart.update(message):
+            self._view.apart(ns, self._apart.points)
 
     def _on_diagnostics(self, ns: int, message: Any) -> None:
         """Step times of nodes, from /diagnostics."""

@@ -38,6 +38,9 @@ class NullView:
     def regions(self, ns: int, outlines: Sequence[Array], colours: Sequence[str]) -> None:
         """Show the outlines (K, 2) of regions in their colours, `#RRGGBB`."""
 
+    def apart(self, ns: int, points: Array) -> None:
+        """Show the scan points (N, 2) of pieces of map whose place is unknown."""
+
     def end_nodes(self, ns: int, places: Array, probabilities: Array) -> None:
         """Show end nodes at places (N, 2) with their position probabilities (N,), 0 to 1."""
 

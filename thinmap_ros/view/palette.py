@@ -8,6 +8,7 @@ EDGE = '#009E73'
 ESTIMATE = '#CC79A7'
 TRUTH = '#332288'
 HIDDEN = '#882255'
+APART = '#DDB5CC'
 # Pale, in turn by id.
 REGIONS = {
     RegionKind.ROOM: ('#C9DFF2', '#D6D3EC', '#C5E3EA', '#DCE6F5'),

@@ -15,7 +15,8 @@ LEGEND = """
   **dark blue** branch, **amber** corner, **green** skeleton
 - **pink** estimated path, pose and its 95 %; **indigo** true path; **grey** odometry;
   **yellow** planned path and target; **purple** samples
-- **red** scan; **blue** features of the local area, its nodes ringed; **pale blue** other features
+- **red** scan; **pale pink** scans of a piece of map whose place is unknown;
+  **blue** features of the local area, its nodes ringed; **pale blue** other features
 - **pale outlines**: rooms (blue), corridors (sand), halls (green)
 """
 # Each curve: name in the legend and colour, by plot.

@@ -35,6 +35,7 @@ _TRAILS = {
 }
 # Heights above the map, m, in the order of importance.
 _Z = {
+    'apart': 0.005,
     'regions': 0.01,
     'skeleton': 0.02,
     'lines': 0.03,
@@ -210,6 +211,18 @@ class View(NullView):
             self._log('map/regions', strips)
 
         self._throttled('regions', ns, draw)
+
+    def apart(self, ns: int, points: Array) -> None:
+        """Show the scan points (N, 2) of pieces whose place is unknown, at most once a second."""
+
+        def draw() -> None:
+            lifted = _lifted(points, _Z['apart'])
+            self._log(
+                'map/apart',
+                self._rr.Points3D(lifted, colors=[rgb(palette.APART)], radii=[self._px(1.2)]),
+            )
+
+        self._throttled('apart', ns, draw)
 
     def end_nodes(self, ns: int, places: Array, probabilities: Array) -> None:
         """Show end nodes (N, 2) with their position probabilities (N,), at most once a second."""

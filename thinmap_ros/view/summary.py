@@ -28,6 +28,7 @@ _BOUNDARY = '#777777'
 _KINDS = {RegionKind.ROOM: 'room', RegionKind.CORRIDOR: 'corridor', RegionKind.HALL: 'hall'}
 # Free cells this near to a region are drawn as part of it: regions end before the walls, m.
 _REGION_MARGIN_M = 0.5
+_NO_POINTS = np.empty((0, 2))
 _ELLIPSIS = '…'
 
 
@@ -80,18 +81,19 @@ def summary_figure(
     regions: RegionMap | None = None,
     hidden: Array | None = None,
     is_measured: bool = True,
+    apart: Array = _NO_POINTS,
 ) -> None:
     """Write a PNG: map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven.
 
     regions: of the grid, in pale colours; hidden (N, 3): positions, m, and hidden area, m2, that is
     expected there; is_measured: whether walls are drawn as lines (see `wall_lines`), or each cell
-    as it is.
+    as it is; apart (N, 2): scan points of pieces of map whose place is unknown.
     """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    area = shown_area(patch)
+    area = shown_area(patch, apart)
     width, height = _map_inches(area)
     with matplotlib.rc_context({'font.size': _LAYOUT.font_pt}):
         figure = Figure(dpi=_LAYOUT.dpi, layout='constrained')
@@ -100,6 +102,7 @@ def summary_figure(
         axes.set_facecolor(_UNKNOWN)
         cells = wall_lines.drawn_cells(patch) if is_measured else raw_cells(patch)
         surfaces = _draw_cells(axes, patch, cells, regions)
+        _draw_apart(axes, apart)
         _draw_paths(axes, estimated, true)
         is_dense = len(topology.nodes) > _LAYOUT.dense_nodes * width * height
         draw_graph(axes, topology, 3.5 if is_dense else 5.0)
@@ -116,17 +119,23 @@ def summary_figure(
             figure.savefig(aside, format='png', bbox_inches='tight', metadata={'Software': None})
 
 
-def shown_area(patch: GridPatch) -> tuple[float, float, float, float]:
-    """Least and greatest x, and y, m, of the map in a picture that is neither tiny nor a strip."""
+def shown_area(patch: GridPatch, points: Array = _NO_POINTS) -> tuple[float, float, float, float]:
+    """Least and greatest x, and y, m, of a picture that is neither tiny nor a strip.
+
+    It shows the map and points (N, 2), m.
+    """
     rows, cols = patch.shape
     frame = patch.frame
-    sides = [max(count * frame.resolution, _LAYOUT.smallest_m) for count in (cols, rows)]
-    m_per_in = max(sides) / _LAYOUT.long_in
+    low = np.array([frame.origin_x, frame.origin_y])
+    high = low + frame.resolution * np.array([cols, rows])
+    low = np.vstack([low, points]).min(axis=0)
+    high = np.vstack([high, points]).max(axis=0)
+    sides = np.maximum(high - low, _LAYOUT.smallest_m)
+    m_per_in = float(sides.max()) / _LAYOUT.long_in
     width, height = (
         max(side, least * m_per_in) for side, least in zip(sides, _LAYOUT.shortest_in, strict=True)
     )
-    x = frame.origin_x + 0.5 * cols * frame.resolution
-    y = frame.origin_y + 0.5 * rows * frame.resolution
+    x, y = (0.5 * (low + high)).tolist()
     return x - 0.5 * width, x + 0.5 * width, y - 0.5 * height, y + 0.5 * height
 
 
@@ -221,6 +230,13 @@ def _draw_boundaries(
             list(ends), colors=_BOUNDARY, linewidths=1.2, label='region boundary', zorder=1.5
         )
         axes.add_collection(lines)
+
+
+def _draw_apart(axes: 'Axes', points: Array) -> None:
+    """Draw the scan points of pieces of map whose place is unknown."""
+    if len(points):
+        style: dict[str, Any] = {'linestyle': '', 'marker': '.', 'markersize': 1.5}
+        axes.plot(*points.T, color=palette.APART, label='place unknown', zorder=1.7, **style)
 
 
 def _draw_paths(axes: 'Axes', estimated: Array, true: Array | None) -> None:

@@ -180,6 +180,10 @@ class EkfLocalizer:
         """Stamps (0,) and poses (0, 3): the filter does not correct earlier poses."""
         return np.empty(0, dtype=np.int64), np.empty((0, 3))
 
+    def apart_points(self) -> Array:
+        """Scan points (0, 2) of pieces that are apart: a lost filter does not map."""
+        return np.empty((0, 2))
+
     def known_places(self) -> Array:
         """Places (N, 2) that enclose what is known: the ends of the line features, m."""
         ends = [end for feature in self.features for end in (feature.start, feature.end)]

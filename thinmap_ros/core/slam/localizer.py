@@ -212,6 +212,10 @@ class Localizer:
         """Places (N, 2) that enclose the published map: cells, and keyframes, m."""
         return self._map.known_places()
 
+    def apart_points(self) -> Array:
+        """Scan points (N, 2) of the pieces that are apart, where dead reckoning puts them, m."""
+        return self._map.apart_points()
+
     def _start_delocalized(self, given: State, keyframes: SavedKeyframes | None = None) -> None:
         """Start in a loaded local map: delocalized until scans fit."""
         start = self.pose

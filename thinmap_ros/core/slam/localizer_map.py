@@ -139,6 +139,16 @@ class LocalizerMap:
         cells = self.local.published(frames).corners()
         return np.vstack([cells, np.array(keyframes).reshape(-1, 2)])
 
+    def apart_points(self) -> Array:
+        """Scan points (N, 2) of the keyframes that are not in the published map, m."""
+        is_published = self.loops.pieces.is_published
+        points = [
+            se2.transform_points(frame.T_map_base, frame.scan.points_base())
+            for frame in self.loops.keyframes.frames
+            if not is_published(frame.submap)
+        ]
+        return np.vstack([np.zeros((0, 2)), *points])
+
     def _correct_heading(self, scan: Scan) -> None:
         """Correct the heading by the wall directions if scans agree with the map."""
         anchor = self.loops.anchor
