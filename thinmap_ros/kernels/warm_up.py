@@ -89,6 +89,18 @@ def localizer() -> None:
     _recognize()
 
 
+def map_joiner() -> None:
+    """Warm up recognition between maps, and merging."""
+    from thinmap_ros.core.slam.joining.rigid import refined
+    from thinmap_ros.core.slam.joining.team_map import RobotMap, merged
+
+    topology_builder()
+    _recognize()
+    room = RobotMap(_room())
+    refined(room.piece, room.piece, np.zeros(3))
+    merged({'a': room, 'b': room}, {'a': np.zeros(3), 'b': np.full(3, 0.1)}, None)
+
+
 def _recognize() -> None:
     """Warm up place recognition: a room is looked for in itself."""
     from thinmap_ros.core.places.recognition.piece import MapPiece

@@ -18,6 +18,7 @@ _REHEARSALS = (
     warm_up.explorer,
     warm_up.navigator,
     warm_up.global_localizer,
+    warm_up.map_joiner,
 )
 
 

@@ -22,8 +22,13 @@ def updates_topic(node: Node, topic: str) -> str:
     return f'{node.resolve_topic_name(topic)}_updates'
 
 
-def subscribe_to_map(node: ThinmapNode, topic: str, process: Callable[[GridPatch], None]) -> None:
-    """Subscribe to a map and to its updates; process: receives the map whenever it has changed."""
+def subscribe_to_map(
+    node: ThinmapNode, topic: str, process: Callable[[GridPatch], None], updates: str = ''
+) -> None:
+    """Subscribe to a map and to its updates; process: receives the map whenever it has changed.
+
+    updates: topic of the updates; '': that of the map with _updates.
+    """
     receiver = MapReceiver()
 
     def on_map(message: OccupancyGrid) -> None:
@@ -35,7 +40,7 @@ def subscribe_to_map(node: ThinmapNode, topic: str, process: Callable[[GridPatch
             process(patch)
 
     subscribe_guarded(node, OccupancyGrid, topic, on_map, qos.LATCHED)
-    name = updates_topic(node, topic)
+    name = updates or updates_topic(node, topic)
     subscribe_guarded(node, OccupancyGridUpdate, name, on_update, qos.STREAM)
 
 

@@ -1,7 +1,7 @@
 """Parameters of other packages, with the parameters of thinmap that do the same.
 
 Names and defaults are those of slam_toolbox (Jazzy), nav2_amcl, Nav2's map server, controller
-and navigator, and m-explore-ros2's explore_lite.
+and navigator, and m-explore-ros2's explore_lite and map_merge.
 """
 
 from dataclasses import dataclass
@@ -217,6 +217,23 @@ EXPLORE_LITE = Package(
     ),
 )
 
+MAP_MERGE = Package(
+    'map_merge of m-explore',
+    ('map_joiner',),
+    (
+        _row('robot_map_topic', 'map', 'map_joiner/robot_map_topic'),
+        _row('robot_map_updates_topic', 'map_updates', 'map_joiner/robot_map_updates_topic'),
+        _row('robot_namespace', '', 'map_joiner/robot_namespace'),
+        _row('merged_map_topic', 'map', 'map_joiner/merged_map_topic', note='default `merged_map`'),
+        _row('world_frame', 'world', 'map_joiner/world_frame'),
+        _row('known_init_poses', 'true', 'map_joiner/known_init_poses', note='default false'),
+        _row('merging_rate', '4.0', 'map_joiner/merging_rate', note='default 1.0'),
+        _row('discovery_rate', '0.05', 'map_joiner/discovery_rate', note='default 0.5'),
+        _row('estimation_rate', '0.5', 'map_joiner/estimation_rate'),
+        _row('estimation_confidence', '1.0', note='no: `join_odds`, posterior odds of a place'),
+    ),
+)
+
 NAV2 = Package(
     'Nav2 controller and bt_navigator',
     ('navigator',),
@@ -260,4 +277,4 @@ MAP_SERVER = Package(
     ),
 )
 
-PACKAGES = (SLAM_TOOLBOX, AMCL, MAP_SERVER, EXPLORE_LITE, NAV2)
+PACKAGES = (SLAM_TOOLBOX, AMCL, MAP_SERVER, EXPLORE_LITE, MAP_MERGE, NAV2)

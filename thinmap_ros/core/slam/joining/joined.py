@@ -1,12 +1,11 @@
 """One map of two pieces: one pose graph, one grid, one topological map whose ids continue."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.rotated import overlaid
 from thinmap_ros.core.places.recognition.recognition import Placement
@@ -14,13 +13,13 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
 from thinmap_ros.core.slam.joining.links import match_keyframes, placed_keyframes
+from thinmap_ros.core.slam.joining.rigid import found, rigid_links, rigid_transform
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
 from thinmap_ros.core.topology.builder import TopologyBuilder, moved_map
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.joining import Ids, join_topologies
 
 _ORIGIN = np.zeros((1, 3))
-_MAX_RIGID_LINKS = 100  # for one transform; more take time
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,15 +58,10 @@ def join(
     is_rigid = first.is_rigid or second.is_rigid
     priors = list(placed_keyframes(second.frames, second.places.views, placement.hypothesis))
     if is_rigid:
-        priors = priors[:: 1 + len(priors) // _MAX_RIGID_LINKS]
-    links = _found(match_keyframes(first.frames, second.frames, priors))
-    if is_rigid:
+        links = rigid_links(first, second, priors)
         return _joined_rigidly(first, second, placement.T_map_piece, links, config)
+    links = found(match_keyframes(first.frames, second.frames, priors))
     return _optimized_together(first, second, placement.T_map_piece, links, config)
-
-
-def _found(links: Iterable[Edge | None]) -> list[Edge]:
-    return [link for link in links if link is not None]
 
 
 def _optimized_together(
@@ -78,7 +72,7 @@ def _optimized_together(
     frames = _at([*first.frames, *second.frames], _bent(poses, first, second, links))
     # Again, where the other keyframes are now: those of the views alone left a third more error.
     nearby = enumerate(frame.T_map_base for frame in frames[count:])
-    links = _found(match_keyframes(frames[:count], frames[count:], nearby))
+    links = found(match_keyframes(frames[:count], frames[count:], nearby))
     poses = _bent(poses, first, second, links)
     frames = _at(frames, poses)
     grid = OccupancyGrid(config.grid, first.patch.frame)
@@ -118,8 +112,7 @@ def _at(frames: Sequence[Keyframe], poses: Array) -> list[Keyframe]:
 def _joined_rigidly(
     first: SlamPiece, second: SlamPiece, T: Array, links: Sequence[Edge], config: JoinConfig
 ) -> JoinedMap:
-    bodies = [_between_bodies(link, first, second) for link in links]
-    T = optimized(np.vstack([np.zeros(3), T]), bodies)[1]
+    T = rigid_transform(first, second, T, links)
     patch = overlaid(first.patch, second.patch, T)
     topology, ids = join_topologies(
         patch,
@@ -131,13 +124,3 @@ def _joined_rigidly(
     piece = SlamPiece.of_bare_map(patch, topology.map, topology.next_id)
     grid = OccupancyGrid.from_patch(patch, config.grid)
     return JoinedMap(piece, grid, topology, T, ids, len(links))
-
-
-def _between_bodies(link: Edge, first: SlamPiece, second: SlamPiece) -> Edge:
-    """A link as an edge from the frame of the first piece to that of the second."""
-    T_first_a = first.poses[link.a]
-    T_first_b = se2.compose(T_first_a, link.T_a_b)
-    T_first_second = se2.compose(T_first_b, se2.invert(second.poses[link.b]))
-    covariance = rotated_covariance(inverse(link.information), float(T_first_a[2]))
-    covariance = propagated_covariance(covariance, T_first_second[:2] - T_first_b[:2])
-    return Edge(0, 1, T_first_second, inverse(covariance), robust=True)

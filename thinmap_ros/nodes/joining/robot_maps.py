@@ -1,0 +1,79 @@
+"""The maps of all robots on the graph: found by the names of their topics, as map_merge does."""
+
+from collections.abc import Callable
+from functools import partial
+
+from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.topology.flat import topology_from_msg
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.nodes.joining.settings import MapJoinerConfig
+from thinmap_ros.ros import qos
+from thinmap_ros.ros.decoding.map_identity import UNKNOWN
+from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
+
+_TYPE = 'nav_msgs/msg/OccupancyGrid'
+
+
+class RobotMaps:
+    """Subscribes to map and topology of each robot, by its namespace.
+
+    patches, graphs: the newest ones; a robot without topological map has no graph.
+    """
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        config: MapJoinerConfig,
+        changed: Callable[[str], None],
+        replaced: Callable[[str], None],
+    ) -> None:
+        """Functions that are called with the namespace of a robot.
+
+        changed: its map has changed; replaced: it has begun another map.
+        """
+        self.patches: dict[str, GridPatch] = {}
+        self.graphs: dict[str, TopologicalMap] = {}
+        self.names: set[str] = set()
+        self._node = node
+        self._config = config
+        self._changed = changed
+        self._replaced = replaced
+        self._map_ids: dict[str, int] = {}
+        self._own = node.resolve_topic_name(config.merged_map_topic)
+
+    def discover(self) -> None:
+        """Subscribe to the maps of robots that have come."""
+        config = self._config
+        ending = f'/{config.robot_map_topic.strip("/")}'
+        for topic, types in self._node.get_topic_names_and_types():
+            is_map = topic.endswith(ending) and config.robot_namespace in topic
+            name = topic.removesuffix(ending) or '/'
+            if is_map and _TYPE in types and topic != self._own and name not in self.names:
+                self.names.add(name)
+                self._subscribe(name, topic)
+
+    def _subscribe(self, name: str, topic: str) -> None:
+        prefix = name.rstrip('/')
+        updates = self._config.robot_map_updates_topic
+        updates = f'{prefix}/{updates.strip("/")}' if updates else ''
+        node = self._node
+        subscribe_to_map(node, topic, partial(self._on_map, name), updates)
+        graph = f'{prefix}/topology'
+        subscribe_guarded(
+            node, TopologicalMapMsg, graph, partial(self._on_topology, name), qos.LATCHED
+        )
+        node.get_logger().info(f'{name}: a robot with the map {topic}')
+
+    def _on_map(self, name: str, patch: GridPatch) -> None:
+        self.patches[name] = patch
+        self._changed(name)
+
+    def _on_topology(self, name: str, message: TopologicalMapMsg) -> None:
+        self.graphs[name] = topology_from_msg(message)
+        before = self._map_ids.get(name, UNKNOWN)
+        self._map_ids[name] = message.map_id
+        if UNKNOWN not in (before, message.map_id) and before != message.map_id:
+            self._replaced(name)

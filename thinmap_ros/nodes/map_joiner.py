@@ -1,0 +1,217 @@
+"""One map of the maps of several robots, whose places relative to each other are recognized."""
+
+import time
+
+from rclpy.clock import Clock, ClockType
+
+from thinmap_msgs.srv import JoinMaps, SeparateMaps
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError, quoted
+from thinmap_ros.core.regions.tracker import RegionTracker
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.joining.map_links import MapLink
+from thinmap_ros.core.slam.joining.team_map import (
+    WORLD,
+    MergedMap,
+    RobotMap,
+    Search,
+    Team,
+    merged,
+)
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.joining.robot_maps import RobotMaps
+from thinmap_ros.nodes.joining.settings import (
+    MapJoinerConfig,
+    declare_initial_poses,
+    odds_text,
+    warn_of_confidence,
+)
+from thinmap_ros.nodes.joining.team_publishers import TeamPublishers
+from thinmap_ros.nodes.joining.worker import Result, Worker
+from thinmap_ros.ros import messages, node_main, parameters
+from thinmap_ros.ros.diagnostics import OK
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.services import fill_response
+
+_POLL_S = 0.1
+_SHARE = 0.3  # of a core that searches and merging may use
+
+
+class MapJoinerNode(ThinmapNode):
+    """ROBOT/map and ROBOT/topology of all robots in; merged_map, merged_topology, tf_static out.
+
+    Also merged_regions and join_status. Services join_maps, which gives the place of a map in
+    another one, and separate_maps, which undoes all joins of a map. Only joined maps are published.
+    Places are searched for in a thread, a pair of maps at a time.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('map_joiner')
+        warn_of_confidence(self)
+        self._config = parameters.declare_config(self, MapJoinerConfig)
+        self._initial = declare_initial_poses(self)
+        parameters.reject_unknown(self)
+        warm_up.map_joiner()
+        config = self._config
+        self._output = TeamPublishers(self, config.merged_map_topic, config.world_frame)
+        self._robots = RobotMaps(self, config, self._on_map, self._on_other_map)
+        self._worker = Worker(_SHARE)
+        self.reset_state()
+        self.create_service(JoinMaps, 'join_maps', self._on_join)
+        self.create_service(SeparateMaps, 'separate_maps', self._on_separate)
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        discovery_s = 1.0 / config.discovery_rate
+        self.create_active_timer(discovery_s, self._robots.discover, clock=wall)
+        self.create_active_timer(_POLL_S, self._work, clock=wall)
+        self.add_activation_callback(self._robots.discover)
+
+    def reset_state(self) -> None:
+        """Separate all maps; those of the robots stay."""
+        self._team = Team(self._config.join_odds)
+        self._merged: MergedMap | None = None
+        self._regions = RegionTracker()
+        self._worker.drop()
+        self._is_merge_due = False
+        self._next_merge_s = 0.0  # time of the machine
+        self._next_search_s = 0.0
+        for name in self._robots.patches:
+            self._on_map(name)
+
+    def _on_map(self, name: str) -> None:
+        """A robot has another map."""
+        is_new = name not in self._team.maps
+        self._team.receive(name, self._robots.patches[name], self._robots.graphs.get(name))
+        if is_new and self._config.known_init_poses:
+            self._give_initial_pose(name)
+        if is_new:
+            self._places_changed()
+        self._is_merge_due = True
+
+    def _on_other_map(self, name: str) -> None:
+        """A robot has begun another map."""
+        self.get_logger().warning(f'{name} has begun another map: its place is searched for')
+        self._team.begin_again(name)
+        self._places_changed()
+
+    def _give_initial_pose(self, name: str) -> None:
+        pose = self._initial.get(name)
+        if pose is None:
+            self.get_logger().warning(
+                f'{name}: no {name.rstrip("/")}/map_merge/init_pose_x, _y, _yaw: its place is '
+                'searched for'
+            )
+        else:
+            self._report_dropped(self._team.give(WORLD, name, pose))
+
+    def _work(self) -> None:
+        """Take the result of the last job, and begin the next one."""
+        self._worker.take_result()
+        if not self._worker.is_free:
+            return
+        now_s = time.monotonic()
+        if self._is_merge_due and now_s >= self._next_merge_s:
+            self._next_merge_s = now_s + 1.0 / self._config.merging_rate
+            self._begin_merging()
+        elif now_s >= self._next_search_s:
+            self._next_search_s = now_s + 1.0 / self._config.estimation_rate
+            search = self._team.next_search()
+            if search is not None:
+                self._worker.begin(lambda: self._searched(search))
+
+    def _searched(self, search: Search) -> Result:
+        """Search, in the thread of the worker."""
+        result = search.run()
+        return lambda: self._found(search, *result)
+
+    def _found(self, search: Search, link: MapLink | None, log_odds: float) -> None:
+        before = self._team.links.between(search.a, search.b)
+        self._report_dropped(self._team.found(search, link, log_odds))
+        after = self._team.links.between(search.a, search.b)
+        if after is not None and after is not before:
+            self._report_link(after, is_new=before is None or not before.matches)
+        self._places_changed()
+
+    def _places_changed(self) -> None:
+        """Publish where the maps lie, and merge them again."""
+        places = self._team.places()
+        self._output.publish_places(self._team, places)
+        count = len(self._team.maps)
+        self.diagnostics.set_state(OK, f'{len(places)} of {count} maps are joined')
+        self._is_merge_due = True
+
+    def _begin_merging(self) -> None:
+        self._is_merge_due = False
+        places = self._team.places()
+        if places:
+            maps = dict(self._team.maps)
+            self._worker.begin(lambda: self._merge(maps, places))
+
+    def _merge(self, maps: dict[str, RobotMap], places: dict[str, Array]) -> Result:
+        """Merge, in the thread of the worker."""
+        merged_map = merged(maps, places, self._merged)
+        regions = self._regions.update(merged_map.patch)
+
+        def publish() -> None:
+            self._merged = merged_map
+            self._output.publish_map(merged_map, regions)
+
+        return publish
+
+    def _report_link(self, link: MapLink, is_new: bool) -> None:
+        x, y, yaw = link.T_a_b.tolist()
+        what = f'joined with {link.a}' if is_new else f'moved in {link.a}'
+        self.get_logger().info(
+            f'{link.b} is {what}: at x {x:.2f} m, y {y:.2f} m, yaw {yaw:.3f} rad, '
+            f'{odds_text(link.log_odds)}, {link.matches} matches'
+        )
+
+    def _report_dropped(self, links: list[MapLink]) -> None:
+        for link in links:
+            self.get_logger().warning(
+                f'{link.b} is separated from {link.a} ({odds_text(link.log_odds)}): surer '
+                'joins, or the maps as they are now, contradict it'
+            )
+
+    def _on_join(self, request: JoinMaps.Request, response: JoinMaps.Response) -> JoinMaps.Response:
+        def work() -> str:
+            first = request.first
+            second = request.second
+            for name in (first, second):
+                self._require_map(name, is_world_allowed=name == first)
+            if first == second:
+                raise InputError(f'second = {quoted(second)}: expected another map than first')
+            T = messages.pose_from_msg(request.pose)
+            if not se2.is_bounded_pose(T):
+                raise InputError(f'pose {T.tolist()}: expected finite numbers')
+            self._report_dropped(self._team.give(first, second, T))
+            self._places_changed()
+            return f'{second} is joined with {first}'
+
+        return fill_response(response, work)
+
+    def _on_separate(
+        self, request: SeparateMaps.Request, response: SeparateMaps.Response
+    ) -> SeparateMaps.Response:
+        def work() -> str:
+            self._require_map(request.name)
+            self._team.separate(request.name)
+            self._merged = None
+            self._places_changed()
+            return f'{request.name} is separated until join_maps joins it'
+
+        return fill_response(response, work)
+
+    def _require_map(self, name: str, is_world_allowed: bool = False) -> None:
+        """Raise InputError unless there is a map of that name."""
+        if name not in self._team.maps and not (is_world_allowed and name == WORLD):
+            known = ', '.join(sorted(self._team.maps)) or 'no map yet'
+            raise InputError(f'{quoted(name)}: expected one of the maps: {known}')
+
+
+def main() -> None:
+    """Run the node."""
+    node_main.run(MapJoinerNode)
+
+
+if __name__ == '__main__':
+    main()
