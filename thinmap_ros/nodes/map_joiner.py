@@ -105,7 +105,10 @@ class MapJoinerNode(ThinmapNode):
 
     def _work(self) -> None:
         """Take the result of the last job, and begin the next one."""
-        self._worker.take_result()
+        try:
+            self._worker.take_result()
+        except InputError as error:
+            self.get_logger().warning(f'maps are not merged: {error}', throttle_duration_sec=60.0)
         if not self._worker.is_free:
             return
         now_s = time.monotonic()

@@ -23,6 +23,7 @@ from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import (
     EndNodeArray,
     ExplorationStatus,
+    JoinStatus,
     LineFeatureArray,
     LocalGrid,
     LocalizedScan,
@@ -86,6 +87,9 @@ SPOKEN = {
     'exploration_status': ExplorationStatus,
     'cmd_vel': Twist,
     'plan': Path,
+    'join_status': JoinStatus,
+    'merged_map': OccupancyGrid,
+    'merged_topology': TopologicalMap,
 }
 LISTENERS = {
     'localizer': {
@@ -109,6 +113,11 @@ LISTENERS = {
         'scan': LaserScan,
         'pose': PoseWithCovarianceStamped,
     },
+    'map_joiner': {
+        '/robot1/map': OccupancyGrid,
+        '/robot1/topology': TopologicalMap,
+        '/robot2/map': OccupancyGrid,
+    },
 }
 LATER = {  # converted only when the corresponding message of another topic has arrived
     'localizer': (),
@@ -116,6 +125,7 @@ LATER = {  # converted only when the corresponding message of another topic has 
     'topology_builder': (),
     'explorer': ('scan',),
     'navigator': ('pose',),
+    'map_joiner': (),
 }
 ANSWERS = {  # topic that each node publishes after valid messages
     'localizer': 'pose',
@@ -123,6 +133,7 @@ ANSWERS = {  # topic that each node publishes after valid messages
     'topology_builder': 'local_topology',
     'explorer': 'end_nodes',
     'navigator': 'cmd_vel',
+    'map_joiner': 'join_status',
 }
 
 
@@ -178,7 +189,9 @@ def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_rejected(
         if topic not in LISTENERS[name]
     }
     doctor = Doctor(graph)
-    mount = {} if name in ('grid_mapper', 'topology_builder') else {'laser_pose': '0,0,0'}
+    mount = (
+        {} if name in ('grid_mapper', 'topology_builder', 'map_joiner') else {'laser_pose': '0,0,0'}
+    )
     graph.start(name, **mount)
     publishers = {}
     for topic, kind in LISTENERS[name].items():

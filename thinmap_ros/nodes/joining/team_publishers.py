@@ -8,6 +8,7 @@ from rclpy.node import Node
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import JoinStatus, RegionArray, RobotMap, TopologicalMap
+from thinmap_ros.core.estimate import MAX_ODDS
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.se2 import Array
@@ -76,6 +77,6 @@ def _robot_map(team: Team, name: str, place: Array | None) -> RobotMap:
         is_joined=place is not None,
         pose=Pose() if place is None else messages.pose_msg(place),
         other=other,
-        log_odds=log_odds,
+        join_odds=math.exp(min(log_odds, math.log(MAX_ODDS))),
         matches=matches,
     )

@@ -3,9 +3,16 @@
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+
+from thinmap_ros.core.errors import InputError
 
 Result = Callable[[], None]
 """Takes what work has found, in the thread of the node."""
+
+
+def _fail(error: InputError) -> None:
+    raise error
 
 
 class Worker:
@@ -28,13 +35,16 @@ class Worker:
 
         def timed() -> tuple[Result, float]:
             began_s = time.thread_time()
-            result = work()
+            try:
+                result = work()
+            except InputError as error:
+                result = partial(_fail, error)
             return result, time.thread_time() - began_s
 
         self._job = self._thread.submit(timed)
 
     def take_result(self) -> None:
-        """Take what the work has found, if it is done."""
+        """Take what the work has found, if it is done; raises what it has raised."""
         if self._job is None or not self._job.done():
             return
         result, used_s = self._job.result()

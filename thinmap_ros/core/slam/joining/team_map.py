@@ -32,7 +32,8 @@ _GIVEN = np.diag(np.square([0.5, 0.5, 0.1]))  # of one that a person has measure
 class RobotMap:
     """The newest map of a robot, in a frame of its own.
 
-    graph: its topological map; None: it is made from the grid.
+    given_graph: its topological map. One that does not lie in the grid, or None, is replaced by one
+    that is made from the grid: map and graph come on two topics.
     """
 
     patch: GridPatch
@@ -42,12 +43,22 @@ class RobotMap:
     def graph(self) -> TopologicalMap:
         """The topological map."""
         given = self.given_graph
-        return build(self.patch, None, TopologyConfig()) if given is None else given
+        if given is not None and _lies_in(given, self.patch):
+            return given
+        return build(self.patch, None, TopologyConfig())
 
     @cached_property
     def piece(self) -> SlamPiece:
         """The map for recognition."""
         return SlamPiece.of_bare_map(self.patch, self.graph)
+
+
+def _lies_in(graph: TopologicalMap, patch: GridPatch) -> bool:
+    """Whether all nodes and paths of a graph lie in the rectangle of a map."""
+    points = [np.array([node.position for node in graph.nodes.values()]).reshape(-1, 2)]
+    points += [edge.path for edge in graph.edges.values()]
+    cells = patch.frame.cells_of(np.vstack(points))
+    return bool(((cells >= 0) & (cells < patch.shape)).all())
 
 
 @dataclass(frozen=True, eq=False)
