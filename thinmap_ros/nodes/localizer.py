@@ -293,7 +293,7 @@ class LocalizerNode(ThinmapNode):
 
     def _restore(self, state: State) -> None:
         """Continue at the last pose of a killed localizer. Raises InputError for another state."""
-        map_id, anchor = snapshot.split_map_id(state)
+        map_id, anchor = snapshot.split_number(state, 'map_id')
         self._relocation = _Relocation(OdometryAnchor.from_state(anchor))
         self._relocation.map = self._given.source.patch
         if self._map_ids is not None:
