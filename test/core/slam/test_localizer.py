@@ -776,9 +776,8 @@ def test_a_killed_localizer_resumes_in_the_occupancy_map(slip):
             if k == 450:
                 began = odom
                 began_slipped = se2.compose(odom, off)
-                localizer = Localizer.from_occupancy_map(
-                    grid.known_area(), last, began_slipped, config
-                )
+                localizer = Localizer.in_occupancy_map(grid.known_area(), config)
+                localizer.resume(last, began_slipped)
             slipped = se2.compose(began_slipped, se2.between(began, odom))
             rows.append((truth, localizer.step(scan, slipped), odom))
     assert not rows[-1][1].is_lost

@@ -85,6 +85,12 @@ class Localizer:
         return [*self._map.loops.keyframes.steps, *self._map.loops.graph.edges]
 
     @property
+    def calibration(self) -> Array:
+        """Calibration of the odometry (5, 4): its parameters, and their covariance (4, 4)."""
+        found = self._tracker.prediction.calibration
+        return np.vstack([found.parameters, found.covariance])
+
+    @property
     def features(self) -> list[LineFeature]:
         """Line features of the map: none, as it is made of scan points."""
         return []
@@ -111,12 +117,12 @@ class Localizer:
         """The published local map as arrays by name, for `from_state`; without the pose."""
         return self._map.local.published(self.keyframes).state()
 
-    def saved_keyframes(self) -> SavedKeyframes | None:
-        """The keyframes of the published map, for `from_state`.
+    def saved_keyframes(self, since_ns: int = 0) -> SavedKeyframes | None:
+        """The keyframes of the published map, for `from_state`, from the one of a stamp on.
 
         None without any, and if the map began with cells that are not made of keyframes.
         """
-        return self._map.loops.saved() if self._map.local.is_of_keyframes else None
+        return self._map.loops.saved(since_ns) if self._map.local.is_of_keyframes else None
 
     @staticmethod
     def from_state(
@@ -154,27 +160,32 @@ class Localizer:
         return localizer
 
     @staticmethod
-    def from_occupancy_map(
-        patch: GridPatch,
-        last: OdometryAnchor,
-        T_odom_base: Array,
-        config: LocalizerConfig | None = None,
+    def from_keyframes(
+        keyframes: SavedKeyframes, calibration: Array, config: LocalizerConfig | None = None
     ) -> 'Localizer':
-        """Localizer that resumes in an occupancy map, after the odometry motion since `last`.
+        """Localizer of the same robot in the map of saved keyframes, at the initial pose.
 
-        T_odom_base (3,): odometry pose now. The standard deviation of the pose is the odometry
-        noise since `last` plus one cell of the map (in rad, too, for the heading).
+        calibration (5, 4): of its odometry. It is delocalized until scans fit.
         """
-        localizer = Localizer.in_occupancy_map(patch, config)
+        localizer = Localizer(config)
+        localizer._tracker.prediction.calibration.begin_with(calibration[0], calibration[1:])
+        localizer._start_delocalized(None, keyframes)
+        return localizer
+
+    def resume(self, last: OdometryAnchor, T_odom_base: Array) -> None:
+        """Continue in the map after the odometry motion since `last`, to T_odom_base (3,).
+
+        The standard deviation of the pose is the odometry noise since `last` plus one cell of the
+        map (in rad, too, for the heading).
+        """
         moved = se2.between(last.T_odom_base, T_odom_base)
         turn = float(last.T_map_odom[2] + last.T_odom_base[2])
-        variances = odometry_variances(moved, localizer.config.odometry)
-        cell = np.full(3, patch.frame.resolution)
-        localizer.set_pose(
+        variances = odometry_variances(moved, self.config.odometry)
+        cell = np.full(3, self.config.local_map.resolution_m)
+        self.set_pose(
             se2.compose(last.T_map_odom, T_odom_base),
             rotated_covariance(np.diag(variances), turn) + np.diag(np.square(cell)),
         )
-        return localizer
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
         """Estimate the pose of a scan, given the odometry pose (3,) at its stamp; update the map.
@@ -212,8 +223,10 @@ class Localizer:
         """Places (N, 2) that enclose the published map: cells, and keyframes, m."""
         return self._map.known_places()
 
-    def _start_delocalized(self, given: State, keyframes: SavedKeyframes | None = None) -> None:
-        """Start in a loaded local map: delocalized until scans fit."""
+    def _start_delocalized(
+        self, given: State | None, keyframes: SavedKeyframes | None = None
+    ) -> None:
+        """Start in a loaded map: delocalized until scans fit."""
         start = self.pose
         self._map.load(given, keyframes)
         self._map.place(start, self._tracker.slip_covariance())
