@@ -89,11 +89,7 @@ class _PosePublishers:
         """Publish an estimate; status: with its state and step time, the rest is filled in."""
         stamp_ns = scan.stamp_ns
         frame = self.map_frame
-        self._pose.publish(
-            messages.pose_with_covariance_msg(
-                estimate.T_map_base, estimate.covariance, frame, stamp_ns
-            )
-        )
+        self._pose.publish(messages.estimate_msg(estimate, frame, stamp_ns))
         header = messages.header(frame, stamp_ns)
         features = [_feature_msg(feature) for feature in localizer.features]
         self._features.publish(LineFeatureArray(header=header, features=features))

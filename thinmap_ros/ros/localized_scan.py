@@ -37,9 +37,7 @@ def localized_scan_msg(
     scan: Scan, estimate: Estimate, status: SlamStatus, frame_id: str, corrected_ns: int = 0
 ) -> LocalizedScanMsg:
     """Message of a scan, its estimate and its status; corrected_ns as in `ReceivedScan`."""
-    T_map_base = messages.pose_with_covariance_msg(
-        estimate.T_map_base, estimate.covariance, frame_id, scan.stamp_ns
-    )
+    T_map_base = messages.estimate_msg(estimate, frame_id, scan.stamp_ns)
     return LocalizedScanMsg(
         header=T_map_base.header,
         scan=messages.scan_msg(scan, '', scan.scan_time_s),

@@ -27,6 +27,7 @@ from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M
 from thinmap_ros.core.grid.mapper import WholeMap
 from thinmap_ros.core.grid.patch import GridPatch
@@ -34,6 +35,7 @@ from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.flat import FIELDS, flat_topology
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -147,6 +149,15 @@ def pose_with_covariance_msg(
     full[np.ix_((0, 1, 5), (0, 1, 5))] = covariance
     message.pose.covariance = full.ravel()
     return message
+
+
+def estimate_msg(estimate: Estimate, frame_id: str, ns: int) -> PoseWithCovarianceStamped:
+    """Pose of an estimate; where the robot is lost, its covariance says so to all who know no mode.
+
+    As AMCL and robot_localization have it.
+    """
+    unsure = UNKNOWN if estimate.is_lost else np.zeros((3, 3))
+    return pose_with_covariance_msg(estimate.T_map_base, estimate.covariance + unsure, frame_id, ns)
 
 
 def covariance_from_msg(message: PoseWithCovarianceStamped) -> Array:

@@ -20,7 +20,6 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
@@ -248,13 +247,12 @@ class Localizer:
         evidence = self._tracker.track.evidence
         anchor = self._map.loops.anchor
         T_map_base = self.pose
-        covariance = self._tracker.covariance(anchor)
         apart = self._map.atlas.apart
         is_lost = apart is not None or evidence.is_lost
         match = tracked.match
         return Estimate(
             T_map_base,
-            covariance + UNKNOWN if is_lost else covariance,
+            self._tracker.covariance(anchor),
             se2.compose(T_map_base, se2.invert(self._tracker.prediction.T_odom_base)),
             inlier_ratio=0.0 if match is None else match.inlier_ratio,
             is_lost=is_lost,
