@@ -1,12 +1,13 @@
 """From the map to its graph."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from thinmap_ros.core import snapshot
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.mapper import MapUpdate, WholeMap
 from thinmap_ros.core.grid.patch import GridPatch
@@ -43,24 +44,6 @@ class Finished:
         return self._result
 
 
-class _NewMap:
-    """The newest whole map, with the newer windows in it, until the graph has it."""
-
-    def __init__(self, whole: WholeMap) -> None:
-        self.whole = whole
-        self._received = MapReceiver()
-        self._received.replace(whole.patch)
-
-    @property
-    def patch(self) -> GridPatch:
-        return self._received.patch or self.whole.patch
-
-    def add(self, update: MapUpdate) -> None:
-        """Add what is newer. Raises InputError where it does not fit."""
-        if update.changes is not None and update.corrected_ns == self.whole.corrected_ns:
-            self._received.paste(update.changes)
-
-
 class Topology(Stage[MapUpdate, TopologicalMap]):
     """The stage of the graph, which follows the map and its corrections.
 
@@ -92,7 +75,7 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
         # Of the correction that changes must have undergone: None until there are some.
         self._corrected_ns: int | None = None
         self._newest: MapUpdate | None = None
-        self._new_map: _NewMap | None = None
+        self._whole: WholeMap | None = None  # the newest one, until the graph has it
         self._job: Job | None = None
         self._pending: list[MapUpdate] = []
 
@@ -116,22 +99,22 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
         self._newest = update
         self._adopt(update)
         if update.whole is not None:
-            self._new_map = _NewMap(update.whole)
-        self._add_to_new_map()
+            self._whole = update.whole
+        self._paste_changes()
         self._begin_to_rebuild()
         is_changed = self._add_changes(update)
-        return self._graph(self._add_whole_map() or is_changed)
+        return self.map if self._add_whole_map() or is_changed else None
 
     def add_map(self, whole: WholeMap) -> TopologicalMap | None:
         """Add all of the map, once it can be used; returns the graph if it is another one.
 
         Raises InputError where the newest changes do not fit it.
         """
-        self._new_map = _NewMap(whole)
-        self._add_to_new_map()
+        self._whole = whole
+        self._paste_changes()
         self._begin_to_rebuild()
         is_rebuilt = self._take_rebuilt()
-        return self._graph(self._add_whole_map() or is_rebuilt)
+        return self.map if self._add_whole_map() or is_rebuilt else None
 
     def finish(self) -> None:
         """Wait for the graph that is being rebuilt."""
@@ -143,9 +126,6 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
             self._add(update.changes, update)
         self._pending = []
 
-    def _graph(self, is_changed: bool) -> TopologicalMap | None:
-        return self.map if is_changed else None
-
     def _adopt(self, update: MapUpdate) -> None:
         """Learn which correction the graph follows, from changes of its map."""
         if self._corrected_ns is None:
@@ -154,14 +134,17 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
             # The mapper was restarted: its map knows of no correction.
             self._corrected_ns = update.corrected_ns
 
-    def _add_to_new_map(self) -> None:
-        if self._new_map is None or self._newest is None:
+    def _paste_changes(self) -> None:
+        """Paste the newest changes into the whole map: they are newer."""
+        whole = self._whole
+        newest = self._newest
+        if whole is None or newest is None or newest.changes is None:
             return
-        try:
-            self._new_map.add(self._newest)
-        except InputError:
-            self._new_map = None
-            raise
+        if newest.corrected_ns == whole.corrected_ns:
+            self._whole = None  # unless they fit
+            received = MapReceiver()
+            received.replace(whole.patch)
+            self._whole = replace(whole, patch=received.paste(newest.changes))
 
     def _accepts_changes(self) -> bool:
         newest = self._newest
@@ -188,27 +171,23 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
 
     def _add_whole_map(self) -> bool:
         """Update the graph by the newest whole map: beams may end outside of the windows."""
-        new = self._new_map
-        if new is None or self._newest is None or self._job is not None:
+        whole = self._whole
+        if whole is None or self._newest is None or self._job is not None:
             return False
-        is_same = new.whole.corrected_ns == self._corrected_ns
-        if not is_same or not self._accepts_changes():
+        if whole.corrected_ns != self._corrected_ns or not self._accepts_changes():
             return False
-        self._new_map = None
-        return self._add(new.patch, self._newest)
+        self._whole = None
+        return self._add(whole.patch, self._newest)
 
     def _begin_to_rebuild(self) -> None:
-        new = self._new_map
-        if new is None or self._corrected_ns is None:
-            return
-        whole = new.whole
-        if not self._corrected_ns < whole.corrected_ns:
+        whole = self._whole
+        corrected_ns = self._corrected_ns
+        if whole is None or corrected_ns is None or corrected_ns >= whole.corrected_ns:
             return
         self.finish()
         # Where another correction is missing, nodes are searched for where they were.
-        is_next = whole.previous_ns == self._corrected_ns
+        is_next = whole.previous_ns == corrected_ns
         moved = whole.moved if is_next else CorrectedPoses(whole.moved.after, whole.moved.after)
         self._corrected_ns = whole.corrected_ns
-        self._new_map = None
-        builder = self.builder
-        self._job = self._begin(lambda: builder.rebuilt(new.patch, *moved))
+        self._whole = None
+        self._job = self._begin(partial(self.builder.rebuilt, whole.patch, *moved))
