@@ -7,16 +7,17 @@ from time import perf_counter
 
 from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.grid.correctable import CorrectableGrid
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
-from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.grid.scan_history import CorrectedPoses
+from thinmap_ros.core.grid.mapper import Mapper
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class
+from thinmap_ros.core.stage import LocalizedScan, Trajectory
 from thinmap_ros.core.start import StartConfig
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.topology import Topology
 
 
 @dataclass(frozen=True)
@@ -28,17 +29,15 @@ class PipelineConfig:
 
     localizer: StartConfig = field(default_factory=LocalizerConfig)
     grid: OccupancyConfig = field(default_factory=OccupancyConfig)
-    window: WindowConfig = field(default_factory=WindowConfig)
     topology: TopologyConfig = field(default_factory=TopologyConfig)
     scans_per_graph: int = 1
 
 
 @dataclass(frozen=True, eq=False)
 class PipelineResult:
-    """Result of one scan: the estimate, and the window of the map that was thinned last."""
+    """Result of one scan."""
 
     estimate: Estimate
-    window: GridPatch
 
 
 class Pipeline:
@@ -55,20 +54,25 @@ class Pipeline:
         self.config = config or PipelineConfig()
         self.localizer = localizer_class(self.config.localizer)(self.config.localizer)
         # Known poses are never corrected.
-        self._grid = CorrectableGrid(OccupancyGrid(self.config.grid), not pose_source)
+        self._mapper = Mapper(
+            self.config.grid, not pose_source, scans_per_update=self.config.scans_per_graph
+        )
+        self._topology = Topology(self.config.topology)
         self.corrections = 0
         self.refusals: list[str] = []  # why scans are not on the map, a reason for each
-        self.topology = TopologyBuilder(self.config.topology)
         self.stage_seconds: dict[str, list[float]] = {}
-        self._scans = 0
-        self._window: GridPatch | None = None
         self._locate = pose_source or self.localizer.step
         self._consistency = ConsistencyMonitor()
 
     @property
     def grid(self) -> OccupancyGrid:
         """The published map; another object after a correction."""
-        return self._grid.shown
+        return self._mapper.grid.shown
+
+    @property
+    def topology(self) -> TopologyBuilder:
+        """The graph of the map; another object after a correction."""
+        return self._topology.builder
 
     @property
     def warnings(self) -> list[str]:
@@ -81,40 +85,31 @@ class Pipeline:
             estimate = self._locate(scan, T_odom_base)
             estimate = self._consistency.checked(scan, T_odom_base, estimate)
         with self._timed('grid'):
-            if estimate.correction is not None:
-                self.corrections += self._grid.apply_correction(
-                    *self.localizer.keyframe_trajectory(), scan.stamp_ns
-                )
-            moved = self._grid.update(scan, estimate.T_map_base, estimate.placement)
-            self.refusals += self._grid.take_refusals()
-        if moved is not None:
-            self._rebuild(moved)
-        if self._window is None or self._scans % self.config.scans_per_graph == 0:
-            self._window = self._thin(estimate.T_map_base)
-        self._scans += 1
-        return PipelineResult(estimate, self._window)
+            update = self._mapper.step(self._localized(scan, estimate))
+        self.refusals += self._mapper.refusals
+        if update is not None:
+            with self._timed('rebuild' if update.whole else 'topology'):
+                self._set_topology(self._topology.step(update))
+        return PipelineResult(estimate)
 
     def finish(self) -> None:
         """Complete a pending correction after the last scan."""
-        moved = self._grid.finish()
-        self.refusals += self._grid.take_refusals()
-        if moved is not None:
-            self._rebuild(moved)
+        whole = self._mapper.finish()
+        self.refusals += self._mapper.refusals
+        if whole is not None:
+            with self._timed('rebuild'):
+                self._set_topology(self._topology.add_map(whole))
 
-    def _thin(self, T_map_base: Array) -> GridPatch:
-        """Update the graph, unless the map is only partly corrected."""
-        with self._timed('topology'):
-            changes = None if self._grid.is_rerendering else self.grid.take_changes()
-            if changes is not None and self.topology.update(changes, T_map_base):
-                self.localizer.set_topology(self.topology.map)
-        return self.grid.window(T_map_base[0], T_map_base[1], self.config.window.local_map_size_m)
+    def _localized(self, scan: Scan, estimate: Estimate) -> LocalizedScan:
+        trajectory = None
+        if estimate.correction is not None:
+            self.corrections += 1
+            trajectory = Trajectory(*self.localizer.keyframe_trajectory(), scan.stamp_ns)
+        return LocalizedScan(scan, estimate.T_map_base, estimate.placement, trajectory=trajectory)
 
-    def _rebuild(self, moved: CorrectedPoses) -> None:
-        """Rebuild the graph after a correction of the grid."""
-        with self._timed('rebuild'):
-            self.grid.take_changes()
-            self.topology = self.topology.rebuilt(self.grid.known_area(), *moved)
-            self.localizer.set_topology(self.topology.map)
+    def _set_topology(self, topology: TopologicalMap | None) -> None:
+        if topology is not None:
+            self.localizer.set_topology(topology)
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

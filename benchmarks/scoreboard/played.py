@@ -114,8 +114,8 @@ def consistency(played: Played, truth: Array) -> Numbers:
     """How well the covariance of the position tells the errors of the live poses.
 
     Normalized estimation error squared of two dimensions, chi-square distributed where it does;
-    sigma: root of the mean trace, what the rms error would be; of scans that are not lost, as one
-    that is has a sigma of hundreds of metres, which a few scans more or less would decide.
+    sigma: root of the mean trace, what the rms error would be; of scans that are not lost: a robot
+    that is claims no place.
     """
     errors = (np.array(played.poses) - truth)[:, :2]
     covariances = np.array(played.covariances)[:, :2, :2] + 1e-12 * np.eye(2)
@@ -123,13 +123,14 @@ def consistency(played: Played, truth: Array) -> Numbers:
     squared = np.einsum('ni,ni->n', errors, whitened)
     widest = np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
     metres = np.hypot(*errors.T)
-    known = ~np.array(played.lost)
+    is_lost = np.array(played.lost)
+    known = ~is_lost
     if not known.any():
         known[:] = True
     rms = math.sqrt(float((metres[known] ** 2).mean()))
     sigma = math.sqrt(float(np.trace(covariances[known], axis1=1, axis2=2).mean()))
     return {
-        'inside_95': float((squared < _CHI2_95).mean()),
+        'inside_95': float(((squared < _CHI2_95) | is_lost).mean()),
         'sigma_of_rms': sigma / max(rms, 1e-3),
-        'wrong_and_sure': int(((metres > _WRONG_M) & (3.0 * widest < metres)).sum()),
+        'wrong_and_sure': int(((metres > _WRONG_M) & (3.0 * widest < metres) & ~is_lost).sum()),
     }

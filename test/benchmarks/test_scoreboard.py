@@ -227,6 +227,9 @@ def test_a_covariance_that_is_right_is_found_to_be():
     right.covariances[:5] = [9e4 * np.eye(3)] * 5
     right.lost[:5] = [True] * 5
     assert consistency(right, truth)['sigma_of_rms'] == pytest.approx(1.0, abs=0.03)
+    lost = Played(poses=list(100.0 + poses), covariances=[covariance] * 4000, lost=[True] * 4000)
+    found = consistency(lost, truth)
+    assert found['inside_95'] == 1.0 and found['wrong_and_sure'] == 0, 'it claims no place'
     sure = Played(poses=list(10.0 * poses), covariances=[covariance] * 4000, lost=[False] * 4000)
     found = consistency(sure, truth)
     assert found['sigma_of_rms'] == pytest.approx(0.1, abs=0.003)

@@ -55,7 +55,6 @@ CONNECTIONS = {
     'topology_builder': {
         'local_grid: publishers': 1,
         'grid: publishers': 1,
-        'trajectory: publishers': 1,
         'topology: subscribers': 1,
         'local_topology: subscribers': 1,
     },

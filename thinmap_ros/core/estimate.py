@@ -70,7 +70,7 @@ class Estimate:
     observed_lines, matched_lines: lines of this scan, and how many of them match features (both 0
     while the robot stands still). n_features, n_local_features: features in the map, and in the
     local area. inlier_ratio: share of the scan points in known space that fit the map.
-    is_lost: the place in the map is unknown; the covariance is accordingly large.
+    is_lost: the place in the map is unknown; pose and covariance are those of dead reckoning.
     apart: the piece of map that the robot is in; None if that is the published map.
     is_contradicted: scans contradict the map, and whether the robot is lost is not yet decided.
     blind_reason: why the laser does not confirm the pose, which follows the odometry; '': it does.

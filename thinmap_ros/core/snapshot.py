@@ -44,10 +44,6 @@ class Field:
 Fields = Mapping[str, Field]
 
 
-STAMPED: Fields = {'latest_ns': Field(np.int64, (), 0, MAX_COUNT)}
-IDENTIFIED: Fields = {'map_id': Field(np.int64, (), 0, MAX_COUNT)}
-
-
 def validate(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:
     """Return the arrays of a state in their declared types; `what` names it in errors.
 
@@ -65,24 +61,14 @@ def validate(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]
     return checked
 
 
-def split_stamp(state: State) -> tuple[int, dict[str, NDArray[Any]]]:
-    """Split the state of a node into its stamp ('latest_ns', ns) and the other arrays.
+def split_number(state: State, name: str) -> tuple[int, dict[str, NDArray[Any]]]:
+    """Split the state of a node into a number that is not negative, and the other arrays.
 
-    Raises InputError if there is no stamp.
+    Raises InputError if there is no such number.
     """
-    own = {name: array for name, array in state.items() if name in STAMPED}
-    stamp_ns = int(validate(own, STAMPED, 'state')['latest_ns'])
-    return stamp_ns, {name: array for name, array in state.items() if name not in STAMPED}
-
-
-def split_map_id(state: State) -> tuple[int, dict[str, NDArray[Any]]]:
-    """Split the state of a node into the id of its map and the other arrays.
-
-    Raises InputError if there is no id.
-    """
-    own = {name: array for name, array in state.items() if name in IDENTIFIED}
-    map_id = int(validate(own, IDENTIFIED, 'state')['map_id'])
-    return map_id, {name: array for name, array in state.items() if name not in IDENTIFIED}
+    own = {key: array for key, array in state.items() if key == name}
+    number = validate(own, {name: Field(np.int64, (), 0, MAX_COUNT)}, 'state')[name]
+    return int(number), {key: array for key, array in state.items() if key != name}
 
 
 def require(is_so: bool, what: str, expected: str) -> None:

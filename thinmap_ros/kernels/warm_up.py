@@ -14,7 +14,6 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
-from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -81,7 +80,7 @@ def localizer() -> None:
     rehearsed.step(_odd_scan(), T_map_base)
     rehearsed.step(_scan(_REHEARSAL.scans + 1, np.full(_REHEARSAL.beams, np.inf)), T_map_base)
     Localizer.from_state(rehearsed.state())
-    Localizer.from_occupancy_map(_room(), OdometryAnchor(0, T_map_base, T_map_base), T_map_base)
+    Localizer.in_occupancy_map(_room())
     # A revisit needs covariances along the graph.
     step = Edge(0, 1, np.zeros(3), np.eye(3), False)
     covariances_from(0, np.zeros((2, 3)), [step], np.ones((2, 6)))

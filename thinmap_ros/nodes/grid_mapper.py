@@ -16,27 +16,25 @@ from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import InputError, ThinmapError
+from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.correctable import CorrectableGrid
-from thinmap_ros.core.grid.occupancy import (
-    ROBOT_GRID,
-    OccupancyConfig,
-    OccupancyGrid,
-    WindowConfig,
-)
+from thinmap_ros.core.grid.mapper import Mapper
+from thinmap_ros.core.grid.occupancy import ROBOT_GRID, OccupancyConfig, WindowConfig
 from thinmap_ros.core.snapshot import State
+from thinmap_ros.core.stage import Trajectory
 from thinmap_ros.core.start import LOCALIZATION, MAPPING
 from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.mapping.map_output import MapPublishers
 from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
 from thinmap_ros.nodes.mapping.scan_queue import ScanQueue
-from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.diagnostics import ERROR
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.localized_scan import LocalizedScan, localized_scan_from_msg
+from thinmap_ros.ros.localized_scan import ReceivedScan, localized_scan_from_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.session_client import SessionClient
@@ -105,6 +103,7 @@ class GridMapperNode(ThinmapNode):
         parameters.reject_unknown(self)
         warm_up.grid_mapper()
         self._stamp = StateStamp()
+        self._mapper = Mapper(self._settings.grid, window_m=self._settings.local_map_size_m)
         self.reset_state()
         self.enable_checkpoint(self._state, self._restore)
         self.create_pause_service()
@@ -144,10 +143,9 @@ class GridMapperNode(ThinmapNode):
         self._output.load_ns = self.get_clock().now().nanoseconds
         has_map = self._session or self._stamp.latest_ns is not None
         self._stamp.latest_ns = None
+        self._mapper.reset()
         if self._session:
-            self._grid = self._load_map(self._session)
-        else:
-            self._grid = CorrectableGrid(OccupancyGrid(self._settings.grid))
+            self._mapper.replace(self._load_map(self._session))
         if has_map:
             self._stamp.latest_ns = self.get_clock().now().nanoseconds
             self._publish_map()
@@ -162,23 +160,18 @@ class GridMapperNode(ThinmapNode):
         if self._stamp.latest_ns is None:
             return None
         return {
-            **self._grid.shown.state(),
+            **self._mapper.state(),
             'latest_ns': np.array(self._stamp.latest_ns),
             'map_id': np.array(self._output.followed.id),
         }
 
     def _restore(self, state: State) -> None:
         """Continue with the map of a killed mapper. Raises InputError where it is no such map."""
-        latest_ns, rest = snapshot.split_stamp(state)
-        map_id, cells = snapshot.split_map_id(rest)
-        grid = OccupancyGrid.from_state(cells, self._settings.grid)
-        expected_m = self._settings.grid.resolution_m
-        if not self._session and grid.frame.resolution != expected_m:
-            raise InputError(
-                f'map with {grid.frame.resolution} m a cell: expected {expected_m} m (resolution_m)'
-            )
+        latest_ns, rest = snapshot.split_number(state, 'latest_ns')
+        map_id, cells = snapshot.split_number(rest, 'map_id')
+        self._mapper.restore(cells)
         self._stamp.restore(latest_ns)
-        self._replace_grid(CorrectableGrid(grid, keeps_scans=False))
+        self._map_replaced()
         self._output.followed = FollowedMap(map_id)
 
     def _on_scan(self, message: LocalizedScanMsg) -> None:
@@ -190,29 +183,27 @@ class GridMapperNode(ThinmapNode):
         self._add_scans()
 
     def _add_scans(self) -> None:
-        for localized, trajectory in self._scans.ready():
-            if trajectory is not None:
-                self._correct(trajectory)
+        for localized in self._scans.ready():
+            if localized.trajectory is not None:
+                self._correct(localized.trajectory)
             self._add_scan(localized)
         self.diagnostics.set_drop_total('scans without their trajectory', self._scans.dropped)
 
-    def _add_scan(self, localized: LocalizedScan) -> None:
-        scan = localized.scan
-        if not self._is_of_this_map(localized.status):
+    def _add_scan(self, localized: ReceivedScan) -> None:
+        if not self._is_of_this_map(localized.message.status):
             return
-        if self._stamp.is_restarted_by(scan.stamp_ns):
+        stamp_ns = localized.scan.stamp_ns
+        if self._stamp.is_restarted_by(stamp_ns):
             self.reset_state()
-        T_map_base = localized.T_map_base
+        placement = localized.placement if self._settings.mapping else Placement.NOWHERE
         with self.diagnostics.time_step('map update'):
-            mapped = scan if self._settings.mapping else None
-            moved = self._grid.update(mapped, T_map_base, localized.placement)
-            x, y, _ = T_map_base
-            window = self._grid.shown.window(x, y, self._settings.local_map_size_m)
-        self._stamp.latest_ns = scan.stamp_ns
-        if moved is not None:
+            update = self._mapper.step(replace(localized, placement=placement, trajectory=None))
+        self._stamp.latest_ns = stamp_ns
+        if update is not None and update.whole is not None:
             self._publish_map()  # before the windows of the corrected map
-        self._output.publish_local_grid(window, self._grid, localized)
-        for refusal in self._grid.take_refusals():
+        if update is not None:
+            self._output.publish_local_grid(update, localized)
+        for refusal in self._mapper.refusals:
             self.diagnostics.message_rejected('localized_scan', refusal)
             self.get_logger().warning(
                 f'localized_scan: {refusal}', throttle_duration_sec=WARN_PERIOD_S
@@ -233,43 +224,44 @@ class GridMapperNode(ThinmapNode):
 
     def _publish_map(self) -> None:
         if self._stamp.latest_ns is not None:
-            self._output.publish_map(self._grid, self._stamp.latest_ns)
+            self._output.publish_map(self._mapper.whole_map(), self._stamp.latest_ns)
 
     def _on_get_map(self, _: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
         stamp_ns = self._stamp.latest_ns or self.get_clock().now().nanoseconds
-        response.map = self._output.map_message(self._grid.shown.known_area(), stamp_ns)
+        response.map = self._output.map_message(self._mapper.whole_map().patch, stamp_ns)
         return response
 
-    def _correct(self, trajectory: Path) -> None:
+    def _correct(self, trajectory: Trajectory) -> None:
         """A loop was closed: correct the poses at which the scans of the map were made."""
-        corrected_ns = messages.stamp_ns(trajectory.header.stamp)
-        if not self._stamp.is_corrected_by(corrected_ns):
+        if not self._stamp.is_corrected_by(trajectory.since_ns):
             # A latched trajectory from before this map, which follows it or is a new one.
-            self._grid.corrected_ns = corrected_ns
+            self._mapper.grid.corrected_ns = trajectory.since_ns
             return
         with self.diagnostics.time_step('map correction'):
-            stamps_ns, poses = messages.trajectory_from_msg(trajectory)
-            is_corrected = self._grid.apply_correction(stamps_ns, poses, since_ns=corrected_ns)
+            is_corrected = self._mapper.correct(trajectory)
         if not is_corrected:
             self.get_logger().warning(
                 'loop closed, but a map that was loaded without keyframes is not corrected'
             )
             self._publish_map()
 
-    def _replace_grid(self, grid: CorrectableGrid) -> None:
-        grid.corrected_ns = self._grid.corrected_ns
-        self._grid = grid
+    def _map_replaced(self) -> None:
         self._output.followed.leave()
         self._output.load_ns = self.get_clock().now().nanoseconds
         self._stamp.latest_ns = self._stamp.latest_ns or self._output.load_ns
         self._publish_map()
 
+    def _load(self, grid: CorrectableGrid) -> None:
+        grid.corrected_ns = self._mapper.grid.corrected_ns
+        self._mapper.replace(grid)
+        self._map_replaced()
+
     def _save_grid(self, path: str) -> str:
         """Save the map, after all of it follows the newest correction."""
-        if self._grid.finish() is not None:
+        if self._mapper.finish() is not None:
             self._publish_map()
-        shown = self._settings.output.trinary(self._grid.shown.known_area())
-        return f'saved {sessions.save_grid(path, self._grid.shown, shown)}'
+        shown = self._settings.output.trinary(self._mapper.whole_map().patch)
+        return f'saved {sessions.save_grid(path, self._mapper.grid.shown, shown)}'
 
     async def _on_save(
         self, request: SaveMap.Request, response: SaveMap.Response
@@ -292,7 +284,7 @@ class GridMapperNode(ThinmapNode):
         try:
             path = self._save_directory.resolve(request.path)
             grid = self._load_map(path, self._save_directory.path)
-            result = await self._session_client.load(path, lambda: self._replace_grid(grid))
+            result = await self._session_client.load(path, lambda: self._load(grid))
         except ThinmapError as error:
             response.success = False
             response.message = str(error)

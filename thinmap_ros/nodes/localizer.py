@@ -2,29 +2,25 @@
 
 import math
 from dataclasses import dataclass, field
-from time import monotonic, perf_counter
+from time import perf_counter
 
 import numpy as np
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Path
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import (
     LineFeature,
     LineFeatureArray,
     LocalizedScan,
-    ProbabilityGrid,
     SlamStatus,
     TopologicalMap,
 )
 from thinmap_msgs.srv import LoadMap, SaveMap
-from thinmap_ros.core import se2, snapshot
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
@@ -37,7 +33,6 @@ from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
     adjust,
     config_class,
-    localizer_class,
     parameters_elsewhere,
 )
 from thinmap_ros.core.snapshot import State
@@ -50,7 +45,9 @@ from thinmap_ros.logs.frames.bag_odometry import NONE
 from thinmap_ros.nodes.localization.given_map import GivenMap, config_at
 from thinmap_ros.nodes.localization.initial_poses import InitialPoses
 from thinmap_ros.nodes.localization.known_area import require_near_map
+from thinmap_ros.nodes.localization.living_map import LivingMap
 from thinmap_ros.nodes.localization.map_source import load_localizer
+from thinmap_ros.nodes.localization.recovery import Recovery, restored, saved_pose
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN, new_map_id
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
@@ -63,7 +60,6 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.tf.map_broadcaster import MapBroadcaster
 from thinmap_ros.ros.tf.odometry_source import OdometrySource
 
-_MAP_WAIT_S = 3.0  # after a restart; the navigator drives for so long without a new pose
 _HEALTH = {
     SlamStatus.TRACKING: (OK, 'tracking'),
     SlamStatus.LOST: (ERROR, 'lost: scans contradict the map'),
@@ -93,11 +89,7 @@ class _PosePublishers:
         """Publish an estimate; status: with its state and step time, the rest is filled in."""
         stamp_ns = scan.stamp_ns
         frame = self.map_frame
-        self._pose.publish(
-            messages.pose_with_covariance_msg(
-                estimate.T_map_base, estimate.covariance, frame, stamp_ns
-            )
-        )
+        self._pose.publish(messages.estimate_msg(estimate, frame, stamp_ns))
         header = messages.header(frame, stamp_ns)
         features = [_feature_msg(feature) for feature in localizer.features]
         self._features.publish(LineFeatureArray(header=header, features=features))
@@ -126,13 +118,11 @@ class _PosePublishers:
 class _Input:
     """Scans with the odometry at their stamps, and the check of both.
 
-    last: the anchor of the last scan at a known place; reported: kinds of warnings that are in the
-    log.
+    reported: kinds of warnings that are in the log.
     """
 
     pairing: ScanOdometrySynchronizer = field(default_factory=ScanOdometrySynchronizer)
     consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
-    last: OdometryAnchor | None = None
     reported: set[str] = field(default_factory=set)
 
     @property
@@ -146,13 +136,11 @@ class _MapIds:
     """Id of the map that the localizer makes, and of the one that a reset has replaced by it.
 
     is_given: whether the map was loaded, or begun by a reset, and not by the start of the node.
-    living: the subscription to the map of a mapper that has outlived the localizer.
     """
 
     id: int = field(default_factory=new_map_id)
     replaced: int = UNKNOWN
     is_given: bool = False
-    living: Subscription | None = None
     _published: int = UNKNOWN
 
     def begin(self) -> None:
@@ -172,38 +160,6 @@ class _MapIds:
         status.map_id = self.id
         status.replaced_map_id = self.replaced
         self._published = self.id
-
-
-class _Relocation:
-    """What a localizer that was killed and restarted waits for: a scan, and the map of before.
-
-    last: the pose in its checkpoint. map: None until it is received.
-    """
-
-    def __init__(self, last: OdometryAnchor) -> None:
-        self.last = last
-        self.map: GridPatch | None = None
-        self._pending: tuple[Scan, Array] | None = None
-        self._waiting_since_s = monotonic()
-
-    @property
-    def waited_s(self) -> float:
-        """How long a scan has been waiting for the map, s."""
-        return monotonic() - self._waiting_since_s
-
-    def is_continuous_with(self, scan: Scan, T_odom_base: Array) -> bool:
-        """Whether the odometry at a scan can continue that of the checkpoint."""
-        return self.last.is_continuous_with(scan.stamp_ns, T_odom_base)
-
-    def next_scan(self, ready: list[tuple[Scan, Array]]) -> tuple[Scan, Array] | None:
-        """The newest scan with its odometry, once the map need not be waited for any longer."""
-        if ready:
-            self._pending = ready[-1]
-        if self._pending is None:
-            self._waiting_since_s = monotonic()
-            return None
-        is_early = self.map is None and self.waited_s < _MAP_WAIT_S
-        return None if is_early else self._pending
 
 
 class LocalizerNode(ThinmapNode):
@@ -240,9 +196,9 @@ class LocalizerNode(ThinmapNode):
         warm_up.localizer()
         self._map_ids: _MapIds | None = _MapIds() if self._config.is_mapping else None
         self._begin()
-        self.enable_checkpoint(self._state, self._restore)
+        self.enable_checkpoint(self._state, self._restore, self._map_state)
         if self._map_ids is not None:
-            self._map_ids.living = self._subscribe_living_map(self._map_ids)
+            LivingMap(self, self._on_living_map)
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('pose')
         self.diagnostics.add_check(WARN, lambda: '; '.join(self._input.warnings.values()))
@@ -282,25 +238,31 @@ class LocalizerNode(ThinmapNode):
         self._odometry.reset()
         self._input = _Input()
         self._topology: Graph | None = None
-        self._relocation: _Relocation | None = None
+        self._recovery = Recovery()
 
     def _state(self) -> State | None:
-        last = self._input.last
-        if last is None:
+        pose = self._recovery.pose_state(self._localizer)
+        is_map_missing = self._map_ids is not None and not self._recovery.is_map_saved
+        if pose is None or is_map_missing:
             return None
         map_id = UNKNOWN if self._map_ids is None else self._map_ids.id
-        return {**last.state(), 'map_id': np.array(map_id)}
+        return {**pose, 'map_id': np.array(map_id)}
+
+    def _map_state(self) -> State | None:
+        """What cannot be loaded again: the map, while it is made."""
+        is_lost = self._recovery.last is None
+        if self._map_ids is None or is_lost:
+            return None
+        return self._recovery.map_state(self._localizer)
 
     def _restore(self, state: State) -> None:
-        """Continue at the last pose of a killed localizer. Raises InputError for another state."""
-        map_id, anchor = snapshot.split_map_id(state)
-        self._relocation = _Relocation(OdometryAnchor.from_state(anchor))
-        self._relocation.map = self._given.source.patch
+        """Continue as a killed localizer would. Raises InputError for another state."""
+        last = saved_pose(state)
+        map_id, own = snapshot.split_number(state, 'map_id')
         if self._map_ids is not None:
+            self._localizer, last = restored(own, self._config)
             self._map_ids.id = map_id
-        self.create_active_timer(
-            _MAP_WAIT_S, lambda: self._process([]), Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        self._recovery = Recovery(last)
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         self._process(self._input.pairing.add_odometry(stamp_ns, T_odom_base))
@@ -317,19 +279,15 @@ class LocalizerNode(ThinmapNode):
 
     def _on_new_map(self) -> None:
         """Localize in the map that topic map has brought."""
-        if self._relocation is None:
-            self._localizer = self._given.with_new_map(self._localizer)
-        elif (patch := self._given.source.patch) is not None:
-            self._relocate_in(self._relocation, patch)
+        self._localizer = self._given.with_new_map(self._localizer)
 
     def _on_topology(self, message: TopologicalMap) -> None:
         self._topology = topology_from_msg(message)
         self._localizer.set_topology(self._topology)
 
     def _process(self, ready: list[tuple[Scan, Array]]) -> None:
-        if self._relocation is not None:
-            ready = self._relocate(self._relocation, ready)
         for scan, T_odom_base in ready:
+            self._resume(scan, T_odom_base)
             started = perf_counter()
             estimate = self._localizer.step(scan, T_odom_base)
             estimate = self._input.consistency.checked(scan, T_odom_base, estimate)
@@ -341,7 +299,10 @@ class LocalizerNode(ThinmapNode):
                     'its pose follows from the scan alone'
                 )
             if not estimate.is_lost:
-                self._input.last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
+                last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
+                self._recovery.last = last
+            if estimate.correction is not None:
+                self.checkpoint_now()
         self._report_warnings()
         diagnostics = self.diagnostics
         diagnostics.set_drop_total(
@@ -358,82 +319,34 @@ class LocalizerNode(ThinmapNode):
                 self.get_logger().warning(f'scan: {text}')
                 self._input.reported.add(kind)
 
-    def _subscribe_living_map(self, ids: _MapIds) -> Subscription:
-        """Subscribe to the map of a mapper that has outlived this node."""
-
-        def on_grid(message: ProbabilityGrid) -> None:
-            if message.map_id == UNKNOWN:
-                return
-            try:
-                self._on_living_map(ids, message.map_id, messages.grid_from_msg(message))
-            except InputError as error:
-                self.get_logger().warning(f'grid: {error}')
-
-        return self.create_subscription(ProbabilityGrid, 'grid', on_grid, qos.LATCHED)
-
-    def _on_living_map(self, ids: _MapIds, map_id: int, patch: GridPatch) -> None:
+    def _on_living_map(self, map_id: int, patch: GridPatch) -> None:
         """Continue in a map that was there before this node, rather than begin a second one."""
-        if self._relocation is not None:
-            self._relocate_in(self._relocation, patch)
-        elif map_id != ids.id and not ids.is_given:
-            if not isinstance(self._config, LocalizerConfig):
-                return  # a map of line features cannot be made of a grid
-            self.get_logger().warning(
-                'grid is of a map that another localizer has begun: lost in that map until scans '
-                'match at the start pose, or a pose is given'
-            )
-            self._start_again_in(patch)
-            ids.id = map_id
-        if ids.living is not None:
-            self.destroy_subscription(ids.living)
-            ids.living = None
+        ids = self._map_ids
+        if ids is None or map_id == ids.id or ids.is_given:
+            return
+        if not isinstance(self._config, LocalizerConfig):
+            return  # a map of line features cannot be made of a grid
+        self.get_logger().warning(
+            'grid is of a map that another localizer has begun: lost in that map until scans '
+            'match at the start pose, or a pose is given'
+        )
+        self._localizer = Localizer.in_occupancy_map(patch, self._config)
+        self._recovery.awaited = None
+        ids.id = map_id
 
-    def _relocate_in(self, relocation: _Relocation, patch: GridPatch) -> None:
-        """Use a map that has come for the relocation, unless that has one."""
-        if relocation.map is None:
-            relocation.map = patch
-        if self.is_active:
-            self._process([])
-
-    def _relocate(
-        self, relocation: _Relocation, ready: list[tuple[Scan, Array]]
-    ) -> list[tuple[Scan, Array]]:
-        """Start at the present pose in the map; returns the scan to continue with, or none yet.
-
-        Where the odometry was reset, too, the robot is at the start pose. Without a map, the
-        localizer starts a new one at the pose of the odometry.
-        """
-        pending = relocation.next_scan(ready)
-        if pending is None:
-            return []
-        last = relocation.last
-        _, T_odom_base = pending
-        if not relocation.is_continuous_with(*pending):
-            self.get_logger().warning('odometry was reset: starting at the initial pose')
-            self._start_again_in(relocation.map)
-        elif relocation.map is None:
-            self.get_logger().warning(
-                f'no map received for {relocation.waited_s:.0f} s: '
-                'the new map may not align with the earlier one'
-            )
-            T_map_base = se2.compose(last.T_map_odom, T_odom_base)
-            self._localizer = self._given.create_localizer_at(T_map_base)
-        else:
-            kind = localizer_class(self._config)
-            self._localizer = kind.from_occupancy_map(
-                relocation.map, last, T_odom_base, self._config
-            )
-        if self._topology is not None:
-            self._localizer.set_topology(self._topology)
-        self._relocation = None
-        return [pending]
-
-    def _start_again_in(self, patch: GridPatch | None) -> None:
-        """Start at the initial pose in the map that is there, or else in a new one."""
-        if patch is not None and isinstance(self._config, LocalizerConfig):
-            self._localizer = Localizer.in_occupancy_map(patch, self._config)
-        elif self._map_ids is not None:
-            self._map_ids.load()
+    def _resume(self, scan: Scan, T_odom_base: Array) -> None:
+        """Continue where the killed localizer was; at the start pose if the odometry was reset."""
+        last = self._recovery.awaited
+        if last is None or not self._given.source.has_map:
+            return
+        self._recovery.awaited = None
+        if last.is_continuous_with(scan.stamp_ns, T_odom_base):
+            self._localizer.resume(last, T_odom_base)
+            return
+        self.get_logger().warning('odometry was reset: starting at the initial pose')
+        if scan.stamp_ns < last.stamp_ns:
+            # So was the robot, with all that made the map.
+            self._localizer = self._given.create_localizer()
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
@@ -465,6 +378,7 @@ class LocalizerNode(ThinmapNode):
         if loaded is None:
             return 'the session has no map of the localizer: it keeps its own'
         self._localizer = loaded
+        self._recovery = Recovery()
         self._given.source.replaced()
         if self._map_ids is not None:
             self._map_ids.load()

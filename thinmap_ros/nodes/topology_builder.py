@@ -1,7 +1,9 @@
 """The topological map: the cells of the grid that change are thinned and merged into the graph."""
 
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+
 import numpy as np
-from nav_msgs.msg import Path
 from rclpy.node import Node
 
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
@@ -10,20 +12,19 @@ from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.regions.tracker import FIELDS as REGION_FIELDS
 from thinmap_ros.core.regions.tracker import RegionTracker
-from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_scans, load_topology
+from thinmap_ros.core.topology.topology import Topology
+from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
-from thinmap_ros.nodes.mapping.rebuild import Rebuilding
 from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
 from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN, FollowedMap, Origin
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.localized_scan import mapped_scan_from_msg
+from thinmap_ros.ros.localized_scan import map_update_from_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
@@ -91,9 +92,9 @@ class TopologyBuilderNode(ThinmapNode):
     replacing the present one. A graph is published when it has changed, /local_topology for each
     scan while somebody subscribes to it. Where Nav2's route server runs, it is given the graph
     when it has changed, and when it is saved: client of route_server/set_route_graph.
-    Cells outside of the windows are those of /grid. After a /trajectory the graph is rebuilt from
-    the /grid that has undergone that correction, in a thread; until then the graph stays as it is.
-    Nodes keep their ids.
+    Cells outside of the windows are those of /grid. After a correction the graph is rebuilt from
+    the /grid that has undergone it, in a thread; until then the graph stays as it is. Nodes keep
+    their ids.
     """
 
     def __init__(self) -> None:
@@ -103,14 +104,13 @@ class TopologyBuilderNode(ThinmapNode):
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
         self._route_graph = RouteGraphUpdates(
-            self, self._output.frame_id, lambda: self._builder.map
+            self, self._output.frame_id, lambda: self._topology.map
         )
         self._regions = RegionUpdates(
-            self, self._output.frame_id, self._config.robot_radius_m, lambda: self._builder.map
+            self, self._output.frame_id, self._config.robot_radius_m, lambda: self._topology.map
         )
         parameters.reject_unknown(self)
         warm_up.topology_builder()
-        subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(self, LocalGrid, 'local_grid', self._on_local_grid, qos.STREAM)
         self.create_service(SaveMap, 'save_topology', self._on_save)
@@ -118,6 +118,7 @@ class TopologyBuilderNode(ThinmapNode):
         self.create_service(LoadMap, 'load_topology', self._on_load)
         self.diagnostics.check_sole_publisher('topology')
         self._stamp = StateStamp()
+        self._topology = Topology(self._config, _begin_in_thread)
         self.reset_state()
         self.enable_checkpoint(self._state, self._restore)
 
@@ -125,34 +126,30 @@ class TopologyBuilderNode(ThinmapNode):
         if self._stamp.latest_ns is None:
             return None
         latest_ns = np.array(self._stamp.latest_ns)
-        return {**self._builder.state(), **self._regions.tracker.state(), 'latest_ns': latest_ns}
+        return {**self._topology.state(), **self._regions.tracker.state(), 'latest_ns': latest_ns}
 
     def _restore(self, state: State) -> None:
         """Continue with the graph of a killed builder. Raises InputError where it is no graph."""
-        latest_ns, rest = snapshot.split_stamp(state)
+        latest_ns, rest = snapshot.split_number(state, 'latest_ns')
         regions = {name: array for name, array in rest.items() if name in REGION_FIELDS}
         graph = {name: array for name, array in rest.items() if name not in REGION_FIELDS}
-        builder = TopologyBuilder.from_state(graph, self._config)
         tracker = RegionTracker.from_state(regions, self._regions.config)
-        for restored in (builder, tracker):
+        self._topology.restore(graph)
+        for restored in (self._topology.builder, tracker):
             restored.skip_ids(_ID_RESERVE)
         self._regions.reset(tracker)
         self._stamp.restore(latest_ns)
-        self._builder = builder
-        self._rebuilding = Rebuilding(from_the_start=False, restored_ns=latest_ns)
         self._publish(latest_ns)
 
     def reset_state(self) -> None:
         """Discard the graph, or return to the session that the node was started with."""
         self._output.followed = FollowedMap()
         self._newest_saved_id = 0
-        self._T_map_base: Array | None = None
-        self._rebuilding = _rebuilding_in(self._session)
+        self._topology.reset()
         if self._session:
-            self._builder = load_topology(self._session, self._config)
+            self._topology.replace(load_topology(self._session, self._config))
             self._regions.reset(REGIONS.load_optional(self._session, self._regions.config))
         else:
-            self._builder = TopologyBuilder(self._config)
             self._regions.reset()
         if self._session or self._output.has_published:
             self._publish(self.get_clock().now().nanoseconds)
@@ -168,64 +165,45 @@ class TopologyBuilderNode(ThinmapNode):
     def _on_local_grid(self, message: LocalGrid) -> None:
         if not self._is_of_this_map(message.grid):
             return
-        mapped = mapped_scan_from_msg(message)
-        stamp_ns = mapped.localized.scan.stamp_ns
+        update = map_update_from_msg(message)
+        stamp_ns = update.localized.scan.stamp_ns
         if self._stamp.is_restarted_by(stamp_ns):
             self.reset_state()
-        self._rebuilding.window(mapped)
         self._stamp.latest_ns = stamp_ns
-        self._T_map_base = mapped.localized.T_map_base
         with self.diagnostics.time_step('graph update'):
-            self._builder, changed = self._rebuilding.update(self._builder)
-        if changed:
+            changed = self._topology.step(update)
+        if changed is not None:
             self._publish(stamp_ns, again=False)
-        self._add_whole_map(stamp_ns)
         # The local map comes last: a subscriber that receives it has all results of this scan.
-        self._output.publish_local_map(self._builder.local_map(), stamp_ns)
-
-    def _on_trajectory(self, message: Path) -> None:
-        corrected_ns = messages.stamp_ns(message.header.stamp)
-        self._rebuilding.correct(corrected_ns, *messages.trajectory_from_msg(message))
-        self._builder = self._rebuilding.start(self._builder)
+        self._output.publish_local_map(self._topology.builder.local_map(), stamp_ns)
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
         if not self._is_of_this_map(message):
             return
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        patch = messages.grid_from_msg(message)
-        self._regions.add_grid(stamp_ns, patch)
-        self._rebuilding.grid(patch, messages.stamp_ns(message.correction_stamp))
-        self._builder = self._rebuilding.start(self._builder)
-        self._add_whole_map(stamp_ns)
-
-    def _add_whole_map(self, stamp_ns: int) -> None:
-        """Update the graph by a new grid: beams may end outside of the windows."""
-        if self._T_map_base is None:
-            return
-        shown = self._rebuilding.whole_map()
-        if shown is None:
-            return
+        whole = messages.whole_map_from_msg(message)
+        self._regions.add_grid(stamp_ns, whole.patch)
         with self.diagnostics.time_step('whole map'):
-            changed = self._builder.update(shown, self._T_map_base)
-        if changed:
+            changed = self._topology.add_map(whole)
+        if changed is not None:
             self._publish(stamp_ns, again=False)
 
     def _publish(self, stamp_ns: int, again: bool = True) -> None:
         self._checkpoint_new_ids()
-        if self._output.publish_map(self._builder.map, stamp_ns, again):
+        if self._output.publish_map(self._topology.map, stamp_ns, again):
             self._route_graph.graph_changed()
             self._regions.graph_changed()
 
     def _checkpoint_new_ids(self) -> None:
         """Save a checkpoint before new ids are published: other nodes may rely on them."""
-        newest = max(self._builder.map.nodes, default=0)
+        newest = max(self._topology.map.nodes, default=0)
         if newest != self._newest_saved_id and self.checkpoint_now():
             self._newest_saved_id = newest
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve_for_saving(request.path, TOPOLOGY)
-            saved = TOPOLOGY.save(path, self._builder)
+            saved = TOPOLOGY.save(path, self._topology.builder)
             REGIONS.save(path, self._regions.tracker)
             self._route_graph.graph_saved()
             return f'saved {saved}'
@@ -252,21 +230,19 @@ class TopologyBuilderNode(ThinmapNode):
     def _load(self, path: str) -> str:
         """Replace the graph by a saved one; windows that were made before are discarded."""
         loaded, regions = self._read(path)
-        self._builder = loaded
+        self._topology.replace(loaded)
         self._output.followed.leave()
         self._regions.reset(regions)
-        self._rebuilding = _rebuilding_in(self._save_directory.resolve(path) if path else '')
         self._publish(self.get_clock().now().nanoseconds)
         return f'graph of {len(loaded.map.nodes)} nodes' if path else 'graph reset'
 
 
-def _rebuilding_in(session: str) -> Rebuilding:
-    """For the graph of a session, which was made where its keyframes are; or for a new graph."""
-    scans = load_scans(session) if session else []
-    rebuilding = Rebuilding(from_the_start=not session or bool(scans))
-    for scan, T_map_base in scans:
-        rebuilding.add_pose(scan.stamp_ns, T_map_base)
-    return rebuilding
+def _begin_in_thread(work: Callable[[], TopologyBuilder]) -> Future[TopologyBuilder]:
+    """Begin to rebuild a graph, so that no scan waits."""
+    thread = ThreadPoolExecutor(max_workers=1)
+    job = thread.submit(work)
+    thread.shutdown(wait=False)
+    return job
 
 
 def main() -> None:

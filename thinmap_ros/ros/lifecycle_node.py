@@ -1,5 +1,6 @@
 """What the nodes of a robot share: lifecycle, diagnostics, pause, reset, checkpoint, time jump."""
 
+import math
 from collections.abc import Callable
 
 from lifecycle_msgs.srv import ChangeState
@@ -19,6 +20,7 @@ from thinmap_ros.ros.foreign.translation import translate
 from thinmap_ros.ros.services import fill_response
 
 _CHECKPOINT_PERIOD_S = 0.5
+_DEAR_INTERVAL = 200.0  # half a percent of the time
 RCLError = rclpy_implementation.RCLError
 
 
@@ -47,7 +49,7 @@ class ThinmapNode(LifecycleNode):
         self.is_paused = False
         self.time_jumps = TimeJumps(self.get_clock())
         self.elapsed_time = ElapsedTime(self.get_clock())
-        self._checkpoint: PeriodicCheckpoint | None = None
+        self._checkpoints: list[PeriodicCheckpoint] = []
         self._activation_callbacks: list[Callable[[], None]] = []
         self.diagnostics.add_update_callback(self.handle_time_jump)
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -87,26 +89,34 @@ class ThinmapNode(LifecycleNode):
         return self.create_timer(period_s, guarded, clock=clock or self.elapsed_time.timer_clock)
 
     def enable_checkpoint(
-        self, state: Callable[[], State | None], restore: Callable[[State], None]
+        self,
+        state: Callable[[], State | None],
+        restore: Callable[[State], None],
+        dear_state: Callable[[], State | None] = lambda: None,
     ) -> None:
         """Restore the checkpoint of a killed predecessor, and save one periodically from now on.
 
-        state: returns what to save; None: nothing. restore: is called with the state of a node that
-        was killed less than `recovery_timeout_s` ago. Where it raises a ThinmapError, as for a node
-        that was started with other parameters, the node starts empty.
+        state: returns what to save; None: nothing. dear_state: the rest, which takes long to save:
+        it is older than the other. restore: is called with both of a node that was killed less than
+        `recovery_timeout_s` ago. Where it raises a ThinmapError, as for a node that was started
+        with other parameters, the node starts empty.
         """
         file = Checkpoint(self, self._recovery_timeout_s)
-        self._checkpoint = PeriodicCheckpoint(file, state)
+        dear = Checkpoint(self, self._recovery_timeout_s and math.inf, '.dear')
+        self._checkpoints = [
+            PeriodicCheckpoint(dear, dear_state, _DEAR_INTERVAL),
+            PeriodicCheckpoint(file, state),
+        ]
         self.create_timer(
             _CHECKPOINT_PERIOD_S,
-            self._checkpoint.save,
+            self._save_checkpoints,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         saved = file.load()
         if saved is None:
             return
         try:
-            restore(saved)
+            restore({**(dear.load() or {}), **saved})
         except ThinmapError as error:
             self.get_logger().warning(
                 f'checkpoint rejected: {one_line_reason(error)}: starting empty'
@@ -117,12 +127,17 @@ class ThinmapNode(LifecycleNode):
 
     def close(self) -> None:
         """Delete the checkpoint: the node ends in order."""
-        if self._checkpoint is not None:
-            self._checkpoint.delete()
+        for checkpoint in self._checkpoints:
+            checkpoint.delete()
+
+    def _save_checkpoints(self) -> None:
+        for checkpoint in self._checkpoints:
+            checkpoint.save()
 
     def checkpoint_now(self) -> bool:
         """Save a checkpoint before a change is published; returns whether there was time."""
-        return self._checkpoint is not None and self._checkpoint.save(is_urgent=True)
+        saved = [checkpoint.save(is_urgent=True) for checkpoint in self._checkpoints]
+        return bool(saved) and all(saved)
 
     def add_activation_callback(self, work: Callable[[], None]) -> None:
         """Call `work` each time that the node becomes active."""
@@ -141,8 +156,7 @@ class ThinmapNode(LifecycleNode):
 
     def _reset(self) -> None:
         self.stop()
-        if self._checkpoint is not None:
-            self._checkpoint.delete()
+        self.close()
         self.reset_state()
 
     # Lifecycle.

@@ -1,6 +1,6 @@
 """Scans with the pose that the localizer found for them, from it to the mapper and beyond."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovariance
@@ -9,67 +9,35 @@ from thinmap_msgs.msg import LocalGrid, SlamStatus
 from thinmap_msgs.msg import LocalizedScan as LocalizedScanMsg
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.estimate import Estimate, Placement
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.mapper import MapUpdate
 from thinmap_ros.core.scan import LaserConfig, Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stage import LocalizedScan
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import messages
 
 
 @dataclass(frozen=True, eq=False)
-class LocalizedScan:
-    """A scan, the pose T_map_base (3,) at which it was made, and the message with both.
+class ReceivedScan(LocalizedScan):
+    """A localized scan with the message that it came in.
 
     corrected_ns: stamp of the newest trajectory that the pose follows; 0: none yet.
     """
 
-    scan: Scan
-    T_map_base: Array
-    corrected_ns: int
-    message: LocalizedScanMsg
-
-    @property
-    def status(self) -> SlamStatus:
-        """Status of the localizer after the scan."""
-        return self.message.status
-
-    @property
-    def placement(self) -> Placement:
-        """Where the scan belongs: nowhere if the robot is lost, or the laser shows nothing."""
-        if self.status.state == SlamStatus.MAPPING_APART:
-            return Placement.APART
-        if self.status.state != SlamStatus.TRACKING:
-            return Placement.NOWHERE
-        return Placement.OPEN if self.status.is_contradicted else Placement.MAP
+    corrected_ns: int = 0
+    message: LocalizedScanMsg = field(default_factory=LocalizedScanMsg)
 
     @property
     def is_blind(self) -> bool:
         """Whether the laser shows nothing of what is around the robot."""
-        is_useless = self.status.state in (SlamStatus.BLIND, SlamStatus.MISALIGNED)
+        is_useless = self.message.status.state in (SlamStatus.BLIND, SlamStatus.MISALIGNED)
         return bool(is_useless or self.scan.is_blind)
-
-
-@dataclass(frozen=True, eq=False)
-class MappedScan:
-    """A scan, and the window of the map that contains it.
-
-    corrected_ns: stamp of the newest trajectory that all of the map follows; is_rerendering:
-    whether a newer one has not reached all of it.
-    """
-
-    localized: LocalizedScan
-    window: GridPatch
-    corrected_ns: int
-    is_rerendering: bool
 
 
 def localized_scan_msg(
     scan: Scan, estimate: Estimate, status: SlamStatus, frame_id: str, corrected_ns: int = 0
 ) -> LocalizedScanMsg:
-    """Message of a scan, its estimate and its status; corrected_ns as in `LocalizedScan`."""
-    T_map_base = messages.pose_with_covariance_msg(
-        estimate.T_map_base, estimate.covariance, frame_id, scan.stamp_ns
-    )
+    """Message of a scan, its estimate and its status; corrected_ns as in `ReceivedScan`."""
+    T_map_base = messages.estimate_msg(estimate, frame_id, scan.stamp_ns)
     return LocalizedScanMsg(
         header=T_map_base.header,
         scan=messages.scan_msg(scan, '', scan.scan_time_s),
@@ -82,7 +50,7 @@ def localized_scan_msg(
     )
 
 
-def localized_scan_from_msg(message: LocalizedScanMsg) -> LocalizedScan:
+def localized_scan_from_msg(message: LocalizedScanMsg) -> ReceivedScan:
     """Scan of a message.
 
     Raises InputError where scan, pose or a stamp is invalid, and where a number that is no range is
@@ -95,17 +63,27 @@ def localized_scan_from_msg(message: LocalizedScanMsg) -> LocalizedScan:
         messages.pose_from_msg(message.laser_pose),
         _laser(message),
     )
-    return LocalizedScan(
+    return ReceivedScan(
         replace(scan, drops_out=message.status.no_return_is_unknown),
         messages.pose_from_msg(message.pose.pose),
-        messages.stamp_ns(message.correction_stamp),
-        message,
+        _placement(message.status),
+        corrected_ns=messages.stamp_ns(message.correction_stamp),
+        message=message,
     )
 
 
-def mapped_scan_from_msg(message: LocalGrid) -> MappedScan:
+def _placement(status: SlamStatus) -> Placement:
+    """Where the scan belongs: nowhere if the robot is lost, or the laser shows nothing."""
+    if status.state == SlamStatus.MAPPING_APART:
+        return Placement.APART
+    if status.state != SlamStatus.TRACKING:
+        return Placement.NOWHERE
+    return Placement.OPEN if status.is_contradicted else Placement.MAP
+
+
+def map_update_from_msg(message: LocalGrid) -> MapUpdate:
     """Scan and window of a message. Raises InputError where one of them is invalid."""
-    return MappedScan(
+    return MapUpdate(
         localized_scan_from_msg(message.localized),
         messages.grid_from_msg(message.grid),
         messages.stamp_ns(message.grid.correction_stamp),

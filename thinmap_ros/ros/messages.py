@@ -25,13 +25,17 @@ from std_msgs.msg import Header
 
 from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
-from thinmap_ros.core import validation
+from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M
+from thinmap_ros.core.grid.mapper import WholeMap
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.rotated import aligned_patch
+from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.flat import FIELDS, flat_topology
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -147,6 +151,15 @@ def pose_with_covariance_msg(
     return message
 
 
+def estimate_msg(estimate: Estimate, frame_id: str, ns: int) -> PoseWithCovarianceStamped:
+    """Pose of an estimate; where the robot is lost, its covariance says so to all who know no mode.
+
+    As AMCL and robot_localization have it.
+    """
+    unsure = UNKNOWN if estimate.is_lost else np.zeros((3, 3))
+    return pose_with_covariance_msg(estimate.T_map_base, estimate.covariance + unsure, frame_id, ns)
+
+
 def covariance_from_msg(message: PoseWithCovarianceStamped) -> Array:
     """Covariance (3, 3) over x, y, theta.
 
@@ -246,6 +259,40 @@ def probability_grid_msg(
     message.map_id = map_id
     message.data = _int8_array(patch.cells)
     return message
+
+
+def whole_map_msg(
+    whole: WholeMap, frame_id: str, ns: int, load_ns: int = 0, map_id: int = 0
+) -> ProbabilityGrid:
+    """Message of a whole map, and of where the newest correction has moved it."""
+    message = probability_grid_msg(whole.patch, frame_id, ns, load_ns, whole.corrected_ns, map_id)
+    message.previous_correction_stamp = time_msg(whole.previous_ns)
+    message.poses_before = array('d', whole.moved.before.tobytes())
+    message.poses_after = array('d', whole.moved.after.tobytes())
+    return message
+
+
+def whole_map_from_msg(message: ProbabilityGrid) -> WholeMap:
+    """Map of a message. Raises InputError where cells, a stamp or a pose is invalid."""
+    return WholeMap(
+        grid_from_msg(message),
+        stamp_ns(message.correction_stamp),
+        stamp_ns(message.previous_correction_stamp),
+        _moved(message),
+    )
+
+
+def _moved(message: ProbabilityGrid) -> CorrectedPoses:
+    before = np.array(message.poses_before)
+    after = np.array(message.poses_after)
+    if before.size != after.size or before.size % 3:
+        raise InputError(
+            f'map with {before.size} numbers of poses before a correction and {after.size} after '
+            'it: expected three for each pose'
+        )
+    if not (np.abs([before, after]) <= se2.MAX_COORDINATE_M).all():
+        raise InputError('map with a pose of a correction that is no place: expected numbers')
+    return CorrectedPoses(before.reshape(-1, 3), after.reshape(-1, 3))
 
 
 def _map_info(patch: GridPatch, load_ns: int) -> MapMetaData:

@@ -15,7 +15,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig
+from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizers import default_config
@@ -180,7 +180,6 @@ def _config(arguments: argparse.Namespace, parameters: NodeParameters) -> Pipeli
     return PipelineConfig(
         localizer=parameters.config('localizer', default_config(slam)),
         grid=cli.config_from(arguments, OccupancyConfig, grid),
-        window=parameters.config('grid_mapper', WindowConfig()),
         topology=parameters.config('topology_builder', TopologyConfig()),
     )
 

@@ -92,9 +92,10 @@ def test_without_mapping_no_feature_comes_grows_or_goes():
 
 def test_it_resumes_at_the_odometry_pose_after_a_restart():
     last = OdometryAnchor(0, se2.pose(1.0, 2.0, 0.5), se2.pose(1.0, 0.0, 0.0))
-    from_occupancy_map = EkfLocalizer.from_occupancy_map(None, last, se2.pose(2.0, 0.0, 0.0))
+    resumed = EkfLocalizer()
+    resumed.resume(last, se2.pose(2.0, 0.0, 0.0))
     expected = se2.compose(last.T_map_odom, se2.pose(2.0, 0.0, 0.0))
-    np.testing.assert_allclose(from_occupancy_map.pose, expected)
+    np.testing.assert_allclose(resumed.pose, expected)
 
 
 def test_input_that_makes_no_sense_is_refused():

@@ -22,8 +22,7 @@ def trajectory(stamp_ns):
 def taken(queue):
     """Stamp of each scan that is ready, and of the trajectory that comes before it."""
     return [
-        (each.scan.stamp_ns, None if path is None else messages.stamp_ns(path.header.stamp))
-        for each, path in queue.ready()
+        (each.scan.stamp_ns, each.trajectory and each.trajectory.since_ns) for each in queue.ready()
     ]
 
 

@@ -24,7 +24,6 @@ from thinmap_ros.core.ekf_slam.features import LineFeature
 from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
 from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor, OdometryIncrement, OdometryIncrements
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
@@ -124,20 +123,10 @@ class EkfLocalizer:
         localizer.set_pose(localizer.pose, _IN_SESSION)
         return localizer
 
-    @staticmethod
-    def from_occupancy_map(
-        patch: GridPatch, last: OdometryAnchor, T_odom_base: Array, config: EkfConfig | None = None
-    ) -> 'EkfLocalizer':
-        """EkfLocalizer that resumes at the last pose plus the odometry motion, without features.
-
-        T_odom_base (3,): odometry pose now. The occupancy map is not used.
-        """
-        localizer = EkfLocalizer(config)
+    def resume(self, last: OdometryAnchor, T_odom_base: Array) -> None:
+        """Continue at the last pose plus the odometry motion since, to T_odom_base (3,)."""
         moved = se2.between(last.T_odom_base, T_odom_base)
-        localizer.set_pose(
-            se2.compose(last.T_map_odom, T_odom_base), localizer._motion_noise(moved)
-        )
-        return localizer
+        self.set_pose(se2.compose(last.T_map_odom, T_odom_base), self._motion_noise(moved))
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
         """Estimate the pose of a scan, given the odometry pose (3,) at its stamp; update the map.

@@ -20,7 +20,6 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
@@ -85,6 +84,12 @@ class Localizer:
         return [*self._map.loops.keyframes.steps, *self._map.loops.graph.edges]
 
     @property
+    def calibration(self) -> Array:
+        """Calibration of the odometry (5, 4): its parameters, and their covariance (4, 4)."""
+        found = self._tracker.prediction.calibration
+        return np.vstack([found.parameters, found.covariance])
+
+    @property
     def features(self) -> list[LineFeature]:
         """Line features of the map: none, as it is made of scan points."""
         return []
@@ -111,12 +116,12 @@ class Localizer:
         """The published local map as arrays by name, for `from_state`; without the pose."""
         return self._map.local.published(self.keyframes).state()
 
-    def saved_keyframes(self) -> SavedKeyframes | None:
-        """The keyframes of the published map, for `from_state`.
+    def saved_keyframes(self, since_ns: int = 0) -> SavedKeyframes | None:
+        """The keyframes of the published map, for `from_state`, from the one of a stamp on.
 
         None without any, and if the map began with cells that are not made of keyframes.
         """
-        return self._map.loops.saved() if self._map.local.is_of_keyframes else None
+        return self._map.loops.saved(since_ns) if self._map.local.is_of_keyframes else None
 
     @staticmethod
     def from_state(
@@ -154,27 +159,32 @@ class Localizer:
         return localizer
 
     @staticmethod
-    def from_occupancy_map(
-        patch: GridPatch,
-        last: OdometryAnchor,
-        T_odom_base: Array,
-        config: LocalizerConfig | None = None,
+    def from_keyframes(
+        keyframes: SavedKeyframes, calibration: Array, config: LocalizerConfig | None = None
     ) -> 'Localizer':
-        """Localizer that resumes in an occupancy map, after the odometry motion since `last`.
+        """Localizer of the same robot in the map of saved keyframes, at the initial pose.
 
-        T_odom_base (3,): odometry pose now. The standard deviation of the pose is the odometry
-        noise since `last` plus one cell of the map (in rad, too, for the heading).
+        calibration (5, 4): of its odometry. It is delocalized until scans fit.
         """
-        localizer = Localizer.in_occupancy_map(patch, config)
+        localizer = Localizer(config)
+        localizer._tracker.prediction.calibration.begin_with(calibration[0], calibration[1:])
+        localizer._start_delocalized(None, keyframes)
+        return localizer
+
+    def resume(self, last: OdometryAnchor, T_odom_base: Array) -> None:
+        """Continue in the map after the odometry motion since `last`, to T_odom_base (3,).
+
+        The standard deviation of the pose is the odometry noise since `last` plus one cell of the
+        map (in rad, too, for the heading).
+        """
         moved = se2.between(last.T_odom_base, T_odom_base)
         turn = float(last.T_map_odom[2] + last.T_odom_base[2])
-        variances = odometry_variances(moved, localizer.config.odometry)
-        cell = np.full(3, patch.frame.resolution)
-        localizer.set_pose(
+        variances = odometry_variances(moved, self.config.odometry)
+        cell = np.full(3, self.config.local_map.resolution_m)
+        self.set_pose(
             se2.compose(last.T_map_odom, T_odom_base),
             rotated_covariance(np.diag(variances), turn) + np.diag(np.square(cell)),
         )
-        return localizer
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
         """Estimate the pose of a scan, given the odometry pose (3,) at its stamp; update the map.
@@ -216,8 +226,10 @@ class Localizer:
         """Scan points (N, 2) of the pieces that are apart, where dead reckoning puts them, m."""
         return self._map.apart_points()
 
-    def _start_delocalized(self, given: State, keyframes: SavedKeyframes | None = None) -> None:
-        """Start in a loaded local map: delocalized until scans fit."""
+    def _start_delocalized(
+        self, given: State | None, keyframes: SavedKeyframes | None = None
+    ) -> None:
+        """Start in a loaded map: delocalized until scans fit."""
         start = self.pose
         self._map.load(given, keyframes)
         self._map.place(start, self._tracker.slip_covariance())
@@ -239,13 +251,12 @@ class Localizer:
         evidence = self._tracker.track.evidence
         anchor = self._map.loops.anchor
         T_map_base = self.pose
-        covariance = self._tracker.covariance(anchor)
         apart = self._map.atlas.apart
         is_lost = apart is not None or evidence.is_lost
         match = tracked.match
         return Estimate(
             T_map_base,
-            covariance + UNKNOWN if is_lost else covariance,
+            self._tracker.covariance(anchor),
             se2.compose(T_map_base, se2.invert(self._tracker.prediction.T_odom_base)),
             inlier_ratio=0.0 if match is None else match.inlier_ratio,
             is_lost=is_lost,

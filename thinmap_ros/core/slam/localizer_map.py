@@ -58,11 +58,17 @@ class LocalizerMap:
         """Current pose T_map_base (3,)."""
         return self.loops.anchor.pose(self._tracker.track.T_anchor_base)
 
-    def load(self, given: State, keyframes: SavedKeyframes | None) -> None:
-        """Begin with the cells of a `LocalMap.state`, and the keyframes that they are made of."""
+    def load(self, given: State | None, keyframes: SavedKeyframes | None) -> None:
+        """Begin with the cells of a `LocalMap.state`, and the keyframes that they are made of.
+
+        Without cells, these are rendered from the keyframes.
+        """
         if keyframes is not None:
             self.loops.load(keyframes)
-        self.local.load(given, len(self.loops.keyframes))
+        if given is None:
+            self.local.rerender(self.loops.keyframes.frames, self.pose)
+        else:
+            self.local.load(given, len(self.loops.keyframes))
 
     def place(self, T_map_base: Array, covariance: Array) -> None:
         """Place the robot at a given pose (3,) with covariance (3, 3) in the published map."""

@@ -5,9 +5,6 @@ from typing import Any, Protocol
 
 from thinmap_ros.core.config import parameters_of, with_values
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
-from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import OdometryAnchor
-from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.snapshot import State
@@ -24,11 +21,6 @@ class LocalizerClass(Protocol):
 
     def from_state(self, state: State, config: Any) -> AnyLocalizer:
         """In the map of a saved state, at the configured initial pose."""
-
-    def from_occupancy_map(
-        self, patch: GridPatch, last: OdometryAnchor, T_odom_base: Array, config: Any
-    ) -> AnyLocalizer:
-        """Resumed after the odometry motion since `last`."""
 
 
 _LOCALIZERS: dict[type[StartConfig], LocalizerClass] = {

@@ -80,6 +80,13 @@ class OdometryCalibration:
         self._travelled_m = self._turned_rad = 0.0
         self._random = np.zeros(2)
 
+    def begin_with(self, parameters: Array, covariance: Array) -> None:
+        """Begin with parameters (4,) and covariance (4, 4) that were found before."""
+        self.parameters = parameters
+        self.covariance = covariance
+        self._spans = _Spans(parameters, covariance)
+        self.applied = parameters
+
     @property
     def spans(self) -> int:
         """Number of spans that the parameters were estimated from."""

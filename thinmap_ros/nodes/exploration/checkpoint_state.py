@@ -47,7 +47,7 @@ class ExplorerState:
 
         Raises InputError where the others are invalid.
         """
-        latest_ns, rest = snapshot.split_stamp(state)
+        latest_ns, rest = snapshot.split_number(state, 'latest_ns')
         own = {name: array for name, array in rest.items() if name in _IDS}
         ids = snapshot.validate(own, _IDS, 'explorer')
         goal_id = ids['goal_ids'][:1].tobytes()

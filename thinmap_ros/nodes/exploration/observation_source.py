@@ -22,7 +22,7 @@ from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.localized_scan import mapped_scan_from_msg
+from thinmap_ros.ros.localized_scan import localized_scan_from_msg
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 _LOOK_PERIOD_S = 0.5
@@ -126,9 +126,8 @@ class ObservationSource:
         self._grids.received(message.grid)
         now_s = self._node.elapsed_time.now_s()
         self.watchdog.add_tracking(messages.is_lost(message.localized.status), now_s)
-        mapped = mapped_scan_from_msg(message)
-        self._mapped.paste(mapped.window)
-        localized = mapped.localized
+        localized = localized_scan_from_msg(message.localized)
+        self._mapped.paste(messages.grid_from_msg(message.grid))
         if localized.is_blind:
             return  # ignored: a blind scan observes nothing
         self.watchdog.awaited = InputWatchdog.awaited

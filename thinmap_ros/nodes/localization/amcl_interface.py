@@ -56,11 +56,7 @@ class AmclInterface:
         self._last = (stamp_ns, estimate)
         if estimate.is_lost:
             return
-        self._pose.publish(
-            messages.pose_with_covariance_msg(
-                estimate.T_map_base, estimate.covariance, self._map_frame, stamp_ns
-            )
-        )
+        self._pose.publish(messages.estimate_msg(estimate, self._map_frame, stamp_ns))
         if self._cloud.get_subscription_count():
             self._cloud.publish(self._posterior(stamp_ns, estimate))
 

@@ -114,7 +114,8 @@ def killed(config, seed, resolution, slip):
             begin = odom if k == 450 else begin
             slipped = se2.compose(se2.compose(begin, off), se2.between(begin, odom))
             if k == 450:
-                localizer = Localizer.from_occupancy_map(grid.known_area(), last, slipped, config)
+                localizer = Localizer.in_occupancy_map(grid.known_area(), config)
+                localizer.resume(last, slipped)
             estimate = localizer.step(scan, slipped)
             after = max(after, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
     return before, after, estimate

@@ -171,10 +171,17 @@ class LoopClosure:
         self.graph.edges = list(saved.edges)
         self.pieces.load(1 + max(frame.submap for frame in saved.frames))
 
-    def saved(self) -> SavedKeyframes | None:
-        """The keyframes of the published map, without a pending one; None if there are none."""
+    def saved(self, since_ns: int = 0) -> SavedKeyframes | None:
+        """The keyframes of the published map, without a pending one; None if there are none.
+
+        since_ns: stamp of the first.
+        """
         frames = self.keyframes.frames
         is_saved = [self.pieces.is_published(frame.submap) for frame in frames]
+        if since_ns:
+            stamps_ns = [frame.scan.stamp_ns for frame in frames]
+            first = stamps_ns.index(since_ns) if since_ns in stamps_ns else len(frames)
+            is_saved[:first] = [False] * first
         if not any(is_saved):
             return None
         steps = self.keyframes.steps

@@ -62,12 +62,14 @@ class SavedKeyframes:
 
     Nothing refers to a calibration of the odometry: its uncertainty when they were saved is part of
     the covariances, in each step by itself. Scans have the stamps 1, 2, 3, ... ns in their order,
-    so that they are told from each other and from all scans of a robot.
+    so that they are told from each other and from all scans of a robot. stamps_ns: those that the
+    scans had; unknown of a session.
     """
 
     frames: list[Keyframe]
     steps: list[Edge]
     edges: list[Edge]
+    stamps_ns: Sequence[int] = ()
 
     @staticmethod
     def of(
@@ -97,7 +99,37 @@ class SavedKeyframes:
             ],
             [renumbered(edge) for edge in own_steps],
             [renumbered(edge) for edge in own_edges],
+            [frames[k].scan.stamp_ns for k in kept],
         )
+
+    def extended(self, tail: 'SavedKeyframes') -> 'SavedKeyframes':
+        """With the keyframes that came next; the first of these is the last one here.
+
+        It may have been corrected in between: the others move along.
+        """
+        last = self.frames[-1]
+        T = se2.compose(last.T_map_base, se2.invert(tail.frames[0].T_map_base))
+        by = len(self.frames) - 1
+        frames = [
+            replace(frame, T_map_base=se2.compose(T, frame.T_map_base), submap=last.submap)
+            for frame in tail.frames[1:]
+        ]
+        steps, edges = (
+            [replace(edge, a=edge.a + by, b=edge.b + by) for edge in own]
+            for own in (tail.steps, tail.edges)
+        )
+        return SavedKeyframes(
+            self.frames + frames,
+            self.steps + steps,
+            self.edges + edges,
+            [*self.stamps_ns, *tail.stamps_ns[1:]],
+        )
+
+    def with_stamps(self, stamps_ns: Sequence[int]) -> 'SavedKeyframes':
+        """The keyframes with the stamps that their scans had: the same robot continues."""
+        pairs = zip(self.frames, stamps_ns, strict=True)
+        frames = [replace(f, scan=replace(f.scan, stamp_ns=stamp_ns)) for f, stamp_ns in pairs]
+        return replace(self, frames=frames, stamps_ns=stamps_ns)
 
     @property
     def scans(self) -> list[tuple[Scan, Array]]:

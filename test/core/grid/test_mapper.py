@@ -1,0 +1,69 @@
+"""The stage of the map."""
+
+import numpy as np
+import pytest
+from support.slam_room import ROOM, scan_in
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.estimate import Placement
+from thinmap_ros.core.grid.mapper import Mapper
+from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.stage import LocalizedScan, Trajectory
+
+POSES = [se2.pose(2.0 + 0.3 * k, 2.0, 0.0) for k in range(8)]
+
+
+def localized(k, T_map_base, trajectory=None):
+    scan = scan_in(ROOM, POSES[k], None, k + 1)
+    return LocalizedScan(scan, T_map_base, Placement.MAP, trajectory)
+
+
+def corrected(mapper):
+    """Map four scans 0.5 m off, correct them, and add others until the map is complete."""
+    for k in range(4):
+        mapper.step(localized(k, POSES[k] + [0.5, 0.0, 0.0]))
+    trajectory = Trajectory(np.arange(1, 5), np.array(POSES[:4]), 5)
+    return [mapper.step(localized(k, POSES[k], trajectory if k == 4 else None)) for k in (4, 5)]
+
+
+def test_an_update_has_the_whole_map_once_all_of_it_is_corrected():
+    begun, complete = corrected(Mapper())
+    assert begun.is_rerendering and begun.whole is None and begun.corrected_ns == 0
+    assert not complete.is_rerendering and complete.corrected_ns == 5
+    whole = complete.whole
+    assert (whole.corrected_ns, whole.previous_ns) == (5, 0)
+    by = whole.moved.before - whole.moved.after
+    np.testing.assert_allclose(by, [[0.5, 0.0, 0.0]] * 5)
+
+
+def test_a_correction_is_completed_at_the_end_and_described_as_long_as_it_is_the_newest():
+    mapper = Mapper()
+    for k in range(4):
+        mapper.step(localized(k, POSES[k]))
+    assert mapper.correct(Trajectory(np.arange(1, 5), np.array(POSES[:4]), 5))
+    whole = mapper.finish()
+    assert whole.corrected_ns == 5 and len(whole.moved.after) == 4
+    assert mapper.finish() is None
+    mapper.step(localized(4, POSES[4]))
+    assert len(mapper.whole_map().moved.after) == 4
+
+
+def test_updates_come_with_every_nth_scan_and_show_what_has_changed_since_the_last():
+    mapper = Mapper(scans_per_update=3)
+    updates = [mapper.step(localized(k, POSES[k])) for k in range(7)]
+    assert [update is not None for update in updates] == [True, False, False] * 2 + [True]
+    assert Mapper(window_m=4.0).step(localized(0, POSES[0])).changes.shape == (40, 40)
+
+
+def test_a_saved_map_is_continued_and_not_corrected():
+    mapper = Mapper()
+    mapper.step(localized(0, POSES[0]))
+    other = Mapper()
+    other.restore(mapper.state())
+    patches = [each.whole_map().patch for each in (mapper, other)]
+    np.testing.assert_array_equal(patches[0].cells, patches[1].cells)
+    assert not other.correct(Trajectory(np.arange(1, 2), np.array(POSES[:1]), 5))
+    assert other.whole_map().corrected_ns == 5
+    with pytest.raises(InputError, match='resolution_m'):
+        Mapper(OccupancyConfig(resolution_m=0.05)).restore(mapper.state())

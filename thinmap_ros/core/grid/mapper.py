@@ -1,0 +1,155 @@
+"""From localized scans to the map."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.scan_history import CorrectedPoses
+from thinmap_ros.core.snapshot import State
+from thinmap_ros.core.stage import LocalizedScan, Stage, Trajectory
+
+_NOWHERE = CorrectedPoses(np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class WholeMap:
+    """All known cells of the map.
+
+    corrected_ns: stamp of the newest trajectory that they follow; previous_ns: of the one before;
+    moved: where the map has moved in between, by the poses of its scans.
+    """
+
+    patch: GridPatch
+    corrected_ns: int = 0
+    previous_ns: int = 0
+    moved: CorrectedPoses = _NOWHERE
+
+
+@dataclass(frozen=True, eq=False)
+class MapUpdate:
+    """What a scan has changed in the map.
+
+    changes: cells of the map, among them those around the robot that have changed; None: none has.
+    corrected_ns: stamp of the newest trajectory that all of the map follows; is_rerendering:
+    whether a newer one has not reached all of it. whole: the map, once it has been rendered again.
+    """
+
+    localized: LocalizedScan
+    changes: GridPatch | None
+    corrected_ns: int
+    is_rerendering: bool
+    whole: WholeMap | None = None
+
+
+class Mapper(Stage[LocalizedScan, MapUpdate]):
+    """The stage of the map: each scan is added at its pose, and the map follows corrections.
+
+    grid: the map; refusals: why scans are not on it, a reason for each.
+    """
+
+    def __init__(
+        self,
+        config: OccupancyConfig | None = None,
+        keeps_scans: bool = True,
+        window_m: float | None = None,
+        scans_per_update: int = 1,
+    ) -> None:
+        """Start empty. If keeps_scans is False, the map is never corrected.
+
+        window_m: edge of the square around the robot that an update shows; None: all changes.
+        """
+        self._config = config or OccupancyConfig()
+        self._keeps_scans = keeps_scans
+        self._window_m = window_m
+        self._scans_per_update = scans_per_update
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin again with an empty map."""
+        self.replace(CorrectableGrid(OccupancyGrid(self._config), self._keeps_scans))
+        self._is_given = False
+
+    def replace(self, grid: CorrectableGrid) -> None:
+        """Continue with another map, whose cells may have any size."""
+        self.grid = grid
+        self.refusals: list[str] = []
+        self._is_given = True
+        self._scans = 0
+        self._previous_ns = 0
+        self._moved = _NOWHERE
+
+    def state(self) -> State:
+        """The cells of the map."""
+        return self.grid.shown.state()
+
+    def restore(self, state: State) -> None:
+        """Continue with saved cells, which are not corrected. Raises InputError for others."""
+        grid = OccupancyGrid.from_state(state, self._config)
+        expected_m = self._config.resolution_m
+        if not self._is_given and grid.frame.resolution != expected_m:
+            raise InputError(
+                f'map with {grid.frame.resolution} m a cell: expected {expected_m} m (resolution_m)'
+            )
+        self.replace(CorrectableGrid(grid, keeps_scans=False))
+
+    def correct(self, trajectory: Trajectory) -> bool:
+        """Begin to follow a trajectory; returns whether the map can be corrected."""
+        before_ns = self.grid.corrected_ns
+        is_corrected = self.grid.apply_correction(*trajectory)
+        if not is_corrected:
+            self._note(before_ns, _NOWHERE)
+        return is_corrected
+
+    def step(self, localized: LocalizedScan, /) -> MapUpdate | None:
+        """Add a scan; None before the next update is due."""
+        if localized.trajectory is not None:
+            self.correct(localized.trajectory)
+        before_ns = self.grid.corrected_ns
+        moved = self.grid.update(localized.scan, localized.T_map_base, localized.placement)
+        self.refusals = self.grid.take_refusals()
+        is_due = self._scans % self._scans_per_update == 0
+        self._scans += 1
+        if moved is not None:
+            self._note(before_ns, moved)
+        elif not is_due:
+            return None
+        return MapUpdate(
+            localized,
+            self._changes(localized, moved is not None),
+            self.grid.corrected_ns,
+            self.grid.is_rerendering,
+            None if moved is None else self.whole_map(),
+        )
+
+    def finish(self) -> WholeMap | None:
+        """Complete a correction; returns the map where it was not complete before."""
+        before_ns = self.grid.corrected_ns
+        moved = self.grid.finish()
+        self.refusals = self.grid.take_refusals()
+        if moved is None:
+            return None
+        self._note(before_ns, moved)
+        return self.whole_map()
+
+    def whole_map(self) -> WholeMap:
+        """All known cells."""
+        grid = self.grid
+        return WholeMap(grid.shown.known_area(), grid.corrected_ns, self._previous_ns, self._moved)
+
+    def _note(self, before_ns: int, moved: CorrectedPoses) -> None:
+        """The map has been corrected, unless it was rendered again for another reason."""
+        if before_ns != self.grid.corrected_ns:
+            self._previous_ns = before_ns
+            self._moved = moved
+
+    def _changes(self, localized: LocalizedScan, is_whole_new: bool) -> GridPatch | None:
+        grid = self.grid.shown
+        if self._window_m is not None:
+            x, y, _ = localized.T_map_base
+            return grid.window(x, y, self._window_m)
+        changes = grid.take_changes()
+        return None if is_whole_new else changes
