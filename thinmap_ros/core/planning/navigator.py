@@ -35,6 +35,8 @@ SENSOR_DELAY_NS = 500_000_000
 _ROUNDING_M_S = 1e-9
 # A waypoint counts as passed on this last part of the path to it at most.
 _MAX_WAYPOINT_PASS_M = 0.7
+# Reasons that begin so name a goal to which the map has no path, whatever stands there now.
+NO_PATH = 'no path'
 _OBSTACLE = 'an obstacle blocks the path'
 _HIDDEN = 'the laser does not see the path: sector of invalid beams'
 _STUCK = (
@@ -302,7 +304,7 @@ class Navigator:
             self.path = None
             where = f'({self._target[0]:.2f}, {self._target[1]:.2f})'
             never = first and self._progress.blocked_s == 0.0
-            return f'no path to {where}' if never else f'the path to {where} is blocked'
+            return f'{NO_PATH} to {where}' if never else f'the path to {where} is blocked'
         self.path = path
         return ''
 
@@ -345,7 +347,7 @@ class Navigator:
 
     def _wait(self, reason: str, dt_s: float) -> Command:
         """Stop; abort the goal if there was never a path, or after blocked_timeout_s."""
-        never = reason.startswith('no path')
+        never = reason.startswith(NO_PATH)
         self._progress.blocked_s += dt_s
         self._progress.remaining_m = 0.0
         if never or self._progress.blocked_s > self.config.blocked_timeout_s:
