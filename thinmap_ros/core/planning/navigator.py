@@ -39,6 +39,7 @@ _MAX_WAYPOINT_PASS_M = 0.7
 NO_PATH = 'no path'
 _OBSTACLE = 'an obstacle blocks the path'
 _HIDDEN = 'the laser does not see the path: sector of invalid beams'
+_OTHER_ROBOT = 'another robot is in the way'
 _STUCK = (
     'the robot does not move as commanded: wheels blocked or off, or an obstacle that the laser '
     'does not see'
@@ -123,7 +124,8 @@ class _Progress:
     """Progress towards a goal: age of the path, time at standstill, remaining path length.
 
     standstills: number of them without progress; recoveries: all of them, up to the last waypoint
-    too; nearest_m: smallest remaining length; is_near: whether the target has been near.
+    too; nearest_m: smallest remaining length; is_near: whether the target has been near; yielded_s:
+    time at standstill for other robots since the last progress.
     """
 
     path_age_s: float = 0.0
@@ -133,6 +135,7 @@ class _Progress:
     recoveries: int = 0
     nearest_m: float = math.inf
     is_near: bool = False
+    yielded_s: float = 0.0
 
 
 class _Motion:
@@ -237,6 +240,19 @@ class Navigator:
             if reason:
                 return self._wait(reason, dt_s)
         return self._drive(T_map_base, dt_s)
+
+    def give_way(self, command: Command, dt_s: float) -> Command:
+        """Command in place of one with which another robot would be touched: turn, or stand.
+
+        The goal is aborted after blocked_timeout_s without progress.
+        """
+        self._progress.yielded_s += dt_s
+        if self._progress.yielded_s > self.config.blocked_timeout_s:
+            self.cancel()
+            still = self._follower.override_speed(0.0, 0.0)
+            return Command(*still, 'failed', _OTHER_ROBOT, is_timeout=True)
+        turn = self._follower.override_speed(0.0, command.w)
+        return Command(*turn, 'blocked', _OTHER_ROBOT)
 
     @property
     def _target(self) -> tuple[float, float]:
@@ -361,6 +377,7 @@ class Navigator:
         self._progress.remaining_m = length_from(self.path, nearest)
         if self._progress.remaining_m < self._progress.nearest_m - self.config.progress_m:
             self._progress.standstills = 0
+            self._progress.yielded_s = 0.0
             self._progress.nearest_m = self._progress.remaining_m
         before = (self._follower.v, self._follower.w)
         room = self._obstacles.clearance_along(self.path, nearest, self.config.clearance_ahead_m)
