@@ -52,4 +52,7 @@ def _places(motion: Motion, times: Array) -> Array:
     half_turn = 0.5 * motion.w * times
     chord = motion.v * times * np.sinc(half_turn / math.pi)
     heading = motion.pose[2] + half_turn
-    return motion.pose[:2] + chord[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+    places: Array = motion.pose[:2] + chord[:, None] * np.column_stack(
+        [np.cos(heading), np.sin(heading)]
+    )
+    return places

@@ -1,0 +1,81 @@
+"""Robots that explore one world together, in a closed loop."""
+
+import math
+from functools import cache
+
+import numpy as np
+
+from thinmap_ros.closed_loop import Options
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.evaluation.exploration_run import explore
+from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
+from thinmap_ros.sim.world import World
+from thinmap_ros.team.radio import Trouble
+
+START = se2.pose(5.0, 2.5, 0.5 * math.pi)
+BESIDE = se2.pose(5.8, 2.5, 0.5 * math.pi)
+OPTIONS = Options(speed_m_s=0.5, seed=1)
+
+
+def world():
+    """A corridor of 10 m, with a room at each end behind a door of 1 m."""
+    cells = np.ones((60, 200), dtype=np.uint8)
+    cells[20:40, 50:150] = 0
+    cells[5:55, 5:45] = 0
+    cells[5:55, 155:195] = 0
+    cells[25:35, 40:160] = 0
+    return World('two_rooms', cells, GridFrame(-5.0, -0.5, 0.1), START)
+
+
+@cache
+def run(robots, **trouble):
+    starts = [START, BESIDE][:robots]
+    return explore_together(world(), starts, OPTIONS, TeamOptions(trouble=Trouble(**trouble)))
+
+
+def test_a_team_of_one_drives_as_a_robot_alone():
+    alone, report = explore(world(), START, OPTIONS)
+    team, of_team = run(1)
+    poses = np.array(team.members[0].loop.log.true_poses)
+    assert np.array_equal(poses, np.array(alone.log.true_poses))
+    assert of_team['time_at'] == report['time_at']
+    assert of_team['reason'] == report['reason']
+
+
+def test_two_robots_are_faster_and_do_not_touch():
+    _, one = run(1)
+    team, two = run(2)
+    assert two['finished']
+    assert two['coverage'] >= 0.995
+    assert two['time'] < 0.7 * one['time']
+    assert two['distance'] < 1.3 * one['distance']
+    assert two['collisions'] == 0
+    # One room each.
+    ends = [member.loop.log.true_poses[-1][0] for member in team.members]
+    assert min(ends) < 3.0 < 7.0 < max(ends)
+
+
+def test_the_same_seed_gives_the_same_run():
+    one = run(2)[0]
+    again = run.__wrapped__(2)[0]
+    for a, b in zip(one.members, again.members, strict=True):
+        assert np.array_equal(a.loop.log.true_poses, b.loop.log.true_poses)
+
+
+def test_when_a_robot_dies_the_other_one_finishes():
+    team, report = run(2, dead=(1, 5.0))
+    assert report['finished']
+    assert report['coverage'] >= 0.99
+    dead = np.array(team.members[1].loop.log.true_poses)
+    assert len(dead) == 25
+    assert report['collisions'] == 0
+
+
+def test_robots_do_not_stay_in_the_map():
+    team, _ = run(2)
+    patch = team.maps.known_area()
+    walls = patch.frame.centres_of(np.argwhere(patch.occupied))
+    distance_m = world().distance_to_wall_m
+    rows, cols = world().frame.cells_of(walls).T
+    assert distance_m[rows, cols].max() < 0.2
