@@ -11,6 +11,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
 from thinmap_ros.sim.world import World
+from thinmap_ros.team.own_maps import TILE_PERIOD_S
 from thinmap_ros.team.radio import Trouble
 
 START = se2.pose(5.0, 2.5, 0.5 * math.pi)
@@ -29,9 +30,10 @@ def world():
 
 
 @cache
-def run(robots, **trouble):
+def run(robots, has_own_maps=False, **trouble):
     starts = [START, BESIDE][:robots]
-    return explore_together(world(), starts, OPTIONS, TeamOptions(trouble=Trouble(**trouble)))
+    team = TeamOptions(trouble=Trouble(**trouble), has_own_maps=has_own_maps)
+    return explore_together(world(), starts, OPTIONS, team)
 
 
 def test_a_team_of_one_drives_as_a_robot_alone():
@@ -79,3 +81,31 @@ def test_robots_do_not_stay_in_the_map():
     distance_m = world().distance_to_wall_m
     rows, cols = world().frame.cells_of(walls).T
     assert distance_m[rows, cols].max() < 0.2
+
+
+def test_robots_with_own_maps_explore_as_with_one():
+    _, shared = run(2)
+    _, own = run(2, has_own_maps=True)
+    assert own['finished']
+    assert own['time'] <= shared['time'] + 2.0 * TILE_PERIOD_S
+    # Each knows what the other one has seen.
+    assert min(robot['coverage'] for robot in own['robots']) >= 0.995
+    assert 0.0 < own['bytes_per_m']['tiles'] < 300.0
+
+
+def test_a_robot_that_was_out_of_reach_catches_up():
+    _, report = run(2, has_own_maps=True, out_of_reach=(1, 4.0, 15.0))
+    assert report['finished']
+    assert min(robot['coverage'] for robot in report['robots']) >= 0.995
+
+
+def test_messages_that_are_lost_leave_no_holes():
+    _, report = run(2, has_own_maps=True, loss=0.3)
+    assert report['finished']
+    assert min(robot['coverage'] for robot in report['robots']) >= 0.995
+
+
+def test_claims_may_be_late():
+    _, report = run(2, claim_delay_s=5.0)
+    assert report['finished']
+    assert report['time'] < 1.3 * run(2)[1]['time']

@@ -120,6 +120,7 @@ def test_a_map_without_a_start_can_be_explored_from_a_given_one(tmp_path: Path) 
         (['WORLD', '--robots', '2', '--strategy', 'paper'], 'the only one that shares candidates'),
         (['WORLD', '--robots', '2', '--kidnap-at', '5'], '--robots=2: expected no --kidnap-at'),
         (['WORLD', '--robots', '2', '--claim-delay', 'nan'], '--claim-delay=nan: expected 0 to'),
+        (['WORLD', '--own-maps'], '--own-maps: expected --robots of 2 or more'),
         (['WORLD', '--claim-delay', '3'], 'expected --robots of 2 or more'),
     ],
 )

@@ -17,16 +17,22 @@ from thinmap_ros.sim.other_robots import SharedWorld
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.team.loop import TeamLoop
-from thinmap_ros.team.maps import SharedMap
+from thinmap_ros.team.maps import SharedMap, TeamMaps
+from thinmap_ros.team.own_maps import OwnMaps
 from thinmap_ros.team.radio import Trouble
 
 
 @dataclass(frozen=True)
 class TeamOptions:
-    """Options of a team, beside those of each robot."""
+    """Options of a team, beside those of each robot.
+
+    has_own_maps: whether each robot has a map of its own and sends the others what has changed, as
+    it does with poses by SLAM, or all have one map at once.
+    """
 
     config: TeamConfig = field(default_factory=TeamConfig)
     trouble: Trouble = field(default_factory=Trouble)
+    has_own_maps: bool = False
 
 
 def make_team(
@@ -49,7 +55,9 @@ def make_team(
             assert isinstance(other_world, SharedWorld)
             other_world.others.append(loop.simulation.robot)
         loops.append(loop)
-    maps = SharedMap(loops, loops[0].pipeline.config.grid)
+    maps: TeamMaps = SharedMap(loops, loops[0].pipeline.config.grid)
+    if team.has_own_maps or options.localization == 'slam':
+        maps = OwnMaps(loops, team.trouble, options.seed)
     return TeamLoop(loops, maps, team.trouble, options.seed)
 
 
@@ -86,14 +94,18 @@ def explore_together(
             {
                 'name': member.name,
                 'start': [round(float(number), 3) for number in start],
+                'coverage': round(goal.coverage(loop.maps.view(number)[1]), 5),
                 'distance': round(distance, 3),
                 'collisions': member.loop.simulation.robot.collisions,
                 'yielded_s': round(member.yielded_s, 1),
             }
-            for member, start, distance in zip(loop.members, starts, distances, strict=True)
+            for number, (member, start, distance) in enumerate(
+                zip(loop.members, starts, distances, strict=True)
+            )
         ],
         'bytes_per_m': {
-            'claims': round(loop.claims.sent_bytes / max(sum(distances), 1.0), 1),
+            kind: round(sent / max(sum(distances), 1.0), 1)
+            for kind, sent in _sent_bytes(loop).items()
         },
         'curve': [[round(float(at), 2), round(float(share), 4)] for at, share in coverage],
         'world': world.name,
@@ -105,6 +117,14 @@ def explore_together(
         'decision_s': [round(seconds, 3) for seconds in decision_s],
     }
     return loop, report
+
+
+def _sent_bytes(loop: TeamLoop) -> dict[str, int]:
+    """Bytes that all robots have sent, each message once, by kind."""
+    sent = {'claims': loop.claims.sent_bytes}
+    if isinstance(loop.maps, OwnMaps):
+        sent['tiles'] = loop.maps.tiles.sent_bytes
+    return sent
 
 
 def _path_length(poses: Sequence[Array]) -> float:

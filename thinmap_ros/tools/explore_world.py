@@ -136,6 +136,8 @@ def _check_team(arguments: argparse.Namespace) -> None:
     if robots == 1:
         if arguments.claim_delay:
             raise InputError('--claim-delay: expected --robots of 2 or more')
+        if arguments.own_maps:
+            raise InputError('--own-maps: expected --robots of 2 or more')
         return
     if arguments.strategy != DEFAULT:
         raise InputError(
@@ -170,7 +172,8 @@ def _work(arguments: argparse.Namespace) -> None:
         else:
             radius_m = PRESETS[options.robot].radius_m
             starts = starts_side_by_side(world, start, arguments.robots, radius_m)
-            team = TeamOptions(trouble=Trouble(claim_delay_s=arguments.claim_delay))
+            trouble = Trouble(claim_delay_s=arguments.claim_delay)
+            team = TeamOptions(trouble=trouble, has_own_maps=arguments.own_maps)
             team_loop, report = explore_together(world, starts, options, team, show)
             write = partial(write_team_outputs, team_loop)
     write(report, arguments.out)
@@ -201,6 +204,12 @@ def main() -> None:
         type=float,
         default=0.0,
         help='time that a claim takes from robot to robot, s (default 0)',
+    )
+    parser.add_argument(
+        '--own-maps',
+        action='store_true',
+        help='each robot has its own map, and sends the others the tiles that have changed; always '
+        'so with --localization=slam',
     )
     add_options(parser)
     cli.run(_work, parser)
