@@ -21,7 +21,7 @@ from thinmap_ros.team.maps import TeamMaps
 from thinmap_ros.team.radio import Radio, Trouble
 
 _CLAIM_PERIOD_S = 1.0
-_NEAR_M = 3.0  # robots so near to each other tell their motion ten times a second
+_NEAR_M = 3.0  # robots that drive so near to another one tell their motion ten times a second
 _CLAIM_BYTES = 104  # of thinmap_msgs with header, pose, speed, place and path length
 _SETTLED_BYTES = 12
 # Beyond the radius of a robot: noise of the laser, and its way in the tenth of a second since.
@@ -186,8 +186,11 @@ class TeamLoop:
         for number, own in motions.items():
             others = {other: motion for other, motion in motions.items() if other != number}
             self.members[number].motions |= {i: (now_s, motion) for i, motion in others.items()}
-            away_m = [math.dist(own.pose[:2], other.pose[:2]) for other in others.values()]
-            self.claims.sent_bytes += _CLAIM_BYTES * (min(away_m, default=math.inf) < _NEAR_M)
+            is_near = any(
+                math.dist(own.pose[:2], other.pose[:2]) < _NEAR_M for other in others.values()
+            )
+            is_moving = own.v != 0.0 or own.w != 0.0
+            self.claims.sent_bytes += _CLAIM_BYTES * (is_near and is_moving)
 
     def _right_of_way(self, member: Member) -> Callable[[Array, Command], bool]:
         others = list(self._heard(member))

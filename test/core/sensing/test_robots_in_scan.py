@@ -25,7 +25,8 @@ def test_beams_at_a_robot_and_those_beside_them_are_invalid():
 
 
 def test_the_first_beam_has_one_neighbour():
-    x, y = 2.0 + 2.0 * math.sin(0.2), 3.0 + 2.0 * math.cos(0.2)
+    x = 2.0 + 2.0 * math.sin(0.2)
+    y = 3.0 + 2.0 * math.cos(0.2)
     cut = without_robots(scan_of([2.0, 5.0, 5.0, 5.0, 5.0]), POSE, np.array([[x, y]]), 0.35)
     assert np.isnan(cut.ranges_m).tolist() == [True, True, False, False, False]
 

@@ -160,9 +160,9 @@ class ReceivedTiles:
         low = cells.min(axis=0)
         high = cells.max(axis=0) + EDGE
         frame = self._frame
-        x, y = frame.origin_x, frame.origin_y
+        origin = (frame.origin_x, frame.origin_y)
         corners = np.array([[low[1], low[0]], [high[1], high[0]]]) * frame.resolution
-        return np.asarray(corners + (x, y))
+        return np.asarray(corners + origin)
 
     def completed(self, own: GridPatch) -> GridPatch:
         """A robot's own map, and what others know where it is undecided."""
