@@ -1,9 +1,11 @@
 """Robots that explore one world together, in a closed loop."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.core import se2
@@ -11,6 +13,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
 from thinmap_ros.sim.world import World
+from thinmap_ros.team import loop as team_loop
 from thinmap_ros.team.own_maps import TILE_PERIOD_S
 from thinmap_ros.team.radio import Trouble
 
@@ -93,16 +96,45 @@ def test_robots_with_own_maps_explore_as_with_one():
     assert 0.0 < own['bytes_per_m']['tiles'] < 300.0
 
 
-def test_a_robot_that_was_out_of_reach_catches_up():
-    _, report = run(2, has_own_maps=True, out_of_reach=(1, 4.0, 15.0))
+@pytest.mark.parametrize('trouble', [{'out_of_reach': (1, 4.0, 12.0)}, {'loss': 0.3}])
+def test_a_robot_that_missed_messages_catches_up(trouble):
+    team, report = run(2, has_own_maps=True, **trouble)
     assert report['finished']
     assert min(robot['coverage'] for robot in report['robots']) >= 0.995
+    one, other = team.maps._maps
+    for receiver, sender in ((one, other), (other, one)):
+        assert receiver.received.version_of(sender.team.name) >= sender.sender.version - 1
 
 
-def test_messages_that_are_lost_leave_no_holes():
-    _, report = run(2, has_own_maps=True, loss=0.3)
+def test_robots_that_would_touch_stand_and_turn(monkeypatch):
+    monkeypatch.setattr(team_loop, 'must_stop', lambda *situation: True)
+    starts = [START, BESIDE]
+    _, report = explore_together(world(), starts, replace(OPTIONS, time_limit_s=6.0))
+    assert report['distance'] == 0.0
+    assert all(robot['yielded_s'] > 1.0 for robot in report['robots'])
+
+
+@pytest.mark.parametrize(('limit_s', 'is_wall'), [(10.0, False), (40.0, True)])
+def test_a_dead_robot_becomes_a_wall_when_its_last_pose_is_old(limit_s, is_wall):
+    starts = [se2.pose(5.0, 2.5, 0.0), se2.pose(6.0, 2.5, 0.0)]
+    trouble = Trouble(dead=(1, 0.5))
+    options = replace(OPTIONS, time_limit_s=limit_s)
+    team, _ = explore_together(world(), starts, options, TeamOptions(trouble=trouble))
+    patch = team.maps.known_area()
+    walls = patch.frame.centres_of(np.argwhere(patch.occupied))
+    place = team.members[1].loop.log.true_poses[-1][:2]
+    assert (np.hypot(*(walls - place).T).min() < 0.3) == is_wall
+
+
+def test_the_graph_holds_what_each_robot_can_reach():
+    divided = world()
+    divided.occupied[:, 98:102] = 1
+    starts = [START - (1.0, 0.0, 0.0), BESIDE]
+    team, report = explore_together(divided, starts, OPTIONS)
+    nodes = team.maps.view(0)[0].nodes.values()
     assert report['finished']
-    assert min(robot['coverage'] for robot in report['robots']) >= 0.995
+    assert min(node.x for node in nodes) < 4.0
+    assert max(node.x for node in nodes) > 6.0
 
 
 def test_claims_may_be_late():

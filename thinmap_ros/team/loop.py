@@ -21,7 +21,7 @@ from thinmap_ros.team.maps import TeamMaps
 from thinmap_ros.team.radio import Radio, Trouble
 
 _CLAIM_PERIOD_S = 1.0
-_NEAR_M = 3.0  # robots that drive so near to another one tell their motion ten times a second
+_NEAR_M = 3.0  # robots that drive so near to another one send their motion ten times a second
 _CLAIM_BYTES = 104  # of thinmap_msgs with header, pose, speed, place and path length
 _SETTLED_BYTES = 12
 # Beyond the radius of a robot: noise of the laser, and its way in the tenth of a second since.
@@ -31,7 +31,7 @@ _GIVE_WAY_MARGIN_M = 0.11
 
 @dataclass(eq=False)
 class Member:
-    """A robot of a team: its closed loop and explorer, and the motions heard of others, with times.
+    """A robot of a team: its closed loop and explorer, and motions of others with their times.
 
     yielded_steps: steps of control in which it has given way.
     """
@@ -63,12 +63,12 @@ class Member:
         return self.loop.pose_at(self.moment.T_odom_base)
 
     def motion(self) -> Motion:
-        """What the others are told of its motion."""
+        """The motion that it sends."""
         robot = self.loop.simulation.robot
         return Motion(self.name, self.pose, robot.v, robot.w)
 
     def claim(self) -> Claim:
-        """What the others are told of its target."""
+        """The claim that it sends."""
         remaining_m = self.loop.navigator.distance_remaining_m
         return self.explorer.claim(self.moment.stamp_ns, self.pose, remaining_m)
 
@@ -124,6 +124,8 @@ class TeamLoop:
                 command = (0.0, 0.0) if is_dead else member.loop.command
                 member.moment = member.loop.simulation.step(*command)
             steps = steps + 1
+        for member in self.members:
+            member.loop.pipeline.finish()
         show(*self._measure(goal))
         return self._outcome(limit_s)
 
@@ -148,7 +150,7 @@ class TeamLoop:
         for number, member in self._working():
             scan = member.moment.scan
             assert scan is not None
-            places = np.array([m.pose[:2] for m in self._heard(member)]).reshape(-1, 2)
+            places = np.array([m.pose[:2] for m in self._recent_motions(member)]).reshape(-1, 2)
             cut_m = member.radius_m + _CUT_MARGIN_M
             seen = without_robots(scan, member.pose, places, cut_m)
             estimates[number] = self.maps.add_scan(number, seen, member.moment.T_odom_base)
@@ -176,7 +178,7 @@ class TeamLoop:
             self.members[receiver].explorer.team.add_claim(claim, stamp_ns)
 
     def _exchange_motions(self) -> None:
-        """Tell all robots in reach how the others move."""
+        """Send the motion of each robot to all others in reach."""
         now_s = self.now_s
         motions = {
             number: member.motion()
@@ -193,7 +195,7 @@ class TeamLoop:
             self.claims.sent_bytes += _CLAIM_BYTES * (is_near and is_moving)
 
     def _right_of_way(self, member: Member) -> Callable[[Array, Command], bool]:
-        others = list(self._heard(member))
+        others = list(self._recent_motions(member))
         distance_m = 2.0 * member.radius_m + _GIVE_WAY_MARGIN_M
         controller = member.loop.navigator.config.controller
         horizon_s = controller.max_speed_m_s / controller.max_acceleration_m_s2
@@ -206,11 +208,11 @@ class TeamLoop:
 
         return must_yield
 
-    def _heard(self, member: Member) -> Iterator[Motion]:
+    def _recent_motions(self, member: Member) -> Iterator[Motion]:
         """Newest motions of the others; one that was silent for long is an obstacle of the map."""
         timeout_s = member.explorer.team.config.claim_timeout_s
-        for heard_s, motion in member.motions.values():
-            if self.now_s - heard_s <= timeout_s:
+        for received_s, motion in member.motions.values():
+            if self.now_s - received_s <= timeout_s:
                 yield motion
 
     def _measure(self, goal: ObservableCells) -> tuple[float, float]:

@@ -19,7 +19,6 @@ from thinmap_ros.core.grid.map_tiles import (
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.team.radio import Radio, Trouble
@@ -48,7 +47,7 @@ class _OwnMap:
         self._corrections = 0
         self._thinned = self.patch
 
-    def update(self, pose: Array | None, now_s: float) -> None:
+    def update(self, pose: Array | None) -> None:
         """Complete the map; with the robot's pose (3,) update the graph, too."""
         patch = self.received.completed(self.loop.pipeline.grid.known_area())
         is_replaced = self.loop.pipeline.corrections != self._corrections
@@ -59,8 +58,7 @@ class _OwnMap:
         changes = changed_part(self._thinned, self.patch)
         self._thinned = self.patch
         if changes is not None:
-            others = self.team.claims.present(round(now_s * SECOND_NS))
-            self.topology.update(changes, np.array([pose, *(claim.pose for claim in others)]))
+            self.topology.update(changes, pose)
 
 
 class OwnMaps:
@@ -87,7 +85,7 @@ class OwnMaps:
             self._receive(receiver, sender, data)
         is_due = self._updates % SCANS_PER_GRAPH == 0
         for robot, pose in poses.items():
-            self._maps[robot].update(pose if is_due else None, now_s)
+            self._maps[robot].update(pose if is_due else None)
         self._updates += 1
 
     def view(self, robot: int) -> tuple[TopologicalMap, GridPatch]:

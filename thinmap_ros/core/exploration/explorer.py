@@ -253,13 +253,13 @@ class Explorer:
             candidate.evidence.failed_ns = self._clock.now_ns
             # A robot or a person in the way is no property of the place.
             if reason.startswith(NO_PATH):
-                self.team.settle(candidate.evidence)
+                self.team.add_settled(candidate.evidence)
         if candidate is not None:
             self._drop_target()
             self._target.goal = None
 
     def claim(self, stamp_ns: int, T_map_base: Array, remaining_m: float = 0.0) -> Claim:
-        """What to tell the other robots of the team, at a pose (3,); remaining_m: of the path."""
+        """What to send the other robots of the team, at a pose (3,); remaining_m: of the path."""
         candidate = self._target.candidate
         place = None if candidate is None or self._target.is_turn else candidate.middle
         team = self.team
@@ -297,7 +297,7 @@ class Explorer:
         if target.scans_at_goal >= _SCANS:
             target.candidate.evidence.visits += 1
             target.candidate.evidence.failures = 0
-            self.team.settle(target.candidate.evidence)
+            self.team.add_settled(target.candidate.evidence)
             target.candidate.examined_ns = -1
             self._drop_target()
             target.goal = None

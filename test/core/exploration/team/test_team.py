@@ -13,8 +13,12 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.exploration.team.claims import Claim, SettledPlace
 from thinmap_ros.core.exploration.team.team import Team, TeamConfig
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import NO_PATH
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.topology.builder import TopologyBuilder
 
 MARGIN_M = 2.0
 
@@ -106,9 +110,9 @@ def test_only_the_newest_settled_places_are_told_each_once():
     for number in range(12):
         place = (float(number), 0.0)
         item = Evidence(number, place, place, visits=1)
-        team.settle(item)
+        team.add_settled(item)
         item.visits = 2
-        team.settle(item)
+        team.add_settled(item)
     assert [place.x for place in team.settled] == [4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0]
     assert {place.visits for place in team.settled} == {2}
 
@@ -129,3 +133,26 @@ def test_no_path_is_told_and_a_blocked_robot_is_not(reason, is_told):
 def test_two_robots_of_one_name_are_refused():
     with pytest.raises(InputError, match="claim of robot 'a': expected another name"):
         Team('a').add_claim(claim('a', 0.0), 0)
+
+
+def test_a_frontier_to_which_another_robot_found_no_path_is_given_up():
+    cells = np.full((30, 60), -1, dtype=np.int8)
+    cells[:, :30] = 0
+    cells[[0, -1], :30] = 100
+    cells[:, 0] = 100
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
+    pose = se2.pose(1.0, 1.5, 0.0)
+    builder = TopologyBuilder()
+    builder.update(patch, pose)
+    explorer = Explorer(team=Team('a'))
+
+    def step(second):
+        scan = Scan.create(second * SECOND_NS, np.full(181, 2.0), -1.57, 0.0175, 0.05, 8.0)
+        return explorer.step(builder.map, patch, scan, pose)
+
+    step(0)
+    assert explorer.claim(0, pose).place is not None
+    places = (SettledPlace(c.place[0], c.place[1], 0, 3) for c in explorer.candidates)
+    explorer.team.add_claim(claim('b', 9.0, settled=tuple(places)), 0)
+    step(2)
+    assert explorer.claim(0, pose).place is None

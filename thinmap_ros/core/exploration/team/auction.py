@@ -1,4 +1,4 @@
-"""The auction: who explores what, decided by each robot alone from what all robots tell.
+"""The auction: who explores what, decided by each robot alone from the claims of all.
 
 Pairs of robot and candidate are formed, the shortest path first, one candidate for each robot. A
 robot keeps what it has claimed unless another one is clearly nearer.

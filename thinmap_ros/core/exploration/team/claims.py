@@ -1,7 +1,7 @@
-"""Claims: what each robot of a team tells the others, and how long it holds.
+"""Claims: what each robot of a team sends the others, and how long it holds.
 
 A claim names the place of a frontier and no id of a node, so that each robot can have a graph of
-its own. It holds as long as its robot is heard and comes nearer to the place.
+its own. It holds as long as its robot is received and comes nearer to the place.
 """
 
 import math
@@ -47,7 +47,7 @@ class SettledPlace(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """What a robot tells the others, about once a second and when its target changes.
+    """What a robot sends the others, about once a second and when its target changes.
 
     robot: its name; stamp_ns: by its own clock; pose (3,); place: of the frontier that it drives
     to, m, None without a target; remaining_m: rest of its path; settled: its latest places.
@@ -69,7 +69,7 @@ class _Received:
     """
 
     claim: Claim
-    heard_ns: int
+    received_ns: int
     progress_ns: int
     nearest_m: float
 
@@ -87,7 +87,7 @@ class Claims:
         After a silence any stamp is accepted: the robot may have restarted with another clock.
         """
         last = self._received.get(claim.robot)
-        if last is None or not self._is_heard(last, now_ns):
+        if last is None or not self._is_recent(last, now_ns):
             self._received[claim.robot] = _Received(claim, now_ns, now_ns, claim.remaining_m)
             return
         if claim.stamp_ns <= last.claim.stamp_ns:
@@ -97,24 +97,24 @@ class Claims:
             last.progress_ns = now_ns
             last.nearest_m = claim.remaining_m
         last.claim = claim
-        last.heard_ns = now_ns
+        last.received_ns = now_ns
 
     def present(self, now_ns: int) -> list[Claim]:
-        """Claims of the robots that were heard lately, in the order of their names."""
-        received = [r for r in self._received.values() if self._is_heard(r, now_ns)]
+        """Claims of the robots that were received recently, in the order of their names."""
+        received = [r for r in self._received.values() if self._is_recent(r, now_ns)]
         return sorted((r.claim for r in received), key=lambda claim: claim.robot)
 
     def place_of(self, robot: str, now_ns: int) -> Place | None:
         """Place that a robot has claimed; None where it has none, or its claim has ended."""
         received = self._received.get(robot)
-        if received is None or not self._is_heard(received, now_ns):
+        if received is None or not self._is_recent(received, now_ns):
             return None
         idle_ns = now_ns - received.progress_ns
         is_held = idle_ns <= self.config.progress_timeout_s * SECOND_NS
         return received.claim.place if is_held else None
 
-    def _is_heard(self, received: _Received, now_ns: int) -> bool:
-        return now_ns - received.heard_ns <= self.config.claim_timeout_s * SECOND_NS
+    def _is_recent(self, received: _Received, now_ns: int) -> bool:
+        return now_ns - received.received_ns <= self.config.claim_timeout_s * SECOND_NS
 
 
 def _is_same(a: Place | None, b: Place | None) -> bool:

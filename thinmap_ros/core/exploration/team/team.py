@@ -80,7 +80,7 @@ class Team:
         self._boxes = []
         return boxes
 
-    def settle(self, evidence: Evidence) -> None:
+    def add_settled(self, evidence: Evidence) -> None:
         """Report to the others how often a place was visited, and no path was found to it."""
         x, y = evidence.place
         kept = [place for place in self._settled if (place.x, place.y) != (x, y)]
