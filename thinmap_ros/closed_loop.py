@@ -15,7 +15,7 @@ from thinmap_ros.core.exploration.mission import Odometer
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, Strategy
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
-from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -28,11 +28,18 @@ from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, make_strategy
 
-_CONTROL_STEPS = 2
+CONTROL_STEPS = 2
 # The period of the candidate search; thinning costs more than all other stages.
 SCANS_PER_GRAPH = 5
 Watch = Callable[[Decision, Array], None]
 """Receives each decision, and the estimated pose (3,) at which it was made."""
+MustYield = Callable[[Array, Command], bool]
+"""Whether a robot at a pose (3,) must not drive as commanded, because of another robot."""
+
+
+def drives_alone(T_map_base: Array, command: Command) -> bool:
+    """No robot must be yielded to."""
+    return False
 
 
 @dataclass(eq=False)
@@ -105,7 +112,8 @@ class ClosedLoop:
         self.decision: Decision | None = None
         self._observation: Observation | None = None
         self._drive = _Drive()
-        self._T_map_odom = np.zeros(3)
+        # The odometry is zero at the start.
+        self._T_map_odom = simulation.robot.T_world_base
         self._stop_reason = ''  # as of the navigator
 
     def run(
@@ -128,16 +136,16 @@ class ClosedLoop:
                     show(*self._measure(goal))
                 if self.is_finished:
                     break
-            if steps % _CONTROL_STEPS == 0:
-                self._control(moment)
-            moment = self.simulation.step(*self._drive.command)
+            if steps % CONTROL_STEPS == 0:
+                self.control(moment)
+            moment = self.simulation.step(*self.command)
             steps = steps + 1
         self.pipeline.finish()
         show(*self._measure(goal))
-        finished, reason = self._ending(limit_s)
+        finished, reason = self.ending(limit_s)
         return ExplorationOutcome(finished, reason, self.simulation.robot.collisions)
 
-    def _ending(self, limit_s: float) -> tuple[bool, str]:
+    def ending(self, limit_s: float) -> tuple[bool, str]:
         """Whether the strategy ended the exploration, which came to something, and why it ended."""
         words = [f'time limit of {limit_s:.0f} s']
         shortcoming = ''
@@ -158,15 +166,20 @@ class ClosedLoop:
         """Process one scan through localization, map and graph to a decision."""
         if self.mishap is not None and self.mishap.intercepts(self, scan, T_odom_base):
             return
+        estimate = self.map_scan(scan, T_odom_base)
+        is_carried = self.mishap is not None and self.mishap.is_lost
+        if not (estimate.blind_reason or is_carried):
+            self.decide(scan, estimate)
+
+    def map_scan(self, scan: Scan, T_odom_base: Array) -> Estimate:
+        """Localize and map one scan; stop the robot where it must not drive on."""
         estimate = self.pipeline.step(scan, T_odom_base).estimate
         self.log_poses(scan, estimate)
         self._stop_reason = _stop_reason(estimate)
         if self._stop_reason:
             self.navigator.reset_velocity()
             self._drive.command = (0.0, 0.0)
-        is_carried = self.mishap is not None and self.mishap.is_lost
-        if not (estimate.blind_reason or is_carried):
-            self.decide(scan, estimate)
+        return estimate
 
     def log_poses(self, scan: Scan, estimate: Estimate) -> None:
         """Log the true and the estimated pose of a scan."""
@@ -178,10 +191,14 @@ class ClosedLoop:
 
     def decide(self, scan: Scan, estimate: Estimate) -> None:
         """Choose a target in the present map."""
-        self._T_map_odom = estimate.T_map_odom
         observation = Observation(
             self.pipeline.topology.map, self.pipeline.grid.known_area(), scan, estimate.T_map_base
         )
+        self.decide_on(observation, estimate.T_map_odom)
+
+    def decide_on(self, observation: Observation, T_map_odom: Array) -> None:
+        """Choose a target by an observation; T_map_odom (3,): of its scan."""
+        self._T_map_odom = T_map_odom
         self._observation = observation
         self.navigator.topology = observation.topology
         # Processor time of this thread: other processes do not count.
@@ -189,8 +206,8 @@ class ClosedLoop:
         self.decision = self.strategy.step(*observation)
         self.log.decision_s.append(time.thread_time() - began)
         if self._watch is not None:
-            self._watch(self.decision, estimate.T_map_base)
-        self._drive.odometer.add_pose(estimate.T_map_base)
+            self._watch(self.decision, observation.T_map_base)
+        self._drive.odometer.add_pose(observation.T_map_base)
         target = self.decision.target
         self._drive.drives.follow(target)
         if target is None:
@@ -226,14 +243,25 @@ class ClosedLoop:
         self._observation = None
         self._drive = _Drive()
 
-    def _control(self, moment: SensorReadings) -> None:
+    @property
+    def command(self) -> tuple[float, float]:
+        """Speed, m/s, and turn rate, rad/s, that the robot is commanded."""
+        return self._drive.command
+
+    def pose_at(self, T_odom_base: Array) -> Array:
+        """Estimated pose (3,) of the robot at a pose (3,) of its odometry."""
+        return se2.compose(self._T_map_odom, T_odom_base)
+
+    def control(self, moment: SensorReadings, must_yield: MustYield = drives_alone) -> None:
+        """Command the robot until the next step; must_yield: to other robots."""
         observation = self._observation
         if observation is None or self._stop_reason:
             return
-        T_map_base = se2.compose(self._T_map_odom, moment.T_odom_base)
-        command = self.navigator.step(
-            T_map_base, observation.patch, observation.scan, _CONTROL_STEPS * STEP_NS / 1e9
-        )
+        T_map_base = self.pose_at(moment.T_odom_base)
+        period_s = CONTROL_STEPS * STEP_NS / 1e9
+        command = self.navigator.step(T_map_base, observation.patch, observation.scan, period_s)
+        if command.v > 0.0 and must_yield(T_map_base, command):
+            command = self.navigator.give_way(command, period_s)
         self._drive.command = (command.v, command.w)
         if command.state == 'failed':
             self._target_failed(command.reason)

@@ -74,6 +74,25 @@ def test_a_room_is_explored_and_everything_written(world: Path, tmp_path: Path) 
 
 
 @pytest.mark.programs
+def test_two_robots_explore_together_and_everything_is_written(world: Path, tmp_path: Path) -> None:
+    out = tmp_path / 'out'
+    result = explore(str(world), '-o', str(out), '--robots', '2', '--speed', '0.3')
+    assert result.returncode == 0, result.stderr
+    report = json.loads((out / 'report.json').read_text())
+    assert report['finished'] is True
+    assert report['coverage'] >= 0.99
+    assert report['collisions'] == 0
+    assert [robot['name'] for robot in report['robots']] == ['robot1', 'robot2']
+    assert sum(robot['distance'] for robot in report['robots']) == pytest.approx(
+        report['distance'], abs=0.01
+    )
+    for name in ('map.pgm', 'topology.geojson', 'summary.png', 'report.html'):
+        assert (out / name).stat().st_size > 0
+    for robot in report['robots']:
+        assert (out / f'trajectory_{robot["name"]}.tum').stat().st_size > 0
+
+
+@pytest.mark.programs
 def test_a_map_without_a_start_can_be_explored_from_a_given_one(tmp_path: Path) -> None:
     # The output is a map_server map, which can be used as a world.
     assert explore('room_10x10', '-o', str(tmp_path / 'one')).returncode == 0
@@ -96,6 +115,13 @@ def test_a_map_without_a_start_can_be_explored_from_a_given_one(tmp_path: Path) 
         (['WORLD', '--range-max-m', '-1'], 'range_max_m = -1.0: expected'),
         (['WORLD', '--speed', '0'], 'max_speed_m_s = 0.0: expected'),
         (['WORLD', '--kidnap-at', '5'], 'expected --localization=slam'),
+        (['WORLD', '--robots', '0'], '--robots=0: expected 1 to 10'),
+        (['WORLD', '--robots', '9'], 'expected room for 9 robots 0.8 m apart, found room for'),
+        (['WORLD', '--robots', '2', '--strategy', 'paper'], 'the only one that shares candidates'),
+        (['WORLD', '--robots', '2', '--kidnap-at', '5'], '--robots=2: expected no --kidnap-at'),
+        (['WORLD', '--robots', '2', '--claim-delay', 'nan'], '--claim-delay=nan: expected 0 to'),
+        (['WORLD', '--own-maps'], '--own-maps: expected --robots of 2 or more'),
+        (['WORLD', '--claim-delay', '3'], 'expected --robots of 2 or more'),
     ],
 )
 def test_bad_input_is_reported_in_one_line(

@@ -126,7 +126,7 @@ def exploration_report(
     """
     steps = np.hypot(*np.diff(true_poses[:, :2], axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    times_at = {f'{share:.2f}': _first_time(coverage, share) for share in MILESTONES}
+    times_at = {f'{share:.2f}': first_time(coverage, share) for share in MILESTONES}
     distances_at = {
         share: None if time is None else round(float(np.interp(time, times_s, along)), 3)
         for share, time in times_at.items()
@@ -157,7 +157,8 @@ def exploration_report(
     }
 
 
-def _first_time(coverage: Array, share: float) -> float | None:
+def first_time(coverage: Array, share: float) -> float | None:
+    """Time, s, of the first measurement (time, coverage) (M, 2) of a coverage; None: of none."""
     reached = np.flatnonzero(coverage[:, 1] >= share)
     return round(float(coverage[reached[0], 0]), 3) if reached.size else None
 

@@ -98,10 +98,8 @@ class LaserScanner:
         if world.glass is not None:
             cells[_meets(world.glass, x, y, angles, cells)] = np.inf
         ranges = cells * frame.resolution
-        if world.moving is None:
-            return ranges
-        nearer = world.moving.ranges(stamp_ns / 1e9, T_world_laser, angles, reach_m)
-        return np.minimum(ranges, nearer)
+        nearer = world.moving_ranges(stamp_ns / 1e9, T_world_laser, angles, reach_m)
+        return ranges if nearer is None else np.minimum(ranges, nearer)
 
     def _mix(self, ranges: Array) -> Array:
         """Add mixed pixels: at a depth edge a beam covers both surfaces, with a range in between.

@@ -100,13 +100,13 @@ class MovingObstacles:
         beams = np.column_stack([np.cos(angles), np.sin(angles)])
         nearest = np.full(len(angles), np.inf)
         for place in places:
-            np.minimum(nearest, _to_disc(place - laser, people.radius_m, beams), out=nearest)
+            np.minimum(nearest, range_to_disc(place - laser, people.radius_m, beams), out=nearest)
         for leaf in self.doors.segments(seconds, laser, reach_m + 3.0):
             np.minimum(nearest, _to_segment(leaf[:2] - laser, leaf[2:] - laser, beams), out=nearest)
         return nearest
 
 
-def _to_disc(centre: Array, radius_m: float, beams: Array) -> Array:
+def range_to_disc(centre: Array, radius_m: float, beams: Array) -> Array:
     """Distance along unit vectors (N, 2) to a disc; inf if they miss it."""
     along = beams @ centre
     across = beams[:, 0] * centre[1] - beams[:, 1] * centre[0]

@@ -42,6 +42,14 @@ class World:
         """
         return (distance_cells(self.occupied != 0) - 0.5) * self.frame.resolution
 
+    def moving_ranges(
+        self, seconds: float, T_world_laser: Array, angles: Array, reach_m: float
+    ) -> Array | None:
+        """Distance, m, at which beams (N,) at world angles hit a moving obstacle; None: none."""
+        if self.moving is None:
+            return None
+        return self.moving.ranges(seconds, T_world_laser, angles, reach_m)
+
     def is_clear(self, x: float, y: float, radius_m: float) -> bool:
         """Whether a disc with its centre in the world touches no obstacle cell; exact."""
         if not (math.isfinite(x) and math.isfinite(y)):

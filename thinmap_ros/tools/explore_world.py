@@ -3,6 +3,7 @@
 import argparse
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +17,24 @@ from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_metrics import exploration_title, hidden_places
 from thinmap_ros.evaluation.exploration_run import explore
+from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
 from thinmap_ros.files import graphs, occupancy_maps, package_data, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.laser import LaserScannerConfig
+from thinmap_ros.sim.other_robots import starts_side_by_side
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, NAMES
+from thinmap_ros.team.loop import TeamLoop
+from thinmap_ros.team.radio import Trouble
 from thinmap_ros.tools import cli
 from thinmap_ros.view import report_page
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import summary_figure
 
+MAX_ROBOTS = 10
+MAX_DELAY_S = 1000.0
 WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's worlds"
 
 
@@ -56,6 +63,28 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
         regions,
         hidden,
         apart=pipeline.localizer.apart_points(),
+    )
+    write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
+    report_page.write(folder, title, report, cli.command_line())
+
+
+def write_team_outputs(loop: TeamLoop, report: dict[str, Any], folder: Path) -> None:
+    """Write all files of several robots into a folder; a trajectory for each."""
+    patch = loop.maps.known_area()
+    topology = loop.maps.view(0)[0]
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {}
+    for member in loop.members:
+        log = member.loop.log
+        trajectories.write_tum(folder / f'trajectory_{member.name}.tum', log.stamps_ns, log.poses)
+        paths[member.name] = np.array(log.true_poses)
+    occupancy_maps.write_map(folder / 'map', patch)
+    regions = find_regions(patch)
+    graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
+    title = exploration_title(report)
+    nowhere = np.empty((0, 3))
+    summary_figure(
+        folder / 'summary.png', patch, topology, nowhere, None, title, regions, robots=paths
     )
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
     report_page.write(folder, title, report, cli.command_line())
@@ -107,21 +136,55 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     cli.add_config(parser, LaserScannerConfig, ['beams', 'field_of_view_deg', 'range_max_m'])
 
 
+def _check_team(arguments: argparse.Namespace) -> None:
+    """Raise InputError where options do not go with several robots."""
+    robots = arguments.robots
+    if not 1 <= robots <= MAX_ROBOTS:
+        raise InputError(f'--robots={robots}: expected 1 to {MAX_ROBOTS}')
+    if robots == 1:
+        if arguments.claim_delay:
+            raise InputError('--claim-delay: expected --robots of 2 or more')
+        if arguments.own_maps:
+            raise InputError('--own-maps: expected --robots of 2 or more')
+        return
+    if arguments.strategy != DEFAULT:
+        raise InputError(
+            f'--robots={robots}: expected --strategy={DEFAULT}, the only one that shares candidates'
+        )
+    if arguments.kidnap_at is not None:
+        raise InputError(f'--robots={robots}: expected no --kidnap-at')
+    if not 0.0 <= arguments.claim_delay <= MAX_DELAY_S:
+        raise InputError(
+            f'--claim-delay={arguments.claim_delay:g}: expected 0 to {MAX_DELAY_S:g} s'
+        )
+
+
 def _work(arguments: argparse.Namespace) -> None:
+    _check_team(arguments)
     world = World.from_patch(*read_world(package_data.world_path(arguments.world)))
     options = options_from(arguments, arguments.strategy)
     if options.kidnap_at_s is not None and options.localization == 'truth':
         raise InputError(
             '--kidnap-at: expected --localization=slam, because true poses are never lost'
         )
+    start = _start(world, arguments.start)
     with ProgressBar('explore_world', arguments.quiet) as bar:
 
         def show(seconds: float, coverage: float) -> None:
             share = max(coverage, seconds / options.time_limit_s)
             bar.show(share, f'{100.0 * coverage:.0f} % seen, {seconds:.0f} s simulated')
 
-        loop, report = explore(world, _start(world, arguments.start), options, show)
-    write_outputs(loop, report, arguments.out)
+        if arguments.robots == 1:
+            loop, report = explore(world, start, options, show)
+            write = partial(write_outputs, loop)
+        else:
+            radius_m = PRESETS[options.robot].radius_m
+            starts = starts_side_by_side(world, start, arguments.robots, radius_m)
+            trouble = Trouble(claim_delay_s=arguments.claim_delay)
+            team = TeamOptions(trouble=trouble, has_own_maps=arguments.own_maps)
+            team_loop, report = explore_together(world, starts, options, team, show)
+            write = partial(write_team_outputs, team_loop)
+    write(report, arguments.out)
     how = 'finished' if report['finished'] else 'not finished'
     print(
         f'{arguments.out}: {how} ({report["reason"]}), '
@@ -138,6 +201,24 @@ def main() -> None:
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
     parser.add_argument('--strategy', default=DEFAULT, choices=sorted(NAMES))
     parser.add_argument('--start', help="X,Y,THETA in m, m, rad; without it the world's own")
+    parser.add_argument(
+        '--robots',
+        type=int,
+        default=1,
+        help='number of robots that explore together, side by side at the start (default 1)',
+    )
+    parser.add_argument(
+        '--claim-delay',
+        type=float,
+        default=0.0,
+        help='time that a claim takes from robot to robot, s (default 0)',
+    )
+    parser.add_argument(
+        '--own-maps',
+        action='store_true',
+        help='each robot has its own map, and sends the others the tiles that have changed; always '
+        'so with --localization=slam',
+    )
     add_options(parser)
     cli.run(_work, parser)
 

@@ -7,6 +7,8 @@ NODES = {NodeKind.END: '#D55E00', NodeKind.BRANCH: '#0072B2', NodeKind.CORNER: '
 EDGE = '#009E73'
 ESTIMATE = '#CC79A7'
 TRUTH = '#332288'
+# Paths of several robots; none is a colour of nodes or edges.
+ROBOTS = ('#332288', '#CC79A7', '#56B4E9', '#999933', '#661100', '#555555')
 HIDDEN = '#882255'
 APART = '#DDB5CC'
 # Pale, in turn by id.

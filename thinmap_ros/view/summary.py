@@ -1,5 +1,6 @@
 """The summary picture of a run: map, regions, graph and paths, with legend and scale bar."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -82,12 +83,14 @@ def summary_figure(
     hidden: Array | None = None,
     is_measured: bool = True,
     apart: Array = _NO_POINTS,
+    robots: Mapping[str, Array] | None = None,
 ) -> None:
     """Write a PNG: map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven.
 
     regions: of the grid, in pale colours; hidden (N, 3): positions, m, and hidden area, m2, that is
     expected there; is_measured: whether walls are drawn as lines (see `wall_lines`), or each cell
-    as it is; apart (N, 2): scan points of pieces of map whose place is unknown.
+    as it is; apart (N, 2): scan points of pieces of map whose place is unknown; robots: paths (N, 2
+    or more) of several robots by name.
     """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -104,6 +107,7 @@ def summary_figure(
         surfaces = _draw_cells(axes, patch, cells, regions)
         _draw_apart(axes, apart)
         _draw_paths(axes, estimated, true)
+        _draw_robots(axes, robots or {})
         is_dense = len(topology.nodes) > _LAYOUT.dense_nodes * width * height
         draw_graph(axes, topology, 3.5 if is_dense else 5.0)
         if hidden is not None and len(hidden):
@@ -264,6 +268,16 @@ def _draw_paths(axes: 'Axes', estimated: Array, true: Array | None) -> None:
         }
         axes.plot(*estimated[0, :2], marker='*', markersize=14, label='start', **style)
         axes.plot(*estimated[-1, :2], marker='X', markersize=9, label='end', **style)
+
+
+def _draw_robots(axes: 'Axes', robots: Mapping[str, Array]) -> None:
+    """Draw the path of each robot in a colour of its own, from a star to a cross."""
+    for number, (name, path) in enumerate(robots.items()):
+        colour = palette.ROBOTS[number % len(palette.ROBOTS)]
+        axes.plot(*path[:, :2].T, color=colour, linewidth=2.2, label=name, zorder=3)
+        style: dict[str, Any] = {'color': 'white', 'markeredgecolor': colour, 'zorder': 6}
+        axes.plot(*path[0, :2], marker='*', markersize=14, markeredgewidth=1.2, **style)
+        axes.plot(*path[-1, :2], marker='X', markersize=9, markeredgewidth=1.2, **style)
 
 
 def _draw_scale_bar(axes: 'Axes', width_m: float) -> None:

@@ -59,6 +59,18 @@ def test_a_speck_between_beams_is_no_frontier():
     assert not frontiers_of(cells).mask[5:20, 4:15].any()
 
 
+def test_what_two_robots_have_changed_is_found_at_once():
+    known = np.full((60, 200), -1)
+    frontiers = FrontierMap()
+    frontiers.update(patch_of(known))
+    known[10:30, 5:25] = 0
+    known[10:30, 170:190] = 0
+    here, there = (np.array([[x, 0.5], [x + 3.0, 3.5]]) for x in (0.2, 16.7))
+    frontiers.update(patch_of(known), here, there)
+    assert (frontiers.mask == frontiers_of(known).mask).all()
+    assert frontiers.free_cells == 800
+
+
 def test_updates_near_the_robot_equal_detection_in_the_whole_map():
     rng = np.random.default_rng(7)
     world = rng.choice(np.array([0, 0, 0, 0, 100]), size=(80, 90))

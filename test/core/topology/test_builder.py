@@ -268,6 +268,22 @@ def test_drives_through_floors_lead_to_the_map_of_the_whole(shared_data, name):
     assert ids(builder.map) == ids(whole(builder))
 
 
+def test_the_map_is_of_all_places_where_robots_are():
+    cells = np.full((100, 200), 100, dtype=np.int8)
+    cells[20:80, 20:80] = 0
+    cells[20:80, 120:180] = 0
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
+    poses = np.array([[5.0, 5.0, 0.0], [15.0, 5.0, 0.0]])
+    one = TopologyBuilder()
+    both = TopologyBuilder()
+    one.update(patch, poses[0])
+    both.update(patch, poses)
+    assert len(one.map.components()) == 1
+    assert len(both.map.components()) == 2
+    with pytest.raises(InputError, match='expected finite numbers'):
+        both.update(patch, np.array([[5.0, 5.0, 0.0], [math.nan, 5.0, 0.0]]))
+
+
 @pytest.mark.parametrize('place', [(2.05, 2.05), (-50.0, -50.0)])
 def test_a_robot_in_no_free_space_starts_nothing(place):
     cells = np.full((100, 100), 100, dtype=np.int8)

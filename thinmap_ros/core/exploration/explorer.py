@@ -8,6 +8,7 @@
 - A target that stays as it is although the robot observes it is evidence that nothing is hidden.
 - One that cannot be reached is tried again after a while and before the end, some times at most.
 - Before the explorer gives up, the robot turns once in place if it stands beside unknown space.
+- In a team the candidates are shared by an auction, and the robot chooses among its own.
 
 Source: exploration paper sections 3.2 and 4.
 """
@@ -37,9 +38,12 @@ from thinmap_ros.core.exploration.frontiers import FrontierMap, Place
 from thinmap_ros.core.exploration.look_around import LookAround, turn_target
 from thinmap_ros.core.exploration.reachable import ReachableSpace
 from thinmap_ros.core.exploration.strategy import Decision, finish_reason
+from thinmap_ros.core.exploration.team.claims import Claim
+from thinmap_ros.core.exploration.team.team import Team
 from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.exploration.visibility import box_of_scan, visible_places
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.navigator import NO_PATH
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
@@ -162,8 +166,15 @@ class _Clock:
 class Explorer:
     """Chooses targets, scan by scan, until no candidate is worth a visit."""
 
-    def __init__(self, config: ExplorerConfig | None = None, model: BeliefModel = FITTED) -> None:
+    def __init__(
+        self,
+        config: ExplorerConfig | None = None,
+        model: BeliefModel = FITTED,
+        team: Team | None = None,
+    ) -> None:
+        """team: the robots that explore together; None: this one alone."""
         self.config = config or ExplorerConfig()
+        self.team = team or Team()
         self.frontier_map = FrontierMap()
         self._finder = CandidateFinder(self.config, model)
         self._space = ReachableSpace(self.config.robot_radius_m)
@@ -208,11 +219,13 @@ class Explorer:
         clock.now_ns = scan.stamp_ns
         clock.began_ns = scan.stamp_ns if clock.began_ns < 0 else clock.began_ns
         self._space.add_pose(T_map_base)
-        self.frontier_map.update(patch, box_of_scan(scan, T_map_base))
+        self.frontier_map.update(patch, box_of_scan(scan, T_map_base), *self.team.take_changes())
         self._add_views(scan, T_map_base)
         self._add_visit(T_map_base)
         if self._is_due():
             clock.found_ns = scan.stamp_ns
+            reach_m = self.config.node_reset_distance_m
+            self.team.apply_settled(self._finder.store.items, reach_m, scan.stamp_ns)
             self._frame = self.frontier_map.frame
             self._space.update(self.frontier_map, T_map_base)
             self._finder.update(
@@ -238,9 +251,19 @@ class Explorer:
         elif candidate is not None:
             candidate.evidence.failures += 1
             candidate.evidence.failed_ns = self._clock.now_ns
+            # A robot or a person in the way is no property of the place.
+            if reason.startswith(NO_PATH):
+                self.team.add_settled(candidate.evidence)
         if candidate is not None:
             self._drop_target()
             self._target.goal = None
+
+    def claim(self, stamp_ns: int, T_map_base: Array, remaining_m: float = 0.0) -> Claim:
+        """What to send the other robots of the team, at a pose (3,); remaining_m: of the path."""
+        candidate = self._target.candidate
+        place = None if candidate is None or self._target.is_turn else candidate.middle
+        team = self.team
+        return Claim(team.name, stamp_ns, T_map_base, place, remaining_m, team.settled)
 
     def frontiers(self) -> list[Array]:
         """Cells of each frontier that a candidate has, (N, 2), m, map frame."""
@@ -274,6 +297,7 @@ class Explorer:
         if target.scans_at_goal >= _SCANS:
             target.candidate.evidence.visits += 1
             target.candidate.evidence.failures = 0
+            self.team.add_settled(target.candidate.evidence)
             target.candidate.examined_ns = -1
             self._drop_target()
             target.goal = None
@@ -308,7 +332,10 @@ class Explorer:
             return
         self._scans_without_target = 0
         self._look.stop()
-        ready = self._ready(worth)
+        own = self.claim(self._clock.now_ns, T_map_base)
+        ready = self.team.share(
+            self._ready(worth), own, self._space.path_lengths_from, self.config.switch_margin_m
+        )
         if not ready:
             self._drop_target()
             return

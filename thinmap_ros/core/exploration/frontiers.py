@@ -51,22 +51,33 @@ class FrontierMap:
         """Known free area."""
         return self.free_cells * self.frame.resolution**2
 
-    def update(self, patch: GridPatch, box: Array) -> None:
-        """Find the frontier cells of the whole map in a box; now and then everywhere.
+    def update(self, patch: GridPatch, *boxes: Array) -> None:
+        """Find the frontier cells of the whole map in some boxes; now and then everywhere.
 
-        box (2, 2): its lower left and upper right corner, m (see visibility.box_of_scan).
+        boxes (2, 2): lower left and upper right corner, m, of what a scan (visibility.box_of_scan)
+        or another robot has changed.
         """
         whole = patch.is_replaced or self._updates % _UPDATES_PER_WHOLE_MAP == 0
         self._updates += 1
         row, col = self._fit(patch)
         if patch.is_replaced:
             self._clear_outside(row, col, patch.shape)
-        rows, cols = (slice(0, size) for size in patch.shape) if whole else _part(patch, box)
+        everything = (slice(0, patch.shape[0]), slice(0, patch.shape[1]))
+        parts = [everything] if whole else [_part(patch, box) for box in boxes]
+        for part in parts:
+            self._update_part(patch, part, (row, col))
+
+    def _update_part(
+        self, patch: GridPatch, part: tuple[slice, slice], place: tuple[int, int]
+    ) -> None:
+        """Find the frontier cells in rows and columns of a map, whose first cell is at a place."""
+        rows, cols = part
+        row, col = place
         wide = (
             slice(max(rows.start - _MARGIN_CELLS, 0), rows.stop + _MARGIN_CELLS),
             slice(max(cols.start - _MARGIN_CELLS, 0), cols.stop + _MARGIN_CELLS),
         )
-        part = GridPatch(patch.frame, np.ascontiguousarray(patch.cells[wide]))
+        cut = GridPatch(patch.frame, np.ascontiguousarray(patch.cells[wide]))
         inner = (
             rows.start - wide[0].start,
             rows.stop - wide[0].start,
@@ -75,8 +86,8 @@ class FrontierMap:
         )
         self._mark_changed((rows.start + row, cols.start + col, rows.stop + row, cols.stop + col))
         self.free_cells += _update(
-            part.cells,
-            known_free(part, _GAPS),
+            cut.cells,
+            known_free(cut, _GAPS),
             inner,
             (wide[0].start + row, wide[1].start + col),
             self.free,

@@ -50,6 +50,7 @@ class ReachableSpace:
         self._recent_path = RecentPath()
         self._standing: Mask = np.zeros((0, 0), dtype=np.bool_)
         self._maybe = self._standing  # if nothing stands in the unknown
+        self._free = self._standing
         self._between = PathLengthTable(_COARSE_M, _FORGET_S, _UNKNOWN_COST)
         nowhere = np.zeros((0, 0))
         self.now = Reachable(self._standing, self._standing, nowhere, GridFrame(0.0, 0.0, 1.0))
@@ -61,6 +62,7 @@ class ReachableSpace:
     def update(self, frontiers: FrontierMap, T_map_base: Array) -> None:
         """Find what can be reached from a pose (3,) in the map of the frontiers."""
         self._update_standing(frontiers)
+        self._free = frontiers.free
         frame = frontiers.frame
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         recent = self._recent_path.cells(frame, frontiers.free.shape)
@@ -72,14 +74,16 @@ class ReachableSpace:
 
     def path_lengths(self, T_map_base: Array, goals: Array) -> Array:
         """Path lengths (N,), m, to goals (N, 2); estimated where there is no path."""
+        return _lengths_in(self.now.path_lengths, self.now.frame, T_map_base, goals)
+
+    def path_lengths_from(self, T_map_base: Array, goals: Array) -> Array:
+        """Path lengths (N,), m, to goals (N, 2) from a pose (3,) of another robot."""
         frame = self.now.frame
-        rows, cols = (frame.cells_of(goals) // SQUARE).T
-        height, width = self.now.path_lengths.shape
-        inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
-        found = np.full(len(goals), np.inf)
-        squares = self.now.path_lengths[rows[inside], cols[inside]]
-        found[inside] = squares * SQUARE * frame.resolution
-        return _with_estimates(found, np.hypot(*(goals - T_map_base[:2]).T))
+        xy = (float(T_map_base[0]), float(T_map_base[1]))
+        allowed = escape_cells(self._standing, self._free, frame, xy, _ESCAPE_M)
+        row, col = (int(v) // SQUARE for v in frame.cells_of(np.array([xy]))[0])
+        lengths = distance_field_from(downsample_mask(allowed, SQUARE), (row, col))
+        return _lengths_in(lengths, frame, T_map_base, goals)
 
     def path_lengths_between(self, goals: Array, stamp_ns: int) -> Array:
         """Path lengths (N, N), m, between goals (N, 2), also through the unknown, at higher cost.
@@ -103,6 +107,16 @@ class ReachableSpace:
                 (self._maybe, frontiers.passable),
             ):
                 update_traversable_cells(standing, free, part, radius_m, resolution)
+
+
+def _lengths_in(squares: Array, frame: GridFrame, T_map_base: Array, goals: Array) -> Array:
+    """Path lengths (N,), m, to goals (N, 2) from those to all squares; see `path_lengths`."""
+    rows, cols = (frame.cells_of(goals) // SQUARE).T
+    height, width = squares.shape
+    inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
+    found = np.full(len(goals), np.inf)
+    found[inside] = squares[rows[inside], cols[inside]] * SQUARE * frame.resolution
+    return _with_estimates(found, np.hypot(*(goals - T_map_base[:2]).T))
 
 
 def _with_estimates(lengths_m: Array, straight_m: Array) -> Array:

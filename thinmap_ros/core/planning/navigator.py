@@ -35,8 +35,11 @@ SENSOR_DELAY_NS = 500_000_000
 _ROUNDING_M_S = 1e-9
 # A waypoint counts as passed on this last part of the path to it at most.
 _MAX_WAYPOINT_PASS_M = 0.7
+# Reasons that begin so name a goal to which the map has no path, whatever stands there now.
+NO_PATH = 'no path'
 _OBSTACLE = 'an obstacle blocks the path'
 _HIDDEN = 'the laser does not see the path: sector of invalid beams'
+_OTHER_ROBOT = 'another robot is in the way'
 _STUCK = (
     'the robot does not move as commanded: wheels blocked or off, or an obstacle that the laser '
     'does not see'
@@ -121,7 +124,8 @@ class _Progress:
     """Progress towards a goal: age of the path, time at standstill, remaining path length.
 
     standstills: number of them without progress; recoveries: all of them, up to the last waypoint
-    too; nearest_m: smallest remaining length; is_near: whether the target has been near.
+    too; nearest_m: smallest remaining length; is_near: whether the target has been near; yielded_s:
+    time at standstill for other robots since the last progress.
     """
 
     path_age_s: float = 0.0
@@ -131,6 +135,7 @@ class _Progress:
     recoveries: int = 0
     nearest_m: float = math.inf
     is_near: bool = False
+    yielded_s: float = 0.0
 
 
 class _Motion:
@@ -236,6 +241,19 @@ class Navigator:
                 return self._wait(reason, dt_s)
         return self._drive(T_map_base, dt_s)
 
+    def give_way(self, command: Command, dt_s: float) -> Command:
+        """Command in place of one with which another robot would be touched: turn, or stand.
+
+        The goal is aborted after blocked_timeout_s without progress.
+        """
+        self._progress.yielded_s += dt_s
+        if self._progress.yielded_s > self.config.blocked_timeout_s:
+            self.cancel()
+            still = self._follower.override_speed(0.0, 0.0)
+            return Command(*still, 'failed', _OTHER_ROBOT, is_timeout=True)
+        turn = self._follower.override_speed(0.0, command.w)
+        return Command(*turn, 'blocked', _OTHER_ROBOT)
+
     @property
     def _target(self) -> tuple[float, float]:
         """The next waypoint, or the goal."""
@@ -302,7 +320,7 @@ class Navigator:
             self.path = None
             where = f'({self._target[0]:.2f}, {self._target[1]:.2f})'
             never = first and self._progress.blocked_s == 0.0
-            return f'no path to {where}' if never else f'the path to {where} is blocked'
+            return f'{NO_PATH} to {where}' if never else f'the path to {where} is blocked'
         self.path = path
         return ''
 
@@ -345,7 +363,7 @@ class Navigator:
 
     def _wait(self, reason: str, dt_s: float) -> Command:
         """Stop; abort the goal if there was never a path, or after blocked_timeout_s."""
-        never = reason.startswith('no path')
+        never = reason.startswith(NO_PATH)
         self._progress.blocked_s += dt_s
         self._progress.remaining_m = 0.0
         if never or self._progress.blocked_s > self.config.blocked_timeout_s:
@@ -359,6 +377,7 @@ class Navigator:
         self._progress.remaining_m = length_from(self.path, nearest)
         if self._progress.remaining_m < self._progress.nearest_m - self.config.progress_m:
             self._progress.standstills = 0
+            self._progress.yielded_s = 0.0
             self._progress.nearest_m = self._progress.remaining_m
         before = (self._follower.v, self._follower.w)
         room = self._obstacles.clearance_along(self.path, nearest, self.config.clearance_ahead_m)

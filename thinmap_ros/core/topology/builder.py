@@ -110,7 +110,7 @@ class TopologyBuilder:
         return None if self._frame is None else self._frame.resolution
 
     def update(self, window: GridPatch, T_map_base: Array) -> bool:
-        """Update the map by a window of the grid, and the robot's pose (3,).
+        """Update the map by a window of the grid, and one robot's pose (3,), or several (N, 3).
 
         The window holds all cells that changed since the last one; its size and place are free.
         Returns whether the map changed. Raises InputError if the window is not on the cells of the
@@ -126,7 +126,8 @@ class TopologyBuilder:
         self._window = Span(*place, *window.shape)
         changed = layers.update_free_space(window, place)
         layers.update_skeleton()
-        layers.mark_robot(self._cell_of(T_map_base))
+        for row, col in self._cells_of(T_map_base):
+            layers.mark_robot((row, col))
         if changed == 0 and not layers.has_new_parts():
             return False
         return registry.update(layers.lattice, layers.edge_changes(registry.hashes))
@@ -239,10 +240,11 @@ class TopologyBuilder:
             self._registry = Registry(window.frame, self.config)
         return self._layers, self._registry, _place_on(self._frame, window.frame)
 
-    def _cell_of(self, T_map_base: Array) -> tuple[int, int]:
+    def _cells_of(self, T_map_base: Array) -> list[list[int]]:
+        """Row and column of a pose (3,), or of each of some poses (N, 3)."""
         assert self._frame is not None
-        row, col = self._frame.cells_of(T_map_base[None, :2])[0].tolist()
-        return row, col
+        cells: list[list[int]] = self._frame.cells_of(T_map_base[..., :2]).tolist()
+        return cells
 
 
 def _place_on(lattice: GridFrame, frame: GridFrame) -> tuple[int, int]:

@@ -1,0 +1,1 @@
+"""Several robots that explore one world together, against one robot and against trouble."""

@@ -1,0 +1,46 @@
+"""The auction: one candidate for each robot, the shortest path first; claims and ties."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.exploration.team.auction import NOTHING, auction
+
+MARGIN_M = 2.0
+
+
+def won(lengths, claimed=None):
+    lengths = np.array(lengths, dtype=np.float64)
+    claimed = [NOTHING] * len(lengths) if claimed is None else claimed
+    return auction(lengths, np.array(claimed), MARGIN_M).tolist()
+
+
+def test_the_second_robot_gets_the_second_candidate():
+    assert won([[1.0, 2.0], [1.5, 9.0]]) == [0, 1]
+    assert won([[1.5, 9.0], [1.0, 2.0]]) == [1, 0]
+
+
+def test_each_robot_has_one_candidate_as_long_as_there_are_any():
+    rng = np.random.default_rng(3)
+    for robots, count in itertools.product((1, 2, 5), (1, 3, 5, 8)):
+        found = [i for i in won(rng.uniform(1.0, 30.0, (robots, count))) if i != NOTHING]
+        assert len(found) == len(set(found)) == min(robots, count)
+
+
+@pytest.mark.parametrize(('nearer_m', 'owner'), [(1.0, 0), (3.0, 1)])
+def test_a_claim_holds_unless_another_robot_is_clearly_nearer(nearer_m, owner):
+    found = won([[10.0], [10.0 - nearer_m]], [0, NOTHING])
+    assert found[owner] == 0
+
+
+def test_equal_paths_have_one_winner():
+    assert won([[5.0], [5.04]]) == [0, NOTHING]
+    assert won([[5.04], [5.0]]) == [0, NOTHING]
+    assert won([[5.0], [4.8]]) == [NOTHING, 0]
+
+
+def test_of_two_that_claim_one_place_the_nearer_one_keeps_its_claim():
+    # Without claims both the far candidate and the near one would go to the first robot's rival.
+    assert won([[6.0, 7.0], [5.0, 4.9]], [0, 0]) == [1, 0]
+    assert won([[5.0, 4.9], [6.0, 7.0]], [0, 0]) == [0, 1]

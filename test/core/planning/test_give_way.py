@@ -1,0 +1,68 @@
+"""Who must stop when two robots meet."""
+
+import math
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.give_way import Motion, must_stop
+from thinmap_ros.core.planning.navigator import Navigator
+
+
+def at(robot, x, y, heading, v, w=0.0):
+    return Motion(robot, se2.pose(x, y, heading), v, w)
+
+
+def stops(own, *others):
+    return must_stop(own, others, 0.55, 1.0)
+
+
+def test_of_two_that_meet_the_larger_name_stops():
+    a = at('a', 0.0, 0.0, 0.4, 0.5)
+    b = at('b', 0.0, 0.8, -0.4, 0.5)
+    assert stops(b, a)
+    assert not stops(a, b)
+
+
+def test_nobody_drives_into_a_robot_that_stands_whatever_its_name():
+    assert stops(at('a', 0.0, 0.0, 0.0, 0.5), at('b', 0.8, 0.0, 0.0, 0.0))
+    assert stops(at('b', 0.0, 0.0, 0.0, 0.5), at('a', 0.8, 0.0, 0.0, 0.0))
+
+
+def test_robots_that_are_close_may_leave_and_turn():
+    standing = at('a', 0.4, 0.0, 0.0, 0.0)
+    assert not stops(at('b', 0.0, 0.0, math.pi, 0.5), standing)
+    assert not stops(at('b', 0.0, 0.0, 0.0, 0.0, 1.0), standing)
+    assert stops(at('b', 0.0, 0.0, 0.0, 0.1), standing)
+
+
+def test_an_arc_around_a_robot_is_free():
+    other = at('a', 1.0, 0.0, 0.0, 0.0)
+    assert stops(at('b', 0.0, 0.0, 0.0, 0.6), other)
+    assert not stops(at('b', 0.0, 0.0, 0.0, 0.6, 1.5), other)
+
+
+def test_a_robot_that_follows_another_one_drives_on():
+    assert not stops(at('b', 0.0, 0.0, 0.0, 0.5), at('a', 1.2, 0.0, 0.0, 0.5))
+
+
+def test_a_navigator_that_gives_way_turns_waits_and_aborts():
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((60, 60), dtype=np.int8))
+    navigator = Navigator()
+    navigator.set_goal(5.0, 3.0)
+    pose = se2.pose(1.0, 3.0, 0.0)
+    states = []
+    for _ in range(100):
+        command = navigator.step(pose, patch, None, 0.1)
+        if command.state == 'driving' and command.v > 0.0:
+            command = navigator.give_way(command, 0.1)
+            assert command.v == 0.0
+        states.append(command.state)
+        if command.state == 'failed':
+            break
+    assert command.reason == 'another robot is in the way'
+    assert command.is_timeout
+    assert 0.1 * len(states) == pytest.approx(8.0, abs=0.5)

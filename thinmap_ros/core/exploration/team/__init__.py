@@ -1,0 +1,1 @@
+"""Exploration by several robots, which share the candidates by what each claims."""

@@ -1,0 +1,240 @@
+"""Tiles of a map that have changed: what robots send each other of their maps.
+
+A tile has 16 x 16 cells of 2 bits: unknown, free, occupied, or in between. A message holds the
+tiles that have changed between two versions of the sender's map, compressed. A receiver that has
+missed one notices by its versions, and asks for all that has changed since the last that it has.
+The lattices of both maps must be the same.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.errors import InputError, one_line_reason
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
+from thinmap_ros.core.se2 import Array
+
+
+def _table() -> NDArray[np.uint8]:
+    """Bits of each value of a cell."""
+    values = np.arange(256, dtype=np.uint8).view(np.int8)
+    bits = np.full(256, 3, dtype=np.uint8)
+    bits[values < 0] = 0
+    bits[(values >= 0) & (values <= FREE_AT_MOST)] = 1
+    bits[values >= OCCUPIED_AT_LEAST] = 2
+    return bits
+
+
+EDGE = 16
+_PACKED_BYTES = EDGE * EDGE // 4
+_MAX_TILES = 1 << 16
+_HEADER = struct.Struct('<IIIddd')
+_SHIFTS = np.array([0, 2, 4, 6], dtype=np.uint8)
+# In the order of their bits.
+_CELLS = np.array([UNKNOWN, 0, 100, 50], dtype=np.int8)
+_TABLE = _table()
+_UNKNOWN_TILE = bytes(_PACKED_BYTES)
+Key = tuple[int, int]
+"""Row and column of a tile, in tiles from the origin of its frame."""
+
+
+@dataclass(frozen=True)
+class TileMessage:
+    """Tiles that have changed after one version of a map, up to another one.
+
+    frame: of the lattice; tiles: packed cells by row and column.
+    """
+
+    after: int
+    version: int
+    frame: GridFrame
+    tiles: dict[Key, bytes]
+
+    def encode(self) -> bytes:
+        """The message as bytes."""
+        frame = self.frame
+        head = _HEADER.pack(
+            self.after,
+            self.version,
+            len(self.tiles),
+            frame.origin_x,
+            frame.origin_y,
+            frame.resolution,
+        )
+        keys = np.array(list(self.tiles), dtype='<i4').reshape(-1, 2)
+        return zlib.compress(head + keys.tobytes() + b''.join(self.tiles.values()), 9)
+
+    @staticmethod
+    def decode(data: bytes) -> 'TileMessage':
+        """The message in some bytes. Raises InputError where they are none."""
+        most = _HEADER.size + _MAX_TILES * (8 + _PACKED_BYTES)
+        try:
+            plain = zlib.decompressobj().decompress(data, most)
+        except zlib.error as error:
+            raise InputError(f'map tiles: {one_line_reason(error)}') from error
+        if len(plain) < _HEADER.size:
+            raise InputError(f'map tiles: {len(plain)} bytes: expected at least {_HEADER.size}')
+        after, version, count, x, y, resolution = _HEADER.unpack_from(plain)
+        expected = _HEADER.size + count * (8 + _PACKED_BYTES)
+        if len(plain) != expected or version < after:
+            raise InputError(
+                f'map tiles: {len(plain)} bytes for {count} tiles of versions {after} to '
+                f'{version}: expected {expected} bytes, and rising versions'
+            )
+        keys = np.frombuffer(plain, '<i4', 2 * count, _HEADER.size).reshape(-1, 2).tolist()
+        first = _HEADER.size + 8 * count
+        tiles = {
+            (row, col): plain[first + i * _PACKED_BYTES : first + (i + 1) * _PACKED_BYTES]
+            for i, (row, col) in enumerate(keys)
+        }
+        return TileMessage(after, version, GridFrame(x, y, resolution), tiles)
+
+
+class TileSender:
+    """The tiles of a robot's own map, with the version in which each has changed last."""
+
+    def __init__(self, frame: GridFrame) -> None:
+        """frame: of the lattice; all maps lie on its cells."""
+        self.frame = frame
+        self.version = 0
+        self._tiles: dict[Key, tuple[bytes, int]] = {}
+
+    def update(self, patch: GridPatch) -> None:
+        """Find the tiles that differ from the last map."""
+        found = _tiles_of(patch, self.frame)
+        gone = dict.fromkeys(self._tiles.keys() - found.keys(), _UNKNOWN_TILE)
+        changed = {
+            key: packed
+            for key, packed in (found | gone).items()
+            if packed != self._tiles.get(key, (_UNKNOWN_TILE, 0))[0]
+        }
+        if changed:
+            self.version += 1
+            self._tiles |= {key: (packed, self.version) for key, packed in changed.items()}
+
+    def changes_after(self, version: int) -> TileMessage:
+        """All tiles that have changed after a version; 0: all tiles."""
+        tiles = {key: packed for key, (packed, changed) in self._tiles.items() if changed > version}
+        return TileMessage(version, self.version, self.frame, tiles)
+
+
+class ReceivedTiles:
+    """What other robots know, filled into a robot's own map where that is unknown."""
+
+    def __init__(self, frame: GridFrame) -> None:
+        """frame: of the lattice of the robot's own map."""
+        self._frame = frame
+        self._tiles: dict[Key, dict[str, NDArray[np.int8]]] = {}
+        self._versions: dict[str, int] = {}
+        self._patch: GridPatch | None = None
+
+    def version_of(self, sender: str) -> int:
+        """Version up to which the tiles of a robot are complete; 0: none."""
+        return self._versions.get(sender, 0)
+
+    def add(self, sender: str, message: TileMessage) -> Array | None:
+        """Add the tiles of a robot; returns the corners (2, 2), m, of what they change.
+
+        None where there is nothing new, or the messages before this one are missing. Raises
+        InputError where its lattice is another one.
+        """
+        if message.frame != self._frame:
+            raise InputError(f'map tiles on {message.frame}: expected those of {self._frame}')
+        known = self.version_of(sender)
+        if message.after > known or message.version <= known:
+            return None
+        self._versions[sender] = message.version
+        if not message.tiles:
+            return None
+        for key, packed in message.tiles.items():
+            layers = self._tiles.setdefault(key, {})
+            # The newest is the last one, and decides where robots contradict each other.
+            layers.pop(sender, None)
+            layers[sender] = _unpacked(packed)
+        self._patch = None
+        cells = EDGE * np.array(list(message.tiles))
+        low = cells.min(axis=0)
+        high = cells.max(axis=0) + EDGE
+        frame = self._frame
+        origin = (frame.origin_x, frame.origin_y)
+        corners = np.array([[low[1], low[0]], [high[1], high[0]]]) * frame.resolution
+        return np.asarray(corners + origin)
+
+    def completed(self, own: GridPatch) -> GridPatch:
+        """A robot's own map, and what others know where it is undecided."""
+        if not self._tiles:
+            return own
+        if self._patch is None:
+            self._patch = self._rendered()
+        return completed(own, self._patch)
+
+    def _rendered(self) -> GridPatch:
+        """All received tiles as one map."""
+        keys = np.array(list(self._tiles))
+        low = keys.min(axis=0)
+        rows, cols = EDGE * (keys.max(axis=0) + 1 - low)
+        cells = np.full((int(rows), int(cols)), UNKNOWN, dtype=np.int8)
+        for (row, col), layers in self._tiles.items():
+            top = EDGE * (row - int(low[0]))
+            left = EDGE * (col - int(low[1]))
+            part = cells[top : top + EDGE, left : left + EDGE]
+            for layer in layers.values():
+                part[:] = _decided(layer, part)
+        row, col = (EDGE * low).tolist()
+        return GridPatch(self._frame.with_origin_at(row, col), cells)
+
+
+def completed(own: GridPatch, other: GridPatch) -> GridPatch:
+    """A map, with the cells of another one on its lattice where it is undecided.
+
+    Raises InputError off the lattice.
+    """
+    wide = own.padded(own.overhang_of(other))
+    row, col = wide.offset_of(other)
+    cells = wide.cells.copy()
+    part = cells[row : row + other.shape[0], col : col + other.shape[1]]
+    part[:] = _decided(part, other.cells)
+    return GridPatch(wide.frame, cells, own.is_replaced)
+
+
+def changed_part(before: GridPatch, now: GridPatch) -> GridPatch | None:
+    """The rectangle of a map in which it differs from an earlier one; None: nowhere."""
+    wide = now.padded(now.overhang_of(before))
+    bounds = wide.changes_since(before.padded(before.overhang_of(now)))
+    return None if bounds is None else wide.part(bounds)
+
+
+def _decided(cells: NDArray[np.int8], otherwise: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Cells (H, W) that are free or occupied; others where those are not."""
+    is_decided = ((cells >= 0) & (cells <= FREE_AT_MOST)) | (cells >= OCCUPIED_AT_LEAST)
+    is_better = is_decided | (otherwise == UNKNOWN)
+    return np.asarray(np.where(is_better, cells, otherwise))
+
+
+def _tiles_of(patch: GridPatch, frame: GridFrame) -> dict[Key, bytes]:
+    """Packed cells of all tiles of a map that are not unknown."""
+    row, col = GridPatch(frame, patch.cells[:0, :0]).offset_of(patch)
+    top = row % EDGE
+    left = col % EDGE
+    rows, cols = patch.shape
+    margins = (top, left, -(top + rows) % EDGE, -(left + cols) % EDGE)
+    cells = _TABLE[patch.padded(margins).cells.view(np.uint8)]
+    first = ((row - top) // EDGE, (col - left) // EDGE)
+    down, right = (size // EDGE for size in cells.shape)
+    tiles = cells.reshape(down, EDGE, right, EDGE).swapaxes(1, 2).reshape(-1, EDGE * EDGE // 4, 4)
+    packed = np.bitwise_or.reduce(tiles << _SHIFTS, axis=2).astype(np.uint8)
+    return {
+        (first[0] + int(i) // right, first[1] + int(i) % right): packed[i].tobytes()
+        for i in np.flatnonzero(packed.any(axis=1))
+    }
+
+
+def _unpacked(packed: bytes) -> NDArray[np.int8]:
+    """Cells (16, 16) of a tile."""
+    bits = np.frombuffer(packed, dtype=np.uint8)[:, None] >> _SHIFTS & 3
+    cells: NDArray[np.int8] = _CELLS[bits].reshape(EDGE, EDGE)
+    return cells

@@ -1,0 +1,1 @@
+"""Several robots that explore one simulated world together, without ROS."""
