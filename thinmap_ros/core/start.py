@@ -41,7 +41,8 @@ class StartConfig(Config):
     slam: str = slam_parameter(SCAN_MATCHING)
     initial_x_m: float = parameter(
         0.0,
-        'Initial x position in the map (m).',
+        'Initial x position in the map (m). A start at 0, 0, 0 in a loaded map is taken as '
+        'unknown: scan matching maps once scans fit there along 6 m of path.',
         low=-se2.MAX_COORDINATE_M,
         high=se2.MAX_COORDINATE_M,
     )
@@ -66,6 +67,11 @@ class StartConfig(Config):
                 f'slam = {quoted(self.slam)}: {type(self).__name__} expected '
                 f'{" or ".join(self.of_slam)}'
             )
+
+    @property
+    def is_start_given(self) -> bool:
+        """Whether a start pose is given: one that is not that of a new map."""
+        return (self.initial_x_m, self.initial_y_m, self.initial_yaw_rad) != (0.0, 0.0, 0.0)
 
     @property
     def is_mapping(self) -> bool:

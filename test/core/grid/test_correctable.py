@@ -12,7 +12,7 @@ from support.slam_room import corridor_ring, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid import rerendering
-from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.correctable import MAX_OPEN, CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
 from thinmap_ros.core.grid.patch import UNKNOWN
 from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
@@ -405,6 +405,20 @@ def test_scans_whose_placement_is_open_wait_until_it_is_decided():
         == occupied_after([MAP, NOWHERE, NOWHERE, NOWHERE, MAP])[0]
     )
     assert with_gap < occupied_after([MAP] * 4)[0]
+
+
+@pytest.mark.parametrize('first', [1, 2])
+def test_of_many_scans_whose_placement_is_open_the_latest_wait(first):
+    """Their number is bounded: the one that was made far off is dropped, or just not yet."""
+    grid = CorrectableGrid(OccupancyGrid())
+    far = TRUE[0] + np.array([100.0, 0.0, 0.0])
+    grid.update(SCANS[0], TRUE[0])
+    for k in range(first, 2 + MAX_OPEN):
+        grid.update(SCANS[0], far if k == first else TRUE[0], OPEN)
+    grid.update(SCANS[0], TRUE[0])
+    known = grid.shown.known_area()
+    width_m = known.shape[1] * known.frame.resolution
+    assert (width_m > 90.0) == (first == 2)
 
 
 def test_scans_whose_placement_is_open_move_with_a_correction():

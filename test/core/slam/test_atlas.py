@@ -7,6 +7,7 @@ import pytest
 from support.carried_robot import carried
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.places.recognition.decision import JOIN_ODDS
 from thinmap_ros.core.slam.localizer import Localizer
 
@@ -49,6 +50,39 @@ def test_a_robot_that_was_carried_into_another_building_stays_apart():
     assert last.apart is not None
     assert last.apart.path_m > 40.0 and last.apart.log_odds < math.log(JOIN_ODDS)
     assert all(estimate.correction is None for drive, estimate, _ in found if drive == 1)
+
+
+def test_a_session_is_not_changed_from_an_unknown_start_until_the_robot_recognizes_its_place():
+    """Where it is, scans fit at the start pose by chance for the first metres."""
+    localizer = Localizer()
+    session = list(carried((9, 0, 70.0)))
+    for moment in session:
+        localizer.step(moment.scan, moment.T_odom_base)
+    T_world_map = session[0].T_world_base
+    state = localizer.state()
+    continued = Localizer.from_state(state, keyframes=localizer.saved_keyframes())
+    before = [frame.T_map_base for frame in continued.keyframes]
+    waiting = []
+    later = []
+    for moment in carried((9, 1, 60.0)):
+        estimate = continued.step(moment.scan, moment.T_odom_base)
+        T_world_base = se2.compose(T_world_map, estimate.T_map_base)
+        off_m = float(np.hypot(*(T_world_base - moment.T_world_base)[:2]))
+        if is_mapped(estimate) or later:
+            later.append((estimate, off_m))
+            continue
+        waiting.append(estimate)
+        poses = [frame.T_map_base for frame in continued.keyframes[: len(before)]]
+        np.testing.assert_array_equal(poses, before)
+        if len(waiting) == 200:
+            for name, array in continued.state().items():
+                np.testing.assert_array_equal(array, state[name])
+    assert len(waiting) > 200
+    assert Placement.OPEN in [estimate.placement for estimate in waiting[:100]]
+    assert waiting[-1].is_mapping_apart
+    assert all(off_m < 0.5 for estimate, off_m in later if is_mapped(estimate))
+    last, off_m = later[-1]
+    assert is_mapped(last) and off_m < 0.1
 
 
 @pytest.mark.parametrize('drives', [((3, 0, 30.0), (4, 1, 5.0)), ((2, 0, 25.0), (5, 1, 5.0))])

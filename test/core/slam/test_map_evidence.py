@@ -22,6 +22,30 @@ def test_two_scans_that_fit_well_or_three_that_fit_place_a_robot(inlier_ratio, s
     assert evidence.agrees
 
 
+def tried(*rows):
+    """Evidence at a start pose that nobody gave, after scans: path, m, and inlier ratio of each."""
+    evidence = MapEvidence(4.0, 0.6)
+    evidence.start_delocalized(is_pose_given=False)
+    for moved_m, inlier_ratio in rows:
+        evidence.update(match(inlier_ratio, 0.0), moved_m=moved_m)
+    return evidence
+
+
+@pytest.mark.parametrize('path_m', [0.0, 5.9, 6.1])
+def test_a_start_that_nobody_gave_is_confirmed_along_the_path_of_a_view(path_m):
+    evidence = tried(*[(0.0, 1.0)] * 2, *[(path_m / 20.0, 1.0)] * 20)
+    is_confirmed = path_m > 6.0
+    assert evidence.permits_mapping == is_confirmed != evidence.is_delocalized
+    assert evidence.agrees and not evidence.is_lost and not evidence.needs_submap
+
+
+def test_a_scan_that_does_not_fit_begins_the_path_anew_and_without_a_view_the_robot_is_elsewhere():
+    rows = [(0.5, 0.3 if k % 8 == 7 else 1.0) for k in range(40)]
+    assert not tried(*rows[:24]).permits_mapping
+    assert not tried(*rows[:24]).needs_submap
+    assert tried(*rows[:25]).needs_submap
+
+
 def test_points_that_contradict_count_three_times_as_much_as_points_that_fit():
     evidence = MapEvidence(4.0, 0.6)
     evidence.update(match(0.75, 0.5))

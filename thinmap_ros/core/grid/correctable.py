@@ -1,5 +1,6 @@
 """Occupancy grid that is corrected after loop closures, and once a laser proves to drop out."""
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,6 +15,8 @@ from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.scan_history import CorrectedPoses, PoseHistory
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+
+MAX_OPEN = 1000  # scans that wait, the latest; 10 MB of a robot that stands at a start pose
 
 
 class CorrectableGrid:
@@ -49,7 +52,8 @@ class CorrectableGrid:
         for scan, T_scan in scans:
             history.add_pose(scan.stamp_ns, T_scan, StoredScan.of(scan, grid.config))
         self._history = history if keeps_scans else None
-        self._open: list[tuple[Scan, Array]] = []  # with the poses (3,) at which they were made
+        # With the poses (3,) at which they were made.
+        self._open: deque[tuple[Scan, Array]] = deque(maxlen=MAX_OPEN)
         self._apart: PoseHistory[StoredScan] | None = None
         self._is_joined = False  # whether a correction has come since the last scan that is apart
         self._pending_ns: int | None = None
@@ -160,7 +164,8 @@ class CorrectableGrid:
         """Move the waiting scans along with the scan before them, from one pose (3,) to another."""
         if before is not None and after is not None:
             T = se2.compose(after, se2.invert(before))
-            self._open = [(scan, se2.compose(T, T_scan)) for scan, T_scan in self._open]
+            moved = [(scan, se2.compose(T, T_scan)) for scan, T_scan in self._open]
+            self._open = deque(moved, maxlen=MAX_OPEN)
 
     def _add_scan(self, scan: Scan, T_map_base: Array) -> None:
         try:

@@ -233,7 +233,8 @@ class Localizer:
         start = self.pose
         self._map.load(given, keyframes)
         self._map.place(start, self._tracker.slip_covariance())
-        self._tracker.track.evidence.start_delocalized()
+        is_believed = self.config.is_start_given or not self.config.is_mapping
+        self._tracker.track.evidence.start_delocalized(is_believed)
 
     def _detect_loss(self) -> None:
         """In a map that does not change, the robot is delocalized if scans contradict it.
@@ -261,7 +262,7 @@ class Localizer:
             inlier_ratio=0.0 if match is None else match.inlier_ratio,
             is_lost=is_lost,
             apart=apart,
-            is_contradicted=self.config.is_mapping and not evidence.agrees,
+            is_contradicted=self.config.is_mapping and not evidence.permits_mapping,
             blind_reason=tracked.blind_reason,
             odometry_discontinuity=tracked.discontinuity,
             scan_information=match.scan_information if match and tracked.fits else None,

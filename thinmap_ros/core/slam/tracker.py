@@ -80,7 +80,9 @@ class Tracker:
         )
         match = self._match(scan, points, prediction.prior, there)
         track.reckoned = track.reckoned.moved(prediction)
-        track.evidence.update(match, self._seen_through_ratio(scan, match, there), is_stationary)
+        moved_m = 0.0 if is_stationary else float(np.hypot(*(prediction.prior - before)[:2]))
+        seen_through = self._seen_through_ratio(scan, match, there)
+        track.evidence.update(match, seen_through, is_stationary, moved_m)
         own = None if match is None else match.seen_from(there.anchor.T_map)
         fits = self._update(own, prediction, is_stationary)
         if fits and match is not None:

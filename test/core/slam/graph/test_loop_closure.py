@@ -186,6 +186,24 @@ def test_where_an_earlier_visit_saw_other_walls_nothing_is_closed():
     assert not driver.loops.graph.edges
 
 
+WIDE = np.diag([9.0, 9.0, 1e-4])
+
+
+def test_a_loop_that_is_5_m_open_is_closed_in_its_place(monkeypatch):
+    """Scans in the smooth hall fit beside it, too: it is closed by views that are apart."""
+    driver = Driver(seed=0)
+    for k, truth in enumerate(round_the_block(laps=2)):
+        if k == 60:
+            driver.pose = driver.pose + [5.0, 0.0, 0.0]
+            driver.covariance = driver.covariance + WIDE
+        with monkeypatch.context() as there:
+            there.setattr(f'{__name__}.STEP', STEP + WIDE if k == 60 else STEP)
+            driver.go(truth, works=4)
+    assert driver.largest > 4.5
+    assert driver.errors().max() < 1.0
+    assert np.hypot(*(driver.pose - truth)[:2]) < 0.5
+
+
 def edge_to(loops, a, b, off, sigma=0.03):
     """Edge between keyframes a and b, at an offset (3,) from their current relative pose."""
     frames = loops.keyframes.frames
