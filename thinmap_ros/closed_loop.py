@@ -33,13 +33,13 @@ CONTROL_STEPS = 2
 SCANS_PER_GRAPH = 5
 Watch = Callable[[Decision, Array], None]
 """Receives each decision, and the estimated pose (3,) at which it was made."""
-MustYield = Callable[[Array, Command], bool]
-"""Whether a robot at a pose (3,) must not drive as commanded, because of another robot."""
+RightOfWay = Callable[[Array, Command, float], Command]
+"""Command of a robot at a pose (3,) for the next seconds, as others allow it to drive."""
 
 
-def drives_alone(T_map_base: Array, command: Command) -> bool:
-    """No robot must be yielded to."""
-    return False
+def drives_alone(T_map_base: Array, command: Command, period_s: float) -> Command:
+    """The command of a robot without others."""
+    return command
 
 
 @dataclass(eq=False)
@@ -252,16 +252,15 @@ class ClosedLoop:
         """Estimated pose (3,) of the robot at a pose (3,) of its odometry."""
         return se2.compose(self._T_map_odom, T_odom_base)
 
-    def control(self, moment: SensorReadings, must_yield: MustYield = drives_alone) -> None:
-        """Command the robot until the next step; must_yield: to other robots."""
+    def control(self, moment: SensorReadings, right_of_way: RightOfWay = drives_alone) -> None:
+        """Command the robot until the next step; right_of_way: among other robots."""
         observation = self._observation
         if observation is None or self._stop_reason:
             return
         T_map_base = self.pose_at(moment.T_odom_base)
         period_s = CONTROL_STEPS * STEP_NS / 1e9
         command = self.navigator.step(T_map_base, observation.patch, observation.scan, period_s)
-        if command.v > 0.0 and must_yield(T_map_base, command):
-            command = self.navigator.give_way(command, period_s)
+        command = right_of_way(T_map_base, command, period_s)
         self._drive.command = (command.v, command.w)
         if command.state == 'failed':
             self._target_failed(command.reason)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thinmap_ros.closed_loop import CONTROL_STEPS, ClosedLoop, ExplorationOutcome
+from thinmap_ros.closed_loop import CONTROL_STEPS, ClosedLoop, ExplorationOutcome, RightOfWay
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.team.claims import Claim
@@ -194,19 +194,21 @@ class TeamLoop:
             is_moving = own.v != 0.0 or own.w != 0.0
             self.claims.sent_bytes += _CLAIM_BYTES * (is_near and is_moving)
 
-    def _right_of_way(self, member: Member) -> Callable[[Array, Command], bool]:
+    def _right_of_way(self, member: Member) -> RightOfWay:
         others = list(self._recent_motions(member))
         distance_m = 2.0 * member.radius_m + _GIVE_WAY_MARGIN_M
         controller = member.loop.navigator.config.controller
         horizon_s = controller.max_speed_m_s / controller.max_acceleration_m_s2
 
-        def must_yield(T_map_base: Array, command: Command) -> bool:
+        def allowed(T_map_base: Array, command: Command, period_s: float) -> Command:
             own = Motion(member.name, T_map_base, command.v, command.w)
-            stops = must_stop(own, others, distance_m, horizon_s)
-            member.yielded_steps += stops
-            return stops
+            if command.v <= 0.0 or not must_stop(own, others, distance_m, horizon_s):
+                return command
+            member.yielded_steps += 1
+            places = np.array([other.pose[:2] for other in others])
+            return member.loop.navigator.give_way(command, period_s, places, distance_m)
 
-        return must_yield
+        return allowed
 
     def _recent_motions(self, member: Member) -> Iterator[Motion]:
         """Newest motions of the others; one that was silent for long is an obstacle of the map."""

@@ -97,6 +97,15 @@ def test_a_robot_believes_its_own_cells_first_and_the_newest_of_others():
     assert receiver.completed(own).cells[0, :4].tolist() == [0, 100, 0, 100]
 
 
+def test_a_robot_believes_others_where_it_is_not_sure():
+    own = GridPatch(LATTICE, np.array([[22, 80, 5, 97, 22, 40]], dtype=np.int8))
+    sender = TileSender(LATTICE)
+    sender.update(GridPatch(LATTICE, np.array([[100, 0, 100, 0, -1, 50]], dtype=np.int8)))
+    receiver = ReceivedTiles(LATTICE)
+    receiver.add('a', sender.changes_after(0))
+    assert receiver.completed(own).cells[0, :6].tolist() == [100, 0, 5, 97, 22, 40]
+
+
 def test_a_corridor_takes_few_bytes():
     cells = np.full((400, 400), -1, dtype=np.int8)
     cells[100:120, 20:380] = 0

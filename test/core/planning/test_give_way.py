@@ -11,6 +11,8 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.give_way import Motion, must_stop
 from thinmap_ros.core.planning.navigator import Navigator
 
+HALL = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((60, 60), dtype=np.int8))
+
 
 def at(robot, x, y, heading, v, w=0.0):
     return Motion(robot, se2.pose(x, y, heading), v, w)
@@ -49,16 +51,29 @@ def test_a_robot_that_follows_another_one_drives_on():
     assert not stops(at('b', 0.0, 0.0, 0.0, 0.5), at('a', 1.2, 0.0, 0.0, 0.5))
 
 
-def test_a_navigator_that_gives_way_turns_waits_and_aborts():
-    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((60, 60), dtype=np.int8))
+def test_a_navigator_that_gives_way_plans_around_the_other_robot():
+    navigator = Navigator()
+    navigator.set_goal(5.0, 3.0)
+    other = np.array([[3.0, 3.0]])
+    nearest_m = []
+    for _ in range(8):
+        command = navigator.step(se2.pose(2.2, 3.0, 0.0), HALL, None, 0.1)
+        if command.v > 0.0:
+            navigator.give_way(command, 0.1, other, 0.55)
+        nearest_m.append(float(np.hypot(*(navigator.path - other).T).min()))
+    assert nearest_m[0] < 0.1
+    assert nearest_m[-1] >= 0.55
+
+
+def test_a_navigator_that_gives_way_waits_and_aborts():
     navigator = Navigator()
     navigator.set_goal(5.0, 3.0)
     pose = se2.pose(1.0, 3.0, 0.0)
     states = []
     for _ in range(100):
-        command = navigator.step(pose, patch, None, 0.1)
+        command = navigator.step(pose, HALL, None, 0.1)
         if command.state == 'driving' and command.v > 0.0:
-            command = navigator.give_way(command, 0.1)
+            command = navigator.give_way(command, 0.1, np.array([[3.0, 0.5]]), 0.55)
             assert command.v == 0.0
         states.append(command.state)
         if command.state == 'failed':

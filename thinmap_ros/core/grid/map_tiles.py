@@ -31,6 +31,9 @@ def _table() -> NDArray[np.uint8]:
 
 EDGE = 16
 _PACKED_BYTES = EDGE * EDGE // 4
+# Percent: after some four beams, of which most agree.
+_SURELY_FREE = 10
+_SURELY_OCCUPIED = 90
 _MAX_TILES = 1 << 16
 _HEADER = struct.Struct('<IIIddd')
 _SHIFTS = np.array([0, 2, 4, 6], dtype=np.uint8)
@@ -189,15 +192,17 @@ class ReceivedTiles:
 
 
 def completed(own: GridPatch, other: GridPatch) -> GridPatch:
-    """A map, with the cells of another one on its lattice where it is undecided.
+    """A map, with the cells that another one on its lattice decides where it is not sure itself.
 
+    From afar a wall is easily taken for free: another robot that was there knows better.
     Raises InputError off the lattice.
     """
     wide = own.padded(own.overhang_of(other))
     row, col = wide.offset_of(other)
     cells = wide.cells.copy()
     part = cells[row : row + other.shape[0], col : col + other.shape[1]]
-    part[:] = _decided(part, other.cells)
+    is_sure = ((part >= 0) & (part <= _SURELY_FREE)) | (part >= _SURELY_OCCUPIED)
+    part[:] = np.where(is_sure, part, _decided(other.cells, part))
     return GridPatch(wide.frame, cells, own.is_replaced)
 
 

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -39,6 +39,10 @@ _MAX_WAYPOINT_PASS_M = 0.7
 NO_PATH = 'no path'
 _OBSTACLE = 'an obstacle blocks the path'
 _HIDDEN = 'the laser does not see the path: sector of invalid beams'
+_REPLAN_S = 0.5  # after a stop for an obstacle
+# Points around another robot, so far apart that no path leads between them.
+_RING = np.array([[math.cos(a), math.sin(a)] for a in np.linspace(0.0, 2.0 * math.pi, 13)[:-1]])
+_RING_MARGIN_M = 0.1  # paths run along cells
 _OTHER_ROBOT = 'another robot is in the way'
 _STUCK = (
     'the robot does not move as commanded: wheels blocked or off, or an obstacle that the laser '
@@ -125,7 +129,7 @@ class _Progress:
 
     standstills: number of them without progress; recoveries: all of them, up to the last waypoint
     too; nearest_m: smallest remaining length; is_near: whether the target has been near; yielded_s:
-    time at standstill for other robots since the last progress.
+    time at standstill for other robots since the last progress; robots: points around these.
     """
 
     path_age_s: float = 0.0
@@ -136,6 +140,7 @@ class _Progress:
     nearest_m: float = math.inf
     is_near: bool = False
     yielded_s: float = 0.0
+    robots: Array = field(default_factory=lambda: np.empty((0, 2)))
 
 
 class _Motion:
@@ -241,11 +246,17 @@ class Navigator:
                 return self._wait(reason, dt_s)
         return self._drive(T_map_base, dt_s)
 
-    def give_way(self, command: Command, dt_s: float) -> Command:
+    def give_way(self, command: Command, dt_s: float, robots: Array, distance_m: float) -> Command:
         """Command in place of one with which another robot would be touched: turn, or stand.
 
-        The goal is aborted after blocked_timeout_s without progress.
+        robots (M, 2), m: where others are; a path around them, at least distance_m away, is planned
+        soon. The goal is aborted after blocked_timeout_s without progress.
         """
+        ring_m = distance_m + _RING_MARGIN_M - self.config.stop_radius_m
+        self._progress.robots = (robots[:, None] + ring_m * _RING).reshape(-1, 2)
+        self._progress.path_age_s = max(
+            self._progress.path_age_s, self.config.replan_period_s - _REPLAN_S
+        )
         self._progress.yielded_s += dt_s
         if self._progress.yielded_s > self.config.blocked_timeout_s:
             self.cancel()
@@ -344,7 +355,7 @@ class Navigator:
 
         These while it is blocked. None for nothing.
         """
-        points = self._motion.stuck_places.points()
+        points = np.concatenate([self._motion.stuck_places.points(), self._progress.robots])
         if self._progress.blocked_s > 0.0:
             reach_m = self.config.scan_obstacle_range_m
             points = np.concatenate([points, self._obstacles.query_radius(T_map_base, reach_m)])
@@ -378,6 +389,7 @@ class Navigator:
         if self._progress.remaining_m < self._progress.nearest_m - self.config.progress_m:
             self._progress.standstills = 0
             self._progress.yielded_s = 0.0
+            self._progress.robots = np.empty((0, 2))
             self._progress.nearest_m = self._progress.remaining_m
         before = (self._follower.v, self._follower.w)
         room = self._obstacles.clearance_along(self.path, nearest, self.config.clearance_ahead_m)
@@ -440,7 +452,7 @@ class Navigator:
         if abs(se2.wrap(heading - float(T_map_base[2]))) > self.config.aim_tolerance_rad:
             return Command(*self._follower.turn_to(T_map_base, heading, dt_s), 'driving')
         self._progress.path_age_s = max(
-            self._progress.path_age_s, self.config.replan_period_s - 0.5
+            self._progress.path_age_s, self.config.replan_period_s - _REPLAN_S
         )
         return Command(*self._follower.override_speed(0.0, 0.0), 'blocked', reason)
 

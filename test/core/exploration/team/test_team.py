@@ -33,7 +33,8 @@ def straight(T_map_base, goals):
     return np.hypot(*(goals - T_map_base[:2]).T)
 
 
-def claim(robot, x, place=None, remaining_m=0.0, stamp_ns=0, settled=()):
+def claim(robot, x, place=(99.0, 99.0), remaining_m=0.0, stamp_ns=0, settled=()):
+    """A claim of a place that no candidate is near to, unless one is given."""
     return Claim(robot, stamp_ns, se2.pose(x, 0.0, 0.0), place, remaining_m, settled)
 
 
@@ -82,14 +83,18 @@ def test_no_robot_waits_far_from_what_is_left():
     assert shares([candidate(3.0)], claims) == [[3.0], []]
 
 
-def test_the_claim_of_a_robot_that_stands_is_free():
+def test_robots_that_stand_or_claim_nothing_do_not_bid():
     team = Team('a')
     for second in range(30):
         now_ns = second * SECOND_NS
         team.add_claim(claim('b', 9.0, (8.0, 0.0), 5.0, now_ns), now_ns)
-        team.add_claim(claim('c', 9.5, None, 0.0, now_ns), now_ns)
-    own = claim('a', 7.5, (8.0, 0.0), stamp_ns=29 * SECOND_NS)
+        team.add_claim(claim('c', 7.9, None, 0.0, now_ns), now_ns)
+    own = claim('a', 3.0, None, stamp_ns=29 * SECOND_NS)
     assert team.share([candidate(8.0)], own, straight, MARGIN_M)
+    now_ns = 29 * SECOND_NS
+    team.add_claim(claim('c', 7.9, (8.0, 0.0), 0.0, now_ns + 1), now_ns)
+    assert not Team('a', TeamConfig(follow_m=0.0)).claims.held(now_ns)
+    assert [held.robot for held in team.claims.held(now_ns)] == ['c']
 
 
 def test_what_one_robot_has_settled_is_settled_for_the_others():

@@ -104,14 +104,15 @@ class Claims:
         received = [r for r in self._received.values() if self._is_recent(r, now_ns)]
         return sorted((r.claim for r in received), key=lambda claim: claim.robot)
 
-    def place_of(self, robot: str, now_ns: int) -> Place | None:
-        """Place that a robot has claimed; None where it has none, or its claim has ended."""
-        received = self._received.get(robot)
-        if received is None or not self._is_recent(received, now_ns):
-            return None
-        idle_ns = now_ns - received.progress_ns
-        is_held = idle_ns <= self.config.progress_timeout_s * SECOND_NS
-        return received.claim.place if is_held else None
+    def held(self, now_ns: int) -> list[Claim]:
+        """Those of them that claim a place to which their robots make progress."""
+        limit_ns = self.config.progress_timeout_s * SECOND_NS
+        return [
+            claim
+            for claim in self.present(now_ns)
+            if claim.place is not None
+            and now_ns - self._received[claim.robot].progress_ns <= limit_ns
+        ]
 
     def _is_recent(self, received: _Received, now_ns: int) -> bool:
         return now_ns - received.received_ns <= self.config.claim_timeout_s * SECOND_NS

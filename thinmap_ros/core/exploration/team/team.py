@@ -107,21 +107,19 @@ class Team:
     ) -> list[Candidate]:
         """The candidates that are this robot's: one by auction, or the nearest one to follow.
 
-        own: what this robot claims now; margin_m: saving for which a claim is given up.
+        own: what this robot claims now; margin_m: saving for which a claim is given up. A robot
+        that claims nothing, or makes no progress, does not bid: it has put aside what is left.
         """
-        others = self.claims.present(own.stamp_ns)
+        others = self.claims.held(own.stamp_ns)
         if not others or not candidates:
             return candidates
-        places = [self.claims.place_of(other.robot, own.stamp_ns) for other in others]
-        bidders = sorted(
-            [(own, own.place), *zip(others, places, strict=True)], key=lambda b: b[0].robot
-        )
-        me = [claim is own for claim, _ in bidders].index(True)
+        bidders = sorted([own, *others], key=lambda claim: claim.robot)
+        me = bidders.index(own)
         goals = np.array([candidate.goal for candidate in candidates])[:, :2]
-        lengths = np.array([lengths_from(claim.pose, goals) for claim, _ in bidders])
+        lengths = np.array([lengths_from(claim.pose, goals) for claim in bidders])
         near = np.argsort(lengths.min(axis=0), kind='stable')[:_MAX_CANDIDATES]
         middles = np.array([candidates[i].middle for i in near])
-        claimed = _claimed(middles, [place for _, place in bidders])
+        claimed = _claimed(middles, [claim.place for claim in bidders])
         won = int(auction(lengths[:, near], claimed, margin_m)[me])
         if won != NOTHING:
             return [candidates[near[won]]]
