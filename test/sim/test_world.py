@@ -225,5 +225,5 @@ def test_starts_of_several_robots_are_read(tmp_path):
     read_world(path)
     for wrong in ('[[1, 1]]', '[1, 1, 0]', 'here', '[[1, 1, .inf]]', '{}'):
         path.write_text(f'{walls}starts: {wrong}\n')
-        with pytest.raises(InputError, match='w.yaml: starts: '):
+        with pytest.raises(InputError, match=r'w\.yaml: starts: '):
             read_starts(path)
