@@ -110,6 +110,7 @@ def test_ctrl_c_ends_everything(ros_domain, tmp_path, robots, nodes):
     assert not (out / 'report.json').exists()
 
 
+@pytest.mark.slow
 def test_two_robots_join_their_maps_and_nothing_is_left(ros_domain, tmp_path):
     """With real localizers and mappers, which do not know the starts of each other."""
     out = tmp_path / 'demo'
