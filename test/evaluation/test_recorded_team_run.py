@@ -68,7 +68,8 @@ class Robots:
 
     def pose(self, T):
         x, y, yaw = T.tolist()
-        w, z = np.cos(yaw / 2.0), np.sin(yaw / 2.0)
+        w = np.cos(yaw / 2.0)
+        z = np.sin(yaw / 2.0)
         return self.make(
             'geometry_msgs/msg/Pose',
             position=self.make('geometry_msgs/msg/Point', x=x, y=y, z=0.0),
