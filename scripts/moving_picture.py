@@ -1,15 +1,18 @@
-"""Draws the pictures at the head of README.md: an exploration as a GIF, a finished map as a PNG.
+"""Draws explorations, of one robot or two, as GIFs, and a finished map as a PNG.
 
     python scripts/moving_picture.py exploration [WORLD] [-o docs/images/exploration.gif]
+    python scripts/moving_picture.py team [WORLD] [-o docs/images/two_robots.gif]
     python scripts/moving_picture.py map MAP.yaml [-o docs/images/intel.png]
 
 `exploration` explores a simulated world with SLAM, as explore_world does, and draws a frame every
 few seconds of simulated time: occupancy map, topological graph, path, robot and laser.
+`team` does so with two robots that explore together, as explore_world --robots 2.
 `map` draws a map_server map, as `replay --resolution-m 0.05` writes it.
 """
 
 import argparse
 import math
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -26,14 +29,17 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.evaluation.team_run import TeamOptions, make_team
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.package_data import world_path
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.other_robots import starts_side_by_side
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
+from thinmap_ros.team.loop import TeamLoop
 from thinmap_ros.view import palette
 
 IMAGES = Path(__file__).resolve().parents[1] / 'docs' / 'images'
@@ -45,6 +51,7 @@ SMOOTHING = 2  # frames are drawn this many times as large
 SCANS_PER_FRAME = 12
 FRAME_MS = 100
 LAST_FRAME_MS = 3000
+TEAM = 2
 MAP_MARGIN_M = 1.0
 WALL_QUANTILE = 0.01
 MAP_SHADES = 16
@@ -145,22 +152,26 @@ def draw_laser(canvas: Canvas, scan: Scan, T_map_base: Array) -> None:
     canvas.draw.polygon(canvas.pixels(np.vstack([[[x, y]], ends])), fill=LASER)
 
 
-def draw_robot(canvas: Canvas, T_map_base: Array, radius_m: float) -> None:
+def draw_robot(canvas: Canvas, T_map_base: Array, radius_m: float, colour: str = ROBOT) -> None:
     """Draw the robot and its heading."""
-    canvas.disc(T_map_base, radius_m * canvas.scale / SMOOTHING, ROBOT)
+    canvas.disc(T_map_base, radius_m * canvas.scale / SMOOTHING, colour)
     x, y, heading = T_map_base
     front = (x + radius_m * math.cos(heading), y + radius_m * math.sin(heading))
     canvas.line(np.array([[x, y], front]), WHITE, 2.0)
+
+
+def shown_area(world: World) -> tuple[Array, Array]:
+    """Lower left and upper right corner, m, of a picture that shows all walls."""
+    rows, cols = np.nonzero(world.occupied)
+    walls = world.frame.centres_of(np.column_stack([rows, cols]))
+    return walls.min(axis=0) - MARGIN_M, walls.max(axis=0) + MARGIN_M
 
 
 class Film(Strategy):
     """A strategy that draws a frame of every few scans and leaves the decisions to another one."""
 
     def __init__(self, world: World, loop: ClosedLoop, radius_m: float) -> None:
-        rows, cols = np.nonzero(world.occupied)
-        walls = world.frame.centres_of(np.column_stack([rows, cols]))
-        self.low = walls.min(axis=0) - MARGIN_M
-        self.high = walls.max(axis=0) + MARGIN_M
+        self.low, self.high = shown_area(world)
         self.loop = loop
         self.strategy = loop.strategy
         self.radius_m = radius_m
@@ -221,6 +232,43 @@ def explore_on_film(world: World, options: Options) -> list[Image.Image]:
     return film.images
 
 
+def explore_together_on_film(world: World, options: Options, count: int) -> list[Image.Image]:
+    """Explore a world with several robots; returns a picture of every few seconds."""
+    radius_m = PRESETS[options.robot].radius_m
+    starts = starts_side_by_side(world, world.start, count, radius_m)
+    loop = make_team(world, starts, options, TeamOptions())
+    low, high = shown_area(world)
+    images: list[Image.Image] = []
+
+    def show(seconds: float, _: float) -> None:
+        images.append(team_image(loop, Canvas(low, high), seconds))
+
+    goal = observable_cells(world, world.start, radius_m, options.laser.range_max_m)
+    outcome = loop.run(goal, options.time_limit_s, show, SCANS_PER_FRAME)
+    print(f'{world.name}: {outcome.reason}, {len(images)} frames')
+    return images
+
+
+def team_image(loop: TeamLoop, canvas: Canvas, seconds: float) -> Image.Image:
+    """The joint map and graph, and the path of each robot."""
+    patch = loop.maps.known_area()
+    paste_map(canvas, patch)
+    for member in loop.members:
+        if member.moment.scan is not None and not loop.is_finished:
+            draw_laser(canvas, member.moment.scan, member.pose)
+    draw_graph(canvas, loop.maps.view(0)[0])
+    driven_m = 0.0
+    for member, colour in zip(loop.members, palette.ROBOTS, strict=False):
+        path = np.array(member.loop.log.poses)[:, :2]
+        driven_m += float(np.hypot(*np.diff(path, axis=0).T).sum())
+        canvas.line(path, colour, 2.5)
+        draw_robot(canvas, member.pose, member.radius_m, colour)
+    known_m2 = float(patch.free.sum()) * patch.frame.resolution**2
+    text = f'{seconds:.0f} s   {driven_m:.0f} m driven   {known_m2:.0f} m² known'
+    canvas.caption(f'{text}   exploration finished' if loop.is_finished else text)
+    return canvas.smoothed()
+
+
 def fine_pipeline(start: Array, options: Options) -> Pipeline:
     """The pipeline of an exploration in the simulator, with cells of CELL_M."""
     x, y, yaw = (float(number) for number in start)
@@ -229,11 +277,11 @@ def fine_pipeline(start: Array, options: Options) -> Pipeline:
     return Pipeline(PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH))
 
 
-def gif_palette() -> Image.Image:
+def gif_palette(drawn: Sequence[str]) -> Image.Image:
     """The colours of a frame, pure and blended with what is below them, as smoothing needs it."""
     grounds = [np.array(palette.rgb(colour)) for colour in (WHITE, BLACK, GREY, OBSERVED)]
-    drawn = (PLAN, ROBOT, PATH, palette.EDGE, *palette.NODES.values())
-    inks = [*grounds, *(np.array(palette.rgb(colour)) for colour in dict.fromkeys(drawn))]
+    colours = dict.fromkeys([*drawn, palette.EDGE, *palette.NODES.values()])
+    inks = [*grounds, *(np.array(palette.rgb(colour)) for colour in colours)]
     blends = {
         tuple(np.rint(ground + share * (ink - ground)).astype(int).tolist())
         for ink in inks
@@ -245,9 +293,9 @@ def gif_palette() -> Image.Image:
     return picture
 
 
-def write_gif(path: Path, images: list[Image.Image]) -> None:
-    """Write an endless loop, with one palette for all frames."""
-    colours = gif_palette()
+def write_gif(path: Path, images: list[Image.Image], drawn: Sequence[str]) -> None:
+    """Write an endless loop, with one palette for all frames; drawn: colours beside the graph's."""
+    colours = gif_palette(drawn)
     frames = [image.quantize(palette=colours, dither=Image.Dither.NONE) for image in images]
     durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
     with atomic_write(path) as aside:
@@ -266,7 +314,15 @@ def write_exploration(arguments: argparse.Namespace) -> None:
     """Explore a world and write the GIF."""
     world = World.from_patch(*read_world(world_path(arguments.world)))
     options = Options(localization='slam', seed=arguments.seed, time_limit_s=LIMIT_S)
-    write_gif(arguments.out, explore_on_film(world, options))
+    write_gif(arguments.out, explore_on_film(world, options), (PLAN, ROBOT, PATH))
+
+
+def write_team(arguments: argparse.Namespace) -> None:
+    """Explore a world with two robots and write the GIF."""
+    world = World.from_patch(*read_world(world_path(arguments.world)))
+    options = Options(seed=arguments.seed, time_limit_s=LIMIT_S)
+    images = explore_together_on_film(world, options, TEAM)
+    write_gif(arguments.out, images, palette.ROBOTS[:TEAM])
 
 
 def building(patch: GridPatch) -> tuple[int, int, int, int]:
@@ -301,6 +357,11 @@ def main() -> None:
     exploration.add_argument('-o', '--out', type=Path, default=IMAGES / 'exploration.gif')
     exploration.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
     exploration.set_defaults(work=write_exploration)
+    team = commands.add_parser('team', help='a GIF of an exploration by two robots')
+    team.add_argument('world', nargs='?', default='lab', help='a world (default: lab)')
+    team.add_argument('-o', '--out', type=Path, default=IMAGES / 'two_robots.gif')
+    team.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
+    team.set_defaults(work=write_team)
     finished = commands.add_parser('map', help='a PNG of a map_server map')
     finished.add_argument('map', type=Path, help='YAML file of the map')
     finished.add_argument('-o', '--out', type=Path, default=IMAGES / 'intel.png')

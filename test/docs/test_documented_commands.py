@@ -70,6 +70,7 @@ MAX_MARKS = 9
 # Too long for every run: only their help is run, to check script, program and options.
 HELP_ONLY = {
     'scripts/demo': 'test/live/test_demo.py runs the demo to its end',
+    'scripts/demo --robots 2 --world office': 'as above',
     'scripts/endurance': 'hours; scripts/endurance --minutes 10 is for releases',
     'scripts/experiment all': 'test/experiments/test_experiments.py runs each experiment',
 }

@@ -97,20 +97,75 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     assert not nodes_of(out)
 
 
-def test_ctrl_c_ends_everything(ros_domain, tmp_path):
+@pytest.mark.parametrize(('robots', 'nodes'), [('1', 8), ('2', 6)])
+def test_ctrl_c_ends_everything(ros_domain, tmp_path, robots, nodes):
     out = tmp_path / 'demo'
-    process = demo(out, '--rate', '5')
-    until = time.monotonic() + PATIENCE_S
-    while not (out / 'bag').exists() or len(process_tree(process)) < 8:
-        assert time.monotonic() < until and process.poll() is None, process.communicate()
-        time.sleep(0.1)
-    tree = process_tree(process)
+    process = demo(out, '--rate', '5', '--robots', robots)
+    tree = until_started(process, out, nodes)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
     assert 'interrupted' in stderr and 'Traceback' not in stderr
     assert not psutil.wait_procs(tree, timeout=PATIENCE_S)[1]
     assert not (out / 'report.json').exists()
+
+
+@pytest.mark.slow
+def test_two_robots_join_their_maps_and_nothing_is_left(ros_domain, tmp_path):
+    """With real localizers and mappers, which do not know the starts of each other."""
+    out = tmp_path / 'demo'
+    office = ['--world', 'office', '--speed', '0.4', '--rate', '20', '--time-limit', '25']
+    process = demo(out, '--robots', '2', *office)
+    stdout, stderr = process.communicate(timeout=PROGRAM_S)
+    assert process.returncode == 0, stderr
+    report = json.loads((out / 'report.json').read_text())
+    assert [robot['name'] for robot in report['robots']] == ['robot1', 'robot2']
+    assert not report['finished'] and report['reason']
+    assert report['collisions'] == 0
+    assert report['distance'] == pytest.approx(sum(r['distance'] for r in report['robots']))
+    for robot in report['robots']:
+        assert robot['distance'] > 1.0
+        assert robot['pose_rmse'] < 0.1
+        assert 0.0 <= robot['joined_at'] < 60.0
+        off_m, off_deg = robot['join_error']
+        assert off_m < 0.15 and off_deg < 1.5
+    assert 'joined: robot2: after ' in stdout
+    # The joint map holds what both have seen.
+    assert occupancy_maps.read_map(out / 'map.yaml').free.sum() * 0.05**2 > 20.0
+    assert len(json.loads((out / 'topology.geojson').read_text())['features']) > 5
+    for name in ('robot1', 'robot2'):
+        assert np.loadtxt(out / f'trajectory_{name}.tum').shape[1] == 8
+    assert (out / 'summary.png').stat().st_size > 10_000
+    assert 'Maps joined' in (out / 'report.html').read_text()
+    topics = {
+        f'/{name}/{topic}' for name in ('robot1', 'robot2') for topic in ('scan', 'map', 'tf')
+    }
+    bag = Bag(out / 'bag')
+    assert set(bag.topics) >= topics | {'/merged_map', '/merged_topology', '/join_status', '/clock'}
+    assert not bag.is_truncated
+    assert not nodes_of(out)
+
+
+def test_a_robot_whose_nodes_die_ends_the_demo_and_leaves_nothing(ros_domain, tmp_path):
+    out = tmp_path / 'demo'
+    process = demo(out, '--robots', '2', '--rate', '5')
+    tree = until_started(process, out, 6)
+    (robot,) = [each for each in tree if '__ns:=/robot2' in each.cmdline()]
+    robot.kill()
+    _, stderr = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 2
+    assert 'robot2 ended early with code -9' in stderr and 'Traceback' not in stderr
+    assert not psutil.wait_procs(tree, timeout=PATIENCE_S)[1]
+    assert not (out / 'report.json').exists()
+
+
+def until_started(process, out, count):
+    """The processes of a demo that has so many, and a bag."""
+    until = time.monotonic() + PATIENCE_S
+    while not (out / 'bag').exists() or len(process_tree(process)) < count:
+        assert time.monotonic() < until and process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    return process_tree(process)
 
 
 def process_tree(process):
@@ -123,6 +178,9 @@ def process_tree(process):
         (['--world', 'atlantis'], 'atlantis'),
         (['--robot', '4wd'], '4wd'),
         (['--rate', 'fast'], 'fast'),
+        (['--robots', '0'], '--robots=0: expected 1 to 9'),
+        (['--robots', '2', '--view'], '--view: '),
+        (['--robots', 'two'], 'two'),
     ],
 )
 def test_wrong_arguments_end_at_once(tmp_path, arguments, said):

@@ -9,9 +9,8 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.sim.laser import LaserScannerConfig
-from thinmap_ros.sim.other_robots import SharedWorld, starts_side_by_side
+from thinmap_ros.sim.other_robots import simulations_in, starts_in, starts_side_by_side
 from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
 RADIUS_M = PRESETS['2dx'].radius_m
@@ -27,15 +26,7 @@ def room(rows=80, cols=80):
 
 def two(place):
     """Simulations of a robot at (2, 4) that faces +x, and of another one at a pose."""
-    worlds = [SharedWorld.of(room()), SharedWorld.of(room())]
-    poses = [se2.pose(2.0, 4.0, 0.0), place]
-    simulations = [
-        Simulation(world, pose, PRESETS['2dx'], LASER, 1)
-        for world, pose in zip(worlds, poses, strict=True)
-    ]
-    worlds[0].others.append(simulations[1].robot)
-    worlds[1].others.append(simulations[0].robot)
-    return simulations
+    return simulations_in(room(), [se2.pose(2.0, 4.0, 0.0), place], PRESETS['2dx'], LASER, 1)
 
 
 def test_a_laser_sees_the_other_robot_and_the_wall_beside_it():
@@ -80,3 +71,30 @@ def test_no_robot_starts_behind_a_wall():
     world.occupied[:, 25] = 1
     starts = starts_side_by_side(world, se2.pose(2.0, 4.0, 0.0), 4, RADIUS_M)
     assert max(start[0] for start in starts) < 2.5
+
+
+def test_a_robot_does_not_start_on_another_one():
+    with pytest.raises(InputError, match=r'start \[2.3, 4.0\]: expected a place'):
+        two(se2.pose(2.3, 4.0, 0.0))
+
+
+def test_listed_starts_come_before_those_side_by_side():
+    world = room()
+    listed = np.array([[5.0, 5.0, 1.0], [2.0, 2.0, 0.0]])
+    for count, expected in ((2, listed.tolist()), (1, [world.start.tolist()])):
+        starts = starts_in(world, world.start, listed, count, RADIUS_M)
+        assert [start.tolist() for start in starts] == expected
+    side_by_side = starts_in(world, world.start, listed, 3, RADIUS_M)
+    assert side_by_side[0].tolist() == world.start.tolist()
+
+
+def test_robots_are_the_same_alone_and_beside_another_one_but_for_what_they_see():
+    """The noise of each is that of its own seed."""
+    one, other = two(se2.pose(2.0, 1.0, 0.0))
+    (alone,) = simulations_in(room(), [se2.pose(2.0, 4.0, 0.0)], PRESETS['2dx'], LASER, 1)
+    for _ in range(40):
+        one.step(0.3, 0.1)
+        other.step(0.3, 0.1)
+        alone.step(0.3, 0.1)
+    assert one.robot.T_odom_base.tolist() == alone.robot.T_odom_base.tolist()
+    assert other.robot.T_odom_base.tolist() != alone.robot.T_odom_base.tolist()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files import worlds
 from thinmap_ros.files.limits import FILES
-from thinmap_ros.files.worlds import read_world
+from thinmap_ros.files.worlds import read_starts, read_world
 from thinmap_ros.sim.world import World
 
 ROOM = Path(__file__).parents[2] / 'worlds' / 'room_10x10.yaml'
@@ -213,3 +213,17 @@ def test_a_map_is_a_world(tmp_path: Path) -> None:
     assert world.occupied[2, 5] == 0
     assert (world.frame.origin_x, world.frame.origin_y) == (-1.0, 2.0)
     assert np.isnan(world.start[:2]).all()
+
+
+def test_starts_of_several_robots_are_read(tmp_path):
+    path = tmp_path / 'w.yaml'
+    walls = 'resolution: 0.1\nwall_thickness: 0.2\nstart: [1, 1, 0]\nwalls: [[[0, 0], [3, 0]]]\n'
+    path.write_text(walls)
+    assert read_starts(path).shape == (0, 3)
+    path.write_text(f'{walls}starts: [[1, 1, 0], [2, 1, 1.5]]\n')
+    assert read_starts(path).tolist() == [[1.0, 1.0, 0.0], [2.0, 1.0, 1.5]]
+    read_world(path)
+    for wrong in ('[[1, 1]]', '[1, 1, 0]', 'here', '[[1, 1, .inf]]', '{}'):
+        path.write_text(f'{walls}starts: {wrong}\n')
+        with pytest.raises(InputError, match=r'w\.yaml: starts: '):
+            read_starts(path)

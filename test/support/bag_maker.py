@@ -22,7 +22,7 @@ class Maker:
     def __init__(self, writer: BagWriter) -> None:
         self.types = writer.typestore.types
 
-    def __call__(self, name: str, **fields: Any) -> Any:
+    def __call__(self, name: str, /, **fields: Any) -> Any:
         return self.types[name](**fields)
 
     def header(self, frame: str, ns: int) -> Any:

@@ -49,17 +49,17 @@ FILES = (
     'summary.png',
     'recording.rrd',
 )
-_TOPICS = {
-    '/ground_truth',
-    '/pose',
-    '/map',
-    '/map_updates',
-    '/topology',
-    '/end_nodes',
-    '/exploration_status',
-    '/collisions',
-    '/scan',
-}
+_TOPICS = (
+    'ground_truth',
+    'pose',
+    'map',
+    'map_updates',
+    'topology',
+    'end_nodes',
+    'exploration_status',
+    'collisions',
+    'scan',
+)
 
 
 @dataclass(eq=False)
@@ -80,38 +80,42 @@ class Recording:
     range_max_m: float = 8.0
 
 
-def read(path: Path) -> Recording:
-    """Read the outputs from the bag of a run. Raises InputError if a topic is missing."""
+def read(path: Path, prefix: str = '/') -> Recording:
+    """Read the outputs from the bag of a run; prefix: of the topics of one of several robots.
+
+    Raises InputError if a topic is missing.
+    """
     bag = Bag(path)
     recording = Recording()
     known = MapReceiver()
-    for raw in bag.messages(_TOPICS):
+    for raw in bag.messages({f'{prefix}{name}' for name in _TOPICS}):
         message = bag.decode(raw)
-        if raw.topic == '/collisions':
+        topic = raw.topic.removeprefix(prefix)
+        if topic == 'collisions':
             recording.collisions = int(message.data)
             continue
         ns = decode.stamp_ns(message)
-        if raw.topic == '/ground_truth':
+        if topic == 'ground_truth':
             recording.true[ns] = decode.pose(message.pose)
-        elif raw.topic == '/pose':
+        elif topic == 'pose':
             recording.estimated[ns] = decode.pose(message.pose.pose)
-        elif raw.topic in ('/map', '/map_updates'):
+        elif topic in ('map', 'map_updates'):
             recording.maps += [(ns, patch) for patch in _known_map(known, ns, message)]
-        elif raw.topic == '/topology':
-            recording.topology = _topology(path, message)
-        elif raw.topic == '/end_nodes':
+        elif topic == 'topology':
+            recording.topology = recorded_topology(path, raw.topic, message)
+        elif topic == 'end_nodes':
             nodes = [(int(n.node_id), n.position.x, n.position.y) for n in message.end_nodes]
             recording.end_nodes.append((ns, nodes))
             recording.hidden = [
                 (n.position.x, n.position.y, float(n.expected_area_m2)) for n in message.end_nodes
             ]
-        elif raw.topic == '/exploration_status':
+        elif topic == 'exploration_status':
             recording.missing = _missing_area(message)
         else:
             recording.range_max_m = float(message.range_max)
     if not (recording.true and recording.estimated and recording.maps):
         raise InputError(
-            f'{path}: expected /ground_truth, /pose and /map; '
+            f'{path}: expected {prefix}ground_truth, {prefix}pose and {prefix}map; '
             f'it has {", ".join(sorted(bag.topics))}'
         )
     return recording
@@ -128,11 +132,12 @@ def _known_map(known: MapReceiver, ns: int, message: Any) -> list[GridPatch]:
     return [known.patch] if is_new and known.patch is not None else []
 
 
-def _topology(path: Path, message: Any) -> TopologicalMap:
+def recorded_topology(path: Path, topic: str, message: Any) -> TopologicalMap:
+    """Topological map of a message. Raises InputError, with path and topic, if it is invalid."""
     try:
         return topology_from_msg(message)
     except InputError as error:
-        raise InputError(f'{path}: /topology: {error}') from error
+        raise InputError(f'{path}: {topic}: {error}') from error
 
 
 def _missing_area(message: Any) -> MissingArea | None:

@@ -41,6 +41,19 @@ def read_tour(path: Path) -> Array:
     return _points(path, 'tour', content['tour'], 1) if 'tour' in content else np.empty((0, 2))
 
 
+def read_starts(path: Path) -> Array:
+    """Starts of several robots in a world, poses (N, 3); may be empty.
+
+    Raises InputError with file, value and expectation.
+    """
+    content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
+    drawn = content.get('starts', [])
+    if not isinstance(drawn, list):
+        raise InputError(f'{path}: starts: {quoted(drawn)}: expected a list of [x, y, theta]')
+    poses = [_numbers(path, {'starts': start}, 'starts', 3) for start in drawn]
+    return np.array([pose(*numbers) for numbers in poses]).reshape(-1, 3)
+
+
 def _from_map(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
     start = np.array([np.nan, np.nan, 0.0])
     if 'start' in content:
@@ -92,7 +105,7 @@ def _points(path: Path, what: str, drawn: object, fewest: int) -> Array:
 
 
 def _from_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
-    known = {'name', 'resolution', 'wall_thickness', 'start', 'tour', 'walls', 'solids'}
+    known = {'name', 'resolution', 'wall_thickness', 'start', 'starts', 'tour', 'walls', 'solids'}
     if unknown := set(content) - known:
         expected = ', '.join(sorted(known))
         raise InputError(f'{path}: unknown key {quoted(min(unknown))}: expected {expected}')

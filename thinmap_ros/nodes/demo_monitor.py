@@ -1,40 +1,37 @@
-"""Requests an exploration, shows its progress in a bar, and writes its result to a file."""
+"""Requests explorations, shows their progress in a bar, and writes their results to a file."""
 
 import json
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from action_msgs.msg import GoalStatus
-from map_msgs.msg import OccupancyGridUpdate
-from nav_msgs.msg import OccupancyGrid
-from rclpy.action import ActionClient
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.task import Future
 
-from thinmap_msgs.action import Explore
-from thinmap_msgs.msg import ExplorationStatus
+from thinmap_msgs.msg import JoinStatus
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.map_receiver import MapReceiver
+from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array
 from thinmap_ros.files import package_data
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.nodes.exploration.goal_result import GoalResult
+from thinmap_ros.nodes.simulation.requested_exploration import RequestedExploration
+from thinmap_ros.nodes.simulation.starts import poses_from
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.decoding.map_updates import received_map, received_update, updates_topic
 from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.other_robots import MAX_ROBOTS
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.view.progress_bar import ProgressBar
 
 _PERIOD_S = 0.5
-# Without an answer for this time, the goal is sent again: an explorer that has just been discovered
-# may be unable to answer.
-_RESEND_S = 10.0
+# Of several robots, after the last exploration: map_joiner searches in the background.
+_JOIN_PATIENCE_S = 20.0
+_LAST_MERGE_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +40,12 @@ class DemoMonitorConfig(Config):
 
     world: str = parameter('room_10x10', 'World whose coverage is shown.')
     robot: str = parameter('2dx', 'Preset of the robot.', choices=tuple(PRESETS))
+    map_poses: str = parameter(
+        '',
+        'Pose in the world of the map frame of each of several robots, as "x,y,theta; x,y,theta" '
+        '(m, m, rad); their topics are in the namespaces robot1, robot2, ... Empty: one robot, '
+        'whose map frame is the world.',
+    )
     range_max_m: float = parameter(8.0, 'Range of the laser (m).', low=0.1, high=200.0)
     time_limit_s: float = parameter(
         0.0, 'Simulated time after which the exploration ends (s). 0: none.', low=0.0
@@ -51,90 +54,99 @@ class DemoMonitorConfig(Config):
 
 
 class DemoMonitorNode(Node):
-    """Client of the action explore."""
+    """Client of the action explore, or of that of each of several robots."""
 
     def __init__(self) -> None:
         super().__init__('demo_monitor')
-        self._config = parameters.declare_config(self, DemoMonitorConfig)
+        config = parameters.declare_config(self, DemoMonitorConfig)
         parameters.reject_unknown(self)
-        world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
-        radius = PRESETS[self._config.robot].radius_m
-        self._coverable = observable_cells(world, world.start, radius, self._config.range_max_m)
-        self._coverage = 0.0
-        self._sent: Any = None
-        self._sent_at = 0.0
-        self._accepted = False
+        self._result = config.result
+        self._is_team = bool(config.map_poses)
+        world = World.from_patch(*read_world(package_data.world_path(config.world)))
+        radius = PRESETS[config.robot].radius_m
+        self._coverable = observable_cells(world, world.start, radius, config.range_max_m)
+        self._known: dict[str, NDArray[np.bool_]] = {}
         self.finished = False
         self._bar = ProgressBar('area seen')
         self._bar.show(0.0, 'waiting for the nodes')
-        self._explore = ActionClient(self, Explore, 'explore')
-        self._map = MapReceiver()
-        self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        updates = updates_topic(self, 'map')
-        self.create_subscription(OccupancyGridUpdate, updates, self._on_update, qos.STREAM)
-        self.create_timer(_PERIOD_S, self._send_goal, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._robots = {
+            prefix: self._robot(prefix, T_world_map, config.time_limit_s)
+            for prefix, T_world_map in _map_poses(config).items()
+        }
+        self._ended_s: float | None = None
+        self._is_joined = False
+        if self._is_team:
+            self.create_subscription(JoinStatus, 'join_status', self._on_joined, qos.LATCHED)
+        self.create_timer(_PERIOD_S, self._work, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def close(self) -> None:
         """End the bar, so that the next output starts on a new line."""
         self._bar.close()
 
-    def _send_goal(self) -> None:
-        if self._accepted or not self._explore.server_is_ready():
-            return
-        if self._sent is not None and monotonic() - self._sent_at < _RESEND_S:
-            return
-        goal = Explore.Goal(time_limit_s=self._config.time_limit_s)
-        self._sent_at = monotonic()
-        self._sent = self._explore.send_goal_async(goal, self._on_feedback)
-        self._sent.add_done_callback(self._on_accepted)
+    def _robot(self, prefix: str, T_world_map: Array, time_limit_s: float) -> RequestedExploration:
+        def on_map(patch: GridPatch) -> None:
+            self._known[prefix] = self._coverable.known(patch, T_world_map)
 
-    def _on_accepted(self, future: Future) -> None:
-        if future is not self._sent:
-            return  # replaced by a newer goal
-        self._accepted = True
-        GoalResult(self, 'explore', future.result(), self._on_result)
+        return RequestedExploration(self, prefix, time_limit_s, on_map, self._show)
 
-    def _on_map(self, message: OccupancyGrid) -> None:
-        self._coverage = self._coverable.coverage(received_map(self._map, message))
+    def _on_joined(self, message: JoinStatus) -> None:
+        joined = [robot for robot in message.maps if robot.is_joined]
+        if len(joined) == len(self._robots) and not self._is_joined:
+            self._is_joined = True
+            self._wait_again()
 
-    def _on_update(self, message: OccupancyGridUpdate) -> None:
-        with suppress(InputError):  # of a map that has not come yet
-            patch = received_update(self._map, message)
-            if patch is not None:
-                self._coverage = self._coverable.coverage(patch)
+    def _work(self) -> None:
+        for robot in self._robots.values():
+            robot.request()
+        if self._ended_s is not None:
+            patience_s = _LAST_MERGE_S if self._is_joined else _JOIN_PATIENCE_S
+            self.finished = monotonic() - self._ended_s > patience_s
 
-    def _on_feedback(self, message: Explore.Impl.FeedbackMessage) -> None:
-        self._show(message.feedback.status)
+    def _wait_again(self) -> None:
+        """A join after the last exploration: its map is still to come."""
+        if self._ended_s is not None:
+            self._ended_s = monotonic()
 
-    def _show(self, status: ExplorationStatus) -> None:
-        position = status.target_position
-        target = (
-            f'to the end node at {position.x:.1f}, {position.y:.1f}'
-            if status.has_target
-            else 'looking around'
-        )
-        doing = target if status.state == ExplorationStatus.EXPLORING else status.reason
-        self._bar.show(
-            self._coverage,
-            f'{status.distance_m:.1f} m, {messages.seconds(status.elapsed):.0f} s: {doing}',
-        )
+    def _show(self) -> None:
+        robots = list(self._robots.values())
+        known = list(self._known.values())
+        coverage = self._coverable.share(known) if known else 0.0
+        statuses = [robot.status for robot in robots if robot.status is not None]
+        distance_m = sum(status.distance_m for status in statuses)
+        elapsed_s = max(messages.seconds(status.elapsed) for status in statuses)
+        doing = robots[0].doing
+        if self._is_team:
+            exploring = sum(robot.result is None for robot in robots)
+            joined = 'joined' if self._is_joined else 'not yet joined'
+            doing = f'{exploring} of {len(robots)} robots explore, maps are {joined}'
+        self._bar.show(coverage, f'{distance_m:.1f} m, {elapsed_s:.0f} s: {doing}')
+        if self._ended_s is None and all(robot.result is not None for robot in robots):
+            self._end()
 
-    def _on_result(self, ended: Any) -> None:
-        status: ExplorationStatus = ended.result.status
-        if ended.status == GoalStatus.STATUS_UNKNOWN:
-            status.reason = 'the explorer was started again, and does not know the exploration'
-        self._show(status)
-        if self._config.result:
-            end_ns = messages.stamp_ns(status.header.stamp)
-            content = {
-                'finished': ended.status == GoalStatus.STATUS_SUCCEEDED
-                and status.reason_code != ExplorationStatus.BUDGET_EXHAUSTED,
-                'reason': status.reason,
-                'start_ns': end_ns - round(1e9 * messages.seconds(status.elapsed)),
-                'end_ns': end_ns,
+    def _end(self) -> None:
+        if self._result:
+            results = {prefix: robot.result for prefix, robot in self._robots.items()}
+            content: dict[str, Any] = {
+                'robots': [
+                    {'name': prefix.rstrip('/'), **(result or {})}
+                    for prefix, result in results.items()
+                ]
             }
-            write_text(Path(self._config.result), json.dumps(content) + '\n')
-        self.finished = True
+            if not self._is_team:
+                content = results[''] or {}
+            write_text(Path(self._result), json.dumps(content) + '\n')
+        self._ended_s = monotonic()
+        self.finished = not self._is_team
+
+
+def _map_poses(config: DemoMonitorConfig) -> dict[str, Array]:
+    """Pose (3,) in the world of the map frame of each robot, by the prefix of its names."""
+    if not config.map_poses:
+        return {'': np.zeros(3)}
+    poses = poses_from('map_poses', config.map_poses)
+    if len(poses) > MAX_ROBOTS:
+        raise ConfigError(f'map_poses: {len(poses)} poses: expected at most {MAX_ROBOTS}')
+    return {f'robot{number}/': pose for number, pose in enumerate(poses, 1)}
 
 
 def main() -> None:

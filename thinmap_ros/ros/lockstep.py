@@ -25,14 +25,18 @@ TIMEOUT_DESCRIPTION = 'Time after which lockstep continues without a result (s, 
 class Lockstep:
     """Waits, after each scan, for its result: the message of a topic with the stamp of the scan."""
 
-    def __init__(self, node: Node, topic: str, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(
+        self, node: Node, topic: str, timeout_s: float = TIMEOUT_S, prefix: str = ''
+    ) -> None:
+        """prefix: of the topic of one of several robots, with a slash."""
         self._node = node
         self._topic = topic
+        self._name = f'{prefix}{topic}'
         self._timeout_s = timeout_s
         self._awaited_ns: int | None = None
         self._since = 0.0
         if topic != NONE:
-            node.create_subscription(_TYPES[topic], topic, self._on_message, qos.STREAM)
+            node.create_subscription(_TYPES[topic], self._name, self._on_message, qos.STREAM)
 
     def scan_published(self, stamp_ns: int) -> None:
         """Wait for the result of a scan that was published."""
@@ -55,7 +59,7 @@ class Lockstep:
         if self.waited_s < self._timeout_s:
             return False
         self._node.get_logger().warning(
-            f'no /{self._topic} for the last scan: continuing without it'
+            f'no /{self._name} for the last scan: continuing without it'
         )
         self._awaited_ns = None
         return True

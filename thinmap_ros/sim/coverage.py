@@ -4,6 +4,7 @@ A cell is observable if it is in range and line of sight of a position that the 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,6 +32,12 @@ class ObservableCells:
     cells: NDArray[np.bool_]
     frame: GridFrame
 
+    @staticmethod
+    def share(known: Sequence[NDArray[np.bool_]]) -> float:
+        """Share of these cells that one of several maps knows; known: of each, (N,)."""
+        together = np.logical_or.reduce(known)
+        return float(together.mean()) if together.size else 1.0
+
     @property
     def area_m2(self) -> float:
         """Area of all of them."""
@@ -41,18 +48,24 @@ class ObservableCells:
 
         T_world_map (3,): pose of the map frame in the world; None: identity.
         """
-        centres = self._centres
-        if len(centres) == 0:
+        count = len(self._centres)
+        if count == 0:
             return 1.0
         offset = self._offset_of(patch.frame)
         if T_world_map is None and offset is not None:
-            return self._count_known(patch, *offset) / len(centres)
+            return self._count_known(patch, *offset) / count
+        return float(self.known(patch, T_world_map).sum()) / count
+
+    def known(self, patch: GridPatch, T_world_map: Array | None = None) -> NDArray[np.bool_]:
+        """Whether the map is free at the centre of each of these cells, (N,); see `coverage`."""
+        centres = self._centres
         if T_world_map is not None:
             centres = se2.transform_points(se2.invert(T_world_map), centres)
         at = patch.frame.cells_of(centres)
         rows, cols = patch.shape
         inside = (at[:, 0] >= 0) & (at[:, 0] < rows) & (at[:, 1] >= 0) & (at[:, 1] < cols)
-        return float(patch.free[at[inside, 0], at[inside, 1]].sum()) / len(centres)
+        inside[inside] = patch.free[at[inside, 0], at[inside, 1]]
+        return inside
 
     def _offset_of(self, frame: GridFrame) -> tuple[int, int] | None:
         """Offset (row, col) of a frame from these cells, if it is on the same lattice."""

@@ -1,6 +1,7 @@
 """Several robots in one world: each sees the others with its laser, and touches them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,10 +9,13 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.moving_obstacles import range_to_disc
-from thinmap_ros.sim.robot import DifferentialDriveRobot
+from thinmap_ros.sim.robot import DifferentialDriveRobot, RobotConfig
+from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
+MAX_ROBOTS = 9
 START_SPACING_M = 0.8
 _RINGS = 3
 _DIRECTIONS = 16
@@ -51,6 +55,44 @@ class SharedWorld(World):
             math.dist((x, y), robot.T_world_base[:2]) >= radius_m + robot.config.radius_m
             for robot in self.others
         )
+
+
+def simulations_in(
+    world: World,
+    starts: Sequence[Array],
+    robot: RobotConfig,
+    laser: LaserScannerConfig,
+    seed: int,
+) -> list[Simulation]:
+    """A simulation for each robot, from its start (3,), in one world.
+
+    seed: of the first robot; each further one has the next.
+    Raises InputError where a robot does not fit, in the world or beside those before it.
+    """
+    simulations: list[Simulation] = []
+    worlds: list[SharedWorld] = []
+    for number, start in enumerate(starts):
+        own_world = SharedWorld.of(world)
+        own_world.others.extend(other.robot for other in simulations)
+        simulation = Simulation(own_world, start, robot, laser, seed + number)
+        for other_world in worlds:
+            other_world.others.append(simulation.robot)
+        worlds.append(own_world)
+        simulations.append(simulation)
+    return simulations
+
+
+def starts_in(
+    world: World, start: Array, listed: Array, count: int, radius_m: float
+) -> list[Array]:
+    """Poses (3,) of robots of a radius: the first of a list (N, 3), or side by side.
+
+    start (3,): of the robot that starts first side by side.
+    Raises InputError where the list is shorter and there is no room at the start.
+    """
+    if len(listed) >= count > 1:
+        return list(listed[:count])
+    return starts_side_by_side(world, start, count, radius_m)
 
 
 def starts_side_by_side(world: World, start: Array, count: int, radius_m: float) -> list[Array]:

@@ -62,10 +62,14 @@ class Simulation:
         return SensorReadings(self.stamp_ns, self.robot.T_odom_base, scan)
 
     def step(self, v: float, w: float) -> SensorReadings:
+        """Drive for one step, as `move`; returns the sensor readings after it."""
+        self.move(v, w)
+        return self.read_sensors()
+
+    def move(self, v: float, w: float) -> None:
         """Drive for one step with a commanded speed (m/s) and turn rate (rad/s)."""
         self.robot.step(v, w, STEP_NS / 1e9)
         self.stamp_ns += STEP_NS
-        return self.read_sensors()
 
 
 def odometry_seed(seed: int) -> int:

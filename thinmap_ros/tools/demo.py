@@ -1,4 +1,7 @@
-"""Demo: a simulated robot explores a room with the live ROS 2 graph, a process per node."""
+"""Demo: a simulated robot, or several, explore a room with the live ROS 2 graph.
+
+A process per node; of several robots a process per robot.
+"""
 
 import argparse
 import contextlib
@@ -10,25 +13,33 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation import recorded_run
+from thinmap_ros.evaluation import recorded_run, recorded_team_run
 from thinmap_ros.evaluation.exploration_metrics import exploration_title
 from thinmap_ros.evaluation.processes import end_with_parent
 from thinmap_ros.files import package_data
-from thinmap_ros.files.worlds import read_world
+from thinmap_ros.files.worlds import read_starts, read_world
+from thinmap_ros.files.yaml import read_mapping
+from thinmap_ros.sim.other_robots import MAX_ROBOTS, starts_in
 from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.ros_check import require_ros
 from thinmap_ros.view import report_page
 
 # On a busy machine nodes need time to exit; a killed recorder leaves a truncated bag.
 _PATIENCE_S = 20.0
-_NODES = ('localizer', 'grid_mapper', 'topology_builder', 'explorer', 'navigator', 'recorder')
-# Subscribers of /scan: simulated time waits for all of them.
+_NODES = ('localizer', 'grid_mapper', 'topology_builder', 'explorer', 'navigator')
+_SIM_TIME = ['-p', 'use_sim_time:=true']
+# Subscribers of the scans of a robot: simulated time waits for all of them.
 _SCAN_LISTENERS = 4
 _SLEEP_S = 0.05
 
@@ -40,12 +51,16 @@ class Processes:
     folder: Path
     running: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
 
-    def start(self, name: str, arguments: list[str], quiet: bool = True) -> None:
-        """Start a node; its output goes to NAME.log, or, unless quiet, to our output."""
+    def start(self, name: str, arguments: list[str], quiet: bool = True, label: str = '') -> None:
+        """Start a node; its output goes to LABEL.log, or, unless quiet, to our output.
+
+        label: its name here; '': that of the node.
+        """
+        label = label or name
         command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', '--ros-args', *arguments]
         self.folder.mkdir(parents=True, exist_ok=True)
-        with (self.folder / f'{name}.log').open('wb') as log:
-            self.running[name] = subprocess.Popen(
+        with (self.folder / f'{label}.log').open('wb') as log:
+            self.running[label] = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=log if quiet else None,
@@ -82,42 +97,90 @@ def _raise_interrupt(number: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
-    """Run the graph until the exploration has ended. Raises ThinmapError if a node exits early."""
+def explore(arguments: argparse.Namespace, world: Path, starts: Sequence[Array]) -> None:
+    """Run the graph until the explorations have ended. Raises ThinmapError if a node exits early.
+
+    starts: pose (3,) of each robot.
+    """
     out: Path = arguments.out
     processes = Processes(out / 'log')
-    sim_time = ['-p', 'use_sim_time:=true']
-    pose = [f'-p initial_x_m:={start[0]} -p initial_y_m:={start[1]} -p initial_yaw_rad:={start[2]}']
-    extra = {
-        'localizer': ' '.join(pose).split(),
-        'navigator': ['-p', f'controller.max_speed_m_s:={arguments.speed}'],
-        'recorder': ['-p', f'bag:={out / "bag"}'],
-    }
-    common = ['-p', f'world:={world}', '-p', f'robot:={arguments.robot}']
+    common = _parameters(world=world, robot=arguments.robot)
+    lockstep = _parameters(lockstep='local_topology', wait_for_subscribers=_SCAN_LISTENERS)
+    clock = _parameters(real_time_factor=arguments.rate, seed=arguments.seed)
+    limit = _parameters(time_limit_s=arguments.time_limit, result=out / 'result.json')
+    is_team = len(starts) > 1
+    where = _parameters(start=_text(starts))
+    maps = []
+    if is_team:
+        where = _parameters(robots=len(starts), starts=_text(starts))
+        maps = _parameters(map_poses=_text(map_poses(starts)))
     try:
-        for name in _NODES:
-            processes.start(name, sim_time + extra.get(name, []))
-        lockstep = [
-            '-p',
-            'lockstep:=local_topology',
-            '-p',
-            f'wait_for_subscribers:={_SCAN_LISTENERS}',
-        ]
-        clock = ['-p', f'real_time_factor:={arguments.rate}', '-p', f'seed:={arguments.seed}']
-        where = ['-p', f'start:={start[0]},{start[1]},{start[2]}']
-        processes.start('sim', common + lockstep + clock + where)
-        limit = [
-            '-p',
-            f'time_limit_s:={arguments.time_limit}',
-            '-p',
-            f'result:={out / "result.json"}',
-        ]
+        if is_team:
+            _start_robots(processes, starts, arguments.speed)
+        else:
+            _start_nodes(processes, starts[0], arguments.speed)
+        processes.start('recorder', [*_SIM_TIME, *_parameters(bag=out / 'bag')])
+        processes.start('sim', [*common, *lockstep, *clock, *where])
         if arguments.view:
-            processes.start('rerun_viewer', sim_time)
-        processes.start('demo_monitor', sim_time + common + limit, quiet=False)
+            processes.start('rerun_viewer', _SIM_TIME)
+        processes.start('demo_monitor', [*_SIM_TIME, *common, *limit, *maps], quiet=False)
         _wait(processes)
     finally:
         processes.stop()
+
+
+def _start_nodes(processes: Processes, start: Array, speed: float) -> None:
+    """Start a process for each node of a single robot."""
+    extra = {
+        'localizer': _initial_pose(start),
+        'navigator': _parameters({'controller.max_speed_m_s': speed}),
+    }
+    for name in _NODES:
+        processes.start(name, _SIM_TIME + extra.get(name, []))
+
+
+def _start_robots(processes: Processes, starts: Sequence[Array], speed: float) -> None:
+    """Start a process for each robot, with all of its nodes, and one that joins the maps."""
+    for number, (start, T_world_map) in enumerate(zip(starts, map_poses(starts), strict=True), 1):
+        namespace = f'__ns:=/robot{number}'
+        remap = ['-r', namespace, '-r', '/tf:=tf', '-r', '/tf_static:=tf_static']
+        limit = _parameters({'controller.max_speed_m_s': speed})
+        pose = _initial_pose(se2.between(T_world_map, start))
+        arguments = [*remap, *_SIM_TIME, *limit, *pose, *_together()]
+        processes.start('thinmap', arguments, label=f'robot{number}')
+    processes.start('map_joiner', _SIM_TIME)
+
+
+def map_poses(starts: Sequence[Array]) -> list[Array]:
+    """Pose (3,) in the world of the frame of the map of each robot, by their starts.
+
+    That of the first robot is the world, as with a single robot. The map of any other begins at its
+    start: the robots do not know the starts of each other.
+    """
+    return [np.zeros(3), *starts[1:]]
+
+
+def _parameters(named: Mapping[str, object] | None = None, **values: object) -> list[str]:
+    """Arguments that set parameters of a node."""
+    given = {**(named or {}), **values}
+    return [word for name, value in given.items() for word in ('-p', f'{name}:={value}')]
+
+
+def _initial_pose(pose: Array) -> list[str]:
+    x, y, yaw = (f'{number:.9f}' for number in pose.tolist())
+    return _parameters(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
+
+
+def _together() -> list[str]:
+    """Parameters with which robots explore together, if the nodes have them."""
+    file = package_data.config_file('explorer')
+    has_team = 'team' in read_mapping(file, 'parameters')['/**']['ros__parameters']
+    return _parameters(team='true') if has_team else []
+
+
+def _text(poses: Sequence[Array]) -> str:
+    """Poses (3,) as sim takes them."""
+    return ';'.join(','.join(str(number) for number in pose.tolist()) for pose in poses)
 
 
 def _wait(processes: Processes) -> None:
@@ -137,7 +200,8 @@ def _prepare(out: Path) -> None:
         for file in (out / 'bag').iterdir():
             file.unlink()
         (out / 'bag').rmdir()
-    for name in ('result.json', *recorded_run.FILES):
+    robots = [path.name for path in out.glob('trajectory_robot?.tum')]
+    for name in ('result.json', *recorded_run.FILES, *robots):
         (out / name).unlink(missing_ok=True)
 
 
@@ -149,35 +213,56 @@ def _choose_domain() -> None:
     print(f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}', file=sys.stderr)
 
 
+def _starts(arguments: argparse.Namespace, file: Path) -> list[Array]:
+    """Start (3,) of each robot. Raises InputError where there are too many, or is no room."""
+    count = arguments.robots
+    if not 1 <= count <= MAX_ROBOTS:
+        raise InputError(f'--robots={count}: expected 1 to {MAX_ROBOTS}')
+    if count > 1 and arguments.view:
+        raise InputError('--view: expected --robots=1')
+    world = World.from_patch(*read_world(file))
+    radius_m = PRESETS[arguments.robot].radius_m
+    return starts_in(world, world.start, read_starts(file), count, radius_m)
+
+
 def _work(arguments: argparse.Namespace) -> None:
     require_ros()
     if arguments.view and importlib.util.find_spec('rerun') is None:
         raise InputError('--view: rerun is not installed: pip install "thinmap_ros[viewer]"')
     world = package_data.world_path(arguments.world)
-    _, _, start = read_world(world)
+    starts = _starts(arguments, world)
     signal.signal(signal.SIGTERM, _raise_interrupt)
     _prepare(arguments.out)
     _choose_domain()
-    explore(arguments, world, start)
+    explore(arguments, world, starts)
     result = json.loads((arguments.out / 'result.json').read_text())
-    report = recorded_run.write(arguments.out, world, arguments.robot, result)
+    run = (arguments.out, world, arguments.robot, result)
+    if len(starts) == 1:
+        report = recorded_run.write(*run)
+    else:
+        report = recorded_team_run.write(*run, map_poses(starts))
     report_page.write(arguments.out, exploration_title(report), report, cli.command_line())
     print(
-        f'{result["reason"]}: {100.0 * report["coverage"]:.1f} % seen, {report["distance"]:.1f} m, '
-        f'{report["time"]:.1f} s, {report["collisions"]} collisions; results in {arguments.out}'
+        f'{report["reason"]}: {100.0 * report["coverage"]:.1f} % seen, '
+        f'{report["distance"]:.1f} m, {report["time"]:.1f} s, {report["collisions"]} collisions; '
+        f'results in {arguments.out}'
     )
-    print(_next_steps(arguments.out))
+    for line in report.get('joins', []):
+        print(f'  joined: {line}')
+    print(_next_steps(arguments.out, len(starts)))
 
 
-def _next_steps(out: Path) -> str:
-    """Where the results are shown, and commands to try next."""
+def _next_steps(out: Path, count: int) -> str:
+    """Where the results are shown, and commands to try next, of a number of robots."""
     folder = out.parent
     after = ' (after `source scripts/env`)' if cli.is_module() else ''
-    commands = (
-        cli.command_of('explore_world', 'office', '-o', str(folder / 'office')),
-        cli.command_of('replay', str(out / 'bag'), '-o', str(folder / 'replay')),
-        cli.command_of('demo', '--world', 'office', '-o', str(folder / 'demo_office')),
-    )
+    office = ['explore_world', 'office', '-o', str(folder / 'office')]
+    demo = ['demo', '--world', 'office', '-o', str(folder / 'demo_office')]
+    robots = [] if count == 1 else ['--robots', str(count)]
+    commands = [cli.command_of(*office, *robots), cli.command_of(*demo, *robots)]
+    if count == 1:
+        replay = cli.command_of('replay', str(out / 'bag'), '-o', str(folder / 'replay'))
+        commands.insert(1, replay)
     return '\n'.join(
         [
             f'pictures and figures: {out / report_page.NAME}',
@@ -195,6 +280,12 @@ def main() -> None:
     )
     parser.add_argument(
         '--robot', default='2dx', choices=tuple(PRESETS), help='which Pioneer (default 2dx)'
+    )
+    parser.add_argument(
+        '--robots',
+        type=int,
+        default=1,
+        help='number of robots, each with its own map, in one world (default 1)',
     )
     parser.add_argument('--speed', type=float, default=0.2, help='top speed, m/s (default 0.2)')
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')

@@ -47,6 +47,7 @@ _FIGURES = (
     _Figure(('distance_at', '0.99'), 'Path length to 99 % seen', 'm', 1.0, 1),
     _Figure(('time',), 'Simulated time', 's'),
     _Figure(('collisions',), 'Collisions'),
+    _Figure(('joins',), 'Maps joined'),
     _Figure(('pose_rmse',), 'Position error (RMS)', 'cm', 100.0, 1),
     _Figure(('pose_rmse_aligned',), 'Position error after alignment (RMS)', 'cm', 100.0, 1),
     _Figure(('heading_rmse_deg',), 'Heading error (RMS)', 'deg', 1.0, 2),

@@ -99,31 +99,36 @@ class VelocitySubscription:
     """
 
     def __init__(
-        self, node: Node, diagnostics: NodeDiagnostics, on_command: Callable[[float, float], None]
+        self,
+        node: Node,
+        diagnostics: NodeDiagnostics,
+        on_command: Callable[[float, float], None],
+        topic: str = TOPIC,
     ) -> None:
-        """on_command: receives v (m/s) and w (rad/s), unchecked."""
+        """on_command: receives v (m/s) and w (rad/s), unchecked; topic: name, of several robots."""
         self._node = node
+        self._topic = topic
         self._diagnostics = diagnostics
         self._on_command = on_command
         self._kind = 'geometry_msgs/msg/Twist'
         self._subscription = self._subscribe()
-        diagnostics.expect_topic(TOPIC)
+        diagnostics.expect_topic(topic)
         diagnostics.add_check(WARN, self._other_types)
         wall = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_CHECK_PERIOD_S, self._follow_publishers, clock=wall)
 
     def _subscribe(self) -> object:
         return self._node.create_subscription(
-            _KINDS[self._kind], TOPIC, self._on_message, qos.STREAM
+            _KINDS[self._kind], self._topic, self._on_message, qos.STREAM
         )
 
     def _on_message(self, message: Twist | TwistStamped) -> None:
-        self._diagnostics.message_received(TOPIC)
+        self._diagnostics.message_received(self._topic)
         twist = message.twist if isinstance(message, TwistStamped) else message
         self._on_command(twist.linear.x, twist.angular.z)
 
     def _published_types(self) -> set[str]:
-        name = self._node.resolve_topic_name(TOPIC)
+        name = self._node.resolve_topic_name(self._topic)
         return {info.topic_type for info in self._node.get_publishers_info_by_topic(name)}
 
     def _follow_publishers(self) -> None:
@@ -138,4 +143,4 @@ class VelocitySubscription:
         others = sorted(self._published_types() - {self._kind})
         if not others:
             return ''
-        return f'{TOPIC}: ignored publishers of {", ".join(others)}: expected {self._kind}'
+        return f'{self._topic}: ignored publishers of {", ".join(others)}: expected {self._kind}'
