@@ -130,8 +130,10 @@ class MapJoinerNode(ThinmapNode):
         before = self._team.links.between(search.a, search.b)
         self._report_dropped(self._team.found(search, link, log_odds))
         after = self._team.links.between(search.a, search.b)
-        if after is not None and after is not before:
-            self._report_link(after, is_new=before is None or not before.matches)
+        if after is not None and (before is None or not before.matches):
+            self._report_link(after, is_new=True)
+        elif after is not None and before is not None and after.contradicts(before):
+            self._report_link(after, is_new=False)
         self._places_changed()
 
     def _places_changed(self) -> None:

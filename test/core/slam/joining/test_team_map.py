@@ -1,12 +1,15 @@
 """The maps of several robots: which are searched, which are joined, and the map of all."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.driven_pieces import driven_piece, true_transform
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.slam.joining.team_map import WORLD, RobotMap, Team, merged
+from thinmap_ros.core.slam.joining import team_map
+from thinmap_ros.core.slam.joining.team_map import WORLD, RobotMap, Search, Team, merged
 
 ROBOTS = {'/a': (1, 1), '/b': (1, 2), '/c': (1, 3), '/foreign': (3, 1)}
 
@@ -64,7 +67,20 @@ def test_a_link_stays_as_long_as_the_maps_do_not_contradict_it(three):
     before = team.links.between('/a', '/b')
     receive(team, '/b')
     search_all(team)
-    assert team.links.between('/a', '/b') is before
+    assert team.links.between('/a', '/b').T_a_b is before.T_a_b
+
+
+@pytest.mark.parametrize(('log_odds', 'is_left'), [(12.0, True), (1000.0, False)])
+def test_a_place_is_left_for_a_surer_one(three, monkeypatch, log_odds, is_left):
+    # As in a building that looks alike: scans match at the wrong place, too.
+    monkeypatch.setattr(team_map, '_FEWEST_MATCHES', 0)
+    team, _ = three
+    right = team.links.between('/a', '/b')
+    wrong = replace(right, T_a_b=right.T_a_b + (50.0, 0.0, 0.0), log_odds=log_odds)
+    maps = (team.maps['/a'], team.maps['/b'])
+    link, _ = Search('/a', '/b', *maps, wrong, None, 100_000.0).run()
+    assert link.contradicts(wrong) == is_left
+    assert link.contradicts(right) != is_left
 
 
 def moved(patch, metres):

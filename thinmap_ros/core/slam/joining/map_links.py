@@ -27,6 +27,11 @@ class MapLink:
     log_odds: float
     matches: int = 0
 
+    @property
+    def is_given(self) -> bool:
+        """Whether a person gave it."""
+        return math.isinf(self.log_odds)
+
     def reversed(self) -> 'MapLink':
         """The link from b to a."""
         T_b_a = se2.invert(self.T_a_b)

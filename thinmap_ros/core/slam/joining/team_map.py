@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -65,7 +65,8 @@ def _lies_in(graph: TopologicalMap, patch: GridPatch) -> bool:
 class Search:
     """A search for the place of map b in map a.
 
-    link: the present one, which is refined; guess: that by other links or by a person, or None.
+    link: the present one, which is refined, and replaced where a surer place is found; guess: that
+    by other links or by a person, or None.
     """
 
     a: str
@@ -78,11 +79,21 @@ class Search:
 
     def run(self) -> tuple[MapLink | None, float]:
         """The link, if there is one, and the log odds of the most likely place."""
-        if self.link is not None:
-            return self._refined(self.link), self.link.log_odds
-        guess = self.guess
-        if guess is not None and (link := self._link_near(guess.T_a_b, guess.log_odds)):
+        known = self.link or self.guess
+        link = None if known is None else self._refined(known)
+        if link is not None and link.is_given:
             return link, link.log_odds
+        found, log_odds = self._recognized()
+        if link is None:
+            return found, log_odds
+        if found is None or log_odds <= link.log_odds:
+            return link, link.log_odds
+        if found.contradicts(link):
+            return found, log_odds
+        return replace(link, log_odds=log_odds), log_odds
+
+    def _recognized(self) -> tuple[MapLink | None, float]:
+        """The link that place recognition finds, and the log odds of the most likely place."""
         decision = recognize(self.second.piece.places, self.first.piece.places, self.join_odds)
         placement = decision.placement
         if not decision.is_joined or placement is None:
@@ -95,7 +106,8 @@ class Search:
         None where they have nothing in common any more: one of the robots has begun another map.
         """
         newer = self._link_near(link.T_a_b, link.log_odds)
-        return newer if newer is None or newer.contradicts(link) else link
+        is_moved = newer is None or not link.matches or newer.contradicts(link)
+        return newer if is_moved else link
 
     def _link_near(self, T: Array, log_odds: float) -> MapLink | None:
         """Link near a pose (3,); None where too few scans match there."""
