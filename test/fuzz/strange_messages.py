@@ -277,7 +277,8 @@ def claims(draw, ns=10**9):
         return lambda: setattr(message, name, draw(STRANGE_32))
 
     def place():
-        message.settled[0].x = draw(STRANGE_32)
+        if message.settled:
+            message.settled[0].x = draw(STRANGE_32)
 
     def count():
         message.settled *= draw(st.sampled_from([0, 3, 5, 100]))
