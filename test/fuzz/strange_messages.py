@@ -4,6 +4,7 @@ As published by faulty drivers and nodes.
 """
 
 import math
+import zlib
 from array import array
 
 import hypothesis
@@ -14,13 +15,27 @@ from hypothesis import strategies as st
 from nav_msgs.msg import OccupancyGrid, Odometry
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import LocalGrid, LocalizedScan, ProbabilityGrid, TopologicalMap
+from thinmap_msgs.msg import (
+    LocalGrid,
+    LocalizedScan,
+    MapTiles,
+    ProbabilityGrid,
+    SettledPlace,
+    TeamClaim,
+    TopologicalMap,
+)
 from thinmap_ros.core.estimate import Placement
+from thinmap_ros.core.exploration.team.team import MAX_SETTLED
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.joined_maps import JoinedMaps
+from thinmap_ros.core.grid.map_tiles import TileSender
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.flat import FIELDS, topology_from_msg
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.localized_scan import localized_scan_from_msg
+from thinmap_ros.ros.team.team_messages import claim_from_msg, tiles_from_msg, tiles_msg
 
 STRANGE = st.sampled_from(
     [
@@ -249,7 +264,66 @@ def local_grids(draw, ns=10**9):
     return LocalGrid(header=grid.header, grid=grid, localized=draw(localized_scans(ns)))
 
 
+@st.composite
+def claims(draw, ns=10**9):
+    message = stamped(draw, TeamClaim(robot='/a', session=1, state=1, remaining_m=2.0), ns)
+    message.settled = [SettledPlace(x=1.0, y=2.0, visits=1)] * 2
+
+    def number(part, name):
+        strange = STRANGE if part == 'pose' else STRANGE_32
+        return lambda: setattr(getattr(message, part), name, draw(strange))
+
+    def own(name):
+        return lambda: setattr(message, name, draw(STRANGE_32))
+
+    def place():
+        if message.settled:
+            message.settled[0].x = draw(STRANGE_32)
+
+    def count():
+        message.settled *= draw(st.sampled_from([0, 3, 5, 100]))
+
+    def name():
+        message.robot = draw(NAMES)
+
+    def state():
+        message.state = draw(st.integers(0, 255))
+
+    points = [number(part, axis) for part in ('pose', 'goal', 'frontier') for axis in 'xy']
+    changed(draw, [*points, *map(own, ('v', 'w', 'remaining_m')), place, count, name, state])
+    return message
+
+
+@st.composite
+def tiles(draw, ns=10**9):
+    frame = GridFrame(0.0, 0.0, 0.1)
+    sender = TileSender(frame)
+    sender.update(GridPatch(frame, np.zeros((40, 40), dtype=np.int8)))
+    head = messages.header('map', ns)
+    message = stamped(draw, tiles_msg(head, '/a', 1, sender.changes_after(0)), ns)
+
+    def name():
+        message.robot = draw(NAMES)
+
+    def cut():
+        del message.data[draw(st.integers(0, len(message.data))) :]
+
+    def byte():
+        if message.data:
+            message.data[draw(st.integers(0, len(message.data) - 1))] = draw(st.integers(0, 255))
+
+    def plain():
+        data = bytearray(zlib.decompress(sender.changes_after(0).encode()))
+        data[draw(st.integers(0, len(data) - 1))] = draw(st.integers(0, 255))
+        message.data = array('B', zlib.compress(bytes(data)))
+
+    changed(draw, [name, cut, byte, plain])
+    return message
+
+
 STRATEGIES = {
+    MapTiles: tiles,
+    TeamClaim: claims,
     LaserScan: scans,
     Odometry: odometries,
     PoseWithCovarianceStamped: poses,
@@ -310,7 +384,25 @@ def check_topology(message):
     )
 
 
+def check_claim(message):
+    found = claim_from_msg(message)
+    assert np.isfinite(found.claim.pose).all() and np.isfinite(found.claim.remaining_m)
+    assert found.claim.place is None or np.isfinite(found.claim.place).all()
+    assert len(found.claim.settled) <= MAX_SETTLED and found.claim.robot
+
+
+def check_tiles(message):
+    received = JoinedMaps()
+    received.place({message.robot: np.zeros(3)})
+    received.add(message.robot, message.session, tiles_from_msg(message))
+    own = GridPatch(GridFrame(0.03, 0.0, 0.1), np.full((1, 1), -1, dtype=np.int8))
+    cells = received.completed(own).cells
+    assert cells.min() >= -1 and cells.max() <= 100
+
+
 CHECKS = {
+    MapTiles: check_tiles,
+    TeamClaim: check_claim,
     LaserScan: check_scan,
     Odometry: check_odometry,
     PoseWithCovarianceStamped: check_pose,

@@ -27,6 +27,7 @@ from thinmap_ros.nodes.exploration.navigation_client import NavigationClient
 from thinmap_ros.nodes.exploration.observation_source import ObservationSource, RobotFrames
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.nodes.exploration.strategy_source import StrategySource
+from thinmap_ros.nodes.exploration.team_member import Progress, declare_team
 from thinmap_ros.ros import node_main, parameters
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.checkpoint import StateStamp
@@ -45,6 +46,9 @@ class ExplorerNode(ThinmapNode):
     explore, by explore/resume, or by itself. Service save_exploration saves what was learned beside
     the map and the graph of a session. An explorer that was killed and is started again continues
     with the exploration, and with the goal of its client, who has to ask again for the result.
+
+    With team: true it shares what is left with the other robots of /join_status, by /team/claims,
+    and their maps, by /team/tiles.
     """
 
     def __init__(self) -> None:
@@ -53,6 +57,9 @@ class ExplorerNode(ThinmapNode):
         self._settings = parameters.declare_config(self, ExplorationSettings)
         frames = RobotFrames(parameters.declare_map_frame(self), LaserTransform(self))
         self._settings.apply_base_frame(frames.laser_transform)
+        self._team = declare_team(
+            self, frames.map_frame, self._strategies.is_default, self._progress
+        )
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
         parameters.reject_unknown(self)
@@ -72,6 +79,7 @@ class ExplorerNode(ThinmapNode):
     def reset_state(self) -> None:
         """Discard map, graph and what was learned, or restore the session of the start."""
         self._source.reset()
+        self._team.reset()
         strategy = self._strategies.initial(self._session)
         self._mission = self._make_mission(MissionGoal(), strategy, MissionState.IDLE)
         self._starts_itself = self._settings.autostart_exploration
@@ -91,6 +99,7 @@ class ExplorerNode(ThinmapNode):
         state = ExplorerState.from_arrays(arrays)
         strategy = self._strategies.restored(state.strategy)
         watchdog = self._source.watchdog
+        self._team.attach(strategy)
         self._mission = resumed_mission(state.mission, strategy, watchdog, self._now_s())
         self._starts_itself &= self._mission.state == MissionState.IDLE
         self._stamp.restore(state.latest_ns)
@@ -132,6 +141,7 @@ class ExplorerNode(ThinmapNode):
         strategy: Strategy,
         state: MissionState = MissionState.EXPLORING,
     ) -> Mission:
+        self._team.attach(strategy)
         return Mission(goal, strategy, self._source.watchdog, self._now_s(), state)
 
     def _on_preempted(self) -> Explore.Result:
@@ -160,6 +170,7 @@ class ExplorerNode(ThinmapNode):
         if self._stamp.is_restarted_by(stamp_ns):
             self.reset('the robot was started again, too')
         self._stamp.latest_ns = stamp_ns
+        self._team.observed(observation)
         if self._starts_itself:
             self._start(MissionGoal())
         if self._mission.is_running:
@@ -168,7 +179,9 @@ class ExplorerNode(ThinmapNode):
             return
         is_exploring = self._mission.state == MissionState.EXPLORING
         if is_exploring and not self._mission.is_paused:
-            observation = self._source.with_graph(observation)
+            completed = self._team.completed(observation)
+            is_completed = completed.patch is not observation.patch
+            observation = self._source.with_graph(completed, is_completed)
         with self.diagnostics.time_step('explorer'):
             action = self._mission.step(observation)
         if is_exploring:
@@ -220,6 +233,12 @@ class ExplorerNode(ThinmapNode):
             outcome = Outcome.CANCELED
         self._goals.finish(outcome, Explore.Result(status=status))
         self.checkpoint_now()
+
+    def _progress(self, last: Observation | None) -> Progress:
+        """What the other robots of a team are told after an observation."""
+        driver = self._driver
+        located = self._source.located(last)
+        return Progress(self._mission, located, driver.goal, driver.remaining_m)
 
     def _publish_progress(self) -> None:
         self._output.progress(self._mission, self._driver.is_yielding)

@@ -29,6 +29,7 @@ from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.mapping.map_output import MapPublishers
 from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
 from thinmap_ros.nodes.mapping.scan_queue import ScanQueue
+from thinmap_ros.nodes.mapping.team_in_scans import TeamInScans
 from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
@@ -92,12 +93,15 @@ class GridMapperNode(ThinmapNode):
     After a /trajectory the map is re-rendered, a slice with each scan, near tiles first; meanwhile
     tiles that are not complete are shown as they were. correction_stamp of grid and local_grid is
     the stamp of the newest trajectory that all of the map follows.
+
+    With team: true the robots of /team/claims that are joined by /join_status are cut out of scans.
     """
 
     def __init__(self) -> None:
         super().__init__('grid_mapper', recovers=True)
         self._settings = _Settings.declare(self, self._on_output)
         self._output = MapPublishers(self, self._settings.output)
+        self._team = TeamInScans(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
         parameters.reject_unknown(self)
@@ -197,7 +201,10 @@ class GridMapperNode(ThinmapNode):
             self.reset_state()
         placement = localized.placement if self._settings.mapping else Placement.NOWHERE
         with self.diagnostics.time_step('map update'):
-            update = self._mapper.step(replace(localized, placement=placement, trajectory=None))
+            scan = self._team.without(localized.scan, localized.T_map_base)
+            update = self._mapper.step(
+                replace(localized, scan=scan, placement=placement, trajectory=None)
+            )
         self._stamp.latest_ns = stamp_ns
         if update is not None and update.whole is not None:
             self._publish_map()  # before the windows of the corrected map

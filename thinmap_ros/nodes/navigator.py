@@ -23,6 +23,7 @@ from thinmap_ros.logs.frames.bag_odometry import NONE
 from thinmap_ros.nodes.navigation.map_input import MapInput
 from thinmap_ros.nodes.navigation.robot_state import RobotState
 from thinmap_ros.nodes.navigation.tasks import ErrorCode, NavigationTask, TaskReader
+from thinmap_ros.nodes.navigation.team_driving import TeamDriving
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.diagnostics import OK, WARN
@@ -80,6 +81,9 @@ class NavigatorNode(ThinmapNode):
     replaces it. /goal_pose sends a goal to navigate_to_pose. Goals in other frames than the map's
     are transformed when they arrive. Where somebody publishes /topology, distant goals are planned
     on it.
+
+    With team: true it plans over the ground that the other robots of /team/tiles know, too, and
+    gives way to those of /team/claims.
     """
 
     def __init__(self) -> None:
@@ -94,6 +98,7 @@ class NavigatorNode(ThinmapNode):
             self, base_frame, lambda ns, T_odom_base: self._robot.add_odometry(ns, T_odom_base)
         )
         self._map = MapInput()
+        self._team = TeamDriving(self)
         parameters.reject_unknown(self)
         warm_up.navigator()
         self.reset_state()
@@ -234,7 +239,11 @@ class NavigatorNode(ThinmapNode):
             return None
         self.diagnostics.set_state(OK, 'driving')
         with self.diagnostics.time_step('navigator'):
-            return self._navigator.step(T_map_base, patch, scan, CONTROL_PERIOD_S)
+            patch = self._team.completed(patch)
+            command = self._navigator.step(T_map_base, patch, scan, CONTROL_PERIOD_S)
+            if self._team.must_yield(T_map_base, command, self._config.controller):
+                command = self._navigator.give_way(command, CONTROL_PERIOD_S)
+            return command
 
     def _publish_feedback(self, speed_m_s: float) -> None:
         """Publish feedback; current_pose has no frame while the pose is unknown."""

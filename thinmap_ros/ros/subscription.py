@@ -22,7 +22,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import LocalizedScan
+from thinmap_msgs.msg import LocalizedScan, TeamClaim
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.ros.diagnostics import WARN
@@ -33,6 +33,7 @@ _TIMEOUT_S = 3.0
 _SCANS = (LaserScan, LocalizedScan)
 # Data of one sensor: those of two mixed are of none. Positions of two odometries jump.
 _SOLE_SOURCE = (*_SCANS, Odometry)
+_MANY_SOURCES = (TeamClaim,)  # stamps by different clocks: losses are not counted
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 
@@ -67,6 +68,7 @@ class _GuardedSubscription:
         self._process = process
         self._is_scan = kind in _SCANS
         self._is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        self._counts_losses = not self._is_latched and kind not in _MANY_SOURCES
         self._latched_message: Any = None
         self._logged_s = -WARN_PERIOD_S
         self._last_ns = 0
@@ -86,7 +88,7 @@ class _GuardedSubscription:
         node.diagnostics.message_received(self._topic)
         last_ns = self._last_ns
         self._last_ns = _stamp_ns(message)
-        if not self._is_latched:
+        if self._counts_losses:
             self._count_losses(info.get('publication_sequence_number'))
         node.handle_time_jump()
         if self._is_outdated(last_ns):

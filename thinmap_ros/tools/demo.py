@@ -27,7 +27,6 @@ from thinmap_ros.evaluation.exploration_metrics import exploration_title
 from thinmap_ros.evaluation.processes import end_with_parent
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_starts, read_world
-from thinmap_ros.files.yaml import read_mapping
 from thinmap_ros.sim.other_robots import MAX_ROBOTS, starts_in
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
@@ -146,7 +145,7 @@ def _start_robots(processes: Processes, starts: Sequence[Array], speed: float) -
         remap = ['-r', namespace, '-r', '/tf:=tf', '-r', '/tf_static:=tf_static']
         limit = _parameters({'controller.max_speed_m_s': speed})
         pose = _initial_pose(se2.between(T_world_map, start))
-        arguments = [*remap, *_SIM_TIME, *limit, *pose, *_together()]
+        arguments = [*remap, *_SIM_TIME, *limit, *pose, *_parameters(team='true')]
         processes.start('thinmap', arguments, label=f'robot{number}')
     processes.start('map_joiner', _SIM_TIME)
 
@@ -169,13 +168,6 @@ def _parameters(named: Mapping[str, object] | None = None, **values: object) -> 
 def _initial_pose(pose: Array) -> list[str]:
     x, y, yaw = (f'{number:.9f}' for number in pose.tolist())
     return _parameters(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
-
-
-def _together() -> list[str]:
-    """Parameters with which robots explore together, if the nodes have them."""
-    file = package_data.config_file('explorer')
-    has_team = 'team' in read_mapping(file, 'parameters')['/**']['ros__parameters']
-    return _parameters(team='true') if has_team else []
 
 
 def _text(poses: Sequence[Array]) -> str:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
+from thinmap_ros.core.grid.tiles import MAX_CELLS
 from thinmap_ros.core.se2 import Array
 
 
@@ -143,13 +144,14 @@ class ReceivedTiles:
         """Add the tiles of a robot; returns the corners (2, 2), m, of what they change.
 
         None where there is nothing new, or the messages before this one are missing. Raises
-        InputError where its lattice is another one.
+        InputError where its lattice is another one, or the map would have more than MAX_CELLS.
         """
         if message.frame != self._frame:
             raise InputError(f'map tiles on {message.frame}: expected those of {self._frame}')
         known = self.version_of(sender)
         if message.after > known or message.version <= known:
             return None
+        self._require_near(message)
         self._versions[sender] = message.version
         if not message.tiles:
             return None
@@ -169,11 +171,25 @@ class ReceivedTiles:
 
     def completed(self, own: GridPatch) -> GridPatch:
         """A robot's own map, and what others know where it is undecided."""
-        if not self._tiles:
-            return own
-        if self._patch is None:
+        received = self.known_area()
+        return own if received is None else completed(own, received)
+
+    def known_area(self) -> GridPatch | None:
+        """All received tiles as one map; None: there are none."""
+        if self._patch is None and self._tiles:
             self._patch = self._rendered()
-        return completed(own, self._patch)
+        return self._patch
+
+    def _require_near(self, message: TileMessage) -> None:
+        """Raise InputError where a map with these tiles, too, would be too large."""
+        keys = np.array([*self._tiles, *message.tiles]).reshape(-1, 2)
+        if not len(keys):
+            return
+        rows, cols = (EDGE * (1 + keys.max(axis=0) - keys.min(axis=0))).tolist()
+        if rows * cols > MAX_CELLS:
+            raise InputError(
+                f'map tiles for a map of {rows} x {cols} cells: expected {MAX_CELLS} at most'
+            )
 
     def _rendered(self) -> GridPatch:
         """All received tiles as one map."""

@@ -29,6 +29,14 @@ class Driver(Protocol):
         """Whether the goal waits for the end of somebody else's."""
 
     @property
+    def goal(self) -> Array | None:
+        """The goal (3,) that has not ended."""
+
+    @property
+    def remaining_m(self) -> float | None:
+        """Rest of the path to the goal; None where it is unknown."""
+
+    @property
     def goal_prefix(self) -> bytes:
         """PREFIX_BYTES with which the ids of its goals begin."""
 
@@ -71,31 +79,32 @@ class ForeignDriver:
     """Another navigator drives to the published targets until it arrives, or the target changes."""
 
     is_yielding = False
+    remaining_m: float | None = None
     goal_prefix = bytes(PREFIX_BYTES)
 
     def __init__(self, on_result: OnResult) -> None:
         self._on_result = on_result
-        self._goal: Array | None = None
+        self.goal: Array | None = None
 
     @property
     def is_driving(self) -> bool:
         """Whether the robot is still to arrive at the goal."""
-        return self._goal is not None
+        return self.goal is not None
 
     def adopt(self, goal_prefix: bytes) -> None:
         """Nothing: goals have no ids here."""
 
     def drive_to(self, goal: Array) -> None:
         """Set the goal (3,)."""
-        self._goal = goal
+        self.goal = goal
 
     def cancel(self) -> None:
         """Forget the goal."""
-        self._goal = None
+        self.goal = None
 
     def robot_moved(self, T_map_base: Array) -> None:
         """Report the arrival of a robot at a pose (3,)."""
-        goal = self._goal
+        goal = self.goal
         if goal is not None and np.hypot(*(goal[:2] - T_map_base[:2])) <= _ARRIVED_M:
-            self._goal = None
+            self.goal = None
             self._on_result(True, '')

@@ -51,6 +51,7 @@ class NavigationClient:
     A goal that is not answered, or no longer reported on, is sent again. One that is rejected, not
     answered or without progress too long has failed. While the server drives for somebody else, the
     goal waits.
+    goal: the one (3,) that has not ended.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class NavigationClient:
         self._on_result = on_result
         self._client = ActionClient(node, NavigateToPose, settings.navigate_to_pose_action)
         self._others = GoalMonitor(node, settings.navigate_to_pose_action)
-        self._goal: Array | None = None
+        self.goal: Array | None = None
         self._drive: _Drive | None = None
         self._retries = Retries()
         self._arrivals = Arrivals()
@@ -77,12 +78,17 @@ class NavigationClient:
     @property
     def is_driving(self) -> bool:
         """Whether there is a goal that has not ended."""
-        return self._goal is not None
+        return self.goal is not None
+
+    @property
+    def remaining_m(self) -> float | None:
+        """Rest of the path to the goal, as the server reports it; None where it is unknown."""
+        return None if self._drive is None else self._drive.request.remaining_m
 
     @property
     def is_yielding(self) -> bool:
         """Whether the goal waits for the end of somebody else's."""
-        return self._goal is not None and self._drive is None and self._others.is_taken()
+        return self.goal is not None and self._drive is None and self._others.is_taken()
 
     @property
     def goal_prefix(self) -> bytes:
@@ -95,7 +101,7 @@ class NavigationClient:
 
     def drive_to(self, goal: Array) -> None:
         """Set the goal (3,), unless the server has about the same."""
-        self._goal = goal
+        self.goal = goal
         if self._arrivals.are_repeated(goal):
             self._arrivals.clear()
             self._end(False, 'reached, but the target stays')
@@ -104,7 +110,7 @@ class NavigationClient:
 
     def cancel(self) -> None:
         """Cancel the goal; there is no result."""
-        self._goal = None
+        self.goal = None
         self._arrivals.clear()
         self._withdraw()
 
@@ -121,7 +127,7 @@ class NavigationClient:
 
     def _advance(self) -> None:
         """Send the goal if the server does not have it, and may have it."""
-        goal = self._goal
+        goal = self.goal
         if goal is None or not self._keeps_waiting(goal):
             return
         logger = self._node.get_logger()
@@ -238,7 +244,7 @@ class NavigationClient:
             drive.handle.cancel_goal_async()
 
     def _end(self, is_success: bool, reason: str) -> None:
-        self._goal = None
+        self.goal = None
         if reason:
             self._node.get_logger().info(f'target not reached: {reason}')
         self._on_result(is_success, reason)

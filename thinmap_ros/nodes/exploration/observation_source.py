@@ -11,6 +11,7 @@ from thinmap_ros.core.exploration.live.map_view import MapGraph
 from thinmap_ros.core.exploration.mission import InputWatchdog
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.grid.map_receiver import MapReceiver
+from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
@@ -28,6 +29,8 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 _LOOK_PERIOD_S = 0.5
 # A publisher that is silent because its map does not change: the old one holds.
 _UNCHANGED_S = 10.0
+# A robot that was not localized for so long is somewhere else, perhaps.
+_POSE_TIMEOUT_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -100,9 +103,28 @@ class ObservationSource:
         self._map.reset()
         self._looked_s = -_UNCHANGED_S
 
-    def with_graph(self, observation: Observation) -> Observation:
-        """Observation with the graph of its map, if nobody publishes a topological map."""
-        if self._topologies.is_found():
+    def located(self, last: Observation | None) -> tuple[int, Array] | None:
+        """Stamp and pose (3,) of the robot; None where it does not know its place.
+
+        last: newest observation. In the map of another program, of now, by TF.
+        """
+        if self._uses_foreign_map():
+            now_ns = int(self._node.get_clock().now().nanoseconds)
+            try:
+                return now_ns, self._view.newest_pose(now_ns)
+            except InputError:
+                return None
+        silent_s = self._node.elapsed_time.now_s() - self.watchdog.last_scan_s
+        if last is None or self.watchdog.is_lost or silent_s > _POSE_TIMEOUT_S:
+            return None
+        return last.scan.stamp_ns, last.T_map_base
+
+    def with_graph(self, observation: Observation, is_completed: bool = False) -> Observation:
+        """Observation with the graph of its map, if nobody publishes a topological map.
+
+        is_completed: whether the map is more than the one whose graph is published.
+        """
+        if self._topologies.is_found() and not is_completed:
             return observation
         T_map_base = observation.T_map_base
         with self._node.diagnostics.time_step('graph of the map'):

@@ -54,7 +54,7 @@ class RobotView:
             found = self._scan_at(message, now_ns)
             if found is not None:
                 return found
-        T_map_base = self._newest_pose(now_ns)
+        T_map_base = self.newest_pose(now_ns)
         return scan_in_map(patch, T_map_base, self._settings.view_range_m, now_ns), T_map_base
 
     def _scan_at(self, message: LaserScan, now_ns: int) -> tuple[Scan, Array] | None:
@@ -68,7 +68,8 @@ class RobotView:
             return None
         return None if scan.is_blind else (scan, T_map_base)
 
-    def _newest_pose(self, now_ns: int) -> Array:
+    def newest_pose(self, now_ns: int) -> Array:
+        """Newest pose (3,) that is not too old. Raises InputError where TF knows none."""
         reason: InputError | None = None
         tolerance_ns = round(self._settings.transform_tolerance * SECOND_NS)
         for age_ns in range(0, tolerance_ns + 1, _LOOKUP_STEP_NS):

@@ -34,6 +34,11 @@ class StrategySource:
         self._is_outdated = False
 
     @property
+    def is_default(self) -> bool:
+        """Whether the strategy is the project's own."""
+        return self._name == DEFAULT
+
+    @property
     def config(self) -> ExplorerConfig:
         """Parameters of the next new strategy."""
         return self._config

@@ -55,6 +55,14 @@ def test_a_robot_alone_has_everything_in_its_order():
     assert Team('a').share(candidates, claim('a', 0.0), straight, MARGIN_M) is candidates
 
 
+def test_a_robot_that_does_not_explore_takes_nothing():
+    candidates = [candidate(1.0), candidate(-8.0)]
+    idle = Claim('a', 0, se2.pose(0.0, 0.0, 0.0), explores=False)
+    team = Team('b')
+    team.add_claim(idle, 0)
+    assert team.share(candidates, claim('b', 0.5), straight, MARGIN_M) is candidates
+
+
 def test_two_robots_agree_who_goes_where():
     candidates = [candidate(1.0), candidate(-8.0)]
     assert shares(candidates, [claim('a', 0.0), claim('b', 0.5)]) == [[-8.0], [1.0]]

@@ -50,7 +50,8 @@ class Claim:
     """What a robot sends the others, about once a second and when its target changes.
 
     robot: its name; stamp_ns: by its own clock; pose (3,); place: of the frontier that it drives
-    to, m, None without a target; remaining_m: rest of its path; settled: its latest places.
+    to, m, None without a target; remaining_m: rest of its path; settled: its latest places;
+    explores: False for one that takes no candidate, whatever is left.
     """
 
     robot: str
@@ -59,6 +60,7 @@ class Claim:
     place: Place | None = None
     remaining_m: float = 0.0
     settled: tuple[SettledPlace, ...] = ()
+    explores: bool = True
 
 
 @dataclass

@@ -23,7 +23,7 @@ from thinmap_ros.core.se2 import Array
 
 _CLAIM_RADIUS_M = 2.0  # a candidate belongs to a claim of a place within this distance
 _MAX_CANDIDATES = 40  # in an auction; the nearest ones
-_MAX_SETTLED = 8  # places in a claim
+MAX_SETTLED = 8  # places in a claim
 LengthsFrom = Callable[[Array, Array], Array]
 """Path lengths (N,), m, from a pose (3,) to goals (N, 2)."""
 
@@ -85,7 +85,7 @@ class Team:
         x, y = evidence.place
         kept = [place for place in self._settled if (place.x, place.y) != (x, y)]
         kept.append(SettledPlace(x, y, evidence.visits, evidence.failures))
-        self._settled = kept[-_MAX_SETTLED:]
+        self._settled = kept[-MAX_SETTLED:]
 
     def apply_settled(self, items: Sequence[Evidence], reach_m: float, now_ns: int) -> None:
         """Add to the evidence about places what the others have settled within a distance of it.

@@ -1,0 +1,257 @@
+"""An explorer's part in a team: what it tells the others, and what it has from them."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+from thinmap_msgs.msg import TeamClaim
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import ConfigError, InputError, quoted
+from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.exploration.mission import Mission, MissionState
+from thinmap_ros.core.exploration.observations import Observation
+from thinmap_ros.core.exploration.strategy import Strategy
+from thinmap_ros.core.exploration.team.claims import Claim, Place
+from thinmap_ros.core.exploration.team.team import Team, TeamConfig
+from thinmap_ros.core.planning.give_way import Motion
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.nodes.exploration.tile_output import TileOutput
+from thinmap_ros.ros import parameters, qos
+from thinmap_ros.ros.decoding.map_identity import new_map_id
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import WARN_PERIOD_S
+from thinmap_ros.ros.team.heard_robots import CLAIMS, HeardRobots
+from thinmap_ros.ros.team.membership import JoinedPlaces, MembershipConfig, declare_membership
+from thinmap_ros.ros.team.received_tiles import TileReceiver
+from thinmap_ros.ros.team.team_messages import RobotClaim, RobotState, claim_msg
+
+_CLAIM_PERIOD_S = 1.0
+_NEAR_PERIOD_S = 0.1
+_NEAR_M = 3.0  # so near to another robot, its pose must not be old
+_TILE_PERIOD_S = 5.0
+
+
+class Progress(NamedTuple):
+    """What a robot tells of its exploration.
+
+    located: stamp and pose (3,), None where it does not know its place; goal (3,): where it drives,
+    and remaining_m: rest of the path, None where they are unknown.
+    """
+
+    mission: Mission
+    located: tuple[int, Array] | None
+    goal: Array | None
+    remaining_m: float | None
+
+
+GetProgress = Callable[[Observation | None], Progress]
+"""Progress after the newest observation."""
+
+
+class Alone:
+    """An explorer without a team."""
+
+    def attach(self, strategy: Strategy) -> None:
+        """Have a strategy share its candidates with the others."""
+
+    def observed(self, observation: Observation) -> None:
+        """Process an observation in the robot's own map, whether it explores or not."""
+
+    def completed(self, observation: Observation) -> Observation:
+        """An observation in the map of all robots, from which a strategy then decides."""
+        return observation
+
+    def reset(self) -> None:
+        """Begin again with another map."""
+
+
+def declare_team(node: ThinmapNode, frame_id: str, is_able: bool, progress: GetProgress) -> Alone:
+    """Declare the parameters of a team, and join it where `team` is true.
+
+    frame_id: of the map; is_able: whether the strategy can share its candidates.
+    Raises ConfigError where it cannot, but has to.
+    """
+    membership = declare_membership(node)
+    config = parameters.declare_config(node, TeamConfig)
+    if not membership.team:
+        return Alone()
+    if not is_able:
+        raise ConfigError('team = true: expected strategy = position_probability')
+    return TeamMember(node, membership, config, frame_id, progress)
+
+
+class TeamMember(Alone):
+    """An explorer that sends its claims and tiles, and hears those of the others."""
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        membership: MembershipConfig,
+        config: TeamConfig,
+        frame_id: str,
+        progress: GetProgress,
+    ) -> None:
+        name = membership.team_name
+        self._node = node
+        self._config = config
+        self._places = JoinedPlaces(node, name)
+        self._heard = HeardRobots(node, self._places, name, self._accepts)
+        self._received = TileReceiver(node, self._places, name)
+        self._tiles = TileOutput(node, name, frame_id)
+        self._claims = _ClaimOutput(node, name, frame_id, progress)
+        self._team = Team(name, config)
+        self._last: Observation | None = None
+        node.create_active_timer(_NEAR_PERIOD_S, self._tell)
+        node.create_active_timer(_TILE_PERIOD_S, self._send_tiles)
+
+    def attach(self, strategy: Strategy) -> None:
+        """As Alone.attach; one that is continued keeps what it has told."""
+        assert isinstance(strategy, Explorer)
+        if strategy.team is self._team:
+            return
+        present = self._team.claims.present(self._now_ns)
+        self._team = Team(self._claims.name, self._config)
+        for claim in present:
+            self._team.add_claim(claim, self._now_ns)
+        strategy.team = self._team
+
+    def observed(self, observation: Observation) -> None:
+        """As Alone.observed."""
+        self._last = observation
+
+    def completed(self, observation: Observation) -> Observation:
+        """As Alone.completed."""
+        own = observation.patch
+        patch = self._received.completed(own)
+        for box in self._received.take_changes():
+            self._team.add_changes(box)
+        if self._received.take_moved():
+            patch = replace(patch, is_replaced=True)
+        return observation._replace(patch=patch)
+
+    def reset(self) -> None:
+        """As Alone.reset."""
+        self._last = None
+        self._tiles.reset()
+
+    @property
+    def _now_ns(self) -> int:
+        """Time by the stamps that the strategy knows."""
+        return 0 if self._last is None else self._last.scan.stamp_ns
+
+    def _accepts(self, heard: RobotClaim) -> bool:
+        """Take a claim into the decisions; returns whether it is of another robot.
+
+        Raises InputError where that has the name of this one.
+        """
+        if heard.session == self._claims.session:
+            return False
+        name = heard.claim.robot
+        if name == self._claims.name:
+            raise InputError(
+                f'another robot is called {quoted(name)}, too: expected another team_name'
+            )
+        T = self._places.poses.get(name)
+        if T is not None:
+            self._team.add_claim(heard.in_map(T).claim, self._now_ns)
+        return True
+
+    def _tell(self) -> None:
+        self._claims.tell([motion for motion, _ in self._heard.motions()], self._last)
+
+    def _send_tiles(self) -> None:
+        if self._last is None or not self._claims.is_located:
+            return
+        try:
+            self._tiles.send(self._last.patch)
+        except InputError as error:
+            self._node.get_logger().warning(
+                f'tiles are not sent: {error}', throttle_duration_sec=WARN_PERIOD_S
+            )
+
+
+class _ClaimOutput:
+    """Publishes claims: each second, when the claimed place changes, and often near others.
+
+    session: that others know this explorer by; is_located: whether it knew its place lately. A
+    robot that does not is silent: others would cut their walls out at its pose.
+    """
+
+    def __init__(self, node: ThinmapNode, name: str, frame_id: str, progress: GetProgress) -> None:
+        self.name = name
+        self.session = new_map_id()
+        self.is_located = False
+        self._node = node
+        self._frame_id = frame_id
+        self._progress = progress
+        self._publisher = node.create_publisher(TeamClaim, CLAIMS, qos.SENSOR)
+        self._told_s = -math.inf
+        self._told_place: Place | None = None
+        self._track = _Track()
+
+    def tell(self, others: list[Motion], last: Observation | None) -> None:
+        """Publish a claim if one is due; others: their motions; last: newest observation."""
+        progress = self._progress(last)
+        self.is_located = progress.located is not None
+        if progress.located is None:
+            return
+        T_map_base = progress.located[1]
+        self._track.add(*progress.located)
+        claim = self._claim(progress, T_map_base)
+        is_near = any(math.dist(T_map_base[:2], other.pose[:2]) < _NEAR_M for other in others)
+        now_s = self._node.elapsed_time.now_s()
+        is_due = not 0.0 <= now_s - self._told_s < _CLAIM_PERIOD_S
+        place = claim.claim.place
+        if is_due or is_near or place != self._told_place:
+            self._told_s = now_s
+            self._told_place = place
+            self._publisher.publish(claim_msg(claim, self._frame_id))
+
+    def _claim(self, progress: Progress, T_map_base: Array) -> RobotClaim:
+        mission = progress.mission
+        explores = mission.state == MissionState.EXPLORING and not mission.is_paused
+        strategy = mission.strategy
+        assert isinstance(strategy, Explorer)
+        goal = progress.goal
+        remaining_m = progress.remaining_m or 0.0
+        if goal is not None and progress.remaining_m is None:
+            remaining_m = math.dist(goal[:2], T_map_base[:2])
+        now_ns = int(self._node.get_clock().now().nanoseconds)
+        claim = strategy.claim(now_ns, T_map_base, remaining_m)
+        if not explores:
+            claim = Claim(self.name, now_ns, T_map_base, settled=claim.settled, explores=False)
+        v, w = self._track.speeds
+        state = _state_of(mission, claim)
+        motion = Motion(self.name, T_map_base, v, w)
+        place = None if goal is None else (float(goal[0]), float(goal[1]))
+        return RobotClaim(claim, motion, state, self.session, place)
+
+
+def _state_of(mission: Mission, claim: Claim) -> RobotState:
+    if claim.explores:
+        return RobotState.WAITING if claim.place is None else RobotState.DRIVING
+    return RobotState.FINISHED if mission.state > MissionState.EXPLORING else RobotState.IDLE
+
+
+class _Track:
+    """Speed, m/s, and turn rate, rad/s, of a robot by its last two poses."""
+
+    def __init__(self) -> None:
+        self.speeds = (0.0, 0.0)
+        self._last: tuple[int, Array] | None = None
+
+    def add(self, stamp_ns: int, T_map_base: Array) -> None:
+        """Add the pose (3,) at a stamp; the last one may be given again."""
+        last = self._last
+        if last is not None and stamp_ns == last[0]:
+            return
+        self._last = (stamp_ns, T_map_base)
+        self.speeds = (0.0, 0.0)
+        if last is None:
+            return
+        seconds = (stamp_ns - last[0]) / SECOND_NS
+        if 0.0 < seconds <= _CLAIM_PERIOD_S:
+            x, _, turn = se2.between(last[1], T_map_base).tolist()
+            self.speeds = (x / seconds, turn / seconds)

@@ -1,0 +1,59 @@
+"""Driving beside other robots of a team: over the ground that they know, and with right of way."""
+
+from dataclasses import dataclass
+
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.give_way import Motion, must_stop
+from thinmap_ros.core.planning.navigator import Command
+from thinmap_ros.core.planning.path_follower import PathFollowerConfig
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.ros import parameters
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.team.heard_robots import HeardRobots
+from thinmap_ros.ros.team.membership import JoinedPlaces, declare_membership
+from thinmap_ros.ros.team.received_tiles import TileReceiver
+
+
+@dataclass(frozen=True)
+class GiveWayConfig(Config):
+    """How near another robot may come."""
+
+    give_way_m: float = parameter(
+        0.61,
+        'The robot does not drive nearer to another robot of the team than this, from centre to '
+        'centre (m). Set it to the sum of the radii of both and 0.11.',
+        low=0.0,
+        high=10.0,
+    )
+
+
+class TeamDriving:
+    """What a navigator knows of the other robots; without a team, nothing."""
+
+    def __init__(self, node: ThinmapNode) -> None:
+        """Declare the parameters."""
+        membership = declare_membership(node)
+        self._distance_m = parameters.declare_config(node, GiveWayConfig).give_way_m
+        self._name = membership.team_name
+        self._heard: HeardRobots | None = None
+        self._tiles: TileReceiver | None = None
+        if membership.team:
+            places = JoinedPlaces(node, self._name)
+            self._heard = HeardRobots(node, places, self._name)
+            self._tiles = TileReceiver(node, places, self._name)
+
+    def completed(self, own: GridPatch) -> GridPatch:
+        """The map of this robot, and what others know where it is undecided."""
+        return own if self._tiles is None else self._tiles.completed(own)
+
+    def must_yield(
+        self, T_map_base: Array, command: Command, controller: PathFollowerConfig
+    ) -> bool:
+        """Whether a robot at a pose (3,) would come too near to another one with a command."""
+        if self._heard is None or command.v <= 0.0:
+            return False
+        own = Motion(self._name, T_map_base, command.v, command.w)
+        others = [motion for motion, _ in self._heard.motions()]
+        brakes_s = controller.max_speed_m_s / controller.max_acceleration_m_s2
+        return must_stop(own, others, self._distance_m, brakes_s)

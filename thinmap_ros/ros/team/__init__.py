@@ -1,0 +1,1 @@
+"""What robots that explore together send each other."""
