@@ -241,9 +241,7 @@ class NavigatorNode(ThinmapNode):
         with self.diagnostics.time_step('navigator'):
             patch = self._team.completed(patch)
             command = self._navigator.step(T_map_base, patch, scan, CONTROL_PERIOD_S)
-            if self._team.must_yield(T_map_base, command, self._config.controller):
-                command = self._navigator.give_way(command, CONTROL_PERIOD_S)
-            return command
+            return self._team.allowed(self._navigator, T_map_base, command, CONTROL_PERIOD_S)
 
     def _publish_feedback(self, speed_m_s: float) -> None:
         """Publish feedback; current_pose has no frame while the pose is unknown."""

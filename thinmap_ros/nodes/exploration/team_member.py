@@ -5,6 +5,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
 from thinmap_msgs.msg import TeamClaim
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError, InputError, quoted
@@ -29,7 +31,8 @@ from thinmap_ros.ros.team.team_messages import RobotClaim, RobotState, claim_msg
 
 _CLAIM_PERIOD_S = 1.0
 _NEAR_PERIOD_S = 0.1
-_NEAR_M = 3.0  # so near to another robot, its pose must not be old
+_NEAR_M = 3.0  # so near to another robot, its pose must not be old:
+_NEAR_STEP_M = 0.05  # it is sent after each cell, and not while the robot stands
 _TILE_PERIOD_S = 5.0
 
 
@@ -189,6 +192,7 @@ class _ClaimOutput:
         self._publisher = node.create_publisher(TeamClaim, CLAIMS, qos.SENSOR)
         self._told_s = -math.inf
         self._told_place: Place | None = None
+        self._told_xy = np.zeros(2)
         self._track = _Track()
 
     def tell(self, others: list[Motion], last: Observation | None) -> None:
@@ -201,11 +205,13 @@ class _ClaimOutput:
         self._track.add(*progress.located)
         claim = self._claim(progress, T_map_base)
         is_near = any(math.dist(T_map_base[:2], other.pose[:2]) < _NEAR_M for other in others)
+        has_moved = math.dist(T_map_base[:2], self._told_xy) > _NEAR_STEP_M
         now_s = self._node.elapsed_time.now_s()
         is_due = not 0.0 <= now_s - self._told_s < _CLAIM_PERIOD_S
         place = claim.claim.place
-        if is_due or is_near or place != self._told_place:
+        if is_due or (is_near and has_moved) or place != self._told_place:
             self._told_s = now_s
+            self._told_xy = T_map_base[:2]
             self._told_place = place
             self._publisher.publish(claim_msg(claim, self._frame_id))
 

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.give_way import Motion, must_stop
-from thinmap_ros.core.planning.navigator import Command
-from thinmap_ros.core.planning.path_follower import PathFollowerConfig
+from thinmap_ros.core.planning.navigator import Command, Navigator
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -47,13 +48,20 @@ class TeamDriving:
         """The map of this robot, and what others know where it is undecided."""
         return own if self._tiles is None else self._tiles.completed(own)
 
-    def must_yield(
-        self, T_map_base: Array, command: Command, controller: PathFollowerConfig
-    ) -> bool:
-        """Whether a robot at a pose (3,) would come too near to another one with a command."""
+    def allowed(
+        self, navigator: Navigator, T_map_base: Array, command: Command, dt_s: float
+    ) -> Command:
+        """The command, or one that gives way where the robot would come too near to another one.
+
+        T_map_base (3,): pose of the robot; dt_s: time between two commands.
+        """
         if self._heard is None or command.v <= 0.0:
-            return False
+            return command
         own = Motion(self._name, T_map_base, command.v, command.w)
         others = [motion for motion, _ in self._heard.motions()]
+        controller = navigator.config.controller
         brakes_s = controller.max_speed_m_s / controller.max_acceleration_m_s2
-        return must_stop(own, others, self._distance_m, brakes_s)
+        if not must_stop(own, others, self._distance_m, brakes_s):
+            return command
+        places = np.array([other.pose[:2] for other in others])
+        return navigator.give_way(command, dt_s, places, self._distance_m)
