@@ -53,9 +53,9 @@ def test_it_does_not_drive_into_a_robot_that_stands(graph, driver):
     driver.commands.clear()
     # The laser shows nothing there.
     status, reason = driver.ended(driver.goes_to(3.0, 0.0))
-    assert status == GoalStatus.STATUS_ABORTED
-    assert reason == 'another robot is in the way'
-    assert driver.commands[-1].linear.x == 0.0
+    assert status == GoalStatus.STATUS_ABORTED, reason
+    # It may turn, to drive around, but this robot does not move.
+    assert {each.linear.x for each in driver.commands} == {0.0}
 
     timer.destroy()
     driver.talk.stands_at(0.6, 1.5)

@@ -7,6 +7,7 @@ from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN
 from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.localized_scan import map_update_from_msg
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 
@@ -50,12 +51,13 @@ class MapInput:
         self._map.replace(messages.grid_from_msg(message))
 
     def _on_local_grid(self, message: LocalGrid) -> None:
-        window = messages.grid_from_msg(message.grid)
+        window = map_update_from_msg(message).changes
         map_id = message.grid.map_id
         if UNKNOWN not in (map_id, self._map_id) and map_id != self._map_id:
             self._map = MapReceiver()
         self._map_id = map_id
-        self._map.paste(window)
+        if window is not None:
+            self._map.paste(window)
 
     def _on_map(self, patch: GridPatch) -> None:
         if not self._has_grid:
