@@ -196,7 +196,7 @@ def _robot_report(
 
 
 def _join_text(robot: dict[str, Any]) -> str:
-    """When the map of a robot was joined, and how far off, in words."""
+    """When the map of a robot was joined, and with which error, in words."""
     if robot['join_error'] is None:
         return f'{robot["name"]}: not joined'
     off_m, off_deg = robot['join_error']

@@ -47,8 +47,8 @@ class ExplorerNode(ThinmapNode):
     the map and the graph of a session. An explorer that was killed and is started again continues
     with the exploration, and with the goal of its client, who has to ask again for the result.
 
-    With team: true it shares what is left with the other robots of /join_status, by /team/claims,
-    and their maps, by /team/tiles.
+    With team: true it shares the unknown area with the other robots of /join_status, by
+    /team/claims, and their maps, by /team/tiles.
     """
 
     def __init__(self) -> None:
@@ -235,7 +235,7 @@ class ExplorerNode(ThinmapNode):
         self.checkpoint_now()
 
     def _progress(self, last: Observation | None) -> Progress:
-        """What the other robots of a team are told after an observation."""
+        """The report to the other robots of a team after an observation."""
         driver = self._driver
         located = self._source.located(last)
         return Progress(self._mission, located, driver.goal, driver.remaining_m)

@@ -24,7 +24,7 @@ _CLAIM_PERIOD_S = 1.0
 _NEAR_M = 3.0  # robots that drive so near to another one send their motion ten times a second
 _CLAIM_BYTES = 104  # of thinmap_msgs with header, pose, speed, place and path length
 _SETTLED_BYTES = 12
-# Beyond the radius of a robot: noise of the laser, and its way in the tenth of a second since.
+# Beyond the radius of a robot: noise of the laser, and its motion in the tenth of a second since.
 _CUT_MARGIN_M = 0.13
 _GIVE_WAY_MARGIN_M = 0.11
 

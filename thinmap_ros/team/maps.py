@@ -35,7 +35,7 @@ class TeamMaps(Protocol):
         """Parts (2, 2), m, of its map that other robots have changed since the last call."""
 
     def known_area(self) -> GridPatch:
-        """All that the robots know together."""
+        """The cells of all robots."""
 
 
 class SharedMap:

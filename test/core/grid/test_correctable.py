@@ -409,7 +409,7 @@ def test_scans_whose_placement_is_open_wait_until_it_is_decided():
 
 @pytest.mark.parametrize('first', [1, 2])
 def test_of_many_scans_whose_placement_is_open_the_latest_wait(first):
-    """Their number is bounded: the one that was made far off is dropped, or just not yet."""
+    """Their number is bounded: the one that was made elsewhere is dropped, or just not yet."""
     grid = CorrectableGrid(OccupancyGrid())
     far = TRUE[0] + np.array([100.0, 0.0, 0.0])
     grid.update(SCANS[0], TRUE[0])

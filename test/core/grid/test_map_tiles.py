@@ -17,7 +17,7 @@ NOTHING = GridPatch(LATTICE, np.full((1, 1), -1, dtype=np.int8))
 
 
 def random_map(seed, row=-37, col=21, shape=(50, 70)):
-    """A map at a place off the borders of tiles; returns it, and as it is sent."""
+    """A map at a place that is no corner of tiles; returns it, and as it is sent."""
     choice = np.random.default_rng(seed).integers(4, size=shape)
     frame = LATTICE.with_origin_at(row, col)
     return GridPatch(frame, VALUES[choice]), GridPatch(frame, SENT[choice])

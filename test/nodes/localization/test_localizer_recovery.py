@@ -66,7 +66,7 @@ def test_a_loop_closes_over_the_kill_and_corrects_the_keyframes_of_before(killed
     corrections = [resumed.step(scan, odom).correction for scan, odom, _ in rest]
     assert any(correction is not None for correction in corrections)
     stamps_ns, poses = resumed.keyframe_trajectory()
-    assert np.isin(stamps_ns, before).sum() > 0.8 * len(before), 'as the mapper knows them'
+    assert np.isin(stamps_ns, before).sum() > 0.8 * len(before), 'as the mapper has them'
     errors = [
         np.hypot(*(T - truths[ns])[:2])
         for ns, T in zip(stamps_ns.tolist(), poses, strict=True)

@@ -42,7 +42,7 @@ class _JoinedMap:
 
 
 class JoinedMaps:
-    """What other robots know, in the map of this one as soon as the place of their maps is known.
+    """Cells of other robots, in the map of this one as soon as the place of their maps is known.
 
     is_moved: whether more of the joined map may have changed than `take_changes` says, since
     somebody set this to False.

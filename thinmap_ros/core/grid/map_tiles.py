@@ -127,7 +127,7 @@ class TileSender:
 
 
 class ReceivedTiles:
-    """What other robots know, filled into a robot's own map where that is unknown."""
+    """Cells of other robots, filled into a robot's own map where that is unknown."""
 
     def __init__(self, frame: GridFrame) -> None:
         """frame: of the lattice of the robot's own map."""

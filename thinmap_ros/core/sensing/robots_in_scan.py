@@ -12,7 +12,8 @@ from thinmap_ros.core.se2 import Array
 def without_robots(scan: Scan, T_map_base: Array, places: Array, radius_m: float) -> Scan:
     """Scan made at a pose (3,) with the beams invalid that end within radius_m of places (M, 2), m.
 
-    The beams beside these are invalid as well: their ranges may be mixed with what lies behind.
+    The beams beside these are invalid as well: their ranges may be mixed with those
+    of walls behind.
     """
     hit = np.flatnonzero(scan.hit)
     if not len(places) or not hit.size:

@@ -37,7 +37,7 @@ _TILE_PERIOD_S = 5.0
 
 
 class Progress(NamedTuple):
-    """What a robot tells of its exploration.
+    """The part of an exploration that a robot reports.
 
     located: stamp and pose (3,), None where it does not know its place; goal (3,): where it drives,
     and remaining_m: rest of the path, None where they are unknown.

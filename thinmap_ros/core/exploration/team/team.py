@@ -42,7 +42,7 @@ class TeamConfig(ClaimConfig):
 
 
 class Team:
-    """What one robot knows of the others; without any of them it has all candidates.
+    """What one robot has received of the others; without any of them it has all candidates.
 
     name: of this robot; two robots of a team never have the same.
     """
