@@ -57,7 +57,7 @@ class GivenMap:
         if self._settings.set_initial_pose:
             T_map_base = self._settings.initial_pose.pose
             return self._placed(T_map_base, GIVEN_COVARIANCE)
-        if (config.initial_x_m, config.initial_y_m, config.initial_yaw_rad) != (0.0, 0.0, 0.0):
+        if config.is_start_given:
             return self.source.create_localizer(config)
         last = self._last_pose.load()
         if last is None:
