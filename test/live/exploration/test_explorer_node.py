@@ -81,6 +81,7 @@ class Robot:
         self.node = graph.node
         self.numbers = count(1)
         self.hears_scans = self.is_tracked = True
+        self.map_id = 0
         self.end_nodes = graph.heard('end_nodes', EndNodeArray, qos.LATCHED)
         self.map = self.node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
         self.graph_map = self.node.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
@@ -104,9 +105,16 @@ class Robot:
     def knows(self, cols):
         self.patch = room(cols)
         self.map.publish(messages.probability_grid_msg(self.patch, 'map', 0))
-        self.graph_map.publish(
-            messages.topology_msg(build(self.patch, (2.0, 2.0), TopologyConfig()), 'map', 0)
-        )
+        self.publish_graph()
+
+    def publish_graph(self, map_id=0):
+        topology = build(self.patch, (2.0, 2.0), TopologyConfig())
+        self.graph_map.publish(messages.topology_msg(topology, 'map', 0, map_id))
+
+    def changes_map(self, map_id):
+        """From now on the grid is that of another map, whose graph is not published yet."""
+        self.map_id = map_id
+        self.map.publish(messages.probability_grid_msg(self.patch, 'map', 0, map_id=map_id))
 
     def speak(self):
         ns = next(self.numbers) * PERIOD_NS
@@ -117,7 +125,7 @@ class Robot:
         scan = Scan.create(ns, ranges, -0.5 * math.pi, math.pi / 180.0, 0.05, 8.0)
         if self.hears_scans:
             state = SlamStatus.TRACKING if self.is_tracked else SlamStatus.LOST
-            self.window.publish(local_grid(self.patch, AT, ns, scan, state))
+            self.window.publish(local_grid(self.patch, AT, ns, scan, state, self.map_id))
 
     def explores(self, **goal):
         """Final status of an exploration, and whether it succeeded."""
@@ -162,6 +170,20 @@ def test_it_reports_why_it_ended(robot):
     assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_ABORTED)
     robot.knows(60)
     assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_it_waits_for_the_graph_of_its_map(robot):
+    """A goal that comes between grid and graph: end nodes would be resolved without evidence."""
+    robot.publish_graph(4)
+    robot.changes_map(5)
+    ended = robot.graph.act(Explore, 'explore', Explore.Goal(area_limit_m2=1.0)).result.status
+    assert ended.reason_code == ExplorationStatus.SENSOR_TIMEOUT
+    assert 'topological map of this map on topology' in ended.reason
+    assert not robot.end_nodes
+    robot.publish_graph(5)
+    assert robot.explores(area_limit_m2=1.0)[0] == ExplorationStatus.BUDGET_EXHAUSTED
+    robot.graph.until(lambda: robot.end_nodes, 'end nodes')
+    assert 1 in robot.evidence()
 
 
 def test_it_resumes_after_a_cancelled_goal_and_after_a_restart(graph, robot, tmp_path):

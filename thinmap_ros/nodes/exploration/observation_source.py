@@ -20,7 +20,7 @@ from thinmap_ros.nodes.exploration.publishers import PublisherCheck
 from thinmap_ros.nodes.exploration.robot_view import RobotView
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
+from thinmap_ros.ros.decoding.map_identity import UNKNOWN, FollowedMap, Origin
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_from_msg
@@ -61,6 +61,32 @@ class _GridPublisher:
             self.followed.origin(message.map_id)
 
 
+class _TopologyPublisher:
+    """The topology builder: whether there is one, and the last graph that it published."""
+
+    def __init__(self, node: ThinmapNode) -> None:
+        self.graph = Topology()
+        self._map_id: int | None = None
+        self._check = PublisherCheck(node, 'topology')
+
+    def is_found(self) -> bool:
+        """Whether somebody publishes topological maps."""
+        return self._check.is_found()
+
+    def received(self, message: TopologicalMap) -> None:
+        """Follow a graph."""
+        self._check.message_received()
+        self._map_id = message.map_id
+        self.graph = topology_from_msg(message)
+
+    def is_awaited(self, map_id: int) -> bool:
+        """Whether the graph of a map is still to come: none is here, or that of another map."""
+        is_here = self._map_id is not None and (
+            map_id == UNKNOWN or self._map_id in (UNKNOWN, map_id)
+        )
+        return not is_here and self.is_found()
+
+
 class ObservationSource:
     """Makes observations of what is published.
 
@@ -82,21 +108,24 @@ class ObservationSource:
         self._on_observation = on_observation
         self._graph_config = TopologyConfig(robot_radius_m=robot_radius_m)
         self._grids = _GridPublisher(node)
-        self._topologies = PublisherCheck(node, 'topology')
+        self._topologies = _TopologyPublisher(node)
         self._view = RobotView(node, settings, frames.map_frame, frames.laser_transform)
         self._map = ForeignMap(node, settings, frames.map_frame, self._uses_foreign_map)
         self.reset()
-        subscribe_guarded(node, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
+        on_topology = self._topologies.received
+        subscribe_guarded(node, TopologicalMap, 'topology', on_topology, qos.LATCHED)
         subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(node, LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
         subscribe_guarded(node, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         node.create_active_timer(_LOOK_PERIOD_S, self._look)
 
     def reset(self) -> None:
-        """Discard map, graph and scans."""
+        """Discard map and scans.
+
+        Not the published graph: that of the next map may have come before its grid.
+        """
         self._grids.followed = FollowedMap()
         self.watchdog = InputWatchdog()
-        self._topology = Topology()
         self._mapped = MapReceiver()
         self._graph = MapGraph(self._graph_config)
         self._view.reset()
@@ -136,10 +165,6 @@ class ObservationSource:
 
     # Inputs.
 
-    def _on_topology(self, message: TopologicalMap) -> None:
-        self._topology = topology_from_msg(message)
-        self._topologies.message_received()
-
     def _on_grid(self, message: ProbabilityGrid) -> None:
         self._grids.received(message)
         self._mapped.replace(messages.grid_from_msg(message))
@@ -152,12 +177,14 @@ class ObservationSource:
         self._mapped.paste(messages.grid_from_msg(message.grid))
         if localized.is_blind:
             return  # ignored: a blind scan observes nothing
+        if self._is_graph_awaited():
+            return
         self.watchdog.awaited = InputWatchdog.awaited
         self.watchdog.add_scan(now_s)
         patch = self._mapped.patch
         if patch is not None:
             self._on_observation(
-                Observation(self._topology, patch, localized.scan, localized.T_map_base)
+                Observation(self._topologies.graph, patch, localized.scan, localized.T_map_base)
             )
 
     def _on_scan(self, message: LaserScan) -> None:
@@ -166,9 +193,16 @@ class ObservationSource:
 
     # Outputs.
 
+    def _is_graph_awaited(self) -> bool:
+        """Whether the graph of the map is still to come: without it, no end node has evidence."""
+        is_awaited = self._topologies.is_awaited(self._grids.followed.id)
+        if is_awaited:
+            self.watchdog.awaited = 'topological map of this map on topology'
+        return is_awaited
+
     def _look(self) -> None:
         """Make an observation of a new map; of an old one if there is none for a long time."""
-        if not self._uses_foreign_map():
+        if not self._uses_foreign_map() or self._is_graph_awaited():
             return
         now_s = self._node.elapsed_time.now_s()
         is_due = not 0.0 <= now_s - self._looked_s < _UNCHANGED_S
@@ -194,4 +228,4 @@ class ObservationSource:
             return None
         now_ns = int(self._node.get_clock().now().nanoseconds)
         scan, T_map_base = self._view.look(patch, now_ns)
-        return Observation(self._topology, patch, scan, T_map_base)
+        return Observation(self._topologies.graph, patch, scan, T_map_base)
