@@ -209,6 +209,18 @@ def global_localizer() -> None:
         rehearsed.step(scan, T_map_base)
 
 
+ALL = (
+    localizer,
+    grid_mapper,
+    topology_builder,
+    explorer,
+    navigator,
+    global_localizer,
+    map_joiner,
+)
+"""Warm-ups of all nodes."""
+
+
 def _room() -> GridPatch:
     """A room with a pillar, and a passage to unknown space."""
     cells = np.zeros((_REHEARSAL.room_cells, _REHEARSAL.room_cells), dtype=np.int8)

@@ -172,7 +172,8 @@ class TopologyBuilderNode(ThinmapNode):
         self._stamp.latest_ns = stamp_ns
         with self.diagnostics.time_step('graph update'):
             changed = self._topology.step(update)
-        if changed is not None:
+        # The first one is published even if it is empty: others wait for the graph of the map.
+        if changed is not None or not self._output.has_published:
             self._publish(stamp_ns, again=False)
         # The local map comes last: a subscriber that receives it has all results of this scan.
         self._output.publish_local_map(self._topology.builder.local_map(), stamp_ns)

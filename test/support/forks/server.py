@@ -21,13 +21,6 @@ import thinmap_ros.startup
 from thinmap_ros.kernels import warm_up
 
 REQUEST_BYTES = 1 << 20
-_REHEARSALS = (
-    warm_up.localizer,
-    warm_up.grid_mapper,
-    warm_up.topology_builder,
-    warm_up.explorer,
-    warm_up.navigator,
-)
 
 
 class Program(NamedTuple):
@@ -44,7 +37,7 @@ def main() -> None:
     """Import, then fork for each request until the other end of the socket is closed."""
     control = socket.socket(fileno=int(sys.argv[1]))
     _import_programs()
-    for rehearse in _REHEARSALS:
+    for rehearse in warm_up.ALL:
         rehearse()
     gc.collect()
     gc.freeze()
