@@ -7,18 +7,11 @@ from rclpy.clock import Clock, ClockType
 from thinmap_msgs.srv import JoinMaps, SeparateMaps
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.map_links import MapLink
-from thinmap_ros.core.slam.joining.team_map import (
-    WORLD,
-    MergedMap,
-    RobotMap,
-    Search,
-    Team,
-    merged,
-)
+from thinmap_ros.core.slam.joining.team_map import WORLD, RobotMap, Search, Team
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.joining.joint_map import JointMap
 from thinmap_ros.nodes.joining.robot_maps import RobotMaps
 from thinmap_ros.nodes.joining.settings import (
     MapJoinerConfig,
@@ -40,7 +33,8 @@ _SHARE = 0.3  # of a core that searches and merging may use
 class MapJoinerNode(ThinmapNode):
     """ROBOT/map and ROBOT/topology of all robots in; merged_map, merged_topology, tf_static out.
 
-    Also merged_regions and join_status. Services join_maps, which gives the place of a map in
+    ROBOT/keyframes and ROBOT/keyframe_poses in, where they are: with them the joint map bends.
+    Also merged_regions and join_status out. Services join_maps, which gives the place of a map in
     another one, and separate_maps, which undoes all joins of a map. Only joined maps are published.
     Places are searched for in a thread, a pair of maps at a time.
     """
@@ -68,8 +62,7 @@ class MapJoinerNode(ThinmapNode):
     def reset_state(self) -> None:
         """Separate all maps; those of the robots stay."""
         self._team = Team(self._config.join_odds)
-        self._merged: MergedMap | None = None
-        self._regions = RegionTracker()
+        self._joint = JointMap()
         self._worker.drop()
         self._is_merge_due = False
         self._next_merge_s = 0.0  # time of the machine
@@ -80,7 +73,10 @@ class MapJoinerNode(ThinmapNode):
     def _on_map(self, name: str) -> None:
         """A robot has another map."""
         is_new = name not in self._team.maps
-        self._team.receive(name, self._robots.patches[name], self._robots.graphs.get(name))
+        robots = self._robots
+        self._team.receive(
+            name, robots.patches[name], robots.graphs.get(name), robots.keyframes(name)
+        )
         if is_new and self._config.known_init_poses:
             self._give_initial_pose(name)
         if is_new:
@@ -138,27 +134,34 @@ class MapJoinerNode(ThinmapNode):
 
     def _places_changed(self) -> None:
         """Publish where the maps lie, and merge them again."""
-        places = self._team.places()
+        self._publish_places()
+        self._is_merge_due = True
+
+    def _publish_places(self) -> None:
+        places = self._joint.bend.present_places(self._team.places())
         self._output.publish_places(self._team, places)
         count = len(self._team.maps)
         self.diagnostics.set_state(OK, f'{len(places)} of {count} maps are joined')
-        self._is_merge_due = True
 
     def _begin_merging(self) -> None:
         self._is_merge_due = False
         places = self._team.places()
         if places:
             maps = dict(self._team.maps)
-            self._worker.begin(lambda: self._merge(maps, places))
+            joint = self._joint
+            self._worker.begin(lambda: self._merge(joint, maps, places))
 
-    def _merge(self, maps: dict[str, RobotMap], places: dict[str, Array]) -> Result:
+    def _merge(
+        self, joint: JointMap, maps: dict[str, RobotMap], places: dict[str, Array]
+    ) -> Result:
         """Merge, in the thread of the worker."""
-        merged_map = merged(maps, places, self._merged)
-        regions = self._regions.update(merged_map.patch)
+        merge = joint.merge(maps, places)
 
         def publish() -> None:
-            self._merged = merged_map
-            self._output.publish_map(merged_map, regions)
+            joint.take(merge)
+            self._output.publish_map(merge.merged, merge.regions)
+            if merge.bend.poses:
+                self._publish_places()
 
         return publish
 
@@ -200,7 +203,7 @@ class MapJoinerNode(ThinmapNode):
         def work() -> str:
             self._require_map(request.name)
             self._team.separate(request.name)
-            self._merged = None
+            self._joint.begin_ids_again()
             self._places_changed()
             return f'{request.name} is separated until join_maps joins it'
 
