@@ -43,7 +43,8 @@ class SentEdge:
 class KeyframeMessage:
     """A keyframe of a number 0, 1, 2, ..., at a pose (3,) after so many corrections (revision).
 
-    edges: that are known since the last message, between keyframes up to this one.
+    edges: that are known since the last message, between keyframes up to this one. A number that
+    has come before brings edges only.
     """
 
     number: int
@@ -138,7 +139,7 @@ def _known_number(number: int) -> int:
 
 def _edge(values: tuple[int | float, ...], number: int) -> SentEdge:
     """An edge between keyframes up to a number."""
-    a, b = int(values[0]), int(values[1])
+    a, b = (int(value) for value in values[:2])
     if a == b or max(a, b) > number:
         raise InputError(f'{_WHAT} {number}: edge from {a} to {b}: expected two up to it')
     information = np.zeros((3, 3))

@@ -67,7 +67,7 @@ class ReceivedKeyframes:
                 scan, surface_points(scan), message.T_map_base, 0.0, np.zeros((3, 3)), submap=0
             )
             self._frames[message.number] = (message.revision, frame)
-            self._edges += message.edges
+        self._edges += message.edges
 
     def correct(self, session: int, revision: int, poses: Array) -> None:
         """Take corrected poses (N, 3) of the first keyframes of a session."""

@@ -177,7 +177,8 @@ def _groups(names: Sequence[str], pairs: Sequence[Pair]) -> list[list[str]]:
     """Names that are connected by pairs, each group in their order."""
     group = {name: name for name in names}
     for a, b in pairs:
-        kept, gone = group[a], group[b]
+        kept = group[a]
+        gone = group[b]
         group = {name: kept if of == gone else of for name, of in group.items()}
     found: dict[str, list[str]] = {}
     for name in names:
