@@ -13,6 +13,7 @@ from thinmap_ros.core.slam.joining.team_map import WORLD, RobotMap, Search, Team
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.joining.joint_map import JointMap
 from thinmap_ros.nodes.joining.robot_maps import RobotMaps
+from thinmap_ros.nodes.joining.saved_maps import SavedMaps
 from thinmap_ros.nodes.joining.settings import (
     MapJoinerConfig,
     declare_initial_poses,
@@ -35,7 +36,8 @@ class MapJoinerNode(ThinmapNode):
 
     ROBOT/keyframes and ROBOT/keyframe_poses in, where they are: with them the joint map bends.
     Also merged_regions and join_status out. Services join_maps, which gives the place of a map in
-    another one, and separate_maps, which undoes all joins of a map. Only joined maps are published.
+    another one, and separate_maps, which undoes all joins of a map; map_merging/add_submap, with a
+    saved map, and map_merging/merge_submaps. Only joined maps are published.
     Places are searched for in a thread, a pair of maps at a time.
     """
 
@@ -44,6 +46,7 @@ class MapJoinerNode(ThinmapNode):
         warn_of_confidence(self)
         self._config = parameters.declare_config(self, MapJoinerConfig)
         self._initial = declare_initial_poses(self)
+        SavedMaps(self, self._on_saved_map, self._merge_now)
         parameters.reject_unknown(self)
         warm_up.map_joiner()
         config = self._config
@@ -67,16 +70,13 @@ class MapJoinerNode(ThinmapNode):
         self._is_merge_due = False
         self._next_merge_s = 0.0  # time of the machine
         self._next_search_s = 0.0
-        for name in self._robots.patches:
+        for name in self._robots.patches | self._robots.saved:
             self._on_map(name)
 
     def _on_map(self, name: str) -> None:
         """A robot has another map."""
         is_new = name not in self._team.maps
-        robots = self._robots
-        self._team.receive(
-            name, robots.patches[name], robots.graphs.get(name), robots.keyframes(name)
-        )
+        self._team.maps[name] = self._robots.map_of(name)
         if is_new and self._config.known_init_poses:
             self._give_initial_pose(name)
         if is_new:
@@ -88,6 +88,23 @@ class MapJoinerNode(ThinmapNode):
         self.get_logger().warning(f'{name} has begun another map: its place is searched for')
         self._team.begin_again(name)
         self._places_changed()
+
+    def _on_saved_map(self, name: str, saved: RobotMap) -> None:
+        """A map of a file is to be joined, instead of an earlier one of that name."""
+        if name in self._robots.names:
+            raise InputError(f'{quoted(name)} is the map of a robot: expected another file name')
+        self._robots.saved[name] = saved
+        self._team.begin_again(name)
+        self._on_map(name)
+
+    def _merge_now(self) -> str:
+        """Merge the maps that are joined; returns which these are."""
+        places = self._team.places()
+        if not places:
+            raise InputError('no map has a place in another one: expected two or more that have')
+        self._is_merge_due = True
+        self._next_merge_s = 0.0
+        return f'{", ".join(sorted(places))}: merged'
 
     def _give_initial_pose(self, name: str) -> None:
         pose = self._initial.get(name)

@@ -11,6 +11,7 @@ from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, checked_poses
 from thinmap_ros.core.slam.joining.robot_keyframes import ReceivedKeyframes, RobotKeyframes
+from thinmap_ros.core.slam.joining.team_map import RobotMap
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.nodes.joining.settings import MapJoinerConfig
@@ -26,7 +27,8 @@ _TYPE = 'nav_msgs/msg/OccupancyGrid'
 class RobotMaps:
     """Subscribes to map, topology and keyframes of each robot, by its namespace.
 
-    patches, graphs: the newest ones; a robot without topological map has no graph.
+    patches, graphs: the newest ones; a robot without topological map has no graph. saved: maps of
+    files, by names of their own.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class RobotMaps:
         """
         self.patches: dict[str, GridPatch] = {}
         self.graphs: dict[str, TopologicalMap] = {}
+        self.saved: dict[str, RobotMap] = {}
         self.names: set[str] = set()
         self._node = node
         self._config = config
@@ -51,7 +54,13 @@ class RobotMaps:
         self._keyframes: dict[str, ReceivedKeyframes] = {}
         self._own = node.resolve_topic_name(config.merged_map_topic)
 
-    def keyframes(self, name: str) -> RobotKeyframes | None:
+    def map_of(self, name: str) -> RobotMap:
+        """The newest map of a robot, or a saved one."""
+        if name in self.saved:
+            return self.saved[name]
+        return RobotMap(self.patches[name], self.graphs.get(name), self._keyframes_of(name))
+
+    def _keyframes_of(self, name: str) -> RobotKeyframes | None:
         """The keyframes of the map of a robot; None where it sends none, or those of another."""
         received = self._keyframes[name]
         is_of_map = received.map_id == self._map_ids.get(name, UNKNOWN)
