@@ -67,7 +67,7 @@ def _joined(floor: Floor, seconds: float) -> list[Any]:
             overlap_errors(a.truth, b.truth, poses['/a'], poses['/b'])
             for poses in (rigid, bend.poses or rigid)
         ]
-        is_right = is_right and bool(errors[0].max(initial=0.0) < _RIGHT_M)
+        is_right = is_right and bool(errors[1].max(initial=0.0) < _RIGHT_M)
     row: list[Any] = [floor.name, joined_m, is_right if joined_m else None]
     row += [min(first[-1].path_m, second[-1].path_m)]
     if errors and len(errors[0]):
