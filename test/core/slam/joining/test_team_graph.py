@@ -126,6 +126,15 @@ def test_too_few_matches_bend_nothing(monkeypatch):
     assert graph.bend(maps, places).poses.keys() == maps.keys(), 'the next matches'
 
 
+def test_keyframes_that_nothing_connects_bend_nothing():
+    maps = {'/a': keyframes('/a'), '/b': replace(keyframes('/b', DRIFT), sent_edges=[])}
+    places = {name: place(name) for name in maps}
+    graph = TeamGraph()
+    assert graph.bend(maps, places).poses == {}
+    whole = {**maps, '/b': keyframes('/b', DRIFT)}
+    assert graph.bend(whole, places).poses.keys() == maps.keys()
+
+
 def test_a_corrected_map_is_matched_at_its_corrected_poses():
     graph = TeamGraph()
     places = {'/a': place('/a'), '/b': place('/b')}

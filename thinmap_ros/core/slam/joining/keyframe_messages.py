@@ -23,6 +23,7 @@ from thinmap_ros.core.validation import MAX_BEAMS
 
 _WHAT = 'keyframe'
 _ROUNDING = 1e-5  # relative error of an information matrix in 32 bit
+_MAX_INFORMATION = 1e12
 # Number, revision, edges, unit of the ranges, pose, laser.
 _HEADER = struct.Struct('<IIIH3f10f')
 _EDGE = struct.Struct('<II6f')
@@ -148,8 +149,8 @@ def _edge(values: tuple[int | float, ...], number: int) -> SentEdge:
 
 
 def _definite(information: Array) -> Array:
-    """The matrix (3, 3). Raises InputError unless it is finite and positive, but for rounding."""
-    if np.isfinite(information).all():
+    """The matrix (3, 3). Raises InputError unless it is bounded and positive, but for rounding."""
+    if (np.abs(information) <= _MAX_INFORMATION).all():
         values = np.linalg.eigvalsh(information)
         if values[2] > 0.0 and values[0] > -_ROUNDING * values[2]:
             return information

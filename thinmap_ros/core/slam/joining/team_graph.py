@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from thinmap_ros.core import se2
@@ -142,7 +144,10 @@ class TeamGraph:
             links.tried.update(near)
 
     def _optimized(self, group: Sequence[str], start: Mapping[str, Array]) -> dict[str, Array]:
-        """Poses (N, 3) of the keyframes of robots that matches connect; the first one is fixed."""
+        """Poses (N, 3) of the keyframes of robots that matches connect; the first one is fixed.
+
+        None of them bends where the edges do not determine the poses.
+        """
         ends = np.cumsum([0, *(len(start[name]) for name in group)]).tolist()
         first = dict(zip(group, ends, strict=False))
         edges: list[Edge] = []
@@ -151,7 +156,11 @@ class TeamGraph:
         for (a, b), links in self._links.items():
             if a in first and b in first:
                 edges += _shifted(links.edges, first[a], first[b])
+        if not _are_connected(ends[-1], edges):
+            return {}  # a robot has not told all of its edges
         poses = optimized(np.vstack([start[name] for name in group]), edges)
+        if not np.isfinite(poses).all():
+            return {}  # edges of absurd weights
         return {
             name: poses[begin:end] for name, (begin, end) in zip(group, pairwise(ends), strict=True)
         }
@@ -166,6 +175,13 @@ def _are_near(T_a: Array, T_b: Array) -> bool:
 def _place_of_last(bent: Array, own: Array) -> Array:
     """Pose (3,) of a map in the world, by the last of its keyframes (N, 3)."""
     return se2.compose(bent[-1], se2.invert(own[-1]))
+
+
+def _are_connected(count: int, edges: Sequence[Edge]) -> bool:
+    """Whether edges connect so many keyframes."""
+    ends = ([edge.a for edge in edges], [edge.b for edge in edges])
+    links = coo_matrix((np.ones(len(edges)), ends), shape=(count, count))
+    return int(connected_components(links, directed=False, return_labels=False)) == 1
 
 
 def _shifted(edges: Sequence[Edge], by_a: int, by_b: int) -> Iterator[Edge]:
