@@ -179,9 +179,11 @@ def _place_of_last(bent: Array, own: Array) -> Array:
 
 def _are_connected(count: int, edges: Sequence[Edge]) -> bool:
     """Whether edges connect so many keyframes."""
-    ends = ([edge.a for edge in edges], [edge.b for edge in edges])
-    links = coo_matrix((np.ones(len(edges)), ends), shape=(count, count))
-    return int(connected_components(links, directed=False, return_labels=False)) == 1
+    a = np.array([edge.a for edge in edges])
+    b = np.array([edge.b for edge in edges])
+    links = coo_matrix((np.ones(len(edges)), (a, b)), shape=(count, count))
+    parts, _ = connected_components(links, directed=False)
+    return bool(parts == 1)
 
 
 def _shifted(edges: Sequence[Edge], by_a: int, by_b: int) -> Iterator[Edge]:
