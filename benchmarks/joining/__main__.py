@@ -27,7 +27,7 @@ _SIX = (
 _LARGE = ('kth/50052748',)
 _TABLES: dict[str, tuple[Callable[[Sequence[Floor], float], Table], tuple[str, ...], float]] = {
     'two_robots': (tables.two_robots, _SIX, 400.0),
-    'load': (tables.load, _LARGE, 1200.0),
+    'load': (tables.load, _LARGE, 600.0),
     'foreign': (tables.foreign, _SIX, 960.0),
 }
 

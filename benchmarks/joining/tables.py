@@ -22,8 +22,9 @@ from thinmap_ros.nodes.joining.joint_map import JointMap
 _RIGHT_M = 0.5  # where the maps overlap
 _ROBOTS = 5
 _DRIVE_EACH_M = 100.0
-_FOREIGN_EACH_M = 20.0
+_FOREIGN_EACH_M = 40.0
 _BEAT_S = 0.005
+_IDLE_S = 10.0
 
 
 def two_robots(floors: Sequence[Floor], seconds: float) -> Table:
@@ -83,13 +84,15 @@ def load(floors: Sequence[Floor], seconds: float) -> Table:
     """Five robots in the first world, with true poses: processor time of each kind of job.
 
     The node waits while a job holds the interpreter: the longest time is that of a thread that
-    wakes up each 5 ms, less what it takes without a job.
+    wakes up each 5 ms; without a job it waits for the other programs of the machine only.
     """
     (floor,) = floors[:1]
     drives = [random_drives(floor, start, seconds, _DRIVE_EACH_M) for start in range(_ROBOTS)]
     team = Team()
     joint = JointMap()
-    taken: dict[str, list[tuple[float, float]]] = {'search': [], 'merge': []}
+    taken: dict[str, list[tuple[float, float]]] = {'nothing': [], 'search': [], 'merge': []}
+    with _timed(taken['nothing']):
+        time.sleep(_IDLE_S)
     areas: list[float] = []
     for sent_by_all in zip_longest(*drives):
         for number, sent in enumerate(sent_by_all):

@@ -1,5 +1,7 @@
 """Maps at a pose, or bent: with rows that are not parallel to the x axis, or laid over another."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,23 +70,44 @@ def _resampled(
     """Cells (H, W) of a moved map on the lattice of another frame; see `aligned_patch`."""
     rows, cols = shape
     resampled = np.full((rows, cols), UNKNOWN, dtype=np.int8)
-    for row in range(0, rows, _BLOCK):  # some at a time: a large map needs little more memory
+    reached = _reached_blocks(patch, motion, frame, shape)
+    for block in np.flatnonzero(reached.any(axis=1)).tolist():
+        # A row of blocks at a time: a large map needs little more memory than its cells.
+        row = block * _BLOCK
         some = np.arange(row, min(row + _BLOCK, rows))
-        new_cells = np.stack(np.meshgrid(some, np.arange(cols), indexing='ij'), axis=-1)
-        centres = frame.centres_of(new_cells.reshape(-1, 2))
-        middles = frame.centres_of(_middles(row, cols))
-        moved_as = np.repeat(motion.nearest_after(middles), _BLOCK)[:cols]
-        old = motion.undone(centres, np.tile(moved_as, len(some)))
+        there = np.flatnonzero(np.repeat(reached[block], _BLOCK)[:cols])
+        new_cells = np.stack(np.meshgrid(some, there, indexing='ij'), axis=-1).reshape(-1, 2)
+        moved_as = motion.nearest_after(frame.centres_of(_middles(row, cols)))[there // _BLOCK]
+        old = motion.undone(frame.centres_of(new_cells), np.tile(moved_as, len(some)))
         old_cells = np.floor(patch.frame.in_cells(old)[:, ::-1] + 1e-9).astype(np.int64)
         inside = ((old_cells >= 0) & (old_cells < patch.shape)).all(axis=1)
-        part = resampled[row : row + len(some)].reshape(-1)
-        part[inside] = patch.cells[tuple(old_cells[inside].T)]
+        resampled[tuple(new_cells[inside].T)] = patch.cells[tuple(old_cells[inside].T)]
     occupied = np.argwhere(patch.cells >= OCCUPIED_AT_LEAST)
     centres = patch.frame.centres_of(occupied)
     walls = frame.cells_of(motion.moved(centres))
     inside = ((walls >= 0) & (walls < shape)).all(axis=1)
     resampled[tuple(walls[inside].T)] = patch.cells[tuple(occupied[inside].T)]
     return resampled
+
+
+def _reached_blocks(
+    patch: GridPatch, motion: MapMotion, frame: GridFrame, shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Blocks (H, W) of the cells of another frame in which known cells of a moved map may lie."""
+    known = np.pad(patch.cells != UNKNOWN, [(0, -size % _BLOCK) for size in patch.shape])
+    down, across = (size // _BLOCK for size in known.shape)
+    blocks = np.argwhere(known.reshape(down, _BLOCK, across, _BLOCK).any(axis=(1, 3)))
+    size = [-(-each // _BLOCK) for each in shape]
+    reached = np.zeros(size, dtype=np.bool_)
+    middles = patch.frame.centres_of(blocks * _BLOCK + _BLOCK // 2)
+    there = frame.cells_of(motion.moved(middles)) // _BLOCK
+    # Half a diagonal, and one block for what does not move exactly as the middle does.
+    far = 1 + math.ceil(math.sqrt(0.5) * patch.frame.resolution / frame.resolution)
+    for off in np.ndindex(2 * far + 1, 2 * far + 1):
+        row, col = (there + off - far).T
+        inside = (row >= 0) & (row < size[0]) & (col >= 0) & (col < size[1])
+        reached[row[inside], col[inside]] = True
+    return reached
 
 
 def _middles(row: int, cols: int) -> NDArray[np.int64]:
