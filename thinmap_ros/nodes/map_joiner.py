@@ -21,13 +21,15 @@ from thinmap_ros.nodes.joining.settings import (
     warn_of_confidence,
 )
 from thinmap_ros.nodes.joining.team_publishers import TeamPublishers
-from thinmap_ros.nodes.joining.worker import Result, Worker
+from thinmap_ros.nodes.joining.worker import Result, Turns, Worker
 from thinmap_ros.ros import messages, node_main, parameters
 from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.services import fill_response
 
 _POLL_S = 0.1
+_MERGE = 'merge'
+_SEARCH = 'search'
 _SHARE = 0.3  # of a core that searches and merging may use
 
 
@@ -53,6 +55,7 @@ class MapJoinerNode(ThinmapNode):
         self._output = TeamPublishers(self, config.merged_map_topic, config.world_frame)
         self._robots = RobotMaps(self, config, self._on_map, self._on_other_map)
         self._worker = Worker(_SHARE)
+        self._turns = Turns()
         self.reset_state()
         self.create_service(JoinMaps, 'join_maps', self._on_join)
         self.create_service(SeparateMaps, 'separate_maps', self._on_separate)
@@ -125,10 +128,13 @@ class MapJoinerNode(ThinmapNode):
         if not self._worker.is_free:
             return
         now_s = time.monotonic()
-        if self._is_merge_due and now_s >= self._next_merge_s:
+        ready = [_MERGE] if self._is_merge_due and now_s >= self._next_merge_s else []
+        ready += [_SEARCH] if now_s >= self._next_search_s else []
+        turn = self._turns.take(ready)
+        if turn == _MERGE:
             self._next_merge_s = now_s + 1.0 / self._config.merging_rate
             self._begin_merging()
-        elif now_s >= self._next_search_s:
+        elif turn == _SEARCH:
             self._next_search_s = now_s + 1.0 / self._config.estimation_rate
             search = self._team.next_search()
             if search is not None:
