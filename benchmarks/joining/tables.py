@@ -149,6 +149,7 @@ def foreign(floors: Sequence[Floor], seconds: float) -> Table:
             highest = max(highest, log_odds)
             if is_joined:
                 joins.append(' and '.join(pair))
+        print(f'{searches} searches, {len(joins)} joins', flush=True)
     pairs = len(floors) * (len(floors) - 1) // 2
     columns = ('pairs of buildings', 'hours of all pairs', 'searches', 'joins', 'highest log odds')
     hours = pairs * seconds / 3600.0
