@@ -37,9 +37,9 @@ def two_robots(floors: Sequence[Floor], seconds: float) -> Table:
         'keyframes that overlap',
         'matches',
         'RMS error m: rigid',
-        'after the graph',
-        'largest: rigid',
-        'after the graph',
+        'RMS error m: after the graph',
+        'largest error m: rigid',
+        'largest error m: after the graph',
         'keyframes: bytes a m',
     )
     return Table('two_robots', columns, [_joined(floor, seconds) for floor in floors], timed=False)
@@ -52,6 +52,8 @@ def _joined(floor: Floor, seconds: float) -> list[Any]:
     joined_m: float | None = None
     is_right = True
     errors: list[Array] = []
+    if not (first and second):
+        return [floor.name, *[None] * 10]  # one of them has not come 10 m far
     sent_bytes = [sent[-1].keyframe_bytes / sent[-1].path_m for sent in (first, second)]
     for a, b in zip(first, second, strict=False):
         for name, sent in (('/a', a), ('/b', b)):
