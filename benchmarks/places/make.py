@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.places.recorded import RecordedPiece
-from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, no_progress
+from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, Mishap, no_progress
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
@@ -60,11 +60,11 @@ def make_exploration(worlds: Path, name: str, start: int, folder: Path, limit_s:
 
 
 def explored(
-    world: World, start: Array, seed: int, limit_s: float
+    world: World, start: Array, seed: int, limit_s: float, watcher: Mishap | None = None
 ) -> tuple[Pipeline, dict[int, Array]]:
     """Explore a world from a start (3,), with SLAM from an origin of its own.
 
-    Returns the pipeline, and the true pose (3,) by the stamp of each scan.
+    watcher: of each scan. Returns the pipeline, and the true pose (3,) by the stamp of each scan.
     """
     laser = LaserScannerConfig()
     simulation = Simulation(world, start, PRESETS['2dx'], laser, seed)
@@ -72,7 +72,8 @@ def explored(
     pipeline = Pipeline(PipelineConfig(grid=grid, scans_per_graph=SCANS_PER_GRAPH))
     controller = PathFollowerConfig(max_speed_m_s=_SPEED_M_S)
     navigator = Navigator(NavigatorConfig(controller=controller))
-    loop = ClosedLoop(simulation, pipeline, make_strategy('nearest_frontier'), navigator)
+    strategy = make_strategy('nearest_frontier')
+    loop = ClosedLoop(simulation, pipeline, strategy, navigator, watcher)
     loop.run(_NO_GOAL, limit_s, no_progress, scans_per_show=10**9)
     pipeline.localizer.optimized_trajectory()
     return pipeline, dict(zip(loop.log.stamps_ns, loop.log.true_poses, strict=True))

@@ -17,15 +17,22 @@ def relative_errors(
     known_poses (K, 3), query_poses (Q, 3): of all keyframes, in one frame. Of keyframes that
     are near each other by the truth.
     """
+    return overlap_errors(known.truth, query.truth, known_poses, query_poses)
+
+
+def overlap_errors(
+    known_truth: Array, query_truth: Array, known_poses: Array, query_poses: Array
+) -> Array:
+    """Errors (N,), m, as `relative_errors`, by the true poses (K, 3) and (Q, 3) of both."""
     errors = []
-    for k, T_true in enumerate(query.truth):
-        away = np.hypot(*(known.truth[:, :2] - T_true[:2]).T)
+    for k, T_true in enumerate(query_truth):
+        away = np.hypot(*(known_truth[:, :2] - T_true[:2]).T)
         if np.isnan(away).all():
             continue
         j = int(np.nanargmin(away))
         if away[j] > _NEAR_M:
             continue
-        want = se2.between(known.truth[j], T_true)
+        want = se2.between(known_truth[j], T_true)
         off = se2.between(want, se2.between(known_poses[j], query_poses[k]))
         errors.append(float(np.hypot(off[0], off[1])))
     return np.array(errors)

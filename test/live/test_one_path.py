@@ -15,10 +15,12 @@ from support.doctor import Doctor
 from support.slam_room import drive_round_the_block
 from support.timeouts import PATIENCE_S
 
-from thinmap_msgs.msg import SlamStatus
+from thinmap_msgs.msg import Keyframe, KeyframePoses, SlamStatus
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, checked_poses
+from thinmap_ros.core.slam.joining.robot_keyframes import ReceivedKeyframes
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.files import occupancy_maps, package_data, sessions
 from thinmap_ros.files.worlds import read_world
@@ -227,6 +229,30 @@ def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, 
     offline = expected.pipeline.topology.map
     # The map is that of the grid. Ids depend on the windows, which are other ones offline.
     assert places(live) == places(offline)
+    assert_told(graph, expected.pipeline.localizer.saved_keyframes())
+
+
+def assert_told(graph, saved):
+    """A subscriber that comes late gets all keyframes, at their corrected poses, and edges."""
+    keyframes = []
+    poses = []
+    node = graph.node
+    node.create_subscription(Keyframe, 'keyframes', keyframes.append, qos.KEYFRAMES)
+    node.create_subscription(KeyframePoses, 'keyframe_poses', poses.append, qos.LATCHED)
+    graph.until(lambda: len(keyframes) >= len(saved.frames) and poses, 'keyframes and poses')
+    received = ReceivedKeyframes()
+    for message in keyframes:
+        received.add(message.session, message.map_id, KeyframeMessage.decode(bytes(message.data)))
+    (newest,) = poses
+    assert newest.revision > 0
+    received.correct(newest.session, newest.revision, checked_poses(np.array(newest.poses)))
+    known = received.known()
+    np.testing.assert_allclose(known.poses, [frame.T_map_base for frame in saved.frames], atol=1e-5)
+    # Edges that came after the last keyframe are told with the next one.
+    told = {(edge.a, edge.b) for edge in known.edges}
+    assert {(step.a, step.b) for step in saved.steps} <= told
+    assert told & {(edge.a, edge.b) for edge in saved.edges}, 'those of the loop'
+    assert max(len(message.data) for message in keyframes) < 1000
 
 
 def errors(stem, truths):

@@ -44,6 +44,7 @@ from thinmap_ros.kernels import warm_up
 from thinmap_ros.logs.frames.bag_odometry import NONE
 from thinmap_ros.nodes.localization.given_map import GivenMap, config_at
 from thinmap_ros.nodes.localization.initial_poses import InitialPoses
+from thinmap_ros.nodes.localization.keyframe_output import KeyframeOutput
 from thinmap_ros.nodes.localization.known_area import require_near_map
 from thinmap_ros.nodes.localization.living_map import LivingMap
 from thinmap_ros.nodes.localization.map_source import load_localizer
@@ -77,6 +78,7 @@ class _PosePublishers:
         self._scan = node.create_publisher(LocalizedScan, 'localized_scan', qos.STREAM)
         self._status = node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
         self._trajectory = node.create_publisher(Path, 'trajectory', qos.LATCHED)
+        self.keyframes = KeyframeOutput(node, self.map_frame)
         self._corrected_ns = 0
 
     def reset(self) -> None:
@@ -165,7 +167,8 @@ class _MapIds:
 class LocalizerNode(ThinmapNode):
     """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out.
 
-    /localized_scan with all that a mapper needs of a scan; /trajectory after a loop closure.
+    /localized_scan with all that a mapper needs of a scan; /trajectory after a loop closure;
+    /keyframes and /keyframe_poses for map_joiner.
 
     Services ~/pause, ~/reset, save_localizer, load_localizer, and check_localizer, which reads a
     saved map without replacing the present one. In a given map it is lost until
@@ -407,6 +410,8 @@ class LocalizerNode(ThinmapNode):
         if self._map_ids is not None:
             self._map_ids.fill_in(status)
         self._output.publish_estimate(scan, estimate, self._localizer, status)
+        if self._map_ids is not None:
+            self._output.keyframes.publish(scan.stamp_ns, self._localizer, self._map_ids.id)
 
 
 def _state_of(estimate: Estimate) -> int:

@@ -7,19 +7,13 @@ from rclpy.clock import Clock, ClockType
 from thinmap_msgs.srv import JoinMaps, SeparateMaps
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.map_links import MapLink
-from thinmap_ros.core.slam.joining.team_map import (
-    WORLD,
-    MergedMap,
-    RobotMap,
-    Search,
-    Team,
-    merged,
-)
+from thinmap_ros.core.slam.joining.team_map import WORLD, RobotMap, Search, Team
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.joining.joint_map import JointMap
 from thinmap_ros.nodes.joining.robot_maps import RobotMaps
+from thinmap_ros.nodes.joining.saved_maps import SavedMaps
 from thinmap_ros.nodes.joining.settings import (
     MapJoinerConfig,
     declare_initial_poses,
@@ -27,21 +21,25 @@ from thinmap_ros.nodes.joining.settings import (
     warn_of_confidence,
 )
 from thinmap_ros.nodes.joining.team_publishers import TeamPublishers
-from thinmap_ros.nodes.joining.worker import Result, Worker
+from thinmap_ros.nodes.joining.worker import Result, Turns, Worker
 from thinmap_ros.ros import messages, node_main, parameters
 from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.services import fill_response
 
 _POLL_S = 0.1
+_MERGE = 'merge'
+_SEARCH = 'search'
 _SHARE = 0.3  # of a core that searches and merging may use
 
 
 class MapJoinerNode(ThinmapNode):
     """ROBOT/map and ROBOT/topology of all robots in; merged_map, merged_topology, tf_static out.
 
-    Also merged_regions and join_status. Services join_maps, which gives the place of a map in
-    another one, and separate_maps, which undoes all joins of a map. Only joined maps are published.
+    ROBOT/keyframes and ROBOT/keyframe_poses in, where they are: with them the joint map bends.
+    Also merged_regions and join_status out. Services join_maps, which gives the place of a map in
+    another one, and separate_maps, which undoes all joins of a map; map_merging/add_submap, with a
+    saved map, and map_merging/merge_submaps. Only joined maps are published.
     Places are searched for in a thread, a pair of maps at a time.
     """
 
@@ -50,12 +48,14 @@ class MapJoinerNode(ThinmapNode):
         warn_of_confidence(self)
         self._config = parameters.declare_config(self, MapJoinerConfig)
         self._initial = declare_initial_poses(self)
+        SavedMaps(self, self._on_saved_map, self._merge_now)
         parameters.reject_unknown(self)
         warm_up.map_joiner()
         config = self._config
         self._output = TeamPublishers(self, config.merged_map_topic, config.world_frame)
         self._robots = RobotMaps(self, config, self._on_map, self._on_other_map)
         self._worker = Worker(_SHARE)
+        self._turns = Turns()
         self.reset_state()
         self.create_service(JoinMaps, 'join_maps', self._on_join)
         self.create_service(SeparateMaps, 'separate_maps', self._on_separate)
@@ -68,19 +68,18 @@ class MapJoinerNode(ThinmapNode):
     def reset_state(self) -> None:
         """Separate all maps; those of the robots stay."""
         self._team = Team(self._config.join_odds)
-        self._merged: MergedMap | None = None
-        self._regions = RegionTracker()
+        self._joint = JointMap()
         self._worker.drop()
         self._is_merge_due = False
         self._next_merge_s = 0.0  # time of the machine
         self._next_search_s = 0.0
-        for name in self._robots.patches:
+        for name in self._robots.patches | self._robots.saved:
             self._on_map(name)
 
     def _on_map(self, name: str) -> None:
         """A robot has another map."""
         is_new = name not in self._team.maps
-        self._team.receive(name, self._robots.patches[name], self._robots.graphs.get(name))
+        self._team.maps[name] = self._robots.map_of(name)
         if is_new and self._config.known_init_poses:
             self._give_initial_pose(name)
         if is_new:
@@ -92,6 +91,23 @@ class MapJoinerNode(ThinmapNode):
         self.get_logger().warning(f'{name} has begun another map: its place is searched for')
         self._team.begin_again(name)
         self._places_changed()
+
+    def _on_saved_map(self, name: str, saved: RobotMap) -> None:
+        """A map of a file is to be joined, instead of an earlier one of that name."""
+        if name in self._robots.names:
+            raise InputError(f'{quoted(name)} is the map of a robot: expected another file name')
+        self._robots.saved[name] = saved
+        self._team.begin_again(name)
+        self._on_map(name)
+
+    def _merge_now(self) -> str:
+        """Merge the maps that are joined; returns which these are."""
+        places = self._team.places()
+        if not places:
+            raise InputError('no map has a place in another one: expected two or more that have')
+        self._is_merge_due = True
+        self._next_merge_s = 0.0
+        return f'{", ".join(sorted(places))}: merged'
 
     def _give_initial_pose(self, name: str) -> None:
         pose = self._initial.get(name)
@@ -112,10 +128,13 @@ class MapJoinerNode(ThinmapNode):
         if not self._worker.is_free:
             return
         now_s = time.monotonic()
-        if self._is_merge_due and now_s >= self._next_merge_s:
+        ready = [_MERGE] if self._is_merge_due and now_s >= self._next_merge_s else []
+        ready += [_SEARCH] if now_s >= self._next_search_s else []
+        turn = self._turns.take(ready)
+        if turn == _MERGE:
             self._next_merge_s = now_s + 1.0 / self._config.merging_rate
             self._begin_merging()
-        elif now_s >= self._next_search_s:
+        elif turn == _SEARCH:
             self._next_search_s = now_s + 1.0 / self._config.estimation_rate
             search = self._team.next_search()
             if search is not None:
@@ -138,27 +157,34 @@ class MapJoinerNode(ThinmapNode):
 
     def _places_changed(self) -> None:
         """Publish where the maps lie, and merge them again."""
-        places = self._team.places()
+        self._publish_places()
+        self._is_merge_due = True
+
+    def _publish_places(self) -> None:
+        places = self._joint.bend.present_places(self._team.places())
         self._output.publish_places(self._team, places)
         count = len(self._team.maps)
         self.diagnostics.set_state(OK, f'{len(places)} of {count} maps are joined')
-        self._is_merge_due = True
 
     def _begin_merging(self) -> None:
         self._is_merge_due = False
         places = self._team.places()
         if places:
             maps = dict(self._team.maps)
-            self._worker.begin(lambda: self._merge(maps, places))
+            joint = self._joint
+            self._worker.begin(lambda: self._merge(joint, maps, places))
 
-    def _merge(self, maps: dict[str, RobotMap], places: dict[str, Array]) -> Result:
+    def _merge(
+        self, joint: JointMap, maps: dict[str, RobotMap], places: dict[str, Array]
+    ) -> Result:
         """Merge, in the thread of the worker."""
-        merged_map = merged(maps, places, self._merged)
-        regions = self._regions.update(merged_map.patch)
+        merge = joint.merge(maps, places)
 
         def publish() -> None:
-            self._merged = merged_map
-            self._output.publish_map(merged_map, regions)
+            joint.take(merge)
+            self._output.publish_map(merge.merged, merge.regions)
+            if merge.bend.poses:
+                self._publish_places()
 
         return publish
 
@@ -200,7 +226,7 @@ class MapJoinerNode(ThinmapNode):
         def work() -> str:
             self._require_map(request.name)
             self._team.separate(request.name)
-            self._merged = None
+            self._joint.begin_ids_again()
             self._places_changed()
             return f'{request.name} is separated until join_maps joins it'
 

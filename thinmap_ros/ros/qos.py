@@ -28,6 +28,12 @@ LATCHED = QoSProfile(
 TILES = QoSProfile(
     depth=50, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
+# All of a map: a subscriber that comes late gets them.
+KEYFRAMES = QoSProfile(
+    depth=16_384,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
 TRANSFORMS = QoSProfile(
     depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
 )

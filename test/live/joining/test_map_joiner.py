@@ -6,10 +6,12 @@ from nav_msgs.msg import OccupancyGrid
 from support.driven_pieces import driven_piece, true_transform
 from tf2_msgs.msg import TFMessage
 
-from thinmap_msgs.msg import JoinStatus, RegionArray, TopologicalMap
-from thinmap_msgs.srv import JoinMaps, SeparateMaps
+from thinmap_msgs.msg import JoinStatus, Keyframe, KeyframePoses, RegionArray, TopologicalMap
+from thinmap_msgs.srv import AddSubmap, JoinMaps, MergeMaps, SeparateMaps
 from thinmap_ros.core import se2
+from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, SentEdge
 from thinmap_ros.core.topology.flat import topology_from_msg
+from thinmap_ros.files.occupancy_maps import write_map
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -52,13 +54,24 @@ class Robots:
         self.regions = graph.heard('merged_regions', RegionArray, qos.LATCHED)
         self.publishers = {}
 
-    def publish(self, name, building, drive):
-        piece = driven_piece(building, drive).piece
-        topic = f'{name}/map'
+    def publish(self, name, building, drive, drift=0.0):
+        piece = driven_piece(building, drive, drift=drift).piece
+        publisher = self.publisher(OccupancyGrid, f'{name}/map', qos.LATCHED)
+        publisher.publish(messages.grid_msg(piece.patch, 'map', 1))
+
+    def publish_keyframes(self, name, building, drive, drift=0.0):
+        """All keyframes of a drive, and the edges along its path."""
+        driven = driven_piece(building, drive, drift=drift)
+        publisher = self.publisher(Keyframe, f'{name}/keyframes', qos.KEYFRAMES)
+        for number, frame in enumerate(driven.piece.keyframes):
+            edges = [SentEdge(e.a, e.b, e.information) for e in driven.edges if e.b == number]
+            message = KeyframeMessage(number, 0, frame.T_map_base, frame.scan, tuple(edges))
+            publisher.publish(Keyframe(session=7, data=message.encode()))
+
+    def publisher(self, kind, topic, profile):
         if topic not in self.publishers:
-            publisher = self.graph.node.create_publisher(OccupancyGrid, topic, qos.LATCHED)
-            self.publishers[topic] = publisher
-        self.publishers[topic].publish(messages.grid_msg(piece.patch, 'map', 1))
+            self.publishers[topic] = self.graph.node.create_publisher(kind, topic, profile)
+        return self.publishers[topic]
 
     def joined(self):
         return {each.name for each in self.status[-1].maps if each.is_joined} if self.status else {}
@@ -132,6 +145,68 @@ def test_maps_of_one_building_are_joined_separated_and_joined_by_hand(graph, rob
     assert done.success, done.message
     graph.until(lambda: robots.joined() and robots.status[-1].maps[-1].matches > 0, 'matches')
     assert_true(robots.place('/robot2'))
+    graph.until(lambda: len(maps) > count, 'the joint map again')
+
+
+def test_the_joint_map_bends_by_keyframes_that_were_sent_before(graph, robots):
+    drift = 0.01
+    maps = graph.heard('merged_map', OccupancyGrid, qos.LATCHED)
+    for name, *drive in (('/robot1', 1, 1), ('/robot2', 1, 2, drift)):
+        robots.publish(name, *drive)
+        robots.publish_keyframes(name, *drive)
+    # Bytes that are no message, and a correction of another session: both are left out.
+    broken = robots.publisher(Keyframe, '/robot1/keyframes', qos.KEYFRAMES)
+    broken.publish(Keyframe(session=7, data=b'nothing'))
+    poses = robots.publisher(KeyframePoses, '/robot1/keyframe_poses', qos.LATCHED)
+    poses.publish(KeyframePoses(session=6, revision=1, poses=[1.0, 2.0, 3.0]))
+    graph.start('map_joiner', **QUICK)
+    robots.until_joined('/robot1', '/robot2')
+    driven = driven_piece(1, 2, drift=drift)
+    last = driven.piece.keyframes[-1].T_map_base
+    straight = driven_piece(1, 2).piece
+    truth = true_transform(driven_piece(1, 1), driven_piece(1, 2))
+    T_true = se2.compose(truth, straight.keyframes[-1].T_map_base)
+
+    def error_m():
+        return float(np.hypot(*(se2.compose(robots.place('/robot2'), last) - T_true)[:2]))
+
+    graph.until(lambda: error_m() < 0.1, f'the robot where it is, not {error_m():.2f} m beside')
+    graph.until(lambda: robots.has_transform('/robot2'), 'the transform')
+    graph.until(lambda: maps, 'the joint map')
+    assert 'keyframe: ' in graph.log('map_joiner')
+
+
+def test_a_saved_map_is_added_and_merged_by_the_services_of_slam_toolbox(graph, robots, tmp_path):
+    maps = graph.heard('merged_map', OccupancyGrid, qos.LATCHED)
+    robots.publish('/robot1', 1, 1)
+    write_map(tmp_path / 'house', driven_piece(1, 2).piece.patch)
+    write_map(tmp_path / 'robot1', driven_piece(1, 2).piece.patch)
+    graph.start('map_joiner', **QUICK)
+    graph.until(lambda: robots.status and robots.status[-1].maps, 'the map of the robot')
+
+    def add(filename):
+        request = AddSubmap.Request(filename=filename)
+        return graph.call(AddSubmap, 'map_merging/add_submap', request)
+
+    def merge():
+        return graph.call(MergeMaps, 'map_merging/merge_submaps', MergeMaps.Request())
+
+    early = merge()
+    assert not early.success and 'expected two or more' in early.message
+    missing = add('nowhere')
+    assert not missing.success and 'nowhere' in missing.message
+    outside = add('../elsewhere')
+    assert not outside.success and 'expected a file below' in outside.message
+    taken = add('robot1')
+    assert not taken.success and 'the map of a robot' in taken.message
+    done = add('house')
+    assert done.success, done.message
+    robots.until_joined('/robot1', '/house')
+    assert_true(se2.between(robots.place('/robot1'), robots.place('/house')))
+    graph.until(lambda: maps, 'the joint map')
+    count = len(maps)
+    done = merge()
+    assert done.success and done.message == '/house, /robot1: merged'
     graph.until(lambda: len(maps) > count, 'the joint map again')
 
 

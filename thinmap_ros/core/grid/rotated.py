@@ -1,16 +1,19 @@
-"""Maps at a pose: with rows that are not parallel to the x axis, or laid over another map."""
+"""Maps at a pose, or bent: with rows that are not parallel to the x axis, or laid over another."""
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.motion import MapMotion
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.grid.tiles import MAX_CELLS
 from thinmap_ros.core.se2 import Array
 
 _ALIGNED_RAD = 1e-6
+_BLOCK = 8  # edge, in cells, of blocks that move as one
 
 
 def aligned_patch(
@@ -25,13 +28,15 @@ def aligned_patch(
     if abs(T_map_origin[2]) < _ALIGNED_RAD:
         x, y, _ = T_map_origin.tolist()
         return GridPatch(GridFrame(x, y, resolution_m), cells)
-    frame, (rows, cols) = _bounds(T_map_origin, resolution_m, cells.shape)
+    patch = GridPatch(GridFrame(0.0, 0.0, resolution_m), cells)
+    motion = MapMotion.rigid(T_map_origin)
+    frame, (rows, cols) = _bounds(patch, motion)
     if rows * cols > max_cells:
         raise InputError(
             f'map rotated by {T_map_origin[2]:.3f} rad: {rows} x {cols} cells: '
             f'expected {max_cells} at most'
         )
-    return GridPatch(frame, _resampled(T_map_origin, resolution_m, cells, frame, (rows, cols)))
+    return GridPatch(frame, _resampled(patch, motion, frame, (rows, cols)))
 
 
 def overlaid(base: GridPatch, other: GridPatch, T_base_other: Array) -> GridPatch:
@@ -40,10 +45,13 @@ def overlaid(base: GridPatch, other: GridPatch, T_base_other: Array) -> GridPatc
     The cells are those of the base, which may be larger or smaller than those of the other map.
     Raises InputError where the map would have more than MAX_CELLS cells.
     """
-    corner = np.array([other.frame.origin_x, other.frame.origin_y, 0.0])
-    T_base_origin = se2.compose(T_base_other, corner)
+    return overlaid_bent(base, other, MapMotion.rigid(T_base_other))
+
+
+def overlaid_bent(base: GridPatch, other: GridPatch, motion: MapMotion) -> GridPatch:
+    """As `overlaid`, with the other map moved into the frame of the base part by part."""
     cell_m = base.frame.resolution
-    own, shape = _bounds(T_base_origin, other.frame.resolution, other.shape)
+    own, shape = _bounds(other, motion)
     rows_cols = base.frame.cells_of(np.array([[own.origin_x, own.origin_y]]))[0]
     ends = rows_cols + np.ceil(np.array(shape) * own.resolution / cell_m).astype(int) + 1
     before = np.maximum(-rows_cols, 0)
@@ -52,49 +60,69 @@ def overlaid(base: GridPatch, other: GridPatch, T_base_other: Array) -> GridPatc
     if rows * cols > MAX_CELLS:
         raise InputError(f'joined map: {rows} x {cols} cells: expected {MAX_CELLS} at most')
     padded = base.padded((int(before[0]), int(before[1]), int(after[0]), int(after[1])))
-    laid = _resampled(
-        T_base_origin, other.frame.resolution, other.cells, padded.frame, padded.shape
-    )
+    laid = _resampled(other, motion, padded.frame, padded.shape)
     return GridPatch(padded.frame, np.where(padded.cells == UNKNOWN, laid, padded.cells))
 
 
 def _resampled(
-    T_map_origin: Array,
-    resolution_m: float,
-    cells: NDArray[np.int8],
-    frame: GridFrame,
-    shape: tuple[int, int],
+    patch: GridPatch, motion: MapMotion, frame: GridFrame, shape: tuple[int, int]
 ) -> NDArray[np.int8]:
-    """Cells (H, W) at a pose (3,) on the lattice of another frame; see `aligned_patch`."""
+    """Cells (H, W) of a moved map on the lattice of another frame; see `aligned_patch`."""
     rows, cols = shape
     resampled = np.full((rows, cols), UNKNOWN, dtype=np.int8)
-    for row in range(rows):  # one at a time: a large map needs little more memory than its cells
-        new_cells = np.column_stack([np.full(cols, row), np.arange(cols)])
-        old_cells = _cells_at(frame.centres_of(new_cells), T_map_origin, resolution_m)
-        inside = ((old_cells >= 0) & (old_cells < cells.shape)).all(axis=1)
-        resampled[row, inside] = cells[tuple(old_cells[inside].T)]
-    occupied = np.argwhere(cells >= OCCUPIED_AT_LEAST)
-    centres = (occupied[:, ::-1].astype(np.float64) + 0.5) * resolution_m
-    centres = se2.transform_points(T_map_origin, centres)
-    resampled[tuple(frame.cells_of(centres).T)] = cells[tuple(occupied.T)]
+    reached = _reached_blocks(patch, motion, frame, shape)
+    for block in np.flatnonzero(reached.any(axis=1)).tolist():
+        # A row of blocks at a time: a large map needs little more memory than its cells.
+        row = block * _BLOCK
+        some = np.arange(row, min(row + _BLOCK, rows))
+        there = np.flatnonzero(np.repeat(reached[block], _BLOCK)[:cols])
+        new_cells = np.stack(np.meshgrid(some, there, indexing='ij'), axis=-1).reshape(-1, 2)
+        moved_as = motion.nearest_after(frame.centres_of(_middles(row, cols)))[there // _BLOCK]
+        old = motion.undone(frame.centres_of(new_cells), np.tile(moved_as, len(some)))
+        old_cells = np.floor(patch.frame.in_cells(old)[:, ::-1] + 1e-9).astype(np.int64)
+        inside = ((old_cells >= 0) & (old_cells < patch.shape)).all(axis=1)
+        resampled[tuple(new_cells[inside].T)] = patch.cells[tuple(old_cells[inside].T)]
+    occupied = np.argwhere(patch.cells >= OCCUPIED_AT_LEAST)
+    centres = patch.frame.centres_of(occupied)
+    walls = frame.cells_of(motion.moved(centres))
+    inside = ((walls >= 0) & (walls < shape)).all(axis=1)
+    resampled[tuple(walls[inside].T)] = patch.cells[tuple(occupied[inside].T)]
     return resampled
 
 
-def _bounds(
-    T_map_origin: Array, resolution_m: float, shape: tuple[int, ...]
-) -> tuple[GridFrame, tuple[int, int]]:
-    """Frame and shape of an aligned grid around a rotated one."""
-    height_m = shape[0] * resolution_m
-    width_m = shape[1] * resolution_m
-    corners = np.array([[0.0, 0.0], [width_m, 0.0], [0.0, height_m], [width_m, height_m]])
-    corners = se2.transform_points(T_map_origin, corners)
-    low = corners.min(axis=0)
+def _reached_blocks(
+    patch: GridPatch, motion: MapMotion, frame: GridFrame, shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Blocks (H, W) of the cells of another frame in which known cells of a moved map may lie."""
+    known = np.pad(patch.cells != UNKNOWN, [(0, -size % _BLOCK) for size in patch.shape])
+    down, across = (size // _BLOCK for size in known.shape)
+    blocks = np.argwhere(known.reshape(down, _BLOCK, across, _BLOCK).any(axis=(1, 3)))
+    size = [-(-each // _BLOCK) for each in shape]
+    reached = np.zeros(size, dtype=np.bool_)
+    middles = patch.frame.centres_of(blocks * _BLOCK + _BLOCK // 2)
+    there = frame.cells_of(motion.moved(middles)) // _BLOCK
+    # Half a diagonal, and one block for what does not move exactly as the middle does.
+    far = 1 + math.ceil(math.sqrt(0.5) * patch.frame.resolution / frame.resolution)
+    for off in np.ndindex(2 * far + 1, 2 * far + 1):
+        row, col = (there + off - far).T
+        inside = (row >= 0) & (row < size[0]) & (col >= 0) & (col < size[1])
+        reached[row[inside], col[inside]] = True
+    return reached
+
+
+def _middles(row: int, cols: int) -> NDArray[np.int64]:
+    """The middle cell of each block in a row of them."""
+    across = np.arange(0, cols, _BLOCK) + _BLOCK // 2
+    return np.column_stack([np.full(len(across), row + _BLOCK // 2), across])
+
+
+def _bounds(patch: GridPatch, motion: MapMotion) -> tuple[GridFrame, tuple[int, int]]:
+    """Frame and shape of an aligned grid around a moved one."""
+    resolution_m = patch.frame.resolution
+    edges = [np.append(np.arange(0, size, _BLOCK), size) for size in patch.shape]
+    corners = np.stack(np.meshgrid(*edges, indexing='ij'), axis=-1).reshape(-1, 2)
+    moved = motion.moved(patch.frame.centres_of(corners) - 0.5 * resolution_m)
+    low = moved.min(axis=0)
     # Rounded, so that a quarter turn keeps the number of cells.
-    cols, rows = np.ceil(np.round((corners.max(axis=0) - low) / resolution_m, 6)).astype(int)
+    cols, rows = np.ceil(np.round((moved.max(axis=0) - low) / resolution_m, 6)).astype(int)
     return GridFrame(float(low[0]), float(low[1]), resolution_m), (int(rows), int(cols))
-
-
-def _cells_at(points: Array, T_map_origin: Array, resolution_m: float) -> NDArray[np.int64]:
-    """Rows and columns (N, 2) of the rotated grid in which points (N, 2) of the map lie."""
-    inner = se2.transform_points(se2.invert(T_map_origin), points)
-    return np.floor(inner[:, ::-1] / resolution_m + 1e-9).astype(np.int64)

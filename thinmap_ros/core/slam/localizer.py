@@ -21,6 +21,7 @@ from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
+from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
@@ -82,6 +83,11 @@ class Localizer:
     def edges(self) -> list[Edge]:
         """Edges of the pose graph between the keyframes: their steps, and those of loops."""
         return [*self._map.loops.keyframes.steps, *self._map.loops.graph.edges]
+
+    @property
+    def published_graph(self) -> LoopClosure | None:
+        """The keyframes and their graph; None where the map is made of other cells, too."""
+        return self._map.loops if self._map.local.is_of_keyframes else None
 
     @property
     def calibration(self) -> Array:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.motion import MapMotion
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology import topology_state
@@ -279,14 +280,7 @@ def _part(topology: TopologicalMap, bounds_m: Array) -> TopologicalMap:
 
 def _moved_points(points: Array, before: Array, after: Array) -> Array:
     """Points (N, 2), each moved as the pose nearest to it was."""
-    moved = points.copy()
-    if not len(before):
-        return moved
-    for i, point in enumerate(points):
-        k = int(((before[:, :2] - point) ** 2).sum(axis=1).argmin())
-        seen = se2.transform_points(se2.invert(before[k]), point[None])
-        moved[i] = se2.transform_points(after[k], seen)[0]
-    return moved
+    return MapMotion(before, after).moved(points) if len(before) else points.copy()
 
 
 def moved_map(topology: TopologicalMap, before: Array, after: Array) -> TopologicalMap:

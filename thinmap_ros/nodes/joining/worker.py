@@ -1,7 +1,7 @@
 """A thread for long work, which uses a share of a core at most."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 
@@ -13,6 +13,19 @@ Result = Callable[[], None]
 
 def _fail(error: InputError) -> None:
     raise error
+
+
+class Turns:
+    """Kinds of work that take turns: none waits for ever because another one is always ready."""
+
+    def __init__(self) -> None:
+        self._last = ''
+
+    def take(self, ready: Sequence[str]) -> str:
+        """One of the kinds that are ready, the first that was not the last; '' without any."""
+        others = [kind for kind in ready if kind != self._last]
+        self._last = next(iter(others or ready), '')
+        return self._last
 
 
 class Worker:

@@ -139,7 +139,7 @@ class LoopClosure:
         calibration: OdometryCalibration,
     ) -> None:
         """calibration: of the odometry, as another part estimates it."""
-        self._calibration = calibration
+        self.calibration = calibration
         self.keyframes = Keyframes(keyframes)
         self.graph = KeyframeGraph(self.keyframes, calibration)
         self.pieces = Pieces()
@@ -189,7 +189,7 @@ class LoopClosure:
         if not any(is_saved):
             return None
         steps = self.keyframes.steps
-        return SavedKeyframes.of(frames, steps, self.graph.edges, is_saved, self._calibration)
+        return SavedKeyframes.of(frames, steps, self.graph.edges, is_saved, self.calibration)
 
     def return_to(self, T_map_base: Array) -> None:
         """Make the keyframe of the published map nearest to a given pose (3,) the anchor.
@@ -244,7 +244,7 @@ class LoopClosure:
     def _earlier_visits(self, here: Keyframe) -> list[_Job]:
         """Jobs for the most similar keyframe of each earlier visit, the most similar first."""
         frames = self.keyframes.frames
-        covariance = here.covariance + self._calibration.covariance_of(here.systematic)
+        covariance = here.covariance + self.calibration.covariance_of(here.systematic)
         reach_m = self._config.reach_m(_sigma_m(covariance))
         near = self.keyframes.near(here.T_map_base, reach_m)
         near = [j for j in near if self._is_earlier(j, here)]
@@ -287,7 +287,7 @@ class LoopClosure:
             covariance = propagated_covariance(covariances[j], to_anchor + from_anchor)
             by = moved - carried(derivatives[j], to_anchor + from_anchor)
             covariance = covariance + rotated_covariance(step.covariance, yaw)
-            found.append(covariance + self._calibration.covariance_of(by))
+            found.append(covariance + self.calibration.covariance_of(by))
         return found
 
     @property

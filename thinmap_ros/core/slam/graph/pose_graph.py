@@ -83,12 +83,17 @@ class Edge:
     def settled(self, poses: Array, parameters: Array) -> 'Edge':
         """The edge as the poses (N, 3) have it, with its robust weight, then calibrated."""
         T = se2.between(poses[self.a], poses[self.b])
-        off = self.T_a_b - T
+        there = replace(self, T_a_b=T, information=self.weight_at(T) * self.information)
+        return there.calibrated(parameters)
+
+    def weight_at(self, T_a_b: Array) -> float:
+        """The weight, 0 to 1, that the robust loss leaves it at a relative pose (3,)."""
+        if not self.robust:
+            return 1.0
+        off = self.T_a_b - T_a_b
         off[2] = wrap(float(off[2]))
         squared = float(off @ self.information @ off)
-        weight = (1.0 + squared / _CONFIG.large) ** -2 if self.robust else 1.0
-        there = replace(self, T_a_b=T, information=weight * self.information)
-        return there.calibrated(parameters)
+        return float((1.0 + squared / _CONFIG.large) ** -2)
 
 
 def optimized(poses: Array, edges: list[Edge]) -> Array:

@@ -89,7 +89,7 @@ class SavedKeyframes:
         own_edges = [edge for edge in edges if is_saved[edge.a] and is_saved[edge.b]]
 
         def renumbered(edge: Edge) -> Edge:
-            settled = _with_calibration(edge, calibration)
+            settled = with_calibration(edge, calibration)
             return replace(settled, a=int(numbers[edge.a]), b=int(numbers[edge.b]))
 
         return SavedKeyframes(
@@ -194,7 +194,7 @@ def _step(step: Edge, frames: Sequence[Keyframe], before: int, is_saved: Sequenc
     return Edge(before, step.b, T, inverse(UNKNOWN), False)
 
 
-def _with_calibration(edge: Edge, calibration: OdometryCalibration) -> Edge:
+def with_calibration(edge: Edge, calibration: OdometryCalibration) -> Edge:
     """The edge with the uncertainty of the calibration among its own."""
     systematic = calibration.covariance_of(edge.systematic.derivative)
     if not systematic.any():

@@ -8,13 +8,15 @@ from functools import cached_property
 import numpy as np
 
 from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.motion import MapMotion
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
-from thinmap_ros.core.grid.rotated import overlaid
+from thinmap_ros.core.grid.rotated import overlaid_bent
 from thinmap_ros.core.places.recognition.decision import JOIN_ODDS, recognize
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.joining.map_links import MapLink, MapLinks
 from thinmap_ros.core.slam.joining.rigid import refined
+from thinmap_ros.core.slam.joining.robot_keyframes import RobotKeyframes
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
 from thinmap_ros.core.topology.builder import TopologyBuilder, build, moved_map
 from thinmap_ros.core.topology.config import TopologyConfig
@@ -23,7 +25,6 @@ from thinmap_ros.core.topology.joining import join_topologies
 
 WORLD = 'world'  # a map without cells, in whose frame a person gives the poses of others
 _FEWEST_MATCHES = LoopClosureConfig().min_consistent_matches
-_ORIGIN = np.zeros((1, 3))
 _MATCHED = np.diag(np.square([0.05, 0.05, 0.01]))  # of the place of a map, by many scans
 _GIVEN = np.diag(np.square([0.5, 0.5, 0.1]))  # of one that a person has measured
 
@@ -33,11 +34,13 @@ class RobotMap:
     """The newest map of a robot, in a frame of its own.
 
     given_graph: its topological map. One that does not lie in the grid, or None, is replaced by one
-    that is made from the grid: map and graph come on two topics.
+    that is made from the grid: map and graph come on two topics. keyframes: with which the map
+    bends; None: it is rigid.
     """
 
     patch: GridPatch
     given_graph: TopologicalMap | None = None
+    keyframes: RobotKeyframes | None = None
 
     @cached_property
     def graph(self) -> TopologicalMap:
@@ -130,9 +133,15 @@ class Team:
         self._separate: set[str] = set()
         self._reference = ''
 
-    def receive(self, name: str, patch: GridPatch, graph: TopologicalMap | None) -> None:
+    def receive(
+        self,
+        name: str,
+        patch: GridPatch,
+        graph: TopologicalMap | None,
+        keyframes: RobotKeyframes | None = None,
+    ) -> None:
         """Take the newest map of a robot."""
-        self.maps[name] = RobotMap(patch, graph)
+        self.maps[name] = RobotMap(patch, graph, keyframes)
 
     def give(self, a: str, b: str, T_a_b: Array) -> list[MapLink]:
         """Join map b to map a, or to WORLD, at a pose (3,) that a person gives.
@@ -220,35 +229,48 @@ def merged(
     maps: Mapping[str, RobotMap],
     places: Mapping[str, Array],
     before: MergedMap | None,
-    config: TopologyConfig | None = None,
+    bent: Mapping[str, Array] | None = None,
 ) -> MergedMap:
     """Merge the maps that have a place (3,) in the world; what the first knows comes first.
 
     before: the map that was merged last, whose ids are continued; None: ids are those of the first
-    map, as far as they can be.
+    map, as far as they can be. bent: poses (N, 3) of the keyframes of each map that bends, world
+    frame.
     """
+    motions = {name: _motion(maps[name], T, (bent or {}).get(name)) for name, T in places.items()}
     first, *others = places
-    patch = _moved(maps[first].patch, places[first])
+    patch = _moved(maps[first].patch, motions[first], places[first])
     for name in others:
-        patch = overlaid(patch, maps[name].patch, places[name])
-    known = before or _begun(maps[first].graph, first, patch, places[first])
-    builder = TopologyBuilder.continued(patch, known.graph, known.next_id, config)
+        patch = overlaid_bent(patch, maps[name].patch, motions[name])
+    known = before or _begun(first, maps[first].graph, patch, motions[first])
+    builder = TopologyBuilder.continued(patch, known.graph, known.next_id)
     for name in places.keys() - known.names:
-        graph = moved_map(maps[name].graph, _ORIGIN, places[name][None])
-        builder, _ = join_topologies(patch, builder.map, graph, builder.next_id, config)
+        graph = _moved_graph(maps[name].graph, motions[name])
+        builder, _ = join_topologies(patch, builder.map, graph, builder.next_id)
     return MergedMap(frozenset(places), patch, builder.map, builder.next_id)
 
 
-def _begun(graph: TopologicalMap, name: str, patch: GridPatch, T: Array) -> MergedMap:
-    """The topological map of the first robot, at its pose (3,), with the cells of all."""
+def _motion(robot: RobotMap, T: Array, bent: Array | None) -> MapMotion:
+    """How a map comes into the world: as its keyframes do, or to its place (3,)."""
+    if bent is None or robot.keyframes is None:
+        return MapMotion.rigid(T)
+    return MapMotion(robot.keyframes.poses, bent)
+
+
+def _begun(name: str, graph: TopologicalMap, patch: GridPatch, motion: MapMotion) -> MergedMap:
+    """The topological map of the first robot, moved, with the cells of all."""
     next_id = max([0, *graph.nodes, *graph.edges]) + 1
-    return MergedMap(frozenset([name]), patch, moved_map(graph, _ORIGIN, T[None]), next_id)
+    return MergedMap(frozenset([name]), patch, _moved_graph(graph, motion), next_id)
 
 
-def _moved(patch: GridPatch, T: Array) -> GridPatch:
-    """A map in the world frame, which has a lattice of its own if the pose (3,) is not 0."""
-    if not T.any():
+def _moved_graph(graph: TopologicalMap, motion: MapMotion) -> TopologicalMap:
+    return moved_map(graph, motion.before, motion.after)
+
+
+def _moved(patch: GridPatch, motion: MapMotion, T: Array) -> GridPatch:
+    """A map in the world frame, on the lattice of a map at a place (3,), which may be its own."""
+    if not motion.after.any():
         return patch
     cell = np.full((1, 1), UNKNOWN, dtype=np.int8)
     empty = GridPatch(GridFrame(float(T[0]), float(T[1]), patch.frame.resolution), cell)
-    return overlaid(empty, patch, T)
+    return overlaid_bent(empty, patch, motion)

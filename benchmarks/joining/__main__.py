@@ -1,0 +1,65 @@
+"""Joint maps of several robots.
+
+Usage: python -m benchmarks.joining [TABLE ...] [--worlds WORLD ...] [--seconds S] [-o DIR].
+
+Tables: two_robots (10 to 60 s of computing for each robot), load, foreign.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from benchmarks.joining import tables
+from benchmarks.places.tables import lines
+from benchmarks.worlds import WORLDS, Floor, floors
+from thinmap_ros.evaluation.machine import write_provenance
+from thinmap_ros.evaluation.outcome import Table
+
+# Three floors and three dungeons; five robots; six buildings.
+_SIX = (
+    'kth/50052748',
+    'kth/50052751',
+    'kth/50052749',
+    'dungeon/d114',
+    'dungeon/d1305',
+    'dungeon/d1115',
+)
+_LARGE = ('kth/50052748',)
+_TABLES: dict[str, tuple[Callable[[Sequence[Floor], float], Table], tuple[str, ...], float]] = {
+    'two_robots': (tables.two_robots, _SIX, 400.0),
+    'load': (tables.load, _LARGE, 600.0),
+    'foreign': (tables.foreign, _SIX, 960.0),
+}
+
+
+def main() -> None:
+    """Print the tables that are named, or all."""
+    parser = argparse.ArgumentParser(
+        prog='benchmarks.joining', description='Joint maps of several robots'
+    )
+    parser.add_argument('tables', nargs='*', help=f'some of {", ".join(_TABLES)} (default: all)')
+    parser.add_argument('--worlds', nargs='+', help='names (default: those of each table)')
+    parser.add_argument('--seconds', type=float, help='of each drive (default: of each table)')
+    parser.add_argument('--folder', type=Path, default=WORLDS, help='folder with worlds.json')
+    parser.add_argument('-o', '--output', type=Path, help='folder for TABLE.csv')
+    arguments = parser.parse_args()
+    if unknown := set(arguments.tables) - set(_TABLES):
+        parser.error(f'unknown table {sorted(unknown)[0]}: expected some of {", ".join(_TABLES)}')
+    known = {floor.name: floor for floor in floors(arguments.folder)}
+    for name in arguments.tables or _TABLES:
+        make, worlds, seconds = _TABLES[name]
+        wanted = arguments.worlds or worlds
+        if missing := set(wanted) - known.keys():
+            parser.error(f'unknown world {sorted(missing)[0]}: expected some of {list(known)}')
+        table = make([known[world] for world in wanted], arguments.seconds or seconds)
+        print(f'\n## {name}\n')
+        print('\n'.join(lines(table)), flush=True)
+        if arguments.output is not None:
+            arguments.output.mkdir(parents=True, exist_ok=True)
+            (arguments.output / f'{name}.csv').write_text(table.csv(), encoding='utf-8')
+    if arguments.output is not None:
+        write_provenance(arguments.output)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,165 @@
+"""Keyframes as bytes: what a robot sends of the map that it makes, for a joint map that bends.
+
+A message holds one keyframe: its pose, its scan with ranges in millimetres, and edges of the pose
+graph. An edge has no relative pose: it is that of the poses, at which the robot's own graph is
+optimal.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2, snapshot
+from thinmap_ros.core.errors import InputError, one_line_reason
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph import packed_scans
+from thinmap_ros.core.slam.graph.saved_keyframes import MAX_EDGES, MAX_KEYFRAMES
+from thinmap_ros.core.snapshot import MAX_COORDINATE_M, State
+from thinmap_ros.core.validation import MAX_BEAMS
+
+_WHAT = 'keyframe'
+_ROUNDING = 1e-5  # relative error of an information matrix in 32 bit
+_MAX_INFORMATION = 1e12
+# Number, revision, edges, unit of the ranges, pose, laser.
+_HEADER = struct.Struct('<IIIH3f10f')
+_EDGE = struct.Struct('<II6f')
+_UPPER = np.triu_indices(3)
+_MOST_BYTES = _HEADER.size + MAX_EDGES * _EDGE.size + 2 * MAX_BEAMS
+
+
+@dataclass(frozen=True, eq=False)
+class SentEdge:
+    """Information (3, 3) on the relative pose of keyframe b in a, by their numbers, frame of a."""
+
+    a: int
+    b: int
+    information: Array
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeMessage:
+    """A keyframe of a number 0, 1, 2, ..., at a pose (3,) after so many corrections (revision).
+
+    edges: that are known since the last message, between keyframes up to this one. A number that
+    has come before brings edges only.
+    """
+
+    number: int
+    revision: int
+    T_map_base: Array
+    scan: Scan
+    edges: tuple[SentEdge, ...] = ()
+
+    def encode(self) -> bytes:
+        """The message as bytes."""
+        packed = packed_scans.packed_scans([self.scan])
+        head = _HEADER.pack(
+            self.number,
+            self.revision,
+            len(self.edges),
+            int(packed['unit_mm'][0]),
+            *self.T_map_base.tolist(),
+            *packed['lasers'][0].tolist(),
+        )
+        edges = [
+            _EDGE.pack(edge.a, edge.b, *edge.information[_UPPER].tolist()) for edge in self.edges
+        ]
+        return zlib.compress(head + b''.join(edges) + _differences(packed['ranges']), 9)
+
+    @staticmethod
+    def decode(data: bytes) -> 'KeyframeMessage':
+        """The message in some bytes. Raises InputError where they are none."""
+        try:
+            plain = zlib.decompressobj().decompress(data, _MOST_BYTES)
+        except zlib.error as error:
+            raise InputError(f'{_WHAT}: {one_line_reason(error)}') from error
+        if len(plain) < _HEADER.size:
+            raise InputError(f'{_WHAT}: {len(plain)} bytes: expected at least {_HEADER.size}')
+        number, revision, count, unit_mm, *numbers = _HEADER.unpack_from(plain)
+        first = _HEADER.size + count * _EDGE.size
+        if len(plain) < first + 2 or (len(plain) - first) % 2:
+            raise InputError(f'{_WHAT}: {len(plain)} bytes: expected {first}, and 2 for each beam')
+        T_map_base = _pose(np.array(numbers[:3]))
+        edges = tuple(
+            _edge(_EDGE.unpack_from(plain, _HEADER.size + k * _EDGE.size), number)
+            for k in range(count)
+        )
+        scan = _scan(np.array(numbers[3:]), unit_mm, _ranges(plain[first:]))
+        return KeyframeMessage(_known_number(number), revision, T_map_base, scan, edges)
+
+
+def checked_poses(values: Array) -> Array:
+    """Poses (N, 3) of as many numbers in a row. Raises InputError where they are none."""
+    if values.size % 3 or values.size > 3 * MAX_KEYFRAMES:
+        raise InputError(
+            f'poses of keyframes: {values.size} numbers: expected 3 for each of at most '
+            f'{MAX_KEYFRAMES}'
+        )
+    poses = np.asarray(values, dtype=np.float64).reshape(-1, 3)
+    for T in poses:
+        _pose(T)
+    return poses
+
+
+def _differences(numbers: NDArray[np.uint16]) -> bytes:
+    """Differences of neighbours, small ones as small numbers, all low bytes first."""
+    steps = np.diff(numbers.astype(np.int64), prepend=0).astype(np.int16)
+    folded = ((steps << 1) ^ (steps >> 15)).astype('<i2')
+    return folded.view(np.uint8).reshape(-1, 2).T.tobytes()
+
+
+def _ranges(data: bytes) -> NDArray[np.uint16]:
+    """The numbers whose `_differences` are these bytes."""
+    halves = np.frombuffer(data, dtype=np.uint8).reshape(2, -1)
+    folded = np.ascontiguousarray(halves.T).view('<u2').reshape(-1).astype(np.int64)
+    steps = (folded >> 1) ^ -(folded & 1)
+    return (np.cumsum(steps) & 0xFFFF).astype(np.uint16)
+
+
+def _scan(laser: Array, unit_mm: int, ranges: NDArray[np.uint16]) -> Scan:
+    state: State = {
+        'lasers': laser[None],
+        'laser_of': np.zeros(1, dtype=np.int32),
+        'beams': np.array([len(ranges)], dtype=np.int32),
+        'unit_mm': np.array([unit_mm], dtype=np.uint16),
+        'ranges': ranges,
+    }
+    checked = snapshot.validate(state, packed_scans.FIELDS, _WHAT)
+    return packed_scans.unpacked_scans(checked, _WHAT)[0]
+
+
+def _known_number(number: int) -> int:
+    if number >= MAX_KEYFRAMES:
+        raise InputError(f'{_WHAT} {number}: expected at most {MAX_KEYFRAMES}')
+    return number
+
+
+def _edge(values: tuple[int | float, ...], number: int) -> SentEdge:
+    """An edge between keyframes up to a number."""
+    a, b = (int(value) for value in values[:2])
+    if a == b or max(a, b) > number:
+        raise InputError(f'{_WHAT} {number}: edge from {a} to {b}: expected two up to it')
+    information = np.zeros((3, 3))
+    information[_UPPER] = values[2:]
+    return SentEdge(a, b, _definite(information + np.triu(information, 1).T))
+
+
+def _definite(information: Array) -> Array:
+    """The matrix (3, 3). Raises InputError unless it is bounded and positive, but for rounding."""
+    if (np.abs(information) <= _MAX_INFORMATION).all():
+        values = np.linalg.eigvalsh(information)
+        if values[2] > 0.0 and values[0] > -_ROUNDING * values[2]:
+            return information
+    raise InputError(f'{_WHAT}: information of an edge: expected a positive definite matrix')
+
+
+def _pose(T: Array) -> Array:
+    if not se2.is_bounded_pose(T):
+        raise InputError(
+            f'{_WHAT}: pose {T.tolist()}: expected finite numbers up to {MAX_COORDINATE_M:g} m'
+        )
+    return T
