@@ -100,10 +100,11 @@ class TeamMember(Alone):
         self._node = node
         self._config = config
         self._places = JoinedPlaces(node, name)
-        self._heard = HeardRobots(node, self._places, name, self._accepts)
+        silence_s = config.claim_timeout_s
+        self._heard = HeardRobots(node, self._places, name, silence_s, self._accepts)
         self._received = TileReceiver(node, self._places, name)
         self._tiles = TileOutput(node, name, frame_id)
-        self._claims = _ClaimOutput(node, name, frame_id, progress)
+        self._claims = _ClaimOutput(node, name, frame_id, progress, self._on_sent)
         self._team = Team(name, config)
         self._last: Observation | None = None
         node.create_active_timer(_NEAR_PERIOD_S, self._tell)
@@ -164,6 +165,9 @@ class TeamMember(Alone):
     def _tell(self) -> None:
         self._claims.tell([motion for motion, _ in self._heard.motions()], self._last)
 
+    def _on_sent(self, claim: Claim) -> None:
+        self._team.sent = claim
+
     def _send_tiles(self) -> None:
         if self._last is None or not self._claims.is_located:
             return
@@ -182,13 +186,22 @@ class _ClaimOutput:
     robot that does not is silent: others would cut their walls out at its pose.
     """
 
-    def __init__(self, node: ThinmapNode, name: str, frame_id: str, progress: GetProgress) -> None:
+    def __init__(
+        self,
+        node: ThinmapNode,
+        name: str,
+        frame_id: str,
+        progress: GetProgress,
+        sent: Callable[[Claim], None],
+    ) -> None:
+        """sent: is called with each claim that was sent."""
         self.name = name
         self.session = new_map_id()
         self.is_located = False
         self._node = node
         self._frame_id = frame_id
         self._progress = progress
+        self._sent = sent
         self._publisher = node.create_publisher(TeamClaim, CLAIMS, qos.SENSOR)
         self._told_s = -math.inf
         self._told_place: Place | None = None
@@ -214,6 +227,7 @@ class _ClaimOutput:
             self._told_xy = T_map_base[:2]
             self._told_place = place
             self._publisher.publish(claim_msg(claim, self._frame_id))
+            self._sent(claim.claim)
 
     def _claim(self, progress: Progress, T_map_base: Array) -> RobotClaim:
         mission = progress.mission
