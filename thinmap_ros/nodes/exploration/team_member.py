@@ -16,7 +16,7 @@ from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Strategy
 from thinmap_ros.core.exploration.team.claims import Claim, Place
 from thinmap_ros.core.exploration.team.team import Team, TeamConfig
-from thinmap_ros.core.planning.give_way import Motion
+from thinmap_ros.core.planning.give_way import MESSAGE_PERIOD_S, Motion, moved_on
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.nodes.exploration.tile_output import TileOutput
@@ -29,7 +29,6 @@ from thinmap_ros.ros.team.membership import JoinedPlaces, MembershipConfig, decl
 from thinmap_ros.ros.team.received_tiles import TileReceiver
 from thinmap_ros.ros.team.team_messages import RobotClaim, RobotState, claim_msg
 
-_CLAIM_PERIOD_S = 1.0
 _NEAR_PERIOD_S = 0.1
 _NEAR_M = 3.0  # so near to another robot, its pose must not be old:
 _NEAR_STEP_M = 0.05  # it is sent after each cell, and not while the robot stands
@@ -214,13 +213,13 @@ class _ClaimOutput:
         self.is_located = progress.located is not None
         if progress.located is None:
             return
-        T_map_base = progress.located[1]
-        self._track.add(*progress.located)
+        now_s = self._node.elapsed_time.now_s()
+        self._track.add(*progress.located, now_s)
+        T_map_base = self._track.pose_at(now_s)
         claim = self._claim(progress, T_map_base)
         is_near = any(math.dist(T_map_base[:2], other.pose[:2]) < _NEAR_M for other in others)
         has_moved = math.dist(T_map_base[:2], self._told_xy) > _NEAR_STEP_M
-        now_s = self._node.elapsed_time.now_s()
-        is_due = not 0.0 <= now_s - self._told_s < _CLAIM_PERIOD_S
+        is_due = not 0.0 <= now_s - self._told_s < MESSAGE_PERIOD_S
         place = claim.claim.place
         if is_due or (is_near and has_moved) or place != self._told_place:
             self._told_s = now_s
@@ -256,22 +255,30 @@ def _state_of(mission: Mission, claim: Claim) -> RobotState:
 
 
 class _Track:
-    """Speed, m/s, and turn rate, rad/s, of a robot by its last two poses."""
+    """Speed, m/s, and turn rate, rad/s, of a robot by its last two poses; where it is since."""
 
     def __init__(self) -> None:
         self.speeds = (0.0, 0.0)
         self._last: tuple[int, Array] | None = None
+        self._added_s = 0.0
 
-    def add(self, stamp_ns: int, T_map_base: Array) -> None:
-        """Add the pose (3,) at a stamp; the last one may be given again."""
+    def add(self, stamp_ns: int, T_map_base: Array, now_s: float) -> None:
+        """Add the pose (3,) at a stamp, received at a time; the last one may be given again."""
         last = self._last
         if last is not None and stamp_ns == last[0]:
             return
         self._last = (stamp_ns, T_map_base)
+        self._added_s = now_s
         self.speeds = (0.0, 0.0)
         if last is None:
             return
         seconds = (stamp_ns - last[0]) / SECOND_NS
-        if 0.0 < seconds <= _CLAIM_PERIOD_S:
+        if 0.0 < seconds <= MESSAGE_PERIOD_S:
             x, _, turn = se2.between(last[1], T_map_base).tolist()
             self.speeds = (x / seconds, turn / seconds)
+
+    def pose_at(self, now_s: float) -> Array:
+        """The last pose (3,), moved on at its speeds: the robot has driven since that scan."""
+        assert self._last is not None
+        age_s = min(max(now_s - self._added_s, 0.0), MESSAGE_PERIOD_S)
+        return moved_on(Motion('', self._last[1], *self.speeds), age_s).pose

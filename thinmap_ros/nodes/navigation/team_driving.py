@@ -6,7 +6,7 @@ import numpy as np
 
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.give_way import Motion, must_stop
+from thinmap_ros.core.planning.give_way import Motion, as_heard, must_stop
 from thinmap_ros.core.planning.navigator import Command, Navigator
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import parameters
@@ -59,7 +59,7 @@ class TeamDriving:
         if self._heard is None or command.v <= 0.0:
             return command
         own = Motion(self._name, T_map_base, command.v, command.w)
-        others = [motion for motion, _ in self._heard.motions()]
+        others = [each for heard in self._heard.motions() for each in as_heard(*heard)]
         controller = navigator.config.controller
         brakes_s = controller.max_speed_m_s / controller.max_acceleration_m_s2
         if not must_stop(own, others, self._distance_m, brakes_s):
