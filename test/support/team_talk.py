@@ -36,10 +36,14 @@ class TeamTalk:
 
     def stands_at(self, x, y):
         """/robot2 stands at a place in the map of /robot1."""
+        self.drives_at(x, y, 0.0, 0.0)
+
+    def drives_at(self, x, y, theta, v):
+        """/robot2 drives at a pose in the map of /robot1, m/s."""
         self._stamp_ns += 1
-        pose = se2.between(T_ME_OTHER, se2.pose(x, y, 0.0))
+        pose = se2.between(T_ME_OTHER, se2.pose(x, y, theta))
         claim = Claim(OTHER, self._stamp_ns, pose)
-        sent = RobotClaim(claim, Motion(OTHER, pose, 0.0, 0.0), RobotState.WAITING, 1)
+        sent = RobotClaim(claim, Motion(OTHER, pose, v, 0.0), RobotState.WAITING, 1)
         self._claims.publish(claim_msg(sent, 'map'))
 
     def knows(self, patch):

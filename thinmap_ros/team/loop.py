@@ -172,6 +172,7 @@ class TeamLoop:
             self._claimed_s = now_s
             for number, member in self._working():
                 claim = member.claim()
+                member.explorer.team.sent = claim
                 self.claims.broadcast(number, claim, _size_of(claim), now_s)
         for receiver, claim in self.claims.received(now_s):
             stamp_ns = round(now_s * SECOND_NS)

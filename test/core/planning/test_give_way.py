@@ -8,7 +8,7 @@ import pytest
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.give_way import Motion, must_stop
+from thinmap_ros.core.planning.give_way import Motion, as_heard, moved_on, must_stop
 from thinmap_ros.core.planning.navigator import Navigator
 
 HALL = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((60, 60), dtype=np.int8))
@@ -49,6 +49,28 @@ def test_an_arc_around_a_robot_is_free():
 
 def test_a_robot_that_follows_another_one_drives_on():
     assert not stops(at('b', 0.0, 0.0, 0.0, 0.5), at('a', 1.2, 0.0, 0.0, 0.5))
+
+
+@pytest.mark.parametrize('w', [0.0, 0.5])
+def test_a_robot_moves_on_along_its_arc(w):
+    motion = Motion('a', se2.pose(1.0, 2.0, 0.7), 0.4, w)
+    steps = motion.pose
+    for _ in range(2000):
+        steps = se2.compose(steps, se2.pose(0.4 * 1e-3, 0.0, w * 1e-3))
+    later = moved_on(motion, 2.0)
+    assert later.pose == pytest.approx(steps, abs=1e-3)
+    assert (later.v, later.w) == (0.4, w)
+
+
+def test_a_robot_that_drives_is_not_where_it_was_heard():
+    own = Motion('a', se2.pose(0.0, 0.0, 0.0), 0.5, 0.0)
+    comes = Motion('b', se2.pose(1.2, 0.0, math.pi), 0.4, 0.0)
+    assert not must_stop(own, [comes], 0.6, 0.5)
+    assert must_stop(own, as_heard(comes, 0.9), 0.6, 0.5)
+    # It may have stopped, and says so a second later at the latest.
+    leaves = Motion('b', se2.pose(0.7, 0.0, 0.0), 0.4, 0.0)
+    assert must_stop(own, as_heard(leaves, 0.9), 0.6, 0.5)
+    assert [each.pose[0] for each in as_heard(leaves, 9.0)] == pytest.approx([0.7, 1.1])
 
 
 def test_a_navigator_that_gives_way_plans_around_the_other_robot():

@@ -27,8 +27,11 @@ from thinmap_msgs.msg import (
     LineFeatureArray,
     LocalGrid,
     LocalizedScan,
+    MapTiles,
     ProbabilityGrid,
+    RobotMap,
     SlamStatus,
+    TeamClaim,
     TopologicalMap,
 )
 from thinmap_ros.core.errors import InputError
@@ -119,6 +122,11 @@ LISTENERS = {
         '/robot2/map': OccupancyGrid,
     },
 }
+TEAM = {  # in a team also
+    'grid_mapper': {'/team/claims': TeamClaim},
+    'explorer': {'/team/claims': TeamClaim, '/team/tiles': MapTiles},
+    'navigator': {'/team/claims': TeamClaim, '/team/tiles': MapTiles},
+}
 LATER = {  # converted only when the corresponding message of another topic has arrived
     'localizer': (),
     'grid_mapper': (),
@@ -183,18 +191,34 @@ def say(graph, name, publishers, count):
     'count', [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
 )
 def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_rejected(graph, name, count):
+    lives_through(graph, name, count, LISTENERS[name])
+
+
+@pytest.mark.parametrize('name', TEAM)
+def test_a_node_of_a_team_lives_through_them(graph, name):
+    joined = [RobotMap(name=each, is_joined=True) for each in ('/me', '/a')]
+    for each in joined:
+        each.pose.orientation.w = 1.0
+    join = graph.node.create_publisher(JoinStatus, '/join_status', qos.LATCHED)
+    join.publish(JoinStatus(header=messages.header('world', 0), maps=joined))
+    listeners = LISTENERS[name] | TEAM[name]
+    lives_through(graph, name, 100, listeners, team=True, team_name='/me')
+
+
+def lives_through(graph, name, count, listeners, **parameters):
+    """A node lives through a number of messages on each topic, and works then as before."""
     spoken = {
         topic: Spoken(graph, topic, kind)
         for topic, kind in SPOKEN.items()
-        if topic not in LISTENERS[name]
+        if topic not in listeners and (topic != 'join_status' or name == 'map_joiner')
     }
     doctor = Doctor(graph)
     mount = (
         {} if name in ('grid_mapper', 'topology_builder', 'map_joiner') else {'laser_pose': '0,0,0'}
     )
-    graph.start(name, **mount)
+    graph.start(name, **mount, **parameters)
     publishers = {}
-    for topic, kind in LISTENERS[name].items():
+    for topic, kind in listeners.items():
         profile = (
             qos.LATCHED if kind in (LocalGrid, ProbabilityGrid, TopologicalMap) else qos.STREAM
         )
@@ -286,6 +310,6 @@ def is_plain(message):
             and abs(message.info.origin.position.x + 2.0) < 1e-9
             and message.data[41] == 0
         )
-    if isinstance(message, TopologicalMap):
+    if isinstance(message, TopologicalMap | TeamClaim | MapTiles):
         return True
     return message.pose.pose.position.x == 0.0 and message.pose.pose.position.y == 0.0

@@ -18,6 +18,7 @@ AT = se2.pose(2.0, 2.0, 0.0)
 ANGLES = np.radians(np.arange(-90.0, 91.0))
 CELL_M = 0.05
 RADIUS_M = 0.25
+SILENCE_S = 14.0  # less than the default: the parameter counts
 SCANS = 10  # at each place: as many make a wall where they are not cut
 
 
@@ -77,6 +78,19 @@ def test_a_robot_that_tells_its_place_is_no_wall(graph):
         return not room.has_wall_at(*place)
 
     graph.until(is_cut, 'a robot that is no wall')
+
+
+def test_a_robot_that_is_silent_for_long_is_a_wall(graph):
+    room = Room(graph, team=True, team_name=ME, claim_timeout_s=1.0)
+    room.talk.join()
+    room.sees_robot_at(3.5, 3.0, tells=True)
+    # What it told last is of the same place.
+
+    def is_mapped():
+        room.sees_robot_at(3.5, 3.0, tells=False)
+        return room.has_wall_at(3.5, 3.0)
+
+    graph.until(is_mapped, 'a wall', seconds=SILENCE_S)
 
 
 def test_without_a_team_it_is_a_wall(graph):

@@ -32,7 +32,7 @@ def _table() -> NDArray[np.uint8]:
 
 EDGE = 16
 _PACKED_BYTES = EDGE * EDGE // 4
-# Percent: after some four beams, of which most agree.
+# Percent: after some four beams, of which most agree. docs/theory/exploration.md has the ablation.
 _SURELY_FREE = 10
 _SURELY_OCCUPIED = 90
 _MAX_TILES = 1 << 16

@@ -13,6 +13,7 @@ import numpy as np
 
 from thinmap_ros.core.se2 import Array
 
+MESSAGE_PERIOD_S = 1.0
 _STEPS = 8
 _APPROACH_M = 1e-3  # two robots that are too close already may not come closer by more
 
@@ -25,6 +26,21 @@ class Motion:
     pose: Array
     v: float
     w: float
+
+
+def moved_on(motion: Motion, seconds: float) -> Motion:
+    """The motion of a robot after a time at its present speeds."""
+    x, y = _places(motion, np.array([seconds]))[0]
+    theta = motion.pose[2] + motion.w * seconds
+    return replace(motion, pose=np.array([x, y, theta]))
+
+
+def as_heard(motion: Motion, age_s: float) -> list[Motion]:
+    """Where a robot may be that was heard some time ago: there still, or as far as it has driven.
+
+    A robot that drives tells its pose at least once a second.
+    """
+    return [motion, moved_on(motion, min(age_s, MESSAGE_PERIOD_S))]
 
 
 def must_stop(own: Motion, others: Iterable[Motion], distance_m: float, horizon_s: float) -> bool:

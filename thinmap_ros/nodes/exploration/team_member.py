@@ -16,7 +16,7 @@ from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Strategy
 from thinmap_ros.core.exploration.team.claims import Claim, Place
 from thinmap_ros.core.exploration.team.team import Team, TeamConfig
-from thinmap_ros.core.planning.give_way import Motion
+from thinmap_ros.core.planning.give_way import MESSAGE_PERIOD_S, Motion, moved_on
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.nodes.exploration.tile_output import TileOutput
@@ -29,7 +29,6 @@ from thinmap_ros.ros.team.membership import JoinedPlaces, MembershipConfig, decl
 from thinmap_ros.ros.team.received_tiles import TileReceiver
 from thinmap_ros.ros.team.team_messages import RobotClaim, RobotState, claim_msg
 
-_CLAIM_PERIOD_S = 1.0
 _NEAR_PERIOD_S = 0.1
 _NEAR_M = 3.0  # so near to another robot, its pose must not be old:
 _NEAR_STEP_M = 0.05  # it is sent after each cell, and not while the robot stands
@@ -100,10 +99,11 @@ class TeamMember(Alone):
         self._node = node
         self._config = config
         self._places = JoinedPlaces(node, name)
-        self._heard = HeardRobots(node, self._places, name, self._accepts)
+        silence_s = config.claim_timeout_s
+        self._heard = HeardRobots(node, self._places, name, silence_s, self._accepts)
         self._received = TileReceiver(node, self._places, name)
         self._tiles = TileOutput(node, name, frame_id)
-        self._claims = _ClaimOutput(node, name, frame_id, progress)
+        self._claims = _ClaimOutput(node, name, frame_id, progress, self._on_sent)
         self._team = Team(name, config)
         self._last: Observation | None = None
         node.create_active_timer(_NEAR_PERIOD_S, self._tell)
@@ -164,6 +164,9 @@ class TeamMember(Alone):
     def _tell(self) -> None:
         self._claims.tell([motion for motion, _ in self._heard.motions()], self._last)
 
+    def _on_sent(self, claim: Claim) -> None:
+        self._team.sent = claim
+
     def _send_tiles(self) -> None:
         if self._last is None or not self._claims.is_located:
             return
@@ -182,13 +185,22 @@ class _ClaimOutput:
     robot that does not is silent: others would cut their walls out at its pose.
     """
 
-    def __init__(self, node: ThinmapNode, name: str, frame_id: str, progress: GetProgress) -> None:
+    def __init__(
+        self,
+        node: ThinmapNode,
+        name: str,
+        frame_id: str,
+        progress: GetProgress,
+        sent: Callable[[Claim], None],
+    ) -> None:
+        """sent: is called with each claim that was sent."""
         self.name = name
         self.session = new_map_id()
         self.is_located = False
         self._node = node
         self._frame_id = frame_id
         self._progress = progress
+        self._sent = sent
         self._publisher = node.create_publisher(TeamClaim, CLAIMS, qos.SENSOR)
         self._told_s = -math.inf
         self._told_place: Place | None = None
@@ -201,19 +213,20 @@ class _ClaimOutput:
         self.is_located = progress.located is not None
         if progress.located is None:
             return
-        T_map_base = progress.located[1]
-        self._track.add(*progress.located)
+        now_s = self._node.elapsed_time.now_s()
+        self._track.add(*progress.located, now_s)
+        T_map_base = self._track.pose_at(now_s)
         claim = self._claim(progress, T_map_base)
         is_near = any(math.dist(T_map_base[:2], other.pose[:2]) < _NEAR_M for other in others)
         has_moved = math.dist(T_map_base[:2], self._told_xy) > _NEAR_STEP_M
-        now_s = self._node.elapsed_time.now_s()
-        is_due = not 0.0 <= now_s - self._told_s < _CLAIM_PERIOD_S
+        is_due = not 0.0 <= now_s - self._told_s < MESSAGE_PERIOD_S
         place = claim.claim.place
         if is_due or (is_near and has_moved) or place != self._told_place:
             self._told_s = now_s
             self._told_xy = T_map_base[:2]
             self._told_place = place
             self._publisher.publish(claim_msg(claim, self._frame_id))
+            self._sent(claim.claim)
 
     def _claim(self, progress: Progress, T_map_base: Array) -> RobotClaim:
         mission = progress.mission
@@ -242,22 +255,30 @@ def _state_of(mission: Mission, claim: Claim) -> RobotState:
 
 
 class _Track:
-    """Speed, m/s, and turn rate, rad/s, of a robot by its last two poses."""
+    """Speed, m/s, and turn rate, rad/s, of a robot by its last two poses; where it is since."""
 
     def __init__(self) -> None:
         self.speeds = (0.0, 0.0)
         self._last: tuple[int, Array] | None = None
+        self._added_s = 0.0
 
-    def add(self, stamp_ns: int, T_map_base: Array) -> None:
-        """Add the pose (3,) at a stamp; the last one may be given again."""
+    def add(self, stamp_ns: int, T_map_base: Array, now_s: float) -> None:
+        """Add the pose (3,) at a stamp, received at a time; the last one may be given again."""
         last = self._last
         if last is not None and stamp_ns == last[0]:
             return
         self._last = (stamp_ns, T_map_base)
+        self._added_s = now_s
         self.speeds = (0.0, 0.0)
         if last is None:
             return
         seconds = (stamp_ns - last[0]) / SECOND_NS
-        if 0.0 < seconds <= _CLAIM_PERIOD_S:
+        if 0.0 < seconds <= MESSAGE_PERIOD_S:
             x, _, turn = se2.between(last[1], T_map_base).tolist()
             self.speeds = (x / seconds, turn / seconds)
+
+    def pose_at(self, now_s: float) -> Array:
+        """The last pose (3,), moved on at its speeds: the robot has driven since that scan."""
+        assert self._last is not None
+        age_s = min(max(now_s - self._added_s, 0.0), MESSAGE_PERIOD_S)
+        return moved_on(Motion('', self._last[1], *self.speeds), age_s).pose

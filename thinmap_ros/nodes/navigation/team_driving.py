@@ -6,12 +6,12 @@ import numpy as np
 
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.give_way import Motion, must_stop
+from thinmap_ros.core.planning.give_way import Motion, as_heard, must_stop
 from thinmap_ros.core.planning.navigator import Command, Navigator
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.team.heard_robots import HeardRobots
+from thinmap_ros.ros.team.heard_robots import HeardRobots, declare_silence
 from thinmap_ros.ros.team.membership import JoinedPlaces, declare_membership
 from thinmap_ros.ros.team.received_tiles import TileReceiver
 
@@ -35,13 +35,14 @@ class TeamDriving:
     def __init__(self, node: ThinmapNode) -> None:
         """Declare the parameters."""
         membership = declare_membership(node)
+        silence_s = declare_silence(node)
         self._distance_m = parameters.declare_config(node, GiveWayConfig).give_way_m
         self._name = membership.team_name
         self._heard: HeardRobots | None = None
         self._tiles: TileReceiver | None = None
         if membership.team:
             places = JoinedPlaces(node, self._name)
-            self._heard = HeardRobots(node, places, self._name)
+            self._heard = HeardRobots(node, places, self._name, silence_s)
             self._tiles = TileReceiver(node, places, self._name)
 
     def completed(self, own: GridPatch) -> GridPatch:
@@ -58,7 +59,7 @@ class TeamDriving:
         if self._heard is None or command.v <= 0.0:
             return command
         own = Motion(self._name, T_map_base, command.v, command.w)
-        others = [motion for motion, _ in self._heard.motions()]
+        others = [each for heard in self._heard.motions() for each in as_heard(*heard)]
         controller = navigator.config.controller
         brakes_s = controller.max_speed_m_s / controller.max_acceleration_m_s2
         if not must_stop(own, others, self._distance_m, brakes_s):

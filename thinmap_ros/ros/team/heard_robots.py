@@ -5,18 +5,21 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from thinmap_msgs.msg import TeamClaim
-from thinmap_ros.core.exploration.team.claims import ClaimConfig
+from thinmap_ros.core.exploration.team.claims import SilenceConfig
 from thinmap_ros.core.planning.give_way import Motion
 from thinmap_ros.core.stamps import SECOND_NS
-from thinmap_ros.ros import qos
+from thinmap_ros.ros import parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.team.membership import JoinedPlaces
 from thinmap_ros.ros.team.team_messages import RobotClaim, claim_from_msg
 
 CLAIMS = '/team/claims'
-# One that was silent for longer is an obstacle as any other.
-_MAX_AGE_S = ClaimConfig().claim_timeout_s
+
+
+def declare_silence(node: ThinmapNode) -> float:
+    """Declare how long a robot may be silent, s."""
+    return parameters.declare_config(node, SilenceConfig).claim_timeout_s
 
 
 class HeardMotion(NamedTuple):
@@ -40,12 +43,17 @@ class HeardRobots:
         node: ThinmapNode,
         places: JoinedPlaces,
         name: str,
+        max_age_s: float,
         heard: Callable[[RobotClaim], bool] = lambda claim: True,
     ) -> None:
-        """name: of this robot; heard: is called with each claim, and says whether to keep it."""
+        """name: of this robot; heard: is called with each claim, and says whether to keep it.
+
+        max_age_s: a robot that was silent for longer is an obstacle as any other.
+        """
         self._node = node
         self._places = places
         self._name = name
+        self._max_age_s = max_age_s
         self._accepts = heard
         self._heard: dict[str, _Heard] = {}
         subscribe_guarded(node, TeamClaim, CLAIMS, self._on_claim, qos.SENSOR)
@@ -57,7 +65,7 @@ class HeardRobots:
         for name, heard in self._heard.items():
             T = self._places.poses.get(name)
             age_s = (now_ns - heard.received_ns) / SECOND_NS
-            if T is not None and 0.0 <= age_s <= _MAX_AGE_S:
+            if T is not None and 0.0 <= age_s <= self._max_age_s:
                 found.append(HeardMotion(heard.claim.in_map(T).motion, age_s))
         return found
 

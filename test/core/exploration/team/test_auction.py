@@ -10,10 +10,12 @@ from thinmap_ros.core.exploration.team.auction import NOTHING, auction
 MARGIN_M = 2.0
 
 
-def won(lengths, claimed=None):
+def won(lengths, claimed=None, told=None):
+    """Candidate of each robot; told: rest of each path as told, that of the lengths by itself."""
     lengths = np.array(lengths, dtype=np.float64)
-    claimed = [NOTHING] * len(lengths) if claimed is None else claimed
-    return auction(lengths, np.array(claimed), MARGIN_M).tolist()
+    claimed = np.array([NOTHING] * len(lengths) if claimed is None else claimed)
+    told = lengths[range(len(lengths)), claimed] if told is None else np.array(told)
+    return auction(lengths, claimed, told, MARGIN_M).tolist()
 
 
 def test_the_second_robot_gets_the_second_candidate():
@@ -44,3 +46,12 @@ def test_of_two_that_claim_one_place_the_nearer_one_keeps_its_claim():
     # Without claims both the far candidate and the near one would go to the first robot's rival.
     assert won([[6.0, 7.0], [5.0, 4.9]], [0, 0]) == [1, 0]
     assert won([[5.0, 4.9], [6.0, 7.0]], [0, 0]) == [0, 1]
+
+
+def test_which_of_two_is_nearer_is_decided_by_what_both_have_told():
+    # Each knows its own pose earlier than that of the other, and sees itself ahead.
+    seen_by_first = [[5.5, 9.0], [6.0, 9.0]]
+    seen_by_second = [[6.0, 9.0], [5.5, 9.0]]
+    for told, expected in (([6.0, 6.1], [0, 1]), ([6.1, 6.0], [1, 0]), ([6.0, 6.0], [0, 1])):
+        assert won(seen_by_first, [0, 0], told) == expected
+        assert won(seen_by_second, [0, 0], told) == expected

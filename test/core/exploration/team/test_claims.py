@@ -1,5 +1,7 @@
 """Claims of other robots, and when they end."""
 
+import math
+
 import numpy as np
 
 from thinmap_ros.core.exploration.team.claims import Claim, Claims
@@ -33,6 +35,17 @@ def test_a_claim_ends_without_progress():
     assert len(claims.present(29 * SECOND_NS)) == 2
     assert place_of(claims, 'drives', 29) == (1.0, 2.0)
     assert place_of(claims, 'stands', 29) is None
+
+
+def test_a_path_that_is_not_planned_yet_is_no_nearest_one():
+    claims = Claims()
+    for second in range(30):
+        claims.add(claim('drives', second, second and 20.0 - 0.5 * second), second * SECOND_NS)
+        claims.add(claim('has no path', second, 0.0), second * SECOND_NS)
+    assert place_of(claims, 'drives', 29) == (1.0, 2.0)
+    assert place_of(claims, 'has no path', 29) is None
+    assert math.isclose(claim('a', 0, 0.0).path_m, math.sqrt(5.0))
+    assert math.isclose(claim('a', 0, 9.0).path_m, 9.0)
 
 
 def test_another_place_is_a_new_claim():

@@ -43,6 +43,7 @@ def shares(candidates, claims, **config):
     found = []
     for own in claims:
         team = Team(own.robot, TeamConfig(**config))
+        team.sent = own
         for other in claims:
             if other is not own:
                 team.add_claim(other, 0)
@@ -81,6 +82,27 @@ def test_a_claimed_place_belongs_to_its_robot_within_a_margin(away, owner):
     found = dict(zip('ba', shares([candidate(8.0)], [held, nearer], follow_m=0.0), strict=True))
     assert found[owner] == [8.0]
     assert sum(map(len, found.values())) == 1
+
+
+def test_two_robots_side_by_side_do_not_drive_to_one_place():
+    """Each second they hear where the other was; each sees itself ahead of it."""
+    candidates = [candidate(10.0), candidate(-14.0)]
+    teams = {name: Team(name, TeamConfig(follow_m=0.0)) for name in 'ab'}
+    x = dict.fromkeys(teams, 0.0)
+    targets = dict.fromkeys(teams, candidates[0])
+    for second in range(8):
+        now_ns = second * SECOND_NS
+        for name, team in teams.items():
+            target = targets[name]
+            remaining_m = abs(target.place[0] - x[name])
+            team.sent = claim(name, x[name], target.middle, remaining_m, now_ns + 1)
+        for name, team in teams.items():
+            team.add_claim(teams['ba'['ab'.index(name)]].sent, now_ns)
+        for name, team in teams.items():
+            x[name] += math.copysign(0.5, targets[name].place[0])
+            own = claim(name, x[name], targets[name].middle, stamp_ns=now_ns)
+            targets[name] = team.share(candidates, own, straight, MARGIN_M)[0]
+    assert [target.place[0] for target in targets.values()] == [10.0, -14.0]
 
 
 def test_no_robot_waits_far_from_what_is_left():

@@ -18,15 +18,22 @@ _PROGRESS_M = 0.5
 
 
 @dataclass(frozen=True)
-class ClaimConfig(Config):
-    """How long a claim holds."""
+class SilenceConfig(Config):
+    """How long a robot that is silent counts."""
 
     claim_timeout_s: float = parameter(
         15.0,
-        'Silence after which the claim of another robot ends (s). Raise it on a bad network.',
+        'Silence after which another robot claims nothing, and is an obstacle as any other (s). '
+        'Raise it on a bad network. Set it for explorer, grid_mapper and navigator.',
         low=1.0,
         high=1000.0,
     )
+
+
+@dataclass(frozen=True)
+class ClaimConfig(SilenceConfig):
+    """How long a claim holds."""
+
     progress_timeout_s: float = parameter(
         20.0,
         'Time without progress after which the claim of another robot ends (s). Raise it where '
@@ -50,8 +57,8 @@ class Claim:
     """What a robot sends the others, about once a second and when its target changes.
 
     robot: its name; stamp_ns: by its own clock; pose (3,); place: of the frontier that it drives
-    to, m, None without a target; remaining_m: rest of its path; settled: its latest places;
-    explores: False for one that takes no candidate, whatever is left.
+    to, m, None without a target; remaining_m: rest of its path, 0 before it is planned; settled:
+    its latest places; explores: False for one that takes no candidate, whatever is left.
     """
 
     robot: str
@@ -61,6 +68,13 @@ class Claim:
     remaining_m: float = 0.0
     settled: tuple[SettledPlace, ...] = ()
     explores: bool = True
+
+    @property
+    def path_m(self) -> float:
+        """Rest of the path to the claimed place; the straight line before a path is planned."""
+        if self.place is None or self.remaining_m > 0.0:
+            return self.remaining_m
+        return math.dist(self.pose[:2], self.place)
 
 
 @dataclass
@@ -90,14 +104,14 @@ class Claims:
         """
         last = self._received.get(claim.robot)
         if last is None or not self._is_recent(last, now_ns):
-            self._received[claim.robot] = _Received(claim, now_ns, now_ns, claim.remaining_m)
+            self._received[claim.robot] = _Received(claim, now_ns, now_ns, _planned_m(claim))
             return
         if claim.stamp_ns <= last.claim.stamp_ns:
             return
-        is_nearer = claim.remaining_m < last.nearest_m - _PROGRESS_M
-        if is_nearer or not _is_same(claim.place, last.claim.place):
+        is_nearer = _planned_m(claim) < last.nearest_m - _PROGRESS_M
+        if is_nearer or not is_same_place(claim.place, last.claim.place):
             last.progress_ns = now_ns
-            last.nearest_m = claim.remaining_m
+            last.nearest_m = _planned_m(claim)
         last.claim = claim
         last.received_ns = now_ns
 
@@ -120,7 +134,13 @@ class Claims:
         return now_ns - received.received_ns <= self.config.claim_timeout_s * SECOND_NS
 
 
-def _is_same(a: Place | None, b: Place | None) -> bool:
+def _planned_m(claim: Claim) -> float:
+    """Rest of the path, infinite before it is planned: the first plan is progress."""
+    return claim.remaining_m or math.inf
+
+
+def is_same_place(a: Place | None, b: Place | None) -> bool:
+    """Whether two claims are of the same place, or both of none."""
     if a is None or b is None:
         return a is b
     return math.dist(a, b) <= SAME_PLACE_M

@@ -18,6 +18,7 @@ from thinmap_ros.core.exploration.team.claims import (
     Claims,
     Place,
     SettledPlace,
+    is_same_place,
 )
 from thinmap_ros.core.se2 import Array
 
@@ -44,13 +45,15 @@ class TeamConfig(ClaimConfig):
 class Team:
     """What one robot has received of the others; without any of them it has all candidates.
 
-    name: of this robot; two robots of a team never have the same.
+    name: of this robot; two robots of a team never have the same. sent: its last claim, as the
+    others were told it.
     """
 
     def __init__(self, name: str = '', config: TeamConfig | None = None) -> None:
         self.name = name
         self.config = config or TeamConfig()
         self.claims = Claims(self.config)
+        self.sent: Claim | None = None
         self._boxes: list[Array] = []
         self._settled: list[SettledPlace] = []
 
@@ -120,12 +123,20 @@ class Team:
         near = np.argsort(lengths.min(axis=0), kind='stable')[:_MAX_CANDIDATES]
         middles = np.array([candidates[i].middle for i in near])
         claimed = _claimed(middles, [claim.place for claim in bidders])
-        won = int(auction(lengths[:, near], claimed, margin_m)[me])
+        told_m = np.array([claim.path_m for claim in bidders])
+        told_m[me] = self._told_m(own)
+        won = int(auction(lengths[:, near], claimed, told_m, margin_m)[me])
         if won != NOTHING:
             return [candidates[near[won]]]
         nearest = int(lengths[me].argmin())
         follows = 0.0 < self.config.follow_m < lengths[me, nearest]
         return [candidates[nearest]] if follows else []
+
+    def _told_m(self, own: Claim) -> float:
+        """Path length to the claimed place that the others know; infinite: they know of none."""
+        sent = self.sent
+        is_sent = sent is not None and is_same_place(sent.place, own.place)
+        return sent.path_m if sent is not None and is_sent else math.inf
 
 
 def _nearest(items: Iterable[Evidence], place: Place, reach_m: float) -> Evidence | None:
