@@ -35,7 +35,8 @@ ROS_DATA = [
     (f'share/{NAME}/config/sensors', glob('config/sensors/*.yaml')),
     (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
 ]
-# A program is a module with a `main`.
+# A program is a module with a `main`. `scripts/env` installs a new one when this file changes, or
+# without .setup/package.stamp. The newest one is evaluate.
 ROS_PROGRAMS = [
     f'{path.stem} = {NAME}.{folder}.{path.stem}:main'
     for folder in ('nodes', 'tools')

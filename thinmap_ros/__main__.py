@@ -20,12 +20,13 @@ class _Program(NamedTuple):
 
 
 PROGRAMS = {
-    'replay': _Program('tools.replay', 'a log or bag into trajectory, map, graph and report'),
+    'replay': _Program('tools.replay', 'logs or bags into trajectory, map, graph and report'),
     'explore_world': _Program('tools.explore_world', 'an exploration in the simulator'),
     'compare_exploration': _Program(
         'tools.compare_exploration', 'exploration strategies on worlds and starts, in one table'
     ),
-    'map_to_graph': _Program('tools.map_to_graph', 'a map_server map into a route graph'),
+    'map_to_graph': _Program('tools.map_to_graph', 'map_server maps into route graphs'),
+    'evaluate': _Program('tools.evaluate', 'errors of a trajectory against a reference'),
     'merge_sessions': _Program('tools.merge_sessions', 'maps of one place into one session'),
     'carmen_to_bag': _Program('tools.carmen_to_bag', 'a CARMEN log into a bag'),
     'bag_repair': _Program('tools.bag_repair', 'a damaged bag (MCAP) into a whole one'),

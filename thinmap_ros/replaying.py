@@ -36,12 +36,14 @@ _REPEATED = 0.01  # m and rad: the pose of a scan that was matched twice differs
 class ScanCounts:
     """Scans that did not change the map, by reason: without odometry, blind, and of a lost robot.
 
+    apart: those of a lost robot that were mapped apart; they are in the map if it was joined.
     records: unusable records of the log, by reason.
     """
 
     without_odometry: dict[str, int] = field(default_factory=dict)
     blind: Counter[str] = field(default_factory=Counter)
     lost: int = 0
+    apart: int = 0
     records: Counter[str] = field(default_factory=Counter)
 
     def add(self, estimate: Estimate) -> None:
@@ -50,6 +52,7 @@ class ScanCounts:
             self.blind[estimate.blind_reason] += 1
         elif estimate.is_lost:
             self.lost += 1
+            self.apart += estimate.is_mapping_apart
 
     @property
     def unused(self) -> int:
@@ -249,6 +252,7 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'without_odometry': sum(result.counts.without_odometry.values()),
         'blind': result.counts.blind.total(),
         'lost': result.counts.lost,
+        'apart': result.counts.apart,
         'reasons': {
             **result.counts.records,
             **result.counts.without_odometry,

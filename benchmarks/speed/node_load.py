@@ -6,30 +6,23 @@ One process with all nodes against a process for each. Delays are those that a l
 scan to answer.
 """
 
-import os
-import random
-import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import psutil
 
+from benchmarks.speed.node_process import processor_s, start, stop, use_own_domain
 from thinmap_ros.evaluation.outcome import Row, at_most
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 _SETTLE_S = 5.0
-_STOP_S = 10.0
 
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows for one process and for many, then the traffic by topic."""
-    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    use_own_domain()
     seconds = 20.0 if quick else 120.0
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / 'bag'
@@ -40,19 +33,6 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         yield from _traffic(bag)
 
 
-def _start(words: list[str], parameters: str) -> psutil.Popen:
-    arguments = [word for parameter in parameters.split() for word in ('-p', parameter)]
-    command = [
-        sys.executable,
-        '-m',
-        f'thinmap_ros.nodes.{words[0]}',
-        *words[1:],
-        '--ros-args',
-        *arguments,
-    ]
-    return psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-
 def _measured(
     what: str,
     programs: list[list[str]],
@@ -60,30 +40,28 @@ def _measured(
     bag: Path | None,
     limits: tuple[float | None, float | None],
 ) -> Iterator[Row]:
-    start = 'initial_x_m:=5.0 initial_y_m:=2.0 initial_yaw_rad:=0.0'
+    start_pose = 'initial_x_m:=5.0 initial_y_m:=2.0 initial_yaw_rad:=0.0'
     placed = ('localizer', 'thinmap')
     nodes = [
-        _start(words, f'use_sim_time:=true {start if words[0] in placed else ""}')
+        start(words, f'use_sim_time:=true {start_pose if words[0] in placed else ""}')
         for words in programs
     ]
-    others = [_start(['sim'], 'start:=5.0,2.0,0.0 wait_for_subscribers:=4')]
+    others = [start(['sim'], 'start:=5.0,2.0,0.0 wait_for_subscribers:=4')]
     if bag is not None:
-        others.append(_start(['recorder'], f'use_sim_time:=true bag:={bag}'))
+        others.append(start(['recorder'], f'use_sim_time:=true bag:={bag}'))
     delays = _Listener()
     try:
         while not delays.heard('local_topology'):
             delays.listen(0.5)
         delays.listen(_SETTLE_S)
         delays.forget()
-        before = sum(_processor_s(node) for node in nodes)
+        before = sum(processor_s(node) for node in nodes)
         delays.listen(seconds)
-        share = 100.0 * (sum(_processor_s(node) for node in nodes) - before) / seconds
+        share = 100.0 * (sum(processor_s(node) for node in nodes) - before) / seconds
         memory = sum(node.memory_full_info().pss for node in nodes) / 1e6
     finally:
-        for process in [*nodes, *others]:
-            process.send_signal(signal.SIGTERM)
         delays.close()
-        psutil.wait_procs([*nodes, *others], timeout=_STOP_S)
+        stop(*nodes, *others)
     yield Row(what, f'{len(delays.of("pose"))} scans')
     for name, value, limit, unit in (
         ('CPU load', share, limits[0], '%'),
@@ -100,11 +78,6 @@ def _measured(
             limit,
             'ms',
         )
-
-
-def _processor_s(process: psutil.Process) -> float:
-    times = process.cpu_times()
-    return float(times.user + times.system)
 
 
 class _Listener:

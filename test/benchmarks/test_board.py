@@ -203,7 +203,7 @@ def small_board(monkeypatch, tmp_path):
 
 @pytest.mark.programs
 def test_a_small_board_is_resumed(small_board, capsys):
-    words = ['-o', small_board, '--processes', 1, '--quiet']
+    words = ['-o', small_board, '--jobs', 1, '--quiet']
     assert called(*words, '--only', 'drive_*_1') == 0
     assert '[1 of 2 cases]' in (small_board / 'slam.md').read_text()
     assert (small_board / 'drives' / 'lab.npz').exists()
@@ -233,7 +233,7 @@ def test_a_small_board_is_resumed(small_board, capsys):
     assert 'other options' in capsys.readouterr().err
     other = ['-o', small_board / 'other', '--recordings', small_board / 'drives']
     other += ['--against', small_board, '--only', '*_1', '--set', 'slam=ekf_ti']
-    assert called(*other, '--processes', 1, '--quiet') == 0
+    assert called(*other, '--jobs', 1, '--quiet') == 0
     assert not (small_board / 'other' / 'drives').exists()
     text = (small_board / 'other' / 'slam.md').read_text()
     assert '| 98765 (drive_lab.odometry_1) |' in text
@@ -245,7 +245,7 @@ def test_a_small_board_is_resumed(small_board, capsys):
 
 @pytest.mark.programs
 def test_what_the_board_cannot_do_is_one_line(small_board, monkeypatch, capsys):
-    words = ['-o', small_board, '--processes', 1, '--quiet']
+    words = ['-o', small_board, '--jobs', 1, '--quiet']
     for option in (['--short'], ['--runs', 2], ['--write-short']):
         assert called(*words, *option) == 2
         assert '--board: expected no --short, --runs or --write-short' in capsys.readouterr().err

@@ -303,7 +303,7 @@ def test_it_resumes_and_a_failed_run_stops_no_other(tmp_path, capsys):
     write_log(logs / 'try_1', 0)
     write_log(logs / 'try_2', 8)
     out = tmp_path / 'out'
-    words = ['-o', out, '--shared', tmp_path / 'shared', '--only', 'try_?', '--processes', 1]
+    words = ['-o', out, '--shared', tmp_path / 'shared', '--only', 'try_?', '--jobs', 1]
     words.append('--quiet')
     assert called(*words) == 2
     assert '1 failed: try_1: ' in capsys.readouterr().err
@@ -383,7 +383,7 @@ def test_a_piece_of_a_real_log_and_the_same_made_worse(shared_data, tmp_path):
             if all(float(word) <= end for word in line.split()[:stamps])
         ]
         (own / name).write_text(''.join(kept))
-    words = ['-o', tmp_path / 'out', '--shared', tmp_path / 'shared', '--processes', 2]
+    words = ['-o', tmp_path / 'out', '--shared', tmp_path / 'shared', '--jobs', 2]
     assert called(*words, '--only', 'aces.s*', '--quiet') == 0
     results = tmp_path / 'out' / 'results'
     reports = {path.stem: json.loads(path.read_text()) for path in results.iterdir()}

@@ -30,10 +30,10 @@ def rest(job):
     time.sleep(600.0)
 
 if __name__ == '__main__':
-    where = argparse.Namespace(processes=1, scheduler='')
+    where = argparse.Namespace(jobs=1, dask='')
     run_pending(rest, [Rest('a')], lambda job: Path(job.name), where, quiet=True)
 """
-ONE_CORE = argparse.Namespace(processes=1, scheduler='')
+ONE_CORE = argparse.Namespace(jobs=1, dask='')
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def test_one_that_fails_is_named_and_the_others_run(
         Sum('wrong', ('x',)),
         Sum('b', (4.0,)),
     ]
-    failures = run(tmp_path, jobs, argparse.Namespace(processes=processes, scheduler=''))
+    failures = run(tmp_path, jobs, argparse.Namespace(jobs=processes, dask=''))
     assert failures['rejected'] == Failure('refused: no numbers')
     assert failures['killed'].reason == 'its process ended with exit code -9'
     assert failures['wrong'].reason.startswith('TypeError: ')
@@ -107,7 +107,7 @@ def test_a_cluster_tells_what_fails_as_well(tmp_path: Path) -> None:
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
     ) as cluster:
-        where = argparse.Namespace(processes=1, scheduler=cluster.scheduler_address)
+        where = argparse.Namespace(jobs=1, dask=cluster.scheduler_address)
         failures = run(tmp_path, jobs, where)
     assert failures == {'rejected': Failure('refused: no numbers')}
     assert read_report(tmp_path / 'a.json', [1.0])['sum'] == 1.0

@@ -330,3 +330,22 @@ def test_graphml_holds_the_regions_of_nodes_and_edges(tmp_path: Path) -> None:
         assert line in text
     write_graph(path, small())
     assert '<data key="node_region">' not in path.read_text()
+
+
+def test_a_path_is_written_once_and_a_feature_is_a_line(tmp_path: Path) -> None:
+    path = tmp_path / 'g.geojson'
+    features = written(tmp_path)
+    by_id = {f['properties']['id']: f for f in features}
+    for own, reverse in ((2, 11), (5, 14)):
+        line = example().edges[own].path.round(4)
+        assert by_id[own]['geometry']['coordinates'] == [line.tolist()]
+        assert by_id[reverse]['geometry']['coordinates'] == [line[[-1, 0]].tolist()]
+    first, *lines, last = path.read_text().splitlines()
+    assert first.endswith('"features":[') and last == ']}'
+    assert [json.loads(line.removesuffix(',')) for line in lines] == features
+
+
+def test_an_empty_graph_is_a_collection(tmp_path: Path) -> None:
+    write_geojson(tmp_path / 'g.geojson', TopologicalMap())
+    assert json.loads((tmp_path / 'g.geojson').read_text())['features'] == []
+    assert not read_geojson(tmp_path / 'g.geojson').nodes

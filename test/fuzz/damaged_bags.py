@@ -133,10 +133,11 @@ def ended(main: Callable[[], None], *arguments: str) -> tuple[int, str, str]:
 def read_log() -> None:
     """Read a whole log in the same manner as replay."""
     parser = argparse.ArgumentParser()
+    parser.add_argument('log', type=Path)
     cli.add_log_options(parser)
 
     def work(arguments: argparse.Namespace) -> None:
-        log = cli.open_log(arguments)
+        log = cli.open_log(arguments.log, arguments)
         count = sum(1 for _ in log.events())
         print(count, log.skipped.count, log.skipped.first)
 

@@ -108,7 +108,7 @@ def test_it_runs_all_writes_all_and_resumes(world: Path, tmp_path: Path) -> None
         str(world),
         '-o',
         str(out),
-        '--processes',
+        '--jobs',
         '1',
         '--strategies',
         'position_probability',
@@ -148,11 +148,9 @@ def test_a_cluster_gives_what_one_machine_gives(world: Path, tmp_path: Path) -> 
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, dashboard_address=None
     ) as cluster:
-        there = compare(
-            *words, '-o', str(tmp_path / 'there'), '--scheduler', cluster.scheduler_address
-        )
+        there = compare(*words, '-o', str(tmp_path / 'there'), '--dask', cluster.scheduler_address)
     assert there.returncode == 0, there.stderr
-    assert compare(*words, '-o', str(tmp_path / 'here'), '--processes', '1').returncode == 0
+    assert compare(*words, '-o', str(tmp_path / 'here'), '--jobs', '1').returncode == 0
     reports = [
         json.loads(next((tmp_path / name).rglob('report.json')).read_text())
         for name in ('there', 'here')

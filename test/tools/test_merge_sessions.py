@@ -1,6 +1,7 @@
 """The program merge_sessions: a session of maps of one place, or one line and nothing written."""
 
 import re
+import shutil
 
 import pytest
 from PIL import Image
@@ -45,6 +46,24 @@ def test_transform_odds_and_ids_are_printed(folder, tmp_path, monkeypatch, capsy
     assert Image.open(tmp_path / 'both.png').width > 1000
     assert (tmp_path / 'ids.csv').read_text().startswith('map,id,merged_id\n')
     sessions.require_session(str(out))
+
+
+def test_all_maps_of_a_folder_are_merged(folder, tmp_path, monkeypatch, capsys):
+    for name in ('a', 'b'):
+        for ending in ('.yaml', '.pgm'):
+            shutil.copy(folder / f'{name}{ending}', tmp_path)
+    out = tmp_path / 'c'
+    for _ in range(2):  # the second time, the result is in the folder
+        assert run(monkeypatch, tmp_path, '-o', out, '--quiet') == 0
+        assert capsys.readouterr().out.splitlines()[1].startswith(f'{tmp_path}/b.yaml: at ')
+    assert sessions.maps_in(tmp_path) == [
+        f'{tmp_path}/{name}' for name in ('a.yaml', 'b.yaml', 'c')
+    ]
+
+
+def test_a_folder_without_maps_is_refused(tmp_path, monkeypatch, capsys):
+    assert run(monkeypatch, tmp_path, '-o', tmp_path / 'out', '--quiet') == 2
+    assert 'no map: expected sessions or map_server YAML files' in capsys.readouterr().err
 
 
 def test_another_place_ends_with_1_and_one_line(folder, tmp_path, monkeypatch, capsys):

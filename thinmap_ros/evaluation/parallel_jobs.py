@@ -46,10 +46,18 @@ class Failure:
 def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that say where jobs run."""
     parser.add_argument(
-        '--processes', type=int, default=os.cpu_count() or 1, help='runs at a time (default: cores)'
+        '--jobs',
+        type=int,
+        default=os.cpu_count() or 1,
+        metavar='N',
+        help='how many run at a time, each in a process of its own (default: cores)',
     )
     parser.add_argument(
-        '--scheduler', default='', help='address of a Dask scheduler, such as tcp://host:8786'
+        '--dask',
+        default='',
+        metavar='ADDRESS',
+        help='address of a Dask scheduler, such as tcp://host:8786, whose workers have thinmap and '
+        'see the same files under the same paths',
     )
 
 
@@ -96,16 +104,16 @@ def failure_summary(failures: dict[str, Failure]) -> InputError:
 def _outcomes(
     work: Callable[[AnyJob], Report], jobs: Sequence[AnyJob], arguments: argparse.Namespace
 ) -> Iterator[tuple[AnyJob, Report | Failure]]:
-    if arguments.scheduler:
-        return _on_cluster(work, jobs, arguments.scheduler)
-    return _on_cores(work, jobs, arguments.processes)
+    if arguments.dask:
+        return _on_cluster(work, jobs, arguments.dask)
+    return _on_cores(work, jobs, arguments.jobs)
 
 
 def _on_cores(
     work: Callable[[AnyJob], Report], jobs: Sequence[AnyJob], processes: int
 ) -> Iterator[tuple[AnyJob, Report | Failure]]:
-    # No pool: one process that the system kills would end all jobs of a pool. Also, the peak memory
-    # of a process is that of its job.
+    # No pool, as joblib's: one process that the system kills ends all jobs of a pool, and jobs of
+    # joblib outlive a program that is killed. Also, the peak memory of a process is of one job.
     waiting = list(reversed(jobs))
     running: dict[Connection, tuple[AnyJob, ForkServerProcess]] = {}
     try:

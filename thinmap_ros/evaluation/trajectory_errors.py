@@ -85,6 +85,26 @@ def relation_errors(
     return RelationErrors(np.array(metres), np.array(degrees))
 
 
+def known_relation_errors(
+    times_s: Array, poses: Array, relations: Path, near_s: float
+) -> RelationErrors:
+    """Errors of poses (N, 3) at times (N,), s, by those relations whose stamps have a pose.
+
+    near_s: how far a pose may be from a stamp, s. Source: as `relation_errors`.
+    """
+    known = read_columns(relations, [0, 1, 2, 3, 7])
+    order = np.argsort(times_s, kind='stable')
+    times = times_s[order]
+    path = poses[order]
+    off = []
+    for t1, t2, *motion in known:
+        a, b = (_nearest(times, t) for t in (t1, t2))
+        if max(abs(times[a] - t1), abs(times[b] - t2)) <= near_s:
+            off.append(se2.between(np.array(motion), se2.between(path[a], path[b])))
+    errors = np.array(off).reshape(-1, 3)
+    return RelationErrors(np.hypot(errors[:, 0], errors[:, 1]), np.degrees(np.abs(errors[:, 2])))
+
+
 def _pose_at(t: float, times: Array, path: Array, wheels: Array, near_s: float) -> Array:
     k = _nearest(times, t)
     if abs(times[k] - t) <= near_s:

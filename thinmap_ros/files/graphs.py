@@ -1,18 +1,19 @@
 """Topological maps as files: GeoJSON for Nav2's route server, GraphML, tmap2.
 
 GeoJSON: nodes are points, edges are lines along their cells (the route server itself drives
-straight from node to node). Its edges are directed, so each edge is written in both directions. Ids
-are unsigned and unique over nodes and edges. Metadata are flat and without nulls, because the
-reader throws on them. `class`, by which the route server's SemanticScorer weighs, is end, branch or
-corner of a node, and dead_end (to an end node) or passage of an edge. Lengths and clearances are in
-m everywhere. Rooms, corridors and halls are polygons, which the route server skips; with them, a
-node has its `region`, and an edge its `region` and, where it passes one, `door` and `width_m`.
+straight from node to node). Its edges are directed, so each edge is written in both directions, the
+second as a straight line: the first one has the path. A line of the text is a feature. Ids are
+unsigned and unique over nodes and edges. Metadata are flat and without nulls, because the reader
+throws on them. `class`, by which the route server's SemanticScorer weighs, is end, branch or corner
+of a node, and dead_end (to an end node) or passage of an edge. Lengths and clearances are in m
+everywhere. Rooms, corridors and halls are polygons, which the route server skips; with them, a node
+has its `region`, and an edge its `region` and, where it passes one, `door` and `width_m`.
 """
 
 import json
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,10 +25,10 @@ import yaml
 from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.regions.membership import Membership
-from thinmap_ros.core.regions.region_map import Region, RegionMap
+from thinmap_ros.core.regions.region_map import Region
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.atomic import atomic_write, read_text, write_text
 from thinmap_ros.files.limits import FILES
 
 Writer = Callable[[Path, TopologicalMap, Membership | None], None]
@@ -74,29 +75,44 @@ def write_geojson(
 ) -> None:
     """Write a topological map atomically.
 
-    The reverse direction of an edge gets an id above all others. with_paths: False for straight
-    edges, as the route server reads no more of them: written in a tenth of the time.
+    The reverse direction of an edge gets an id above all others, and no path. with_paths: False for
+    straight edges, as the route server reads no more of them: written in a tenth of the time.
 
     Raises InputError if an id is too large for an unsigned int.
     """
     highest = max([0, *topology.nodes, *topology.edges])
     if highest + max([0, *topology.edges]) > _MAX_ID:
         raise InputError(f'{path}: id {highest}: expected ids whose sum stays below {_MAX_ID}')
-    features = [_node_feature(node, frame_id, regions) for node in topology.nodes.values()]
+    with atomic_write(path) as aside, aside.open('w', encoding='utf-8') as file:
+        file.write(f'{{"type":"FeatureCollection","name":{json.dumps(path.stem)},"features":[')
+        separator = '\n'
+        for feature in _features(topology, regions, frame_id, highest, with_paths):
+            file.write(separator + json.dumps(feature, allow_nan=False, separators=(',', ':')))
+            separator = ',\n'
+        file.write('\n]}\n')
+
+
+def _features(
+    topology: TopologicalMap,
+    regions: Membership | None,
+    frame_id: str,
+    highest: int,
+    with_paths: bool,
+) -> Iterator[dict[str, Any]]:
+    """Nodes, edges in both directions, and regions; one at a time, as there may be many."""
+    for node in topology.nodes.values():
+        yield _node_feature(node, frame_id, regions)
     for edge in topology.edges.values():
-        ends = (topology.nodes[edge.a].kind, topology.nodes[edge.b].kind)
-        edge_class = 'dead_end' if NodeKind.END in ends else 'passage'
-        line = edge.path if with_paths else edge.path[[0, -1]]
+        kinds = (topology.nodes[edge.a].kind, topology.nodes[edge.b].kind)
+        edge_class = 'dead_end' if NodeKind.END in kinds else 'passage'
+        ends = edge.path[[0, -1]]
         metadata = _edge_metadata(edge, edge_class, regions)
-        features.append(_edge_feature(edge, line, edge.id, edge.a, metadata))
-        features.append(_edge_feature(edge, line[::-1], highest + edge.id, edge.b, metadata))
+        yield _edge_feature(edge, edge.path if with_paths else ends, edge.id, edge.a, metadata)
+        yield _edge_feature(edge, ends[::-1], highest + edge.id, edge.b, metadata)
     if regions is not None:
-        features += [
-            _region_feature(region, regions.regions) for region in regions.regions.regions.values()
-        ]
-    collection = {'type': 'FeatureCollection', 'name': path.stem, 'features': features}
-    indent = 1 if with_paths else None
-    write_text(path, json.dumps(collection, indent=indent, allow_nan=False) + '\n')
+        neighbours = regions.regions.all_neighbours()
+        for region in regions.regions.regions.values():
+            yield _region_feature(region, neighbours.get(region.id, []))
 
 
 def write_graphml(path: Path, topology: TopologicalMap, regions: Membership | None = None) -> None:
@@ -329,12 +345,12 @@ def _edge_metadata(edge: Edge, edge_class: str, regions: Membership | None) -> d
     }
 
 
-def _region_feature(region: Region, regions: RegionMap) -> dict[str, Any]:
+def _region_feature(region: Region, neighbours: list[int]) -> dict[str, Any]:
     properties = {
         'id': region.id,
         'kind': region.kind.name.lower(),
         'area_m2': round(region.area_m2, 2),
-        'neighbours': regions.neighbours(region.id),
+        'neighbours': neighbours,
     }
     ring = _rounded(np.concatenate([region.outline, region.outline[:1]]))
     geometry = {'type': _REGION, 'coordinates': [ring]}

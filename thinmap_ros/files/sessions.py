@@ -152,6 +152,14 @@ def stem_of(path: str) -> Path:
     return Path(path).absolute()
 
 
+def maps_in(folder: Path) -> list[str]:
+    """Sessions (path STEM) and map_server YAML files of a folder, in the order of their names."""
+    sessions = {str(path).removesuffix(GRID.ending) for path in folder.glob(f'*{GRID.ending}')}
+    maps = [str(path) for path in folder.glob(f'*{_MAP_ENDING}')]
+    alone = {path for path in maps if path.removesuffix(_MAP_ENDING) not in sessions}
+    return sorted(sessions | alone)
+
+
 def require_session(path: str) -> None:
     """Raise InputError where a path names no session: none of its files, and no map, exists."""
     stem = stem_of(path)

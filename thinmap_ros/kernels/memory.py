@@ -1,4 +1,4 @@
-"""Releases memory pages of the kernel compiler."""
+"""Releases memory pages that are no longer needed."""
 
 import ctypes
 import gc
@@ -35,6 +35,13 @@ def _shared_bytes() -> int:
     return int(statm.read_text().split()[2]) * mmap.PAGESIZE if statm.exists() else 0
 
 
+def release_free_pages() -> None:
+    """Return what was freed to the system, which the allocator would keep; where it can."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, 'malloc_trim'):
+        libc.malloc_trim(0)
+
+
 def release_compiler_pages() -> None:
     """Release the memory pages of the kernel compiler.
 
@@ -46,9 +53,8 @@ def release_compiler_pages() -> None:
     smaps = Path('/proc/self/smaps')
     if not smaps.exists():
         return
+    release_free_pages()
     libc = ctypes.CDLL(None)
-    if hasattr(libc, 'malloc_trim'):
-        libc.malloc_trim(0)
     for first, last in _clean_mappings(smaps.read_text(), 'llvmlite'):
         libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), mmap.MADV_DONTNEED)
 

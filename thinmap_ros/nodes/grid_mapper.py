@@ -86,7 +86,7 @@ class GridMapperNode(ThinmapNode):
     changed: once in map_update_interval, and at once after a reset, a load and a correction. As
     long as every node that subscribes to /map also subscribes to /map_updates, /map is sent only
     where its size, origin or identity changes, when a subscriber comes, and 10 intervals after an
-    update.
+    update; where it has more than 400 kB, later, so that this is at most 40 kB/s.
 
     Services save_map, load_map; map and dynamic_map return the present map.
 

@@ -22,7 +22,6 @@ from thinmap_ros.logs.carmen import LaserOptions
 from thinmap_ros.logs.frames.bag_odometry import SOURCES
 from thinmap_ros.logs.frames.laser_mount import parse_laser_pose
 from thinmap_ros.logs.log import Log
-from thinmap_ros.logs.log_format import known_formats
 from thinmap_ros.tools.parameter_file import NodeParameters
 
 BAD_INPUT = 2
@@ -142,8 +141,7 @@ def config_from(
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Add the log, and options for its laser pose, topics and frames."""
-    parser.add_argument('log', type=Path, help=f'the log: {known_formats()}')
+    """Add options for the laser pose, topics and frames of a log."""
     carmen = parser.add_argument_group('laser of a CARMEN log', 'Only --offset-m applies to bags.')
     add_config(carmen, LaserOptions)
     parser.add_argument(
@@ -177,8 +175,10 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def open_log(arguments: argparse.Namespace, parameters: NodeParameters = _NO_PARAMETERS) -> Log:
-    """Return the log that the arguments name.
+def open_log(
+    path: Path, arguments: argparse.Namespace, parameters: NodeParameters = _NO_PARAMETERS
+) -> Log:
+    """Return a log, with the options of `add_log_options`.
 
     A laser pose that is given comes before that of the log. parameters: of the node localizer, for
     what is not among the arguments.
@@ -193,7 +193,7 @@ def open_log(arguments: argparse.Namespace, parameters: NodeParameters = _NO_PAR
     offset = getattr(arguments, 'offset_m', None)
     T_base_laser = None if offset is None else np.array([offset, 0.0, 0.0])
     return reading.open_log(
-        arguments.log,
+        path,
         config_from(arguments, LaserOptions),
         arguments.scan_topic,
         arguments.odom_topic,

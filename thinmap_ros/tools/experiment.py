@@ -120,7 +120,7 @@ def _work_experiments(arguments: argparse.Namespace) -> None:
         )
     source = Source(arguments.seed, arguments.from_bag, arguments.quick)
     write_provenance(arguments.out)
-    for name, seconds in _run_all(names, source, arguments.out, arguments.processes):
+    for name, seconds in _run_all(names, source, arguments.out, arguments.jobs):
         print(f'{name}: {seconds:.0f} s', flush=True)
 
 
@@ -155,7 +155,7 @@ def main() -> None:
         '--quick', action='store_true', help='fewer runs and shorter drives, to see that all works'
     )
     parser.add_argument(
-        '--processes', type=int, default=os.cpu_count() or 1, help='at a time (default: cores)'
+        '--jobs', type=int, default=os.cpu_count() or 1, help='at a time (default: cores)'
     )
     cli.run(_work, parser)
 

@@ -1,8 +1,10 @@
-"""Converts a map_server map to a route graph."""
+"""Converts map_server maps to route graphs."""
 
 import argparse
 import math
 import sys
+import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +14,24 @@ from thinmap_ros.core.regions.config import RegionConfig
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.evaluation.batch import (
+    REASON,
+    Batch,
+    FileJob,
+    jobs_of,
+    reported,
+    run_batch,
+)
+from thinmap_ros.evaluation.parallel_jobs import Report, add_run_options
 from thinmap_ros.files import graphs, occupancy_maps
 from thinmap_ros.tools import cli
 from thinmap_ros.view.summary import summary_figure
 
 _DEFAULTS = TopologyConfig()
+_DESCRIPTIONS = ('.yaml', '.yml')
+_FORMATS = ('geojson', 'graphml', 'tmap2.yaml')
+# Arguments that decide about a graph.
+_OPTIONS = ('robot_radius', 'min_clearance', 'prune', 'start', 'format')
 
 
 def _start(given: str | None) -> tuple[float, float] | None:
@@ -42,46 +57,126 @@ def _config(arguments: argparse.Namespace) -> TopologyConfig:
     return TopologyConfig(robot_radius_m=radius, min_branch_length_m=arguments.prune)
 
 
-def _work(arguments: argparse.Namespace) -> None:
-    graphs.writer_of(arguments.out)  # report a wrong name before the work
-    if arguments.picture is not None and arguments.picture.suffix != '.png':
-        raise InputError(f'{arguments.picture}: expected a name that ends in .png')
+@dataclass(frozen=True)
+class _Graph:
+    """What was found in a map: counts, and why there is nothing, if so."""
+
+    nodes: int
+    edges: int
+    parts: int
+    regions: int
+    empty: str
+
+
+def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Namespace) -> _Graph:
+    """Write the graph of a map, and a picture of it."""
     start = _start(arguments.start)
     config = _config(arguments)
-    patch = occupancy_maps.read_map(arguments.map, keeps_unknown=True)
+    patch = occupancy_maps.read_map(path, keeps_unknown=True)
     topology = build(patch, start, config)
     regions = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius))
-    graphs.write_graph(arguments.out, topology, membership_of(topology, regions))
-    if arguments.picture is not None:
+    graphs.write_graph(out, topology, membership_of(topology, regions))
+    if picture is not None:
         summary_figure(
-            arguments.picture,
+            picture,
             patch,
             topology,
             np.empty((0, 2)),
-            title=arguments.map.stem,
+            title=path.stem,
             regions=regions,
             is_measured=False,
         )
-    if not topology.nodes:
-        place = 'no free place' if start is None else f'no free place round {start}'
-        print(
-            f'map_to_graph: warning: {arguments.map}: {place} '
-            f'for a robot of {config.robot_radius_m} m radius: the graph is empty',
-            file=sys.stderr,
-        )
-    parts = len(topology.components())
+    place = 'no free place' if start is None else f'no free place round {start}'
+    empty = f'{place} for a robot of {config.robot_radius_m} m radius: the graph is empty'
+    return _Graph(
+        len(topology.nodes),
+        len(topology.edges),
+        len(topology.components()),
+        len(regions.regions),
+        '' if topology.nodes else empty,
+    )
+
+
+def run_job(job: FileJob) -> Report:
+    """Convert one of many maps into its folder."""
+    arguments = argparse.Namespace(**job.arguments)
+    job.folder.mkdir(parents=True, exist_ok=True)
+    began = time.process_time()
+    found = _convert(
+        job.path,
+        job.folder / f'topology.{arguments.format}',
+        job.folder / 'summary.png',
+        arguments,
+    )
+    row = {
+        'nodes': found.nodes,
+        'edges': found.edges,
+        'parts': found.parts,
+        'regions': found.regions,
+        'cpu_s': round(time.process_time() - began, 2),
+        REASON: found.empty,
+    }
+    return reported(job, row)
+
+
+_BATCH = Batch(run_job, ('nodes', 'edges', 'parts', 'regions', 'cpu_s'), 'Route graphs of maps')
+
+
+def _work(arguments: argparse.Namespace) -> None:
+    _config(arguments)  # report a wrong value before the work
+    _start(arguments.start)
+    maps = _without_images(arguments.maps)
+    if len(maps) == 1:
+        _convert_one(maps[0], arguments)
+        return
+    if arguments.picture is not None:
+        raise InputError('--picture: expected one map: of several, each has a summary.png')
+    arguments.command = cli.command_line()
+    options = {name: getattr(arguments, name) for name in _OPTIONS}
+    jobs = jobs_of(maps, arguments.out, options, vars(arguments))
+    run_batch(_BATCH, jobs, arguments)
+
+
+def _without_images(paths: list[Path]) -> list[Path]:
+    """The paths without the images of descriptions among them, as of maps/*."""
+    described = {path.with_suffix('') for path in paths if path.suffix in _DESCRIPTIONS}
+    return [
+        path
+        for path in paths
+        if path.suffix in _DESCRIPTIONS or path.with_suffix('') not in described
+    ]
+
+
+def _convert_one(path: Path, arguments: argparse.Namespace) -> None:
+    graphs.writer_of(arguments.out)  # report a wrong name before the work
+    if arguments.picture is not None and arguments.picture.suffix != '.png':
+        raise InputError(f'{arguments.picture}: expected a name that ends in .png')
+    found = _convert(path, arguments.out, arguments.picture, arguments)
+    if found.empty:
+        print(f'map_to_graph: warning: {path}: {found.empty}', file=sys.stderr)
     print(
-        f'{arguments.out}: {len(topology.nodes)} nodes, {len(topology.edges)} edges, '
-        f'connected parts: {parts}, regions: {len(regions.regions)}'
+        f'{arguments.out}: {found.nodes} nodes, {found.edges} edges, '
+        f'connected parts: {found.parts}, regions: {found.regions}'
     )
 
 
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='map_to_graph', description=__doc__)
-    parser.add_argument('map', type=Path, help='map_server YAML file')
-    out_help = 'FILE.geojson (Nav2 route server), .graphml, or .tmap2.yaml (topological_navigation)'
+    parser.add_argument('maps', type=Path, nargs='+', metavar='MAP', help='map_server YAML file')
+    out_help = (
+        'FILE.geojson (Nav2 route server), .graphml, or .tmap2.yaml (topological_navigation); of '
+        'several maps a folder with one for each, summary.csv and report.html'
+    )
     parser.add_argument('-o', '--out', type=Path, required=True, help=out_help)
+    add_run_options(parser)
+    parser.add_argument('--quiet', action='store_true', help='no progress bar')
+    parser.add_argument(
+        '--format',
+        choices=_FORMATS,
+        default=_FORMATS[0],
+        help=f'of the graphs of several maps (default {_FORMATS[0]})',
+    )
     radius = _DEFAULTS.robot_radius_m
     parser.add_argument('--robot-radius', type=float, default=radius, help=f'm (default {radius})')
     clearance_help = 'how far nodes and edges stay from obstacles, m (default: the robot radius)'

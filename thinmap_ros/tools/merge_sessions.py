@@ -17,7 +17,7 @@ from thinmap_ros.files.merging import (
     merge_maps,
     write_ids,
 )
-from thinmap_ros.files.sessions import GRID, require_own_files
+from thinmap_ros.files.sessions import GRID, maps_in, require_own_files, stem_of
 from thinmap_ros.tools import cli
 from thinmap_ros.view.merged_figure import merged_figure
 from thinmap_ros.view.progress_bar import ProgressBar
@@ -42,6 +42,17 @@ def _print_ids(first: str, merged: MergedMap) -> None:
     print(f'{first}: {len(own.keys() & there.keys())} of {len(own)} nodes keep their ids')
 
 
+def _maps_of(given: str, out: str) -> list[str]:
+    """The map that is given; of a folder, its sessions and maps in the order of their names."""
+    folder = Path(given)
+    if not folder.is_dir():
+        return [given]
+    found = maps_in(folder)
+    if not found:
+        raise InputError(f'{given}: no map: expected sessions or map_server YAML files')
+    return [path for path in found if stem_of(path) != stem_of(out)]
+
+
 def _merge(arguments: argparse.Namespace) -> MergedMap:
     with ProgressBar('merge_sessions', arguments.quiet) as bar:
         try:
@@ -54,6 +65,7 @@ def _merge(arguments: argparse.Namespace) -> MergedMap:
 
 def _work(arguments: argparse.Namespace) -> None:
     require_own_files(arguments.out, GRID)  # report a wrong name before the work
+    arguments.maps = [each for given in arguments.maps for each in _maps_of(given, arguments.out)]
     if arguments.picture is not None and arguments.picture.suffix != '.png':
         raise InputError(f'{arguments.picture}: expected a name that ends in .png')
     merged = _merge(arguments)
@@ -78,7 +90,10 @@ def main() -> None:
         epilog='Ends with 1, and writes nothing, if a map does not show the same place.',
     )
     parser.add_argument(
-        'maps', nargs='+', metavar='MAP', help='session (path STEM) or map_server YAML file'
+        'maps',
+        nargs='+',
+        metavar='MAP',
+        help='session (path STEM), map_server YAML file, or a folder of such',
     )
     parser.add_argument('-o', '--out', required=True, help='path STEM of the merged session')
     odds_help = (

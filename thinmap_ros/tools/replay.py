@@ -1,9 +1,8 @@
-"""Replays a log or bag through localizer, grid and topology, as fast as possible."""
+"""Replays logs or bags through localizer, grid and topology, as fast as possible."""
 
 import argparse
 import signal
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -18,23 +17,21 @@ from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizers import default_config
 from thinmap_ros.core.start import StartConfig
-from thinmap_ros.core.topology.builder import TopologyConfig
+from thinmap_ros.evaluation.batch import jobs_of, run_batch
+from thinmap_ros.evaluation.parallel_jobs import add_run_options
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs.log import Event, Log, SkippedRecords
-from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.replaying import Replay, replay, write_outputs
+from thinmap_ros.logs.log_format import known_formats
+from thinmap_ros.pipeline import Pipeline
+from thinmap_ros.replaying import Replay
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.parameter_file import NodeParameters, read_parameter_file
-from thinmap_ros.view import report_page
+from thinmap_ros.tools.replay_run import BATCH, options_of, replay_log
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
 # Large data are converted once a second: a view does not draw them more often.
 _PERIOD_NS = 1_000_000_000
-# Whose parameters replay takes from a file.
-_NODES = ('localizer', 'grid_mapper', 'topology_builder')
 _STAGES = {'localizer': 'localizer', 'grid': 'map update', 'topology': 'graph update'}
 
 
@@ -88,6 +85,14 @@ class ReplayView:
 
 
 def _work(arguments: argparse.Namespace) -> None:
+    arguments.command = cli.command_line()
+    if len(arguments.logs) > 1:
+        _replay_many(arguments)
+    else:
+        _replay_one(arguments)
+
+
+def _replay_one(arguments: argparse.Namespace) -> None:
     with _view(arguments) as view:
         result = _play(arguments, None if view is None else ReplayView(view))
         if view is not None and arguments.view and result.ended_by is None:
@@ -164,43 +169,23 @@ def _interruptible(log: Log) -> Iterator[_InterruptibleLog]:
             signal.signal(number, handler)
 
 
-def _parameters(arguments: argparse.Namespace) -> NodeParameters:
-    """Parameters of the file; `slam` of the command line comes before that of the file."""
-    slam = getattr(arguments, 'slam', '')
-    file = arguments.params_file
-    if file:
-        return read_parameter_file(file, _NODES, slam)
-    return NodeParameters({'localizer': {'slam': slam or StartConfig.slam}})
-
-
-def _config(arguments: argparse.Namespace, parameters: NodeParameters) -> PipelineConfig:
-    """Parameters of all stages: those of the command line come before those of a file."""
-    slam = parameters.value('localizer', 'slam', StartConfig.slam)
-    grid = parameters.config('grid_mapper', OccupancyConfig())
-    return PipelineConfig(
-        localizer=parameters.config('localizer', default_config(slam)),
-        grid=cli.config_from(arguments, OccupancyConfig, grid),
-        topology=parameters.config('topology_builder', TopologyConfig()),
-    )
-
-
 def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
-    parameters = _parameters(arguments)
-    config = _config(arguments, parameters)
-    wall = time.perf_counter()
-    cpu = time.process_time()
-    with _interruptible(cli.open_log(arguments, parameters)) as log:
-        result = replay(
-            log, config, show_progress=not arguments.quiet, watcher=shown, keep_partial=True
-        )
-    result.notes = [*parameters.notes, *result.notes]
-    seconds = (time.perf_counter() - wall, time.process_time() - cpu)
-    title = f'{arguments.log.name}: {len(result.poses)} scans'
-    report = write_outputs(result, arguments.out, title, seconds)
-    report_page.write(arguments.out, title, report, cli.command_line())
+    (path,) = arguments.logs
+    result, report = replay_log(path, arguments.out, arguments, shown, _interruptible)
     print(f'{arguments.out}: {_summary(result, report)}')
     _print_notes(result)
     return result
+
+
+def _replay_many(arguments: argparse.Namespace) -> None:
+    """Replay several logs, each into a folder of its own."""
+    if arguments.view or arguments.recording:
+        raise InputError('--view, --recording: expected one log')
+    # A job shows no bar of its own.
+    jobs = jobs_of(
+        arguments.logs, arguments.out, options_of(arguments), {**vars(arguments), 'quiet': True}
+    )
+    run_batch(BATCH, jobs, arguments)
 
 
 def _summary(result: Replay, report: dict[str, Any]) -> str:
@@ -242,8 +227,17 @@ def _print_notes(result: Replay) -> None:
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='replay', description=__doc__)
+    parser.add_argument(
+        'logs',
+        type=Path,
+        nargs='+',
+        metavar='LOG',
+        help=f'a log: {known_formats()}. Of several, each has a folder of its own below OUT, and '
+        'summary.csv and report.html there are over all; what is done is not done again',
+    )
     cli.add_log_options(parser)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
+    add_run_options(parser)
     parser.add_argument(
         '--params-file',
         type=Path,

@@ -40,6 +40,7 @@ _FIGURES = (
     _Figure(('without_odometry',), 'Scans without odometry'),
     _Figure(('blind',), 'Blind scans'),
     _Figure(('lost',), 'Scans of a lost robot'),
+    _Figure(('apart',), 'Scans mapped apart'),
     _Figure(('refused',), 'Scans not mapped'),
     _Figure(('first_refused',), 'First scan not mapped'),
     _Figure(('warnings',), 'Warnings'),
@@ -78,7 +79,7 @@ _FILES = {
     'log': 'output of each node',
     'result.json': 'result of the action explore',
 }
-_STYLE = """
+STYLE = """
 :root { color-scheme: light; }
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff;
   max-width: 56rem; margin: 0 auto; padding: 1rem; overflow-wrap: anywhere; }
@@ -132,7 +133,7 @@ def write(folder: Path, title: str, report: Mapping[str, Any], command: str) -> 
         for heading, content in sections
         if content
     )
-    page = _PAGE.format(title=html.escape(title), style=_STYLE, sections=text)
+    page = _PAGE.format(title=html.escape(title), style=STYLE, sections=text)
     write_text(folder / NAME, page)
     return folder / NAME
 

@@ -1,5 +1,7 @@
 """Regions of a known floor: kinds, areas, doors, outlines, nodes and edges; and of a noisy one."""
 
+import itertools
+
 import numpy as np
 import pytest
 from core.regions.floors import CELL_M, noisy, office, patch_of
@@ -107,6 +109,26 @@ def test_nodes_and_edges_know_their_region() -> None:
     through = {number for door in found.doors for number in member.edges_through(door)}
     assert through == member.door_of.keys() and len(through) == 2
     assert all(member.edges_through(door) for door in found.doors)
+
+
+def test_doors_of_edges_are_those_of_a_search_among_all() -> None:
+    patch = patch_of(np.tile(office(), (2, 2)))
+    found = find_regions(patch)
+    topology = build(patch, None, TopologyConfig())
+    member = membership_of(topology, found)
+    for number, edge in topology.edges.items():
+        steps = [np.linspace(a, b, 50) for a, b in itertools.pairwise(edge.path)]
+        path = np.concatenate(steps)
+        inside = {*found.ids_at(path).tolist(), member.of_node[edge.a], member.of_node[edge.b]}
+        widths = [
+            door.width_m
+            for door in found.doors
+            if {door.a, door.b} <= inside
+            and np.hypot(*(path - (door.x, door.y)).T).min() <= 0.5 * door.width_m
+        ]
+        narrowest = member.door_of.get(number)
+        assert (min(widths) if widths else None) == (narrowest and narrowest.width_m)
+    assert len(member.door_of) >= 8
 
 
 def test_outline_of_a_ring_is_its_outer_border() -> None:

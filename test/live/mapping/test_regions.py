@@ -1,5 +1,8 @@
 """Rooms on a live graph: topology_builder publishes them with the nodes of its graph."""
 
+import time
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from core.regions.floors import office, patch_of
@@ -48,3 +51,29 @@ def test_regions_name_the_nodes_of_the_graph(graph):
     assert all(door.edge_ids and set(door.edge_ids) <= edges for door in message.doors)
     graph.until(lambda: markers and len(markers[-1].markers) == 6, 'outlines, doors and names')
     assert graph.stop('topology_builder') == graph.stop('markers') == 0
+
+
+def test_regions_are_computed_where_cells_have_changed(graph):
+    patch = patch_of(office())
+    grids = graph.node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
+    heard = graph.heard('regions', RegionArray, qos.LATCHED)
+    graph.start('topology_builder', region_update_period_s=0.1)
+    grids.publish(messages.probability_grid_msg(patch, 'map', S))
+    graph.until(lambda: heard, 'regions')
+    # More certainly free than before: the same cells are free.
+    surer = replace(patch, cells=np.where(patch.free, patch.cells + 1, patch.cells).astype(np.int8))
+    assert np.array_equal(surer.free, patch.free) and not np.array_equal(surer.cells, patch.cells)
+    for ns, same in ((2 * S, patch), (3 * S, surer)):
+        grids.publish(messages.probability_grid_msg(same, 'map', ns))
+        # Long enough to compute them, unless the machine is slow: then this test sees less.
+        until = time.monotonic() + 1.0
+        graph.until(lambda until=until: time.monotonic() > until, 'some periods')
+    assert len(heard) == 1
+    # Without its lower rooms.
+    half = replace(patch, cells=patch.cells.copy())
+    half.cells[: half.shape[0] // 2] = -1
+    grids.publish(messages.probability_grid_msg(half, 'map', 4 * S))
+    graph.until(lambda: len(heard) == 2, 'regions of the other map')
+    assert messages.stamp_ns(heard[1].header.stamp) == 4 * S
+    assert len(heard[1].regions) < len(heard[0].regions)
+    assert graph.stop('topology_builder') == 0

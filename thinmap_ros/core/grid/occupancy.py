@@ -290,7 +290,10 @@ class OccupancyGrid:
         return self._cut(int(row), int(col), count, count)
 
     def known_area(self) -> GridPatch:
-        """Bounding rectangle of all known cells; one unknown cell if there are none."""
+        """Bounding rectangle of all known cells; one unknown cell if there are none.
+
+        Read-only, and the same object as long as the grid does not change.
+        """
         return self._rendered.render(self._tiles, self.frame)
 
     def take_changes(self) -> GridPatch | None:

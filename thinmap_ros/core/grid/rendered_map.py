@@ -20,13 +20,24 @@ class RenderedMap:
         self._bounds: Bounds = (0, 0, 0, 0)
         self._known: Bounds | None = None
         self._stale: Bounds | None = None
+        self._patch: GridPatch | None = None  # the newest copy, until a cell is outdated
 
     def mark_dirty(self, row: int, col: int, end_row: int, end_col: int) -> None:
         """Mark cells [row, end_row) x [col, end_col) as outdated."""
         self._stale = _union(self._stale, (row, col, end_row, end_col))
+        self._patch = None
 
     def render(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
-        """Copy of the bounding rectangle of the known cells; one unknown cell if there are none."""
+        """Bounding rectangle of the known cells; one unknown cell if there are none.
+
+        A copy, which is the same object as long as no cell is outdated, and read-only.
+        """
+        if self._patch is None:
+            self._patch = self._copy(tiles, frame)
+            self._patch.cells.flags.writeable = False
+        return self._patch
+
+    def _copy(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
         self._enlarge(tiles)
         if self._stale is not None:
             row, col, end_row, end_col = _intersection(self._stale, self._bounds)

@@ -38,10 +38,8 @@ def flood(clearance: NDArray[np.float64], neck: Neck) -> tuple[Labels, Cells]:
     widest first (N, 3): flat index of the cell, lower and higher basin.
     """
     flat = np.ascontiguousarray(clearance).ravel()
-    inside = np.flatnonzero(flat > 0.0)
-    order = inside[np.argsort(-flat[inside], kind='stable')]
     basin, parent, saddles = _flood(
-        flat, order, clearance.shape[1], neck.ratio, neck.widest, neck.least_cells
+        flat, _from_widest(flat), clearance.shape[1], neck.ratio, neck.widest, neck.least_cells
     )
     number = np.zeros(len(parent) + 1, dtype=np.int32)  # the last: of cells outside
     number[:-1] = 1 + np.unique(parent, return_inverse=True)[1]
@@ -49,6 +47,12 @@ def flood(clearance: NDArray[np.float64], neck: Neck) -> tuple[Labels, Cells]:
     apart = pairs[:, 0] != pairs[:, 1]
     labels: Labels = number[basin].reshape(clearance.shape)
     return labels, np.column_stack([saddles[apart, 0], pairs[apart]])
+
+
+def _from_widest(flat: NDArray[np.float64]) -> Cells:
+    """Indices of the cells inside, the roomiest first."""
+    inside = np.flatnonzero(flat > 0.0)
+    return inside[np.argsort(-flat[inside], kind='stable')]
 
 
 @inlined
@@ -67,9 +71,9 @@ def _flood(
     ratio: float,
     widest: float,
     least_cells: int,
-) -> tuple[Cells, Cells, Cells]:
+) -> tuple[Labels, Cells, Cells]:
     """Basin of each cell (-1 outside), basin that each one was merged into, saddles (N, 3)."""
-    basin = np.full(flat.size, -1, dtype=np.int64)
+    basin = np.full(flat.size, -1, dtype=np.int32)
     parent = np.empty(order.size, dtype=np.int64)
     peak = np.empty(order.size)
     cells = np.zeros(order.size, dtype=np.int64)

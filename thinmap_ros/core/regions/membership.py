@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -27,7 +28,15 @@ class Membership:
 
     def edges_through(self, door: Door) -> list[int]:
         """Ids of the edges that pass through a door as the narrowest one on their path."""
-        return [number for number, narrowest in self.door_of.items() if narrowest is door]
+        return self._edges_by_door.get(id(door), [])
+
+    @cached_property
+    def _edges_by_door(self) -> dict[int, list[int]]:
+        """Ids of edges, by the identity of their narrowest door: doors may be equal."""
+        found: dict[int, list[int]] = {}
+        for number, door in self.door_of.items():
+            found.setdefault(id(door), []).append(number)
+        return found
 
 
 def membership_of(topology: TopologicalMap, regions: RegionMap) -> Membership:
@@ -37,13 +46,14 @@ def membership_of(topology: TopologicalMap, regions: RegionMap) -> Membership:
     of_node = dict(zip((node.id for node in nodes), _nearest_ids(regions, places), strict=True))
     of_edge = {}
     door_of = {}
+    doors_at = _doors_by_region(regions)
     for edge in topology.edges.values():
         path = _sampled(edge.path)
         ids = regions.ids_at(path)
         named = ids[ids > 0]
         of_edge[edge.id] = int(np.bincount(named).argmax()) if named.size else of_node[edge.a]
         ends = {of_node[edge.a], of_node[edge.b], *named.tolist()}
-        door = _door_on(path, ends, regions)
+        door = _door_on(path, ends, doors_at)
         if door is not None:
             door_of[edge.id] = door
     return Membership(regions, _without_0(of_node), _without_0(of_edge), door_of)
@@ -56,12 +66,21 @@ def _sampled(path: Array) -> Array:
     return np.column_stack([np.interp(marks, along, path[:, axis]) for axis in (0, 1)])
 
 
-def _door_on(path: Array, ids: set[int], regions: RegionMap) -> Door | None:
+def _doors_by_region(regions: RegionMap) -> dict[int, list[Door]]:
+    """The doors of each region, each once: at the first of the two that it joins."""
+    found: dict[int, list[Door]] = {}
+    for door in regions.doors:
+        found.setdefault(door.a, []).append(door)
+    return found
+
+
+def _door_on(path: Array, ids: set[int], doors_at: Mapping[int, list[Door]]) -> Door | None:
     """The narrowest door between two of the regions that a path (K, 2) passes through."""
     doors = [
         door
-        for door in regions.doors
-        if door.a in ids and door.b in ids and _distance_m(path, door) <= 0.5 * door.width_m
+        for region in sorted(ids)
+        for door in doors_at.get(region, ())
+        if door.b in ids and _distance_m(path, door) <= 0.5 * door.width_m
     ]
     return min(doors, key=lambda door: door.width_m, default=None)
 

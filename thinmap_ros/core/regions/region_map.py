@@ -68,6 +68,12 @@ class RegionMap:
 
     def neighbours(self, region_id: int) -> list[int]:
         """Ids of the regions that a door joins to a region, each once."""
-        pairs = [(door.a, door.b) for door in self.doors]
-        ends = {end for pair in pairs if region_id in pair for end in pair}
-        return sorted(ends - {region_id})
+        return self.all_neighbours().get(region_id, [])
+
+    def all_neighbours(self) -> dict[int, list[int]]:
+        """Neighbours of each region that has a door, by id."""
+        found: dict[int, set[int]] = {}
+        for door in self.doors:
+            found.setdefault(door.a, set()).add(door.b)
+            found.setdefault(door.b, set()).add(door.a)
+        return {region: sorted(ends) for region, ends in found.items()}

@@ -73,7 +73,9 @@ class NavigationClient:
         self._retries = Retries()
         self._arrivals = Arrivals()
         wall = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_active_timer(_PERIOD_S, self._advance, clock=wall)
+        # Only while there is a goal.
+        self._timer = node.create_active_timer(_PERIOD_S, self._advance, clock=wall)
+        self._timer.cancel()
 
     @property
     def is_driving(self) -> bool:
@@ -102,6 +104,7 @@ class NavigationClient:
     def drive_to(self, goal: Array) -> None:
         """Set the goal (3,), unless the server has about the same."""
         self.goal = goal
+        self._timer.reset()
         if self._arrivals.are_repeated(goal):
             self._arrivals.clear()
             self._end(False, 'reached, but the target stays')
@@ -128,7 +131,10 @@ class NavigationClient:
     def _advance(self) -> None:
         """Send the goal if the server does not have it, and may have it."""
         goal = self.goal
-        if goal is None or not self._keeps_waiting(goal):
+        if goal is None:
+            self._timer.cancel()
+            return
+        if not self._keeps_waiting(goal):
             return
         logger = self._node.get_logger()
         if self._others.is_taken():

@@ -13,8 +13,10 @@ from thinmap_ros.ros import diagnostics, messages, qos
 from thinmap_ros.ros.decoding.map_updates import updates_topic
 
 # Calls after which a whole map follows an update: one that was lost, for a reason that no
-# publisher knows, is missing for so long.
+# publisher knows, is missing for so long. That of a large map is rarer, so that it is no more
+# traffic than this.
 _MAX_CALLS_BEHIND = 10
+_MAX_REPEATED_BYTES_PER_S = 40e3
 # Room of a map that grows, a share of its length: it grows again when the room is used up.
 _ROOM = 0.25
 
@@ -24,7 +26,8 @@ class MapTopic:
 
     The map is whole where its rectangle grows or it is another map, and as long as somebody
     subscribes to map and not to map_updates. Else map_updates has the rectangle that has changed;
-    the whole map follows ten calls later, or once a subscriber comes.
+    the whole map follows ten calls later (of a map of 100 x 100 m after 100 s), or once a
+    subscriber comes.
     Where all subscribe to both, the rectangle has room to grow; else it ends at the known cells.
     """
 
@@ -71,7 +74,7 @@ class MapTopic:
         self._calls_behind += 1
         if self._has_subscriber_of_map_alone():
             self._publish_whole(version, version.shown())
-        elif self._calls_behind > _MAX_CALLS_BEHIND:
+        elif self._calls_behind > _calls_between_whole(self._shown, version):
             self._publish_whole(version, self._shown)
         elif changed is not None:
             self._updates.publish(
@@ -112,6 +115,12 @@ class MapTopic:
         has_come = matched.current_count_change > 0
         if has_come and is_behind and self._newest is not None and self._shown is not None:
             self._publish_whole(self._newest, self._shown)
+
+
+def _calls_between_whole(shown: GridPatch, version: MapVersion) -> float:
+    """Calls after which the whole map follows an update."""
+    period_s = shown.cells.nbytes / _MAX_REPEATED_BYTES_PER_S
+    return max(_MAX_CALLS_BEHIND, period_s / version.identity.config.map_update_interval)
 
 
 def _with_room(patch: GridPatch, margins: Margins) -> Margins:

@@ -40,6 +40,8 @@ class MapVersion:
         )
         if before is None or not is_same_rectangle:
             return (0, 0, *self.patch.shape)
+        if self.patch is before.patch:
+            return None
         return self.patch.changes_since(before.patch)
 
     def shown(self, bounds: Bounds | None = None) -> GridPatch:

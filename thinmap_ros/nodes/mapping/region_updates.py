@@ -3,7 +3,9 @@
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from time import monotonic
 
+import numpy as np
 from rclpy.clock import Clock, ClockType
 
 from thinmap_msgs.msg import RegionArray
@@ -14,11 +16,14 @@ from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.kernels.memory import release_free_pages
 from thinmap_ros.nodes.mapping.region_messages import region_array_msg
 from thinmap_ros.ros import parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 _POLL_S = 0.1
+# Of a core, that is used for regions at most: on a map of 100 x 100 m they take more than a second.
+_MAX_CPU_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -27,13 +32,52 @@ class RegionUpdatesConfig(Config):
 
     region_update_period_s: float = parameter(
         5.0,
-        'Least time between two updates of the topic regions (s). Raise it for maps of more than '
-        '5000 m2 on a slow computer, lower it for names of rooms as soon as they are seen. '
-        '0: no regions.',
+        'Least time between two updates of the topic regions (s). Where computing takes more than '
+        'a tenth of it, updates are rarer. Raise it for a slow computer, lower it for names of '
+        'rooms as soon as they are seen. 0: no regions.',
         low=0.0,
         high=3600.0,
     )
     regions: RegionConfig = part(RegionConfig)
+
+
+class _RegionJob:
+    """Computes regions in a thread of its own, where the map has changed since the last time."""
+
+    def __init__(self, tracker: RegionTracker) -> None:
+        self.tracker = tracker
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix='regions')
+        self._last: GridPatch | None = None
+        self._rests_until_s = 0.0
+
+    @property
+    def is_resting(self) -> bool:
+        """Whether the last regions took so long that the next ones have to wait."""
+        return monotonic() < self._rests_until_s
+
+    def submit(self, patch: GridPatch) -> Future[RegionMap]:
+        """Begin to compute the regions of a grid; those of before, if no cell shows another."""
+        return self._worker.submit(self._regions_of, patch)
+
+    def _regions_of(self, patch: GridPatch) -> RegionMap:
+        before = self._last
+        self._last = patch
+        known = self.tracker.regions
+        if known is not None and before is not None and _shows_the_same(patch, before):
+            return known
+        began_s = monotonic()
+        regions = self.tracker.update(patch)
+        # On a large map this takes, and frees, a hundred bytes a cell.
+        release_free_pages()
+        ended_s = monotonic()
+        self._rests_until_s = ended_s + (ended_s - began_s) / _MAX_CPU_SHARE
+        return regions
+
+
+def _shows_the_same(patch: GridPatch, before: GridPatch) -> bool:
+    """Whether the same cells are free, and the same ones occupied, as in a patch of before."""
+    is_same_rectangle = patch.frame == before.frame and patch.shape == before.shape
+    return is_same_rectangle and np.array_equal(patch.trinary(), before.trinary())
 
 
 class RegionUpdates:
@@ -55,17 +99,16 @@ class RegionUpdates:
         self._topology = topology
         config = parameters.declare_config(node, RegionUpdatesConfig)
         self._config = replace(config.regions, robot_radius_m=robot_radius_m)
-        self._tracker = RegionTracker(self._config)
-        self._newest: tuple[int, GridPatch] | None = None
+        self._published: RegionMap | None = None
         self._is_graph_newer = False
-        self._pending: Future[RegionMap] | None = None
-        self._pending_ns = 0
+        self.reset()
         if config.region_update_period_s > 0.0:
-            self._worker = ThreadPoolExecutor(1, thread_name_prefix='regions')
             self._publisher = node.create_publisher(RegionArray, 'regions', qos.LATCHED)
             wall = Clock(clock_type=ClockType.STEADY_TIME)
             node.create_active_timer(config.region_update_period_s, self._begin, clock=wall)
-            node.create_active_timer(_POLL_S, self._publish_computed, clock=wall)
+            # Only while regions are computed.
+            self._poll = node.create_active_timer(_POLL_S, self._publish_computed, clock=wall)
+            self._poll.cancel()
 
     @property
     def config(self) -> RegionConfig:
@@ -75,13 +118,14 @@ class RegionUpdates:
     @property
     def tracker(self) -> RegionTracker:
         """The regions and their ids."""
-        return self._tracker
+        return self._job.tracker
 
     def reset(self, tracker: RegionTracker | None = None) -> None:
         """Forget the grid, and continue with the ids of a tracker; None: of none."""
-        self._tracker = tracker or RegionTracker(self._config)
-        self._pending = None
-        self._newest = None
+        self._job = _RegionJob(tracker or RegionTracker(self._config))
+        self._pending: Future[RegionMap] | None = None
+        self._pending_ns = 0
+        self._newest: tuple[int, GridPatch] | None = None
 
     def add_grid(self, stamp_ns: int, patch: GridPatch) -> None:
         """The newest grid, whose regions are to be published."""
@@ -95,24 +139,30 @@ class RegionUpdates:
         """Begin to compute the regions of the newest grid; of the same grid with a new graph."""
         if self._pending is not None:
             return
-        if self._newest is not None:
+        if self._newest is not None and not self._job.is_resting:
             self._pending_ns, patch = self._newest
             self._newest = None
-            self._pending = self._worker.submit(self._tracker.update, patch)
-        elif self._is_graph_newer and self._tracker.regions is not None:
-            self._publish(self._tracker.regions)
+            self._pending = self._job.submit(patch)
+            self._poll.reset()
+        elif self._is_graph_newer and self.tracker.regions is not None:
+            self._publish(self.tracker.regions)
 
     def _publish_computed(self) -> None:
-        """Publish the regions that were computed."""
-        if self._pending is None or not self._pending.done():
+        """Publish the regions that were computed, if they or the graph are new."""
+        if self._pending is not None and not self._pending.done():
+            return
+        self._poll.cancel()
+        if self._pending is None:
             return
         regions = self._pending.result()
         self._pending = None
-        self._publish(regions)
+        if regions is not self._published or self._is_graph_newer:
+            self._publish(regions)
 
     def _publish(self, regions: RegionMap) -> None:
         """Publish regions with the nodes and edges of the present graph."""
         self._is_graph_newer = False
+        self._published = regions
         with self._node.diagnostics.time_step('regions published'):
             membership = membership_of(self._topology(), regions)
             message = region_array_msg(membership, self._frame_id, self._pending_ns)
