@@ -10,8 +10,9 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
-from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.coverage import observable_cells, robot_observable_cells
 from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
+from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.world import World
 
 
@@ -124,6 +125,19 @@ def test_a_leaf_at_the_start_is_no_obstacle() -> None:
     at_the_leaf = np.array([1.75, 1.6, 0.0])
     found = observable_cells(world, at_the_leaf, 0.25, 8.0).cells
     assert (found == observable_cells(*with_door(10.0, 1.5), 0.25, 8.0).cells).all()
+
+
+def test_a_robot_is_asked_to_see_what_it_plans_to_enter_or_starts_in() -> None:
+    robot = RobotConfig(radius_m=0.2)
+    world = walled(40, 40)
+    world.occupied[20, :] = 1
+    world.occupied[20, 18:23] = 0  # 0.5 m wide: paths are planned for a radius of 0.25 m
+    south = np.array([2.0, 1.0, 0.0])
+    found = robot_observable_cells(world, south, robot, 8.0)
+    assert (found.cells == observable_cells(world, south, 0.25, 8.0).cells).all()
+    assert not found.cells[21:39, 1:39].all()
+    narrow = np.array([2.05, 2.05, 0.0])
+    assert robot_observable_cells(world, narrow, robot, 8.0).cells[1:20, 1:39].all()
 
 
 def test_range_counts() -> None:

@@ -17,13 +17,16 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
+from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import kernel
+from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.world import World
 
 CELL_M = 0.1
 _RAY_SPACING_M = 0.05
 _ALIGNED = 1e-3
+_PLANNED_RADIUS_M = WavefrontConfig().robot_radius_m
 _PER_CELL = 10  # points of a leaf, so that no ray passes between two of its cells
 
 
@@ -86,6 +89,22 @@ class ObservableCells:
     @cached_property
     def _centres(self) -> Array:
         return self.frame.centres_of(np.argwhere(self.cells))
+
+
+def robot_observable_cells(
+    world: World, start: Array, robot: RobotConfig, range_m: float
+) -> ObservableCells:
+    """Cells that a robot can observe with a range and 360 degrees, from a start (3,).
+
+    It does not enter what is narrower than the radius with which paths are planned, unless it
+    starts there. Raises InputError if the robot does not fit at its start.
+    """
+    row, col = world.frame.cells_of(start[None, :2])[0]
+    rows, cols = world.occupied.shape
+    planned_m = max(robot.radius_m, _PLANNED_RADIUS_M)
+    inside = 0 <= row < rows and 0 <= col < cols
+    has_room = inside and world.distance_to_wall_m[row, col] > planned_m
+    return observable_cells(world, start, planned_m if has_room else robot.radius_m, range_m)
 
 
 def observable_cells(

@@ -25,11 +25,10 @@ AT = se2.pose(1.0, 2.0, 0.0)
 class Room:
     """A map with its frontiers, and the candidates found in it."""
 
-    def __init__(self, cells, ends=()):
+    def __init__(self, cells):
         self.frontiers = FrontierMap()
         self.space = ReachableSpace(CandidateConfig().robot_radius_m)
         self.finder = CandidateFinder(CandidateConfig(), FITTED)
-        self.nodes = [Node(5 + i, NodeKind.END, x, y, 1.0) for i, (x, y) in enumerate(ends)]
         self.set_cells(cells)
 
     def set_cells(self, cells):
@@ -38,9 +37,7 @@ class Room:
 
     def find(self, at=AT, seconds=0.0):
         self.space.update(self.frontiers, at)
-        topology = TopologicalMap(self.nodes)
-        stamp_ns = int(seconds * SECOND_NS)
-        self.finder.update(topology, self.frontiers, self.space.now, at, 8.0, stamp_ns)
+        self.finder.update(self.frontiers, self.space.now, at, 8.0, int(seconds * SECOND_NS))
         return self.finder.candidates
 
 
@@ -78,7 +75,7 @@ def open_hall(seen_to_m):
 
 def test_a_frontier_at_the_end_of_the_range_is_observed_from_a_little_nearer():
     (candidate,) = Room(corridor()).find()
-    assert candidate.node_id == candidate.evidence.id == FIRST_FRONTIER_ID
+    assert candidate.published(None).node_id == candidate.evidence.id == FIRST_FRONTIER_ID
     assert len(candidate.cells) == 38
     assert candidate.length_m == pytest.approx(3.8)
     # Cells 2 m behind the frontier at 9 m are in range from 3.5 m on.
@@ -87,9 +84,8 @@ def test_a_frontier_at_the_end_of_the_range_is_observed_from_a_little_nearer():
 
 
 def test_after_a_visit_without_success_a_frontier_is_observed_from_nearby():
-    room = Room(corridor(), [(8.0, 2.0)])
+    room = Room(corridor())
     (far,) = room.find()
-    assert far.node_id == 5
     assert far.goal[0] < 5.0
     far.evidence.visits += 1
     far.examined_ns = -1
@@ -99,17 +95,20 @@ def test_after_a_visit_without_success_a_frontier_is_observed_from_nearby():
     assert near.probability > far.probability
 
 
-def test_a_frontier_belongs_to_the_nearest_end_node_that_sees_it():
-    room = Room(corridor(), [(6.5, 2.0), (8.0, 2.0), (8.5, 20.0)])
-    by_id = {candidate.node_id: candidate for candidate in room.find()}
-    assert len(by_id[6].cells) == 38
-    assert all(len(by_id[node_id].cells) == 0 for node_id in (5, 7))
-    assert by_id[5].probability > 0.99 > 0.5 > by_id[6].probability
-    cells = corridor()
-    cells[1:38, 85] = 100
-    room.set_cells(cells)
-    own = [candidate for candidate in room.find(seconds=1.0) if not candidate.is_end_node]
-    assert sum(len(candidate.cells) for candidate in own) == 38
+def test_a_frontier_belongs_to_the_nearest_end_node_around_it():
+    room = Room(corridor())
+    (candidate,) = room.find()
+    places = [(6.5, 2.0), (8.0, 2.0), (8.5, 20.0), (5.0, 2.0)]
+    nodes = [Node(5 + i, NodeKind.END, x, y, 1.0) for i, (x, y) in enumerate(places)]
+    nodes.append(Node(9, NodeKind.BRANCH, 8.5, 2.0, 1.0))
+    settled = room.finder.settled(TopologicalMap(nodes))
+    assert [node.node_id for node in settled] == [5, 7, 8]
+    assert all(node.probability > 0.99 and node.expected_area_m2 == 0.0 for node in settled)
+    published = candidate.published(None)
+    assert (published.node_id, published.x, published.y) == (6, 8.0, 2.0)
+    assert published.probability == candidate.probability < 0.5
+    assert room.finder.settled(TopologicalMap([])) == []
+    assert candidate.published(None).node_id == FIRST_FRONTIER_ID
 
 
 def test_free_specks_behind_a_wall_are_no_candidates():

@@ -6,9 +6,9 @@
   disappears.
 - Finished when no end node below the threshold is left.
 
-What the paper leaves open: which views count, and which end node continues which (`evidence`); an
-end node that the robot has reached without success is not visited again, nor one that the
-navigator could not reach.
+What the paper leaves open: which views count, and which end node continues which
+(`paper_evidence`); an end node that the robot has reached without success is not visited again, nor
+one that the navigator could not reach.
 
 Source: exploration paper sections 3.2 and 4.
 """
@@ -19,12 +19,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.belief.evidence import Evidence, EvidenceStore
-from thinmap_ros.core.exploration.candidates import end_node_of
-from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.frontiers import FrontierMap
+from thinmap_ros.core.exploration.paper_evidence import (
+    EndNodeEvidence,
+    EndNodeEvidenceStore,
+    PaperConfig,
+)
 from thinmap_ros.core.exploration.position_probability import bayes_update
-from thinmap_ros.core.exploration.strategy import Decision, finish_reason
+from thinmap_ros.core.exploration.strategy import Decision, EndNode, finish_reason, unobserved
 from thinmap_ros.core.exploration.visibility import box_of_scan, visible_places
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
@@ -44,17 +46,30 @@ class _EndNode:
     """An end node: its id in the graph, its evidence, and its position probability."""
 
     node_id: int
-    evidence: Evidence
+    evidence: EndNodeEvidence
     probability: float = PRIOR
+
+    def published(self, target_goal: Array | None) -> EndNode:
+        """End node of a decision; target_goal (3,): where the robot drives if it is the target."""
+        evidence = self.evidence
+        end_node = unobserved(self.node_id, evidence.place, self.probability)._replace(
+            distance_index=evidence.distance_index,
+            angle_index=evidence.angle_index,
+            min_distance_m=evidence.min_distance_m,
+            angle_span_deg=evidence.angle_span_deg,
+        )
+        if target_goal is None:
+            return end_node
+        return end_node._replace(is_target=True, goal=target_goal)
 
 
 class PaperExplorer:
     """Visits end nodes until the position probability of each one passes the threshold."""
 
-    def __init__(self, config: ExplorerConfig | None = None) -> None:
-        self.config = config or ExplorerConfig()
+    def __init__(self, config: PaperConfig | None = None) -> None:
+        self.config = config or PaperConfig()
         self._frontier_map = FrontierMap()
-        self._store = EvidenceStore(1)
+        self._store = EndNodeEvidenceStore(1)
         self._end_nodes: list[_EndNode] = []
         self._target: _EndNode | None = None
         self._goal = np.zeros(3)
@@ -146,13 +161,10 @@ class PaperExplorer:
         return min(left, key=lambda node: lengths.get(node.node_id, math.inf))
 
     def _decision(self) -> Decision:
-        chosen = None
-        end_nodes = []
-        for node in self._end_nodes:
-            end_node = end_node_of(node.node_id, node.evidence, node.probability)
-            if node is self._target:
-                end_node = chosen = end_node._replace(is_target=True, goal=self._goal)
-            end_nodes.append(end_node)
+        end_nodes = [
+            node.published(self._goal if node is self._target else None) for node in self._end_nodes
+        ]
+        chosen = next((end_node for end_node in end_nodes if end_node.is_target), None)
         doubtful = self._doubtful
         given_up = sorted(node.node_id for node in doubtful if _attempts(node))
         finished = self._scans_without_target >= _SCANS
