@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.exploration.paper_evidence import (
-    EndNodeEvidence,
-    EndNodeEvidenceStore,
+    PRIOR,
     PaperConfig,
+    PaperEndNode,
+    PaperEndNodes,
 )
 from thinmap_ros.core.exploration.position_probability import angle_index, distance_index
+from thinmap_ros.core.topology.graph import Node, NodeKind
 
 CONFIG = PaperConfig()
 
@@ -20,7 +22,7 @@ def laser_at(x, y):
 
 
 def evidence_at(place=(5.0, 0.0)):
-    return EndNodeEvidence(1, place, place)
+    return PaperEndNode(1, place, place)
 
 
 def test_a_robot_that_stands_still_learns_nothing_new():
@@ -45,31 +47,33 @@ def test_the_indices_come_from_the_nearest_view_and_the_widest_angle():
 
 
 def followed(store, *places):
-    return store.follow(places, CONFIG.node_reset_distance_m)
+    nodes = [Node(i, NodeKind.END, x, y, 1.0) for i, (x, y) in enumerate(places)]
+    return store.follow(nodes, CONFIG.node_reset_distance_m)
 
 
 def test_a_place_that_moves_a_little_keeps_its_evidence_and_one_that_moves_on_loses_it():
-    store = EndNodeEvidenceStore(1)
+    store = PaperEndNodes()
     (evidence,) = followed(store, (5.0, 0.0))
     evidence.add_view(laser_at(0.0, 0.0), CONFIG)
     evidence.visits = 1
+    evidence.probability = 0.8
     assert followed(store, (5.3, 0.0)) == [evidence]
-    assert evidence.views and evidence.visits == 1
+    assert evidence.views and evidence.visits == 1 and evidence.probability == 0.8
     assert followed(store, (5.7, 0.0)) == [evidence]
-    assert not evidence.views and evidence.visits == 0
+    assert not evidence.views and evidence.visits == 0 and evidence.probability == PRIOR
     (other,) = followed(store, (7.0, 0.0))
-    assert other is not evidence and other.id == 2
+    assert other is not evidence
 
 
 def test_evidence_is_inherited_once_and_by_the_nearest_place_in_reach():
-    store = EndNodeEvidenceStore(1)
+    store = PaperEndNodes()
     (first,) = followed(store, (0.0, 0.0))
     found = followed(store, (0.1, 0.0), (0.2, 0.0))
     assert found[0] is first and found[1] is not first
 
 
 def test_what_was_visited_is_remembered_while_it_is_no_candidate():
-    store = EndNodeEvidenceStore(1)
+    store = PaperEndNodes()
     visited, seen = followed(store, (0.0, 0.0), (5.0, 0.0))
     visited.visits = 2
     followed(store)

@@ -24,9 +24,11 @@ from thinmap_ros.core.exploration.position_probability import (
     reliability,
 )
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import Node
 from thinmap_ros.jit import kernel
 
 Place = tuple[float, float]
+PRIOR = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,21 +48,27 @@ class PaperConfig:
 
 
 @dataclass(eq=False)
-class EndNodeEvidence:
-    """Evidence about one place (x, y), m.
+class PaperEndNode:
+    """An end node of the graph with its position probability, and the evidence for it.
 
-    began_at: where it began; views: distance, m, and bearing, rad, of each view that counted;
-    angle_span_deg: largest difference between two of these bearings;
+    place (x, y), m; began_at: where its evidence began; views: distance, m, and bearing, rad, of
+    each view that counted; angle_span_deg: largest difference between two of these bearings;
     visits, failures: how often the robot was there, and could not get there.
     """
 
-    id: int
+    node_id: int
     place: Place
     began_at: Place
+    probability: float = PRIOR
     views: list[tuple[float, float]] = field(default_factory=list)
     angle_span_deg: float = 0.0
     visits: int = 0
     failures: int = 0
+
+    @property
+    def tries(self) -> int:
+        """How often the robot was there, or could not get there."""
+        return self.visits + self.failures
 
     @property
     def min_distance_m(self) -> float:
@@ -81,11 +89,6 @@ class EndNodeEvidence:
     def reliability(self) -> float:
         """R of equation (5); 0 before the first view."""
         return reliability(self.min_distance_m, self.angle_span_deg) if self.views else 0.0
-
-    @property
-    def is_lasting(self) -> bool:
-        """Whether it is kept when its place is no candidate for a while."""
-        return self.visits > 0 or self.failures > 0
 
     def add_view(self, laser: Array, config: PaperConfig) -> bool:
         """Add a view from a laser at (x, y, ...), m; returns whether it counts."""
@@ -111,38 +114,40 @@ class EndNodeEvidence:
         self.place = place
         if math.dist(place, self.began_at) > reset_distance_m:
             self.began_at = place
+            self.probability = PRIOR
             self.views = []
             self.angle_span_deg = 0.0
             self.visits = 0
 
 
-class EndNodeEvidenceStore:
-    """Evidence by place: of the present candidates, and lasting evidence of earlier ones."""
+class PaperEndNodes:
+    """End nodes of the present graph, and earlier ones that were tried."""
 
-    def __init__(self, first_id: int) -> None:
-        """first_id: id of the first place; no id is used twice."""
-        self.items: list[EndNodeEvidence] = []
-        self._next_id = first_id
+    def __init__(self) -> None:
+        self.items: list[PaperEndNode] = []
 
-    def follow(self, places: Sequence[Place], reset_distance_m: float) -> list[EndNodeEvidence]:
-        """Evidence of each place now; each continues the nearest one within reset_distance_m."""
+    def follow(self, nodes: Sequence[Node], reset_distance_m: float) -> list[PaperEndNode]:
+        """Each end node now; it continues the nearest earlier one within reset_distance_m."""
         earlier = self.items
+        places = [(node.x, node.y) for node in nodes]
         indices = _continued(
             np.array([item.place for item in earlier]).reshape(-1, 2),
             np.array(places, dtype=np.float64).reshape(-1, 2),
             reset_distance_m,
         ).tolist()
         found = []
-        for place, index in zip(places, indices, strict=True):
+        for node, place, index in zip(nodes, places, indices, strict=True):
             if index < 0:
-                found.append(EndNodeEvidence(self._next_id, place, place))
-                self._next_id += 1
-            else:
-                earlier[index].move_to(place, reset_distance_m)
-                found.append(earlier[index])
+                found.append(PaperEndNode(node.id, place, place))
+                continue
+            earlier[index].node_id = node.id
+            earlier[index].move_to(place, reset_distance_m)
+            found.append(earlier[index])
         continued = set(indices)
-        left = (item for i, item in enumerate(earlier) if i not in continued)
-        self.items = found + [item for item in left if item.is_lasting]
+        left = [item for i, item in enumerate(earlier) if i not in continued and item.tries]
+        for item in left:
+            item.probability = PRIOR
+        self.items = found + left
         return found
 
 
