@@ -25,10 +25,11 @@ AT = se2.pose(1.0, 2.0, 0.0)
 class Room:
     """A map with its frontiers, and the candidates found in it."""
 
-    def __init__(self, cells):
+    def __init__(self, cells, ends=()):
         self.frontiers = FrontierMap()
         self.space = ReachableSpace(CandidateConfig().robot_radius_m)
         self.finder = CandidateFinder(CandidateConfig(), FITTED)
+        self.nodes = [Node(5 + i, NodeKind.END, x, y, 1.0) for i, (x, y) in enumerate(ends)]
         self.set_cells(cells)
 
     def set_cells(self, cells):
@@ -37,7 +38,9 @@ class Room:
 
     def find(self, at=AT, seconds=0.0):
         self.space.update(self.frontiers, at)
-        self.finder.update(self.frontiers, self.space.now, at, 8.0, int(seconds * SECOND_NS))
+        topology = TopologicalMap(self.nodes)
+        stamp_ns = int(seconds * SECOND_NS)
+        self.finder.update(topology, self.frontiers, self.space.now, at, 8.0, stamp_ns)
         return self.finder.candidates
 
 
@@ -84,8 +87,9 @@ def test_a_frontier_at_the_end_of_the_range_is_observed_from_a_little_nearer():
 
 
 def test_after_a_visit_without_success_a_frontier_is_observed_from_nearby():
-    room = Room(corridor())
+    room = Room(corridor(), [(8.0, 2.0)])
     (far,) = room.find()
+    assert far.node_id == 5
     assert far.goal[0] < 5.0
     far.evidence.visits += 1
     far.examined_ns = -1
@@ -95,20 +99,22 @@ def test_after_a_visit_without_success_a_frontier_is_observed_from_nearby():
     assert near.probability > far.probability
 
 
-def test_a_frontier_belongs_to_the_nearest_end_node_around_it():
-    room = Room(corridor())
+def test_a_frontier_belongs_to_the_nearest_end_node_that_sees_it():
+    room = Room(corridor(), [(6.5, 2.0), (8.0, 2.0), (8.5, 20.0)])
     (candidate,) = room.find()
-    places = [(6.5, 2.0), (8.0, 2.0), (8.5, 20.0), (5.0, 2.0)]
-    nodes = [Node(5 + i, NodeKind.END, x, y, 1.0) for i, (x, y) in enumerate(places)]
-    nodes.append(Node(9, NodeKind.BRANCH, 8.5, 2.0, 1.0))
-    settled = room.finder.settled(TopologicalMap(nodes))
-    assert [node.node_id for node in settled] == [5, 7, 8]
-    assert all(node.probability > 0.99 and node.expected_area_m2 == 0.0 for node in settled)
     published = candidate.published(None)
     assert (published.node_id, published.x, published.y) == (6, 8.0, 2.0)
+    assert len(candidate.cells) == 38
     assert published.probability == candidate.probability < 0.5
-    assert room.finder.settled(TopologicalMap([])) == []
-    assert candidate.published(None).node_id == FIRST_FRONTIER_ID
+    settled = room.finder.settled
+    assert [node.node_id for node in settled] == [5, 7]
+    assert all(node.probability > 0.99 and node.expected_area_m2 == 0.0 for node in settled)
+    cells = corridor()
+    cells[1:38, 85] = 100
+    room.set_cells(cells)
+    own = [c for c in room.find(seconds=1.0) if c.node_id >= FIRST_FRONTIER_ID]
+    assert sum(len(candidate.cells) for candidate in own) == 38
+    assert [node.node_id for node in room.finder.settled] == [5, 6, 7]
 
 
 def test_free_specks_behind_a_wall_are_no_candidates():

@@ -1,14 +1,17 @@
 """Candidates: frontiers that may hide unknown space, with the belief about each.
 
-Specks of free cells behind a wall, from beams that noise moved across it, have frontiers, too: they
-are no candidates. Where an end node of the topological map is near, the candidate is published as
-that end node; an end node without a candidate is settled.
+All frontiers of an end node are one candidate: from one viewpoint the robot sees them all. Unknown
+space that no end node sees, such as a niche that the skeleton does not reach into, is a candidate
+of its own. Specks of free cells behind a wall, from beams that noise moved across it, have
+frontiers, too: they are no candidates.
 """
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter, robot_radius
@@ -19,9 +22,11 @@ from thinmap_ros.core.exploration.reachable import Reachable
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode, unobserved
 from thinmap_ros.core.exploration.unknown_space import depth_behind_m, hidden_area_m2
 from thinmap_ros.core.exploration.viewpoints import is_enclosed, place_beside, place_for
+from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
+from thinmap_ros.jit import kernel
 
 SETTLED = 0.999  # probability of an end node without a frontier
 _RIM_M = 0.5  # at the end of its range the laser sees little
@@ -45,8 +50,8 @@ class CandidateConfig(Config):
     )
     frontier_assignment_radius_m: float = parameter(
         3.0,
-        'A frontier belongs to the nearest end node within this distance, and one that no '
-        'reachable place sees is observed from within it (m). Raise it in halls.',
+        'A frontier belongs to the nearest visible end node within this distance (m). Raise it in '
+        'halls.',
         low=0.1,
         high=50.0,
     )
@@ -64,7 +69,7 @@ class Candidate:
     """A frontier that may hide unknown space, with the belief about it.
 
     cells (N, 2): of the frontier; middle (x, y), m: of these cells; end_node: of the topological
-    map, if it is the nearest frontier of one; goal (3,): viewpoint, None
+    map, to which the frontier belongs; goal (3,): viewpoint, None
     where none can be reached; hidden_m2: unknown area in line of sight; depth_m: of the unknown
     behind it; probability: that nothing worth seeing is behind; mean_area_m2: if there is;
     examined_ns: when viewpoint, hidden area and depth were determined; is_enclosed: whether its
@@ -104,29 +109,34 @@ class Candidate:
 
 
 class CandidateFinder:
-    """Finds the candidates of a growing map, each with the evidence that it had before."""
+    """Finds the candidates of a growing map, each with the evidence that it had before.
+
+    settled: end nodes without a frontier.
+    """
 
     def __init__(self, config: CandidateConfig, model: BeliefModel) -> None:
         self._config = config
         self._model = model
         self.store = EvidenceStore(FIRST_FRONTIER_ID)
         self.candidates: list[Candidate] = []
+        self.settled: list[EndNode] = []
         self._found: list[Candidate] = []
 
     def update(
         self,
+        topology: TopologicalMap,
         frontiers: FrontierMap,
         reachable: Reachable,
         T_map_base: Array,
         range_max_m: float,
         stamp_ns: int,
     ) -> None:
-        """Find the candidates of a map, and update the belief about each.
+        """Find the candidates of a graph and a map, and update the belief about each.
 
         T_map_base (3,): pose of the robot; range_max_m: of the laser.
         """
         before = {id(c.evidence): c for c in self._found}
-        self._found = self._find(frontiers)
+        self._found = self._find(topology, frontiers)
         for candidate in self._found:
             known = before.get(id(candidate.evidence))
             if known is None or not _may_keep(candidate, known, stamp_ns, T_map_base):
@@ -141,38 +151,46 @@ class CandidateFinder:
             candidate.mean_area_m2 = self._model.mean_area(candidate.hidden_m2)
         self.candidates = [c for c in self._found if not c.is_enclosed]
 
-    def settled(self, topology: TopologicalMap) -> list[EndNode]:
-        """End nodes of a graph without a candidate; the others are named to their candidates.
-
-        A candidate belongs to the nearest end node around it, an end node to the nearest candidate.
-        """
+    def _find(self, topology: TopologicalMap, frontiers: FrontierMap) -> list[Candidate]:
         nodes = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
-        places = np.array([(node.x, node.y) for node in nodes]).reshape(-1, 2)
-        nearest: dict[int, tuple[float, Candidate]] = {}
-        for candidate in self.candidates:
-            candidate.end_node = None
-            away = np.hypot(*(places - candidate.middle).T)
-            i = int(away.argmin()) if len(away) else -1
-            if i < 0 or away[i] > self._config.frontier_assignment_radius_m:
-                continue
-            if i not in nearest or away[i] < nearest[i][0]:
-                nearest[i] = (float(away[i]), candidate)
-        for i, (_, candidate) in nearest.items():
-            candidate.end_node = nodes[i]
-        left = [node for i, node in enumerate(nodes) if i not in nearest]
-        return [unobserved(node.id, (node.x, node.y), SETTLED) for node in left]
-
-    def _find(self, frontiers: FrontierMap) -> list[Candidate]:
         clusters = frontiers.clusters(self._config.min_frontier_size)
-        middles = [frontiers.middle_of(cells) for cells in clusters]
+        owners = self._owners(frontiers, clusters, nodes)
+        self.settled = [
+            unobserved(node.id, (node.x, node.y), SETTLED)
+            for i, node in enumerate(nodes)
+            if i not in owners
+        ]
+        owned: dict[tuple[int, int], list[Cells]] = defaultdict(list)
+        for i, (cells, owner) in enumerate(zip(clusters, owners, strict=True)):
+            owned[owner, i if owner < 0 else 0].append(cells)
+        found = [np.vstack(parts) for parts in owned.values()]
+        end_nodes = [nodes[owner] if owner >= 0 else None for owner, _ in owned]
+        middles = [frontiers.middle_of(cells) for cells in found]
         frame = frontiers.frame
         first = np.array([frame.origin_y, frame.origin_x]) / frame.resolution
-        on_lattice = [cells + np.round(first).astype(np.int64) for cells in clusters]
+        on_lattice = [cells + np.round(first).astype(np.int64) for cells in found]
         evidence = self.store.follow(middles, on_lattice, frame.resolution)
         return [
-            Candidate(item, cells, middle, length_m=len(cells) * frame.resolution)
-            for item, cells, middle in zip(evidence, clusters, middles, strict=True)
+            Candidate(item, cells, middle, node, len(cells) * frame.resolution)
+            for item, cells, middle, node in zip(evidence, found, middles, end_nodes, strict=True)
         ]
+
+    def _owners(
+        self, frontiers: FrontierMap, clusters: list[Cells], nodes: list[Node]
+    ) -> list[int]:
+        """Index of the nearest end node that sees the middle of each frontier; -1: none."""
+        middles = np.array([frontiers.middle_of(cells) for cells in clusters]).reshape(-1, 2)
+        places = np.array([(node.x, node.y) for node in nodes]).reshape(-1, 2)
+        frame = frontiers.frame
+        owners: list[int] = _nearest_in_sight(
+            frontiers.free,
+            middles,
+            places,
+            frame.cells_of(middles),
+            frame.cells_of(places),
+            self._config.frontier_assignment_radius_m,
+        ).tolist()
+        return owners
 
     def _examine(
         self, candidate: Candidate, frontiers: FrontierMap, reachable: Reachable, range_max_m: float
@@ -215,6 +233,33 @@ class CandidateFinder:
         row, col = frontiers.frame.cells_of(np.array([candidate.middle]))[0]
         towards = (int(row), int(col))
         return place_beside(frontiers.free, candidate.cells, reachable.cells, steps, towards)
+
+
+@kernel
+def _nearest_in_sight(
+    free: NDArray[np.bool_],
+    points: Array,
+    nodes: Array,
+    point_cells: Cells,
+    node_cells: Cells,
+    radius_m: float,
+) -> NDArray[np.int64]:
+    """Index of the nearest node (N, 2), m, within a radius of each point (M, 2), m; -1: none.
+
+    All cells between are free. point_cells (M, 2), node_cells (N, 2): the cells of both.
+    """
+    nearest = np.full(points.shape[0], -1, dtype=np.int64)
+    for i in range(points.shape[0]):
+        best_m = np.inf
+        for k in range(nodes.shape[0]):
+            away_m = math.hypot(nodes[k, 0] - points[i, 0], nodes[k, 1] - points[i, 1])
+            if away_m > radius_m or away_m >= best_m:
+                continue
+            row, col = node_cells[k]
+            if line_is_clear(free, row, col, point_cells[i, 0], point_cells[i, 1]):
+                best_m = away_m
+                nearest[i] = k
+    return nearest
 
 
 def _may_keep(candidate: Candidate, known: Candidate, stamp_ns: int, T_map_base: Array) -> bool:

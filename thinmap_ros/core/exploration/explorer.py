@@ -31,7 +31,7 @@ from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, 
 from thinmap_ros.core.exploration.frontiers import FrontierMap, Place
 from thinmap_ros.core.exploration.look_around import LookAround, turn_target
 from thinmap_ros.core.exploration.reachable import ReachableSpace
-from thinmap_ros.core.exploration.strategy import Decision, EndNode, finish_reason
+from thinmap_ros.core.exploration.strategy import Decision, finish_reason
 from thinmap_ros.core.exploration.team.claims import SAME_PLACE_M, Claim
 from thinmap_ros.core.exploration.team.team import Team
 from thinmap_ros.core.exploration.tour import tours_by_first
@@ -97,7 +97,8 @@ class ExplorerConfig(CandidateConfig):
     )
     candidate_period_s: float = parameter(
         1.0,
-        'Period at which candidates are found and the target is chosen (s). Raise it to save time.',
+        'Period at which frontiers are assigned and candidates are found (s). Raise it to save '
+        'time.',
         low=0.0,
         high=60.0,
     )
@@ -172,7 +173,6 @@ class Explorer:
         self._clock = _Clock()
         self._frame = self.frontier_map.frame
         self._scans_without_target = 0
-        self._settled: list[EndNode] = []
 
     @property
     def candidates(self) -> list[Candidate]:
@@ -215,9 +215,13 @@ class Explorer:
             self._frame = self.frontier_map.frame
             self._space.update(self.frontier_map, T_map_base)
             self._finder.update(
-                self.frontier_map, self._space.now, T_map_base, scan.range_max_m, scan.stamp_ns
+                topology,
+                self.frontier_map,
+                self._space.now,
+                T_map_base,
+                scan.range_max_m,
+                scan.stamp_ns,
             )
-            self._settled = self._finder.settled(topology)
             self._choose(topology, T_map_base)
         return self._decision()
 
@@ -428,7 +432,7 @@ class Explorer:
             finished,
             reason,
             code,
-            self._settled + published,
+            self._finder.settled + published,
             aside,
             self.frontier_map.known_area_m2,
             left,

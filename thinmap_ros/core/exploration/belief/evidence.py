@@ -180,10 +180,11 @@ def _count_on(cells: Cells, frontier: Cells, reach: int) -> int:
     """How many cells (N, 2) lie on a frontier (M, 2), or within reach of it."""
     if frontier.shape[0] == 0:
         return 0
-    # Most frontiers are far away.
-    apart = max(abs(cells[0, 0] - frontier[0, 0]), abs(cells[0, 1] - frontier[0, 1]))
-    if apart > reach + cells.shape[0] + frontier.shape[0]:
-        return 0
+    for axis in range(2):  # most frontiers are far away
+        if cells[:, axis].min() - frontier[:, axis].max() > reach:
+            return 0
+        if frontier[:, axis].min() - cells[:, axis].max() > reach:
+            return 0
     count = 0
     for a in range(cells.shape[0]):
         for b in range(frontier.shape[0]):

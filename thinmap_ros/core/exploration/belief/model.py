@@ -6,8 +6,7 @@ The paper's threshold on a probability remains; the probability itself comes fro
   is: inside of a wall it is two or three cells;
 - each visit that showed nothing.
 
-Distance and angles of observations, the paper's D and A, add nothing to these: their weight in a
-fit is 0.04 of their log odds.
+Distance and angles of observations, the paper's D and A, add nothing to these.
 
 Source: exploration paper section 3.2; the constants are fitted, see `benchmarks/exploration/`.
 """
