@@ -10,6 +10,7 @@ from importlib import import_module
 
 from thinmap_ros.core.errors import ConfigError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.paper_evidence import PaperConfig
 from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
 from thinmap_ros.core.exploration.strategy import Strategy
 
@@ -29,7 +30,7 @@ _EXPECTED = f'expected one of {", ".join(NAMES)}, or package.module:factory'
 
 
 def make_strategy(name: str, config: ExplorerConfig | None = None) -> Strategy:
-    """Make a strategy; config: of `position_probability` and `paper`, the others have none.
+    """Make a strategy; config: of `position_probability`, of which `paper` has the threshold only.
 
     Raises ConfigError where the name is unknown, or its factory does not return a strategy.
     """
@@ -53,7 +54,7 @@ def _factory(name: str, config: ExplorerConfig) -> Callable[[], object]:
     if name == DEFAULT:
         return partial(Explorer, config)
     if name == _PAPER:
-        return partial(PaperExplorer, config)
+        return partial(PaperExplorer, PaperConfig(config.probability_threshold))
     if name in _BASELINES:
         return _imported(name, 'thinmap_ros.baselines.exploration', _BASELINES[name])
     module, colon, attribute = name.partition(':')

@@ -30,7 +30,6 @@ _FIRST_UNSEEN_SEED = 5000
 _UNSEEN_BUILDINGS = 20
 _EDGES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001)
 _AREA_QUANTILES = (0.05, 0.15, 0.3, 0.5, 0.75)
-_R_LIMIT = 0.02
 _STEPS = 60
 _MAX_STEP = 2.0
 _L2 = 1e-3
@@ -59,8 +58,6 @@ def observed(paths: list[Path]) -> Observed:
         tables.append(np.column_stack([rows, np.full(len(rows), run)]))
     table = np.vstack(tables)
     columns = dict(zip((*COLUMNS, 'run'), table.T, strict=True))
-    open_ones = columns['length_m'] > 0.0
-    columns = {name: values[open_ones] for name, values in columns.items()}
     pairs = np.column_stack([columns['run'], columns['evidence_id']])
     _, inverse, counts = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
     return Observed(columns, 1.0 / counts[inverse.ravel()])
@@ -68,14 +65,12 @@ def observed(paths: list[Path]) -> Observed:
 
 def design(columns: dict[str, Array]) -> Array:
     """Terms of the log odds, (N, 5), in the order of the first fields of BeliefModel."""
-    reliability = np.maximum(columns['distance_index'], columns['angle_index'])
-    reliability = np.clip(reliability, _R_LIMIT, 1.0 - _R_LIMIT)
     return np.column_stack(
         [
-            np.ones(len(reliability)),
+            np.ones(len(columns['length_m'])),
             np.log(np.maximum(columns['length_m'], 0.1)),
             np.log(np.maximum(columns['hidden_m2'], 0.05)),
-            np.log(reliability / (1.0 - reliability)),
+            np.log(np.maximum(columns['depth_m'], 0.05)),
             columns['visits'],
         ]
     )

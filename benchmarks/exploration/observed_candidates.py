@@ -14,24 +14,22 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import kernel
-from thinmap_ros.sim.coverage import ObservableCells, observable_cells
+from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 COLUMNS = (
     'evidence_id',
-    'is_end_node',
     'length_m',
     'hidden_m2',
-    'distance_index',
-    'angle_index',
+    'depth_m',
     'visits',
     'probability',
     'expected_m2',
     'area_m2',
 )
-_DECISIONS_PER_ROW = 10
+_DECISIONS_PER_ROW = 40
 _SPEED_M_S = 0.5
 _LIMIT_S = 4000.0
 
@@ -53,8 +51,9 @@ def observe(case: Case) -> dict[str, Any]:
     """Explore a world; returns a row of COLUMNS for each candidate, now and then."""
     world, start = load_case(case.world, case.start)
     options = Options(speed_m_s=_SPEED_M_S)
-    radius_m = PRESETS[options.robot].radius_m
-    observable = observable_cells(world, start, radius_m, options.laser.range_max_m)
+    observable = robot_observable_cells(
+        world, start, PRESETS[options.robot], options.laser.range_max_m
+    )
     rows: list[list[float]] = []
     decisions = 0
 
@@ -89,14 +88,12 @@ def _rows(explorer: Explorer, patch: GridPatch, observable: ObservableCells) -> 
     return [
         [
             c.evidence.id,
-            float(c.is_end_node),
             c.length_m,
             c.hidden_m2,
-            c.evidence.distance_index,
-            c.evidence.angle_index,
+            c.depth_m,
             c.evidence.visits,
             c.probability,
-            c.expected_area_m2,
+            (1.0 - c.probability) * c.mean_area_m2,
             area,
         ]
         for c, area in zip(candidates, areas.tolist(), strict=True)

@@ -57,10 +57,10 @@ them. The robot visits an end node only while its probability is below 0.9.
   behind it. The exploration stops early, as the coverage of `paper` in the tables shows.
 - **Efficiency**: the tables compare the distances in pairs. If an interval includes zero, neither
   strategy is shown to be shorter.
-- **What the calibrated belief changes**: the strategy `position_probability` keeps the form of the
-  paper. Its prior depends on the length of the frontier and on the unknown space in line of sight
-  behind it. These predict hidden area better than observations do: with them, distance and angle
-  add almost nothing (weight 0.04 of their log odds).
+- **What the calibrated belief changes**: the strategy `position_probability` keeps the threshold of
+  the paper. Its probability depends on the length of the frontier, on the unknown space in line of
+  sight behind it, and on the depth of the unknown straight behind it. These predict hidden area
+  better than observations do: with them, distance and angle add nothing.
 
 There is no parameter for a share of the area that may remain unexplored. It would not shorten the
 path, as no observation distinguishes the last room from the last niche. The report states the area

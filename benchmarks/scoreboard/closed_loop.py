@@ -25,7 +25,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import ObservableCells, observable_cells
+from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
@@ -88,9 +88,7 @@ def measure_loop(case: LoopCase, worlds: Path, options: Numbers) -> Numbers:
     laser = LASERS[case.laser]
     simulation = Simulation(world, start, _ROBOT, laser, case.seed)
     is_whole = case.world not in _LIMITS_S
-    goal = (
-        observable_cells(world, start, _ROBOT.radius_m, laser.range_max_m) if is_whole else _NOTHING
-    )
+    goal = robot_observable_cells(world, start, _ROBOT, laser.range_max_m) if is_whole else _NOTHING
     rehearse()
     pipeline = PlayedPipeline(_pipeline_config(laser, options, start))
     loop = _closed_loop(simulation, pipeline)

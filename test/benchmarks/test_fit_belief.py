@@ -15,7 +15,6 @@ from benchmarks.exploration.fit_belief import (
     source,
 )
 from benchmarks.exploration.observed_candidates import COLUMNS, hidden_areas
-from thinmap_ros.core.exploration.belief.evidence import Evidence
 from thinmap_ros.core.exploration.belief.fitted import FITTED
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -27,14 +26,15 @@ def candidates(folder, count=4000):
     rng = np.random.default_rng(5)
     length = rng.uniform(0.5, 8.0, count)
     hidden = rng.uniform(0.1, 30.0, count)
-    near = Evidence(1, (0.0, 0.0), (0.0, 0.0), [(2.0, 0.0)])
-    p = np.array([FITTED.probability(near, a, b) for a, b in zip(length, hidden, strict=True)])
+    depth = rng.uniform(0.1, 1.0, count)
+    features = zip(length, hidden, depth, strict=True)
+    p = np.array([FITTED.probability(*frontier) for frontier in features])
     area = np.where(rng.random(count) < p, 0.0, 0.6 + hidden)
     columns = {
         'evidence_id': np.arange(count),
         'length_m': length,
         'hidden_m2': hidden,
-        'distance_index': np.full(count, near.distance_index),
+        'depth_m': depth,
         'probability': p,
         'area_m2': area,
     }

@@ -1,6 +1,7 @@
 """Coverage compared with a slow reference that follows the definition."""
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
-from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.coverage import observable_cells, robot_observable_cells
+from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
+from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.world import World
 
 
@@ -85,6 +88,56 @@ def test_a_closet_that_the_robot_cannot_enter_is_seen_through_its_door() -> None
     assert not inside.cells[21, 2]
     world.occupied[20, 18:21] = 1
     assert not observable_cells(world, np.array([1.95, 1.0, 0.0]), 0.25, 8.0).cells[21:].any()
+
+
+def with_door(period_s: float, open_rad: float, shut: bool = False) -> tuple[World, np.ndarray]:
+    """Two rooms of 2 x 4 m, a doorway of 0.9 m, and a leaf that opens into the first one."""
+    world = walled(40, 40)
+    world.occupied[20, :] = 1
+    world.occupied[20, 15:24] = 0
+    doors = Doors(
+        np.array([[1.5, 2.05]]),
+        np.array([[2.4, 2.05]]),
+        np.array([period_s]),
+        np.array([[-open_rad]]),
+        np.array([[shut]]),
+    )
+    nobody = Pedestrians(np.zeros((0, 4, 2)), np.zeros(0), np.zeros((0, 4)))
+    return replace(world, moving=MovingObstacles(nobody, doors)), np.array([0.6, 0.6, 0.0])
+
+
+def test_a_door_leaf_that_never_moves_is_an_obstacle_that_moves_is_none() -> None:
+    without = observable_cells(*with_door(10.0, 0.3), 0.25, 8.0).cells
+    assert without[21:39, 1:39].all(), 'a robot waits for a door'
+    assert (observable_cells(*with_door(np.inf, 0.3, True), 0.25, 8.0).cells == without).all()
+    ajar = observable_cells(*with_door(np.inf, 0.3), 0.25, 8.0).cells
+    assert not ajar[21:39, 1:39].all(), 'too narrow for the robot: what it cannot see is not asked'
+    wide = observable_cells(*with_door(np.inf, 1.5), 0.25, 8.0).cells
+    assert wide[21:39, 1:39].all()
+    leaf = without & ~wide
+    rows, cols = np.nonzero(leaf)
+    assert 8 <= leaf.sum() <= 20
+    assert rows.min() >= 11 and cols.min() >= 14 and cols.max() <= 17
+
+
+def test_a_leaf_at_the_start_is_no_obstacle() -> None:
+    world, _ = with_door(np.inf, 1.5)
+    at_the_leaf = np.array([1.75, 1.6, 0.0])
+    found = observable_cells(world, at_the_leaf, 0.25, 8.0).cells
+    assert (found == observable_cells(*with_door(10.0, 1.5), 0.25, 8.0).cells).all()
+
+
+def test_a_robot_is_asked_to_see_what_it_plans_to_enter_or_starts_in() -> None:
+    robot = RobotConfig(radius_m=0.2)
+    world = walled(40, 40)
+    world.occupied[20, :] = 1
+    world.occupied[20, 18:23] = 0  # 0.5 m wide: paths are planned for a radius of 0.25 m
+    south = np.array([2.0, 1.0, 0.0])
+    found = robot_observable_cells(world, south, robot, 8.0)
+    assert (found.cells == observable_cells(world, south, 0.25, 8.0).cells).all()
+    assert not found.cells[21:39, 1:39].all()
+    narrow = np.array([2.05, 2.05, 0.0])
+    assert robot_observable_cells(world, narrow, robot, 8.0).cells[1:20, 1:39].all()
 
 
 def test_range_counts() -> None:

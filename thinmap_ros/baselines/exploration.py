@@ -16,8 +16,8 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.strategy import (
     FIRST_FRONTIER_ID,
     Decision,
-    EndNode,
     FinishCode,
+    unobserved,
 )
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
@@ -395,24 +395,21 @@ def _decision(
 ) -> Decision:
     """Decision with the end nodes of the graph, with a probability of 0.5 each."""
     nodes = [
-        _end_node(node.id, se2.pose(node.x, node.y, 0.0), False)
+        unobserved(node.id, (node.x, node.y), 0.5)
         for node in topology.nodes.values()
         if node.kind == NodeKind.END
     ]
     goal = target.goal if isinstance(target, Frontier) else target
-    chosen = None if goal is None else _end_node(FIRST_FRONTIER_ID + number, goal, True)
+    chosen = None
+    if goal is not None:
+        chosen = unobserved(FIRST_FRONTIER_ID + number, _place(goal), 0.5)
+        chosen = chosen._replace(is_target=True, goal=goal)
     code = FinishCode.NONE
     reason = 'targets remain'
     if finished:
         code = FinishCode.UNREACHABLE if failures else FinishCode.ALL_RESOLVED
         reason = 'remaining targets are unreachable' if failures else 'no target is left'
     return Decision(chosen, finished, reason, code, nodes, [], 0.0)
-
-
-def _end_node(node_id: int, goal: Array, is_target: bool) -> EndNode:
-    x = float(goal[0])
-    y = float(goal[1])
-    return EndNode(node_id, x, y, 0.5, 0.0, 0.0, math.inf, 0.0, 0.0, 0.0, is_target, goal)
 
 
 @kernel

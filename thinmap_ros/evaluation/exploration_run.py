@@ -17,7 +17,7 @@ from thinmap_ros.evaluation.exploration_metrics import (
     missing_area_report,
 )
 from thinmap_ros.evaluation.kidnapping import Kidnapping
-from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 
@@ -40,9 +40,7 @@ def explore(
         None if options.kidnap_at_s is None else Kidnapping(options.kidnap_at_s, options.seed)
     )
     loop = make_loop(world, start, options, kidnapping, watch)
-    goal = observable_cells(
-        world, start, PRESETS[options.robot].radius_m, options.laser.range_max_m
-    )
+    goal = robot_observable_cells(world, start, PRESETS[options.robot], options.laser.range_max_m)
     began = time.perf_counter()
     cpu_began = time.process_time()
     ending = loop.run(goal, options.time_limit_s, show)

@@ -32,7 +32,7 @@ from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
-from thinmap_ros.sim.coverage import ObservableCells, observable_cells
+from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.view import rerun_sinks
@@ -153,7 +153,7 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     recording = read(out / 'bag')
     world = World.from_patch(*read_world(world_file))
     start = next(iter(recording.true.values()))
-    seen = observable_cells(world, start, PRESETS[robot].radius_m, recording.range_max_m)
+    seen = robot_observable_cells(world, start, PRESETS[robot], recording.range_max_m)
     report = _report(recording, seen, result)
     patch = recording.maps[-1][1]
     occupancy_maps.write_map(out / 'map', patch)

@@ -22,8 +22,8 @@ from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
-from thinmap_ros.sim.coverage import observable_cells
-from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.coverage import robot_observable_cells
+from thinmap_ros.sim.robot import PRESETS, RobotConfig
 from thinmap_ros.sim.world import World
 from thinmap_ros.view.summary import summary_figure
 
@@ -91,7 +91,7 @@ def write(
     ]
     joint = _read_joint(bag)
     world = World.from_patch(*read_world(world_file))
-    report = {'world': world.name, **_report(robots, joint, world, PRESETS[robot].radius_m)}
+    report = {'world': world.name, **_report(robots, joint, world, PRESETS[robot])}
     first = robots[0].recording
     patch = first.maps[-1][1] if joint.patch is None else joint.patch
     topology = first.topology if joint.patch is None else joint.topology
@@ -146,11 +146,11 @@ def _world_pose(robots: Sequence[RobotRun], joint: _Joint) -> Array:
 
 
 def _report(
-    robots: Sequence[RobotRun], joint: _Joint, world: World, radius_m: float
+    robots: Sequence[RobotRun], joint: _Joint, world: World, robot: RobotConfig
 ) -> dict[str, Any]:
     start_ns = min(int(each.result['start_ns']) for each in robots)
     end_ns = max(int(each.result['end_ns']) for each in robots)
-    curve = _coverage(robots, world, radius_m, start_ns)
+    curve = _coverage(robots, world, robot, start_ns)
     T_merged_world = _world_pose(robots, joint)
     reports = [_robot_report(each, joint, T_merged_world, start_ns) for each in robots]
     reasons = dict.fromkeys(str(each.result['reason']) for each in robots)
@@ -204,15 +204,15 @@ def _join_text(robot: dict[str, Any]) -> str:
     return f'{after}, off by {off_m:.2f} m, {off_deg:.1f} deg'
 
 
-def _coverage(robots: Sequence[RobotRun], world: World, radius_m: float, start_ns: int) -> Array:
+def _coverage(robots: Sequence[RobotRun], world: World, robot: RobotConfig, start_ns: int) -> Array:
     """Time, s, and share of the area that one of the maps holds, for each map (N, 2)."""
     range_m = max(each.recording.range_max_m for each in robots)
     start = next(iter(robots[0].recording.true.values()))
-    seen = observable_cells(world, start, radius_m, range_m)
+    seen = robot_observable_cells(world, start, robot, range_m)
     maps = [(ns, patch, each) for each in robots for ns, patch in each.recording.maps]
     known = {}
     curve = []
-    for ns, patch, robot in sorted(maps, key=lambda entry: entry[0]):
-        known[robot.name] = seen.known(patch, robot.T_world_map)
+    for ns, patch, each in sorted(maps, key=lambda entry: entry[0]):
+        known[each.name] = seen.known(patch, each.T_world_map)
         curve.append(((ns - start_ns) / 1e9, seen.share(list(known.values()))))
     return np.array(curve)

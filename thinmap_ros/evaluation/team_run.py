@@ -12,7 +12,7 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.team.team import Team, TeamConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_metrics import MILESTONES, first_time
-from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.other_robots import SharedWorld
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
@@ -71,8 +71,8 @@ def explore_together(
     """Explore a world from several starts (3,); returns the finished loop and the report."""
     team = team or TeamOptions()
     loop = make_team(world, starts, options, team)
-    goal = observable_cells(
-        world, starts[0], PRESETS[options.robot].radius_m, options.laser.range_max_m
+    goal = robot_observable_cells(
+        world, starts[0], PRESETS[options.robot], options.laser.range_max_m
     )
     began = time.perf_counter()
     cpu_began = time.process_time()

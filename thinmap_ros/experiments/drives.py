@@ -19,7 +19,7 @@ from thinmap_ros.files.worlds import read_tour, read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.log import OdometryEvent
-from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.drives import DriveConfig, DriveSample, drive, random_drive, tour_paths
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
@@ -133,8 +133,8 @@ def _exploration(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     loop = make_loop(world, world.start, options)
     watched = _Watched(loop.strategy, loop.simulation)
     loop.strategy = watched
-    goal = observable_cells(
-        world, world.start, PRESETS[recipe.robot].radius_m, LaserScannerConfig().range_max_m
+    goal = robot_observable_cells(
+        world, world.start, PRESETS[recipe.robot], LaserScannerConfig().range_max_m
     )
     loop.run(goal, SETUP.exploration_limit_s, no_progress)
     return iter(watched.samples)

@@ -169,7 +169,7 @@ def topology_builder() -> None:
 def explorer() -> None:
     """Warm up the choice of an end node, in a partly unknown room, and what other maps need."""
     from thinmap_ros.core.exploration.explorer import Explorer
-    from thinmap_ros.core.exploration.live.map_view import scan_in_map
+    from thinmap_ros.core.grid.foreign_maps import scan_in_map
     from thinmap_ros.core.topology.builder import TopologyConfig, build
 
     patch = _room()

@@ -22,7 +22,7 @@ from thinmap_ros.files.worlds import read_world
 from thinmap_ros.nodes.simulation.requested_exploration import RequestedExploration
 from thinmap_ros.nodes.simulation.starts import poses_from
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.other_robots import MAX_ROBOTS
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
@@ -63,8 +63,9 @@ class DemoMonitorNode(Node):
         self._result = config.result
         self._is_team = bool(config.map_poses)
         world = World.from_patch(*read_world(package_data.world_path(config.world)))
-        radius = PRESETS[config.robot].radius_m
-        self._coverable = observable_cells(world, world.start, radius, config.range_max_m)
+        self._coverable = robot_observable_cells(
+            world, world.start, PRESETS[config.robot], config.range_max_m
+        )
         self._known: dict[str, NDArray[np.bool_]] = {}
         self.finished = False
         self._bar = ProgressBar('area seen')

@@ -11,8 +11,8 @@ from thinmap_msgs.msg import LocalizationStatus, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import LocalizeGlobally
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.active_localization import ActiveSearch
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.places.active_search import ActiveSearch
 from thinmap_ros.core.places.global_localizer import (
     GlobalLocalization,
     GlobalLocalizationConfig,

@@ -1,6 +1,7 @@
 """Coverage: share of the observable cells that are known as free.
 
 A cell is observable if it is in range and line of sight of a position that the robot can reach.
+Door leaves that never move are obstacles, as the laser and the robot meet them.
 """
 
 import math
@@ -16,13 +17,17 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
+from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import kernel
+from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.world import World
 
 CELL_M = 0.1
 _RAY_SPACING_M = 0.05
 _ALIGNED = 1e-3
+_PLANNED_RADIUS_M = WavefrontConfig().robot_radius_m
+_PER_CELL = 10  # points of a leaf, so that no ray passes between two of its cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +91,22 @@ class ObservableCells:
         return self.frame.centres_of(np.argwhere(self.cells))
 
 
+def robot_observable_cells(
+    world: World, start: Array, robot: RobotConfig, range_m: float
+) -> ObservableCells:
+    """Cells that a robot can observe with a range and 360 degrees, from a start (3,).
+
+    It does not enter what is narrower than the radius with which paths are planned, unless it
+    starts there. Raises InputError if the robot does not fit at its start.
+    """
+    row, col = world.frame.cells_of(start[None, :2])[0]
+    rows, cols = world.occupied.shape
+    planned_m = max(robot.radius_m, _PLANNED_RADIUS_M)
+    inside = 0 <= row < rows and 0 <= col < cols
+    has_room = inside and world.distance_to_wall_m[row, col] > planned_m
+    return observable_cells(world, start, planned_m if has_room else robot.radius_m, range_m)
+
+
 def observable_cells(
     world: World, start: Array, radius_m: float, range_m: float
 ) -> ObservableCells:
@@ -96,6 +117,7 @@ def observable_cells(
     so that narrower gaps at this distance may be missed.
     Raises InputError if the robot does not fit at its start.
     """
+    world = _with_standing_leaves(world, start, radius_m)
     reached = _reachable_from(world, start, radius_m)
     # The lattice of maps: its lines pass through the origin of the world.
     low = np.floor(np.array([world.frame.origin_x, world.frame.origin_y]) / CELL_M + 1e-6) * CELL_M
@@ -112,6 +134,23 @@ def observable_cells(
     coverable_cells = np.zeros(tuple(last + 1), dtype=np.bool_)
     coverable_cells[cells[:, 0], cells[:, 1]] = seen
     return ObservableCells(coverable_cells, frame)
+
+
+def _with_standing_leaves(world: World, start: Array, radius_m: float) -> World:
+    """World with the door leaves that never move as obstacles, but for those at the start (3,)."""
+    if world.moving is None:
+        return world
+    occupied = world.occupied.copy()
+    for leaf in world.moving.doors.standing():
+        length_m = math.dist(leaf[:2], leaf[2:])
+        share = np.linspace(0.0, 1.0, 2 + math.ceil(_PER_CELL * length_m / world.frame.resolution))
+        points = leaf[:2] + share[:, None] * (leaf[2:] - leaf[:2])
+        if np.hypot(*(points - start[:2]).T).min() <= radius_m + CELL_M:
+            continue  # the robot stands in its door
+        rows, cols = world.frame.cells_of(points).T
+        inside = (rows >= 0) & (rows < occupied.shape[0]) & (cols >= 0) & (cols < occupied.shape[1])
+        occupied[rows[inside], cols[inside]] = 1
+    return World(world.name, occupied, world.frame, world.start)
 
 
 def _reachable_from(world: World, start: Array, radius_m: float) -> NDArray[np.bool_]:

@@ -69,12 +69,20 @@ class Doors:
         """Leaves (M, 4) near a robot (x, y): from the hinge to the present end, m."""
         away = np.hypot(*(self.hinges - robot).T)
         near = np.flatnonzero(away < reach_m)
-        angles = self._angles(near, seconds, away[near] < self.held_open_m)
-        shut = self.ends[near] - self.hinges[near]
+        return self._leaves(near, self._angles(near, seconds, away[near] < self.held_open_m))
+
+    def standing(self) -> Array:
+        """Leaves (M, 4) that never move: open, with no period; as `segments`."""
+        never = np.flatnonzero(np.isinf(self.period_s) & ~self.is_shut[:, 0])
+        return self._leaves(never, self.open_rad[never, 0])
+
+    def _leaves(self, doors: NDArray[np.int64], angles: Array) -> Array:
+        """Leaves (M, 4) of some doors at opening angles, rad: from the hinge to the end, m."""
+        shut = self.ends[doors] - self.hinges[doors]
         c = np.cos(angles)
         s = np.sin(angles)
         ends = np.column_stack([c * shut[:, 0] - s * shut[:, 1], s * shut[:, 0] + c * shut[:, 1]])
-        return np.column_stack([self.hinges[near], self.hinges[near] + ends])
+        return np.column_stack([self.hinges[doors], self.hinges[doors] + ends])
 
     def _angles(self, doors: NDArray[np.int64], seconds: float, held: NDArray[np.bool_]) -> Array:
         """Opening angles of some doors, rad; doors held open do not close."""

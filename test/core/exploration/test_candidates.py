@@ -78,7 +78,7 @@ def open_hall(seen_to_m):
 
 def test_a_frontier_at_the_end_of_the_range_is_observed_from_a_little_nearer():
     (candidate,) = Room(corridor()).find()
-    assert candidate.node_id == candidate.evidence.id == FIRST_FRONTIER_ID
+    assert candidate.published(None).node_id == candidate.evidence.id == FIRST_FRONTIER_ID
     assert len(candidate.cells) == 38
     assert candidate.length_m == pytest.approx(3.8)
     # Cells 2 m behind the frontier at 9 m are in range from 3.5 m on.
@@ -101,15 +101,20 @@ def test_after_a_visit_without_success_a_frontier_is_observed_from_nearby():
 
 def test_a_frontier_belongs_to_the_nearest_end_node_that_sees_it():
     room = Room(corridor(), [(6.5, 2.0), (8.0, 2.0), (8.5, 20.0)])
-    by_id = {candidate.node_id: candidate for candidate in room.find()}
-    assert len(by_id[6].cells) == 38
-    assert all(len(by_id[node_id].cells) == 0 for node_id in (5, 7))
-    assert by_id[5].probability > 0.99 > 0.5 > by_id[6].probability
+    (candidate,) = room.find()
+    published = candidate.published(None)
+    assert (published.node_id, published.x, published.y) == (6, 8.0, 2.0)
+    assert len(candidate.cells) == 38
+    assert published.probability == candidate.probability < 0.5
+    settled = room.finder.settled
+    assert [node.node_id for node in settled] == [5, 7]
+    assert all(node.probability > 0.99 and node.expected_area_m2 == 0.0 for node in settled)
     cells = corridor()
     cells[1:38, 85] = 100
     room.set_cells(cells)
-    own = [candidate for candidate in room.find(seconds=1.0) if not candidate.is_end_node]
+    own = [c for c in room.find(seconds=1.0) if c.node_id >= FIRST_FRONTIER_ID]
     assert sum(len(candidate.cells) for candidate in own) == 38
+    assert [node.node_id for node in room.finder.settled] == [5, 6, 7]
 
 
 def test_free_specks_behind_a_wall_are_no_candidates():

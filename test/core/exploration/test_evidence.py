@@ -1,119 +1,87 @@
-"""Evidence: which views count, and to which place evidence belongs."""
-
-import math
+"""Evidence: which frontier is which place, and how long tries are remembered."""
 
 import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.belief.evidence import (
-    FIELDS,
-    Evidence,
-    EvidenceConfig,
-    EvidenceStore,
-)
-from thinmap_ros.core.exploration.position_probability import angle_index, distance_index
+from thinmap_ros.core.exploration.belief.evidence import FIELDS, EvidenceStore
 from thinmap_ros.core.snapshot import validate
 
-CONFIG = EvidenceConfig()
+CELL_M = 0.1
 
 
-def laser_at(x, y):
-    return np.array([x, y, 0.0])
+def line(first, count=20, row=100):
+    """Cells of a straight frontier."""
+    return np.column_stack([np.full(count, row), np.arange(first, first + count)])
 
 
-def evidence_at(place=(5.0, 0.0)):
-    return Evidence(1, place, place)
+def followed(store, *frontiers):
+    return store.follow([(0.1 * f[0, 1], 0.1 * f[0, 0]) for f in frontiers], frontiers, CELL_M)
 
 
-def test_a_robot_that_stands_still_learns_nothing_new():
-    evidence = evidence_at()
-    assert evidence.add_view(laser_at(0.0, 0.0), CONFIG)
-    assert not evidence.add_view(laser_at(0.1, 0.0), CONFIG)
-    assert evidence.add_view(laser_at(0.6, 0.0), CONFIG)
-    assert evidence.add_view(laser_at(4.9, 0.05), CONFIG)
-    assert evidence.add_view(laser_at(4.95, -0.05), CONFIG), 'the bearing has turned'
-    assert len(evidence.views) == 4
-
-
-def test_the_indices_come_from_the_nearest_view_and_the_widest_angle():
-    evidence = evidence_at()
-    assert evidence.reliability == evidence.distance_index == evidence.angle_index == 0.0
-    for laser in (laser_at(0.0, 0.0), laser_at(5.0, -3.0), laser_at(9.0, 0.0)):
-        evidence.add_view(laser, CONFIG)
-    assert evidence.min_distance_m == pytest.approx(3.0)
-    assert evidence.angle_span_deg == pytest.approx(180.0)
-    assert evidence.distance_index == distance_index(3.0)
-    assert evidence.reliability == evidence.angle_index == angle_index(180.0)
-
-
-def followed(store, *places):
-    return store.follow(places, CONFIG.node_reset_distance_m)
-
-
-def test_a_place_that_moves_a_little_keeps_its_evidence_and_one_that_moves_on_loses_it():
+def test_a_frontier_that_moves_a_little_is_the_same_place_and_one_that_moves_on_is_another():
     store = EvidenceStore(1)
-    (evidence,) = followed(store, (5.0, 0.0))
-    evidence.add_view(laser_at(0.0, 0.0), CONFIG)
-    evidence.visits = 1
-    assert followed(store, (5.3, 0.0)) == [evidence]
-    assert evidence.views and evidence.visits == 1
-    assert followed(store, (5.7, 0.0)) == [evidence]
-    assert not evidence.views and evidence.visits == 0
-    (other,) = followed(store, (7.0, 0.0))
+    (evidence,) = followed(store, line(0))
+    assert followed(store, line(0, row=104)) == [evidence]
+    assert followed(store, line(8, row=104)) == [evidence]
+    (other,) = followed(store, line(8, row=111))
     assert other is not evidence and other.id == 2
+    assert followed(store) == []
+    assert followed(store, line(8, row=111)) != [other], 'it was not tried'
 
 
-def test_evidence_is_inherited_once_and_by_the_nearest_place_in_reach():
+def test_what_was_tried_is_the_same_place_until_half_of_its_frontier_has_changed():
     store = EvidenceStore(1)
-    (first,) = followed(store, (0.0, 0.0))
-    found = followed(store, (0.1, 0.0), (0.2, 0.0))
-    assert found[0] is first and found[1] is not first
+    (visited,) = followed(store, line(0))
+    visited.visits = 1
+    assert followed(store) == []
+    assert followed(store, line(0, 6)) == [visited], 'what is left of it'
+    assert followed(store, line(6)) == [visited]
+    assert followed(store, line(0, 30)) == [visited]
+    # It is compared with the frontier of the try: many small changes make another place.
+    (other,) = followed(store, line(0, 60))
+    assert other.visits == 0
+    assert followed(store, line(0)) == [visited]
 
 
-def test_what_was_visited_is_remembered_while_it_is_no_candidate():
+def test_both_parts_of_what_was_tried_are_tried():
     store = EvidenceStore(1)
-    visited, seen = followed(store, (0.0, 0.0), (5.0, 0.0))
-    visited.visits = 2
-    followed(store)
-    again = followed(store, (0.1, 0.0), (5.0, 0.0))
-    assert again[0] is visited
-    assert again[1] is not seen
+    (evidence,) = followed(store, line(0))
+    evidence.failures = 2
+    evidence.failed_ns = 7
+    left, right = followed(store, line(0, 8), line(12, 8))
+    assert left is evidence and right.id == 2
+    assert (right.failures, right.failed_ns) == (2, 7)
+
+
+def test_of_two_frontiers_side_by_side_each_keeps_its_own_evidence():
+    store = EvidenceStore(1)
+    first, second = followed(store, line(0), line(40))
+    assert followed(store, line(43), line(2)) == [second, first]
 
 
 def test_a_store_continues_from_its_state():
     store = EvidenceStore(1)
-    near, far = followed(store, (0.0, 0.0), (5.0, 0.0))
-    for laser in (laser_at(2.0, 0.0), laser_at(0.0, 2.0)):
-        far.add_view(laser, CONFIG)
+    near, far = followed(store, line(0), line(60, 7))
     near.visits = 3
     near.failures = 1
     again = EvidenceStore(1)
     again.restore(validate(store.state(), FIELDS, 'exploration'))
     kept, moved = again.items
-    assert (kept.id, kept.place, kept.visits, kept.failures) == (1, (0.0, 0.0), 3, 0)
-    assert moved.views == far.views
-    assert moved.angle_span_deg == far.angle_span_deg
-    (fresh,) = followed(again, (9.0, 9.0))
-    assert fresh.id == 3
+    assert (kept.id, kept.place, kept.visits, kept.failures) == (1, (0.0, 10.0), 3, 0)
+    assert (moved.cells == far.cells).all()
+    assert [item.id for item in followed(again, line(0), line(60, 7), line(90))] == [1, 2, 3]
+    again.restore(validate(EvidenceStore(1).state(), FIELDS, 'exploration'))
+    assert again.items == []
 
 
 @pytest.mark.parametrize(
     ('name', 'value'),
-    [('view_counts', [1, 1]), ('view_counts', [2**62, 2**62]), ('ids', [1, 1])],
+    [('cell_counts', [1, 1]), ('cell_counts', [2**62, 2**62]), ('ids', [1, 1])],
 )
 def test_a_state_that_contradicts_itself_is_refused(name, value):
     store = EvidenceStore(1)
-    followed(store, (0.0, 0.0), (5.0, 0.0))
+    followed(store, line(0), line(60))
     state = store.state() | {name: np.array(value)}
     with pytest.raises(InputError, match='saved exploration'):
         EvidenceStore(1).restore(validate(state, FIELDS, 'exploration'))
-
-
-def test_bearings_wrap_around():
-    evidence = evidence_at((0.0, 0.0))
-    evidence.add_view(laser_at(5.0, 0.1), CONFIG)
-    evidence.add_view(laser_at(4.0, -0.1), CONFIG)
-    assert evidence.angle_span_deg == pytest.approx(
-        math.degrees(math.atan2(0.1, 5.0) + math.atan2(0.1, 4.0))
-    )

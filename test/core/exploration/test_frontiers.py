@@ -7,6 +7,7 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.frontiers import NOTHING, FrontierMap
+from thinmap_ros.core.exploration.unknown_space import depth_behind_m, hidden_area_m2
 from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -141,9 +142,32 @@ def test_the_hidden_area_is_what_is_unknown_in_line_of_sight():
     frontiers = frontiers_of(cells)
     place = frontiers.middle_of(np.argwhere(frontiers.mask))
     # A half disc of 1 m, without the walls that are not known yet.
-    assert frontiers.hidden_area_m2(place, 1.0) == pytest.approx(0.5 * math.pi, rel=0.15)
+    assert hidden_area_m2(frontiers, place, 1.0) == pytest.approx(0.5 * math.pi, rel=0.15)
     cells[:, 22] = 100
-    assert frontiers_of(cells).hidden_area_m2(place, 1.0) < 0.5
+    assert hidden_area_m2(frontiers_of(cells), place, 1.0) < 0.5
+
+
+@pytest.mark.parametrize('behind', [0, 100])
+def test_the_depth_of_the_unknown_ends_at_the_next_known_cell(behind):
+    cells = half_known()
+    (frontier,) = frontiers_of(cells).clusters(0.4)
+    assert depth_behind_m(frontiers_of(cells), frontier) == pytest.approx(1.0), 'nothing is known'
+    cells[:, 23:] = behind
+    assert depth_behind_m(frontiers_of(cells), frontier) == pytest.approx(0.3)
+    cells[:20, 23:] = -1
+    assert depth_behind_m(frontiers_of(cells), frontier) == pytest.approx(1.0), 'a doorway counts'
+
+
+def test_behind_an_oblique_frontier_the_depth_is_that_straight_behind_it():
+    cells = np.full((60, 60), -1)
+    row, col = np.indices(cells.shape)
+    cells[row + col < 50] = 0
+    cells[row + col > 57] = 100
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    frontiers = frontiers_of(cells)
+    (frontier,) = frontiers.clusters(0.4)
+    assert depth_behind_m(frontiers, frontier) == pytest.approx(0.8 / math.sqrt(2.0), abs=0.11)
 
 
 def test_a_map_that_is_replaced_is_processed_everywhere_and_forgotten_where_it_ends():

@@ -6,7 +6,7 @@
   costs: what most probably hides little is best observed in passing.
 - The target is kept unless another one saves a clear margin, so that the robot does not oscillate.
 - A target that stays as it is although the robot observes it is evidence that nothing is hidden.
-- One that cannot be reached is tried again after a while and before the end, some times at most.
+- What was tried is tried again when its frontier has changed, or once before the end.
 - Before the explorer gives up, the robot turns once in place if it stands beside unknown space.
 - In a team the candidates are shared by an auction, and the robot chooses among its own.
 
@@ -26,22 +26,17 @@ from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.belief import evidence
 from thinmap_ros.core.exploration.belief.fitted import FITTED
-from thinmap_ros.core.exploration.belief.model import (
-    HIDDEN_REACH_M,
-    WORTH_SEEING_M2,
-    BeliefModel,
-    MissingArea,
-    missing_area,
-)
+from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2, BeliefModel
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.frontiers import FrontierMap, Place
 from thinmap_ros.core.exploration.look_around import LookAround, turn_target
 from thinmap_ros.core.exploration.reachable import ReachableSpace
 from thinmap_ros.core.exploration.strategy import Decision, finish_reason
-from thinmap_ros.core.exploration.team.claims import Claim
+from thinmap_ros.core.exploration.team.claims import SAME_PLACE_M, Claim
 from thinmap_ros.core.exploration.team.team import Team
 from thinmap_ros.core.exploration.tour import tours_by_first
-from thinmap_ros.core.exploration.visibility import box_of_scan, visible_places
+from thinmap_ros.core.exploration.unknown_space import hidden_area_m2
+from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import NO_PATH
 from thinmap_ros.core.scan import Scan
@@ -52,11 +47,12 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 _NEAR_M = 0.3
 _NEAR_RAD = 0.35
 _SAME_PLACE_M = 1.5  # a target whose middle moves less is the same one
-_MAX_ATTEMPTS = 3  # visits, or drives, until a candidate is given up
+_MAX_VISITS = 3  # until a candidate is given up
+_MAX_FAILURES = 2
 _SCANS = 3  # at the goal, or with nothing left
 _GONE_S = 0.35
 _START_S = 5.0  # the first scans are no graph yet
-_FINAL_PAUSE_S = 20.0  # a navigator that starts, or is blocked by people, refuses goals meanwhile
+_FINAL_PAUSE_S = 40.0  # a navigator that starts, or is blocked by people, refuses goals meanwhile
 _MAX_DOUBLINGS = 30
 _MAX_TOUR = 20  # the cost of a tour grows with the fourth power of its places
 _IMPROBABLE_WAIT = 3.0  # waiting costs so much more where most probably nothing is hidden
@@ -98,13 +94,6 @@ class ExplorerConfig(CandidateConfig):
         'Smallest saving for which the target is changed (m). Raise it if the robot oscillates.',
         low=0.0,
         high=100.0,
-    )
-    blacklist_timeout_s: float = parameter(
-        60.0,
-        'Time after which an unreachable target is tried again (s). Lower it where people block '
-        'doors.',
-        low=0.0,
-        high=1e5,
     )
     candidate_period_s: float = parameter(
         1.0,
@@ -184,7 +173,6 @@ class Explorer:
         self._clock = _Clock()
         self._frame = self.frontier_map.frame
         self._scans_without_target = 0
-        self._missing = MissingArea(0.0, 0.0)
 
     @property
     def candidates(self) -> list[Candidate]:
@@ -220,12 +208,10 @@ class Explorer:
         clock.began_ns = scan.stamp_ns if clock.began_ns < 0 else clock.began_ns
         self._space.add_pose(T_map_base)
         self.frontier_map.update(patch, box_of_scan(scan, T_map_base), *self.team.take_changes())
-        self._add_views(scan, T_map_base)
         self._add_visit(T_map_base)
         if self._is_due():
             clock.found_ns = scan.stamp_ns
-            reach_m = self.config.node_reset_distance_m
-            self.team.apply_settled(self._finder.store.items, reach_m, scan.stamp_ns)
+            self.team.apply_settled(self._finder.store.items, SAME_PLACE_M, scan.stamp_ns)
             self._frame = self.frontier_map.frame
             self._space.update(self.frontier_map, T_map_base)
             self._finder.update(
@@ -235,10 +221,6 @@ class Explorer:
                 T_map_base,
                 scan.range_max_m,
                 scan.stamp_ns,
-            )
-            self._missing = missing_area(
-                np.array([candidate.probability for candidate in self.candidates]),
-                np.array([candidate.mean_area_m2 for candidate in self.candidates]),
             )
             self._choose(topology, T_map_base)
         return self._decision()
@@ -266,23 +248,10 @@ class Explorer:
         return Claim(team.name, stamp_ns, T_map_base, place, remaining_m, team.settled)
 
     def frontiers(self) -> list[Array]:
-        """Cells of each frontier that a candidate has, (N, 2), m, map frame."""
-        return [self._frame.centres_of(c.cells) for c in self.candidates if len(c.cells)]
+        """Cells of each candidate, (N, 2), m, map frame."""
+        return [self._frame.centres_of(c.cells) for c in self.candidates]
 
     # Evidence.
-
-    def _add_views(self, scan: Scan, T_map_base: Array) -> None:
-        """Add a view of each candidate that this scan sees."""
-        if not self.candidates:
-            return
-        T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
-        places = np.array([candidate.place for candidate in self.candidates])
-        frontiers = self.frontier_map
-        seen = visible_places(places, scan, T_map_laser, frontiers.free, frontiers.frame)
-        for i in np.flatnonzero(seen):
-            candidate = self.candidates[i]
-            if candidate.evidence.add_view(T_map_laser, self.config):
-                self._finder.judge(candidate)
 
     def _add_visit(self, T_map_base: Array) -> None:
         """A target that stays although the robot is there and observes it hides nothing, probably.
@@ -354,7 +323,7 @@ class Explorer:
         """Begin to turn, or turn on, if that can show anything; returns whether it can."""
         frontiers = self.frontier_map
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        hidden_m2 = frontiers.hidden_area_m2(xy, HIDDEN_REACH_M)
+        hidden_m2 = hidden_area_m2(frontiers, xy)
         is_left = bool(self._doubtful)
         goal = self._look.next_goal(T_map_base, hidden_m2, frontiers.known_area_m2, is_left)
         if goal is None:
@@ -376,13 +345,13 @@ class Explorer:
         return [candidate for candidate in self.candidates if candidate.probability < threshold]
 
     def _ready(self, worth: list[Candidate]) -> list[Candidate]:
-        """Candidates that did not fail lately; if there are none, those after a shorter pause."""
-        for pause_s in (self.config.blacklist_timeout_s, _FINAL_PAUSE_S):
-            since_ns = self._clock.now_ns - pause_s * SECOND_NS
-            ready = [c for c in worth if not c.evidence.failures or c.evidence.failed_ns < since_ns]
-            if ready:
-                return ready
-        return []
+        """Candidates to which no drive failed; if there are none, all others after a pause.
+
+        A frontier that has changed since is another candidate.
+        """
+        untried = [c for c in worth if not c.evidence.failures]
+        since_ns = self._clock.now_ns - _FINAL_PAUSE_S * SECOND_NS
+        return untried or [c for c in worth if c.evidence.failed_ns < since_ns]
 
     def _kept(self, candidates: list[Candidate]) -> Candidate | None:
         """The target, or the candidate to which its frontier belongs now."""
@@ -448,16 +417,11 @@ class Explorer:
 
     def _decision(self) -> Decision:
         target = self._target
-        chosen = None
-        end_nodes = []
         places = self.candidates
         if target.is_turn and target.candidate is not None:
             places = [*places, target.candidate]
-        for candidate in places:
-            is_target = candidate is target.candidate
-            end_node = candidate.as_end_node(target.goal if is_target else None)
-            chosen = end_node if is_target else chosen
-            end_nodes.append(end_node)
+        published = [c.published(target.goal if c is target.candidate else None) for c in places]
+        chosen = next((end_node for end_node in published if end_node.is_target), None)
         doubtful = self._doubtful
         aside = sorted(c.node_id for c in doubtful if c.evidence.failures or _is_given_up(c))
         finished = self._scans_without_target >= _SCANS
@@ -468,18 +432,19 @@ class Explorer:
             finished,
             reason,
             code,
-            end_nodes,
+            self._finder.settled + published,
             aside,
             self.frontier_map.known_area_m2,
             left,
-            self._missing,
+            [(c.probability, c.mean_area_m2) for c in self.candidates],
         )
 
 
 def _is_given_up(candidate: Candidate) -> bool:
     """Whether there is no way to a candidate, or it was tried as often as it is worth."""
-    attempts = max(candidate.evidence.visits, candidate.evidence.failures)
-    return candidate.goal is None or attempts >= _MAX_ATTEMPTS
+    tried = candidate.evidence
+    is_tried = tried.visits >= _MAX_VISITS or tried.failures >= _MAX_FAILURES
+    return candidate.goal is None or is_tried
 
 
 def _turns(T_map_base: Array, goals: Array) -> Array:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, GridPatch
-from thinmap_ros.core.grid.raytrace import axis_setup
 from thinmap_ros.core.planning.traversability import Part
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
@@ -29,7 +28,6 @@ _SPARE_CELLS = 64  # of room when the map grows: users of these arrays start aga
 _MARGIN_CELLS = 3  # read beyond those that are written, so that the cut is no frontier
 _UPDATES_PER_WHOLE_MAP = 100  # corrections of the map reach cells that no scan can change
 _MAX_CELLS = 1 << 28
-_RAYS = 120
 
 
 class FrontierMap:
@@ -132,13 +130,6 @@ class FrontierMap:
             frame.origin_x + (col + 0.5) * frame.resolution,
             frame.origin_y + (row + 0.5) * frame.resolution,
         )
-
-    def hidden_area_m2(self, place: Place, reach_m: float) -> float:
-        """Unknown area in line of sight of a place, m: through the unknown, up to an obstacle."""
-        row, col = self.frame.cells_of(np.array([place]))[0]
-        resolution = self.frame.resolution
-        cells = _hidden_cells(self.free, self.passable, row, col, reach_m / resolution)
-        return float(cells) * resolution**2
 
     def _indices(self) -> NDArray[np.int32]:
         """Zeros for each cell and a margin of one cell, kept: a map has few frontier cells."""
@@ -328,33 +319,3 @@ def _clusters(
     for place in places:
         at[place] = 0
     return numbers, sizes[:clusters].copy()
-
-
-@kernel
-def _hidden_cells(free: Mask, passable: Mask, row: int, col: int, reach: float) -> int:
-    """Cells neither free nor occupied on rays from a cell, each counted once."""
-    rows, cols = free.shape
-    whole = int(reach) + 2
-    seen = np.zeros((2 * whole + 1, 2 * whole + 1), dtype=np.bool_)
-    count = 0
-    for k in range(_RAYS):
-        angle = 2.0 * math.pi * k / _RAYS
-        c, step_x, next_x, delta_x = axis_setup(col + 0.5, math.cos(angle))
-        r, step_y, next_y, delta_y = axis_setup(row + 0.5, math.sin(angle))
-        travelled = 0.0
-        while travelled <= reach:
-            inside = 0 <= r < rows and 0 <= c < cols
-            if inside and not passable[r, c] and not free[r, c]:
-                break
-            if not (inside and free[r, c]) and not seen[r - row + whole, c - col + whole]:
-                seen[r - row + whole, c - col + whole] = True
-                count += 1
-            if next_x < next_y:
-                travelled = next_x
-                next_x += delta_x
-                c += step_x
-            else:
-                travelled = next_y
-                next_y += delta_y
-                r += step_y
-    return count

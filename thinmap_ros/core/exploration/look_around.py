@@ -57,7 +57,7 @@ def turn_target(goal: Array) -> Candidate:
     """The place (3,) where the robot turns, as a target: it has no frontier of its own."""
     place = float(goal[0]), float(goal[1])
     nothing = np.zeros((0, 2), dtype=np.int64)
-    return Candidate(TURN_ID, place, nothing, place, Evidence(TURN_ID, place, place), goal=goal)
+    return Candidate(Evidence(TURN_ID, place), nothing, place, goal=goal)
 
 
 def _has_heading(T_map_base: Array, goal: Array) -> bool:

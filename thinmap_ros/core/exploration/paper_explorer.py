@@ -6,25 +6,26 @@
   disappears.
 - Finished when no end node below the threshold is left.
 
-What the paper leaves open: which views count, and which end node continues which (`evidence`); an
-end node that the robot has reached without success is not visited again, nor one that the
-navigator could not reach.
+What the paper leaves open: which views count, and which end node continues which
+(`paper_evidence`); an end node that the robot has reached without success is not visited again, nor
+one that the navigator could not reach.
 
 Source: exploration paper sections 3.2 and 4.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.belief.evidence import Evidence, EvidenceStore
-from thinmap_ros.core.exploration.candidates import end_node_of
-from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.frontiers import FrontierMap
+from thinmap_ros.core.exploration.paper_evidence import (
+    PaperConfig,
+    PaperEndNode,
+    PaperEndNodes,
+)
 from thinmap_ros.core.exploration.position_probability import bayes_update
-from thinmap_ros.core.exploration.strategy import Decision, finish_reason
+from thinmap_ros.core.exploration.strategy import Decision, EndNode, finish_reason, unobserved
 from thinmap_ros.core.exploration.visibility import box_of_scan, visible_places
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
@@ -33,30 +34,20 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 
-PRIOR = 0.5
 _NEAR_M = 0.3
 _SCANS = 3
 _START_S = 5.0  # the first scans are no graph yet
 
 
-@dataclass(eq=False)
-class _EndNode:
-    """An end node: its id in the graph, its evidence, and its position probability."""
-
-    node_id: int
-    evidence: Evidence
-    probability: float = PRIOR
-
-
 class PaperExplorer:
     """Visits end nodes until the position probability of each one passes the threshold."""
 
-    def __init__(self, config: ExplorerConfig | None = None) -> None:
-        self.config = config or ExplorerConfig()
+    def __init__(self, config: PaperConfig | None = None) -> None:
+        self.config = config or PaperConfig()
         self._frontier_map = FrontierMap()
-        self._store = EvidenceStore(1)
-        self._end_nodes: list[_EndNode] = []
-        self._target: _EndNode | None = None
+        self._followed = PaperEndNodes()
+        self._end_nodes: list[PaperEndNode] = []
+        self._target: PaperEndNode | None = None
         self._goal = np.zeros(3)
         self._is_first = True
         self._began_ns = -1
@@ -68,11 +59,12 @@ class PaperExplorer:
         """Choose where to drive; see strategy.Strategy."""
         self._began_ns = scan.stamp_ns if self._began_ns < 0 else self._began_ns
         self._frontier_map.update(patch, box_of_scan(scan, T_map_base))
-        self._follow(topology)
+        nodes = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
+        self._end_nodes = self._followed.follow(nodes, self.config.node_reset_distance_m)
         self._add_views(scan, T_map_base)
         self._add_visit(T_map_base)
         waits = not topology.nodes and scan.stamp_ns - self._began_ns < _START_S * SECOND_NS
-        left = [node for node in self._doubtful if not _attempts(node)]
+        left = [node for node in self._doubtful if not node.tries]
         self._scans_without_target = 0 if left or waits else self._scans_without_target + 1
         self._choose(left, topology, T_map_base)
         return self._decision()
@@ -80,81 +72,69 @@ class PaperExplorer:
     def target_failed(self, reason: str) -> None:
         """Process that the present target could not be reached."""
         if self._target is not None:
-            self._target.evidence.failures += 1
+            self._target.failures += 1
             self._target = None
-
-    def _follow(self, topology: TopologicalMap) -> None:
-        """Follow the end nodes of the graph; one that has moved away begins again."""
-        before = {node.evidence.id: node for node in self._end_nodes}
-        nodes = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
-        places = [(node.x, node.y) for node in nodes]
-        found = self._store.follow(places, self.config.node_reset_distance_m)
-        self._end_nodes = []
-        for node, evidence in zip(nodes, found, strict=True):
-            known = before.get(evidence.id, _EndNode(node.id, evidence))
-            known.node_id = node.id
-            if not evidence.views:
-                known.probability = PRIOR
-            self._end_nodes.append(known)
 
     def _add_views(self, scan: Scan, T_map_base: Array) -> None:
         """Equations (1) to (10) for each end node of which this scan is a view."""
         if not self._end_nodes:
             return
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
-        places = np.array([node.evidence.place for node in self._end_nodes])
+        places = np.array([node.place for node in self._end_nodes])
         frontiers = self._frontier_map
         seen = visible_places(places, scan, T_map_laser, frontiers.free, frontiers.frame)
         for i in np.flatnonzero(seen):
             node = self._end_nodes[i]
-            if node.evidence.add_view(T_map_laser, self.config):
-                node.probability = bayes_update(node.probability, node.evidence.reliability)
+            if node.add_view(T_map_laser, self.config):
+                node.probability = bayes_update(node.probability, node.reliability)
 
     def _add_visit(self, T_map_base: Array) -> None:
         """An end node that the robot has reached needs no further visit."""
         target = self._target
         if target is None:
             return
-        is_there = math.dist(T_map_base[:2], target.evidence.place) <= _NEAR_M
+        is_there = math.dist(T_map_base[:2], target.place) <= _NEAR_M
         self._scans_at_goal = self._scans_at_goal + 1 if is_there else 0
         if self._scans_at_goal >= _SCANS:
-            target.evidence.visits += 1
+            target.visits += 1
             self._scans_at_goal = 0
 
     @property
-    def _doubtful(self) -> list[_EndNode]:
+    def _doubtful(self) -> list[PaperEndNode]:
         """End nodes that are not resolved: worth a visit, or given up after one."""
         threshold = self.config.probability_threshold
         return [node for node in self._end_nodes if node.probability < threshold]
 
-    def _choose(self, left: list[_EndNode], topology: TopologicalMap, T_map_base: Array) -> None:
+    def _choose(
+        self, left: list[PaperEndNode], topology: TopologicalMap, T_map_base: Array
+    ) -> None:
         if self._target not in left:
             self._target = self._next(left, topology, T_map_base) if left else None
             self._goal = np.full(3, np.inf)
         if self._target is None:
             return
-        place = self._target.evidence.place
+        place = self._target.place
         if math.dist(place, self._goal[:2]) > _NEAR_M:  # it moves as the map grows
             heading = math.atan2(place[1] - T_map_base[1], place[0] - T_map_base[0])
             self._goal = se2.pose(*place, heading)
 
-    def _next(self, left: list[_EndNode], topology: TopologicalMap, T_map_base: Array) -> _EndNode:
+    def _next(
+        self, left: list[PaperEndNode], topology: TopologicalMap, T_map_base: Array
+    ) -> PaperEndNode:
         if self._is_first:
             self._is_first = False
-            return min(left, key=lambda node: _turn(T_map_base, node.evidence.place))
+            return min(left, key=lambda node: _turn(T_map_base, node.place))
         lengths = path_lengths_to_nodes(topology, float(T_map_base[0]), float(T_map_base[1]))
         return min(left, key=lambda node: lengths.get(node.node_id, math.inf))
 
     def _decision(self) -> Decision:
-        chosen = None
-        end_nodes = []
-        for node in self._end_nodes:
-            end_node = end_node_of(node.node_id, node.evidence, node.probability)
-            if node is self._target:
-                end_node = chosen = end_node._replace(is_target=True, goal=self._goal)
-            end_nodes.append(end_node)
+        end_nodes = [
+            _published(node, self._goal if node is self._target else None)
+            for node in self._end_nodes
+        ]
+        chosen = next((end_node for end_node in end_nodes if end_node.is_target), None)
         doubtful = self._doubtful
-        given_up = sorted(node.node_id for node in doubtful if _attempts(node))
+        given_up = sorted(node.node_id for node in doubtful if node.tries)
         finished = self._scans_without_target >= _SCANS
         left = len(doubtful)
         code, reason = finish_reason(finished, left)
@@ -162,9 +142,17 @@ class PaperExplorer:
         return Decision(chosen, finished, reason, code, end_nodes, given_up, area_m2, left)
 
 
-def _attempts(node: _EndNode) -> int:
-    """How often the robot was there, or could not get there."""
-    return node.evidence.visits + node.evidence.failures
+def _published(node: PaperEndNode, target_goal: Array | None) -> EndNode:
+    """End node of a decision; target_goal (3,): where the robot drives if it is the target."""
+    end_node = unobserved(node.node_id, node.place, node.probability)
+    return end_node._replace(
+        distance_index=node.distance_index,
+        angle_index=node.angle_index,
+        min_distance_m=node.min_distance_m,
+        angle_span_deg=node.angle_span_deg,
+        is_target=target_goal is not None,
+        goal=end_node.goal if target_goal is None else target_goal,
+    )
 
 
 def _turn(T_map_base: Array, place: tuple[float, float]) -> float:

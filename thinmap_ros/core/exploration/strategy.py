@@ -1,10 +1,13 @@
 """Exploration strategy: chooses where the robot drives next, from graph, map and scan."""
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from thinmap_ros.core.exploration.belief.model import MissingArea
+import numpy as np
+
+from thinmap_ros.core.exploration.belief.model import MissingArea, missing_area
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -33,8 +36,9 @@ class EndNode(NamedTuple):
     """An end node at x, y in m (map frame), with its position probability and what it comes from.
 
     node_id: id in the topological map, or from FIRST_FRONTIER_ID on, below 2^32; goal: pose (3,)
-    from which to observe it; frontier_length_m: length of the frontier that is
-    assigned to it; expected_area_m2: hidden area expected behind that.
+    from which to observe it; distance_index, angle_index, min_distance_m, angle_span_deg: of the
+    strategy `paper`, which counts observations; frontier_length_m: length of a frontier;
+    expected_area_m2: hidden area expected behind that.
     """
 
     node_id: int
@@ -51,13 +55,20 @@ class EndNode(NamedTuple):
     goal: Array
 
 
+def unobserved(node_id: int, place: tuple[float, float], probability: float) -> EndNode:
+    """End node at a place (x, y), m, without counted observations: no target, no frontier."""
+    goal = np.array([*place, 0.0])
+    return EndNode(node_id, *place, probability, 0.0, 0.0, math.inf, 0.0, 0.0, 0.0, False, goal)
+
+
 @dataclass(frozen=True)
 class Decision:
     """What to do next: drive to target.goal, stay, or finish.
 
     reason: words for the end, or for the progress; unreachable: ids of end nodes that are put aside
     or given up: without a way to them, or visited in vain; remaining: how many are not resolved,
-    these included; missing: area that is not seen, None where the strategy does not estimate it.
+    these included; hidden: of each candidate the probability that it hides nothing, and the mean
+    area, m2, that it hides if not; None where the strategy does not estimate them.
     """
 
     target: EndNode | None
@@ -68,14 +79,20 @@ class Decision:
     unreachable: list[int]
     known_area_m2: float
     remaining: int = 0
-    missing: MissingArea | None = None
+    hidden: list[tuple[float, float]] | None = None
+
+    @property
+    def missing(self) -> MissingArea | None:
+        """Area that is not seen; None where the strategy does not estimate it."""
+        return None if self.hidden is None else missing_area(self.hidden)
 
     @property
     def coverage_estimate(self) -> float:
         """Known free area over that and the missing one, 0 to 1; 0 where nothing is estimated."""
-        if self.missing is None or self.known_area_m2 <= 0.0:
+        missing = self.missing
+        if missing is None or self.known_area_m2 <= 0.0:
             return 0.0
-        return self.known_area_m2 / (self.known_area_m2 + self.missing.expected_m2)
+        return self.known_area_m2 / (self.known_area_m2 + missing.expected_m2)
 
 
 @runtime_checkable

@@ -15,7 +15,7 @@ from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
@@ -68,8 +68,8 @@ def run(source: Source) -> Outcome:
     """Replay the decisions of the drive from the same scans, and show the map at six moments."""
     world = world_of('room_10x10')
     moments, census = _replay_exploration(list(source.samples('room_10x10')))
-    goal = observable_cells(
-        world, world.start, PRESETS['2dx'].radius_m, LaserScannerConfig().range_max_m
+    goal = robot_observable_cells(
+        world, world.start, PRESETS['2dx'], LaserScannerConfig().range_max_m
     )
     coverage = [(m.seconds, goal.coverage(m.patch)) for m in moments]
     last = moments[-1]

@@ -7,7 +7,7 @@ from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid
 
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.exploration.live.map_view import occupancy_from_costs
+from thinmap_ros.core.grid.foreign_maps import occupancy_from_costs
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.logs import decode

@@ -7,7 +7,6 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid, TopologicalMap
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.live.map_view import MapGraph
 from thinmap_ros.core.exploration.mission import InputWatchdog
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.grid.map_receiver import MapReceiver
@@ -15,6 +14,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
+from thinmap_ros.core.topology.map_graph import MapGraph
 from thinmap_ros.nodes.exploration.foreign_map import ForeignMap
 from thinmap_ros.nodes.exploration.publishers import PublisherCheck
 from thinmap_ros.nodes.exploration.robot_view import RobotView

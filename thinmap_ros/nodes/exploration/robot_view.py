@@ -5,7 +5,7 @@ from collections import deque
 from sensor_msgs.msg import LaserScan
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.live.map_view import scan_in_map
+from thinmap_ros.core.grid.foreign_maps import scan_in_map
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

@@ -24,9 +24,9 @@ MARGIN_M = 2.0
 
 
 def candidate(x, y=0.0):
-    evidence = Evidence(FIRST_FRONTIER_ID, (x, y), (x, y))
+    evidence = Evidence(FIRST_FRONTIER_ID, (x, y))
     cells = np.zeros((1, 2), dtype=np.int64)
-    return Candidate(FIRST_FRONTIER_ID, (x, y), cells, (x, y), evidence, goal=se2.pose(x, y, 0.0))
+    return Candidate(evidence, cells, (x, y), goal=se2.pose(x, y, 0.0))
 
 
 def straight(T_map_base, goals):
@@ -47,7 +47,7 @@ def shares(candidates, claims, **config):
         for other in claims:
             if other is not own:
                 team.add_claim(other, 0)
-        found.append([c.place[0] for c in team.share(candidates, own, straight, MARGIN_M)])
+        found.append([c.middle[0] for c in team.share(candidates, own, straight, MARGIN_M)])
     return found
 
 
@@ -131,8 +131,8 @@ def test_what_one_robot_has_settled_is_settled_for_the_others():
     team = Team('a')
     settled = (SettledPlace(1.0, 0.0, 2, 0), SettledPlace(5.0, 0.0, 0, 3))
     team.add_claim(claim('b', 0.0, settled=settled), 0)
-    items = [Evidence(1, (1.2, 0.0), (1.2, 0.0)), Evidence(2, (5.0, 0.1), (5.0, 0.1))]
-    visited = Evidence(3, (5.0, 0.0), (5.0, 0.0), visits=1)
+    items = [Evidence(1, (1.2, 0.0)), Evidence(2, (5.0, 0.1))]
+    visited = Evidence(3, (5.0, 0.0), visits=1)
     team.apply_settled(items, 0.5, 7)
     assert (items[0].visits, items[0].failures) == (2, 0)
     assert (items[1].visits, items[1].failures, items[1].failed_ns) == (0, 3, 7)
@@ -144,7 +144,7 @@ def test_only_the_newest_settled_places_are_told_each_once():
     team = Team('a')
     for number in range(12):
         place = (float(number), 0.0)
-        item = Evidence(number, place, place, visits=1)
+        item = Evidence(number, place, visits=1)
         team.add_settled(item)
         item.visits = 2
         team.add_settled(item)
@@ -187,7 +187,7 @@ def test_a_frontier_to_which_another_robot_found_no_path_is_given_up():
 
     step(0)
     assert explorer.claim(0, pose).place is not None
-    places = (SettledPlace(c.place[0], c.place[1], 0, 3) for c in explorer.candidates)
+    places = (SettledPlace(c.middle[0], c.middle[1], 0, 3) for c in explorer.candidates)
     explorer.team.add_claim(claim('b', 9.0, settled=tuple(places)), 0)
     step(2)
     assert explorer.claim(0, pose).place is None

@@ -1,20 +1,16 @@
-"""Maps of other publishers: costs, updates, what is seen in them, and their graph."""
+"""Graphs of maps of other publishers: ids stay from map to map."""
 
 import math
 
 import numpy as np
 import pytest
 
-from thinmap_ros.core.exploration.live.map_view import (
-    MapGraph,
-    occupancy_from_costs,
-    scan_in_map,
-)
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import pose
 from thinmap_ros.core.topology.builder import TopologyConfig, build, build_again
 from thinmap_ros.core.topology.graph import NodeKind
+from thinmap_ros.core.topology.map_graph import MapGraph
 
 SECOND_NS = 1_000_000_000
 AT = pose(1.0, 3.0, 0.0)
@@ -33,24 +29,6 @@ def shifted(patch, rows, cols):
     """The same map with unknown cells before its first rows and columns."""
     cells = np.pad(patch.cells, ((rows, 0), (cols, 0)), constant_values=-1)
     return GridPatch(patch.frame.with_origin_at(-rows, -cols), cells)
-
-
-def test_costs_below_lethal_are_free_space():
-    cells = np.array([[-1, 0, 1, 50, 98, 99, 100]], dtype=np.int8)
-    found = occupancy_from_costs(GridPatch(GridFrame(0.0, 0.0, 0.05), cells))
-    assert found.cells.tolist() == [[-1, 0, 0, 0, 0, 0, 100]]
-
-
-def test_what_a_map_shows_ends_at_walls_and_at_the_unknown():
-    scan = scan_in_map(crossing(known_cols=100), pose(3.0, 3.0, 0.5 * math.pi), 8.0, 7)
-    assert scan.stamp_ns == 7
-    ahead, left, behind, right = (scan.ranges_m[i] for i in (180, 270, 0, 90))
-    assert ahead == pytest.approx(2.9, abs=0.01)  # +y
-    assert left == pytest.approx(2.9, abs=0.01)  # -x
-    assert behind == pytest.approx(2.9, abs=0.01)  # -y
-    assert right == pytest.approx(2.0, abs=0.01)  # +x, up to the unknown
-    near = scan_in_map(crossing(), pose(3.0, 3.0, 0.0), 2.0, 0)
-    assert np.isinf(near.ranges_m[180])
 
 
 def test_the_graph_keeps_its_ids_while_the_map_grows_and_its_origin_shifts():

@@ -7,7 +7,7 @@ import pytest
 from support.small_floor import floor, map_of, world_of
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.active_localization import (
+from thinmap_ros.core.places.active_search import (
     ActiveSearch,
     best_viewpoint,
     common_patch,
