@@ -181,14 +181,6 @@ def test_path_lengths_are_those_on_the_grid_or_a_detour():
     assert others == pytest.approx([30.0, 153.0])
 
 
-def test_paths_between_goals_may_lead_through_the_unknown():
-    room = Room(corridor())
-    room.find()
-    ((_, through),) = room.space.path_lengths_between(np.array([[2.0, 2.0], [11.0, 2.0]]), 0)[:1]
-    assert 9.0 < through < 15.0
-    assert math.isfinite(through)
-
-
 def test_a_frontier_behind_a_passage_that_looks_too_narrow_is_observed_from_before_it():
     cells = np.full((40, 80), -1)
     cells[:, :40] = 0

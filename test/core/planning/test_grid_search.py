@@ -6,9 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.planning.grid_search import (
-    PathLengthTable,
     distance_field_from,
     downsample_mask,
     path_lengths_from,
@@ -81,54 +79,6 @@ def test_a_coarse_square_is_set_where_any_of_its_cells_is():
     mask = np.zeros((5, 7), dtype=np.bool_)
     mask[4, 6] = mask[1, 2] = True
     assert np.argwhere(downsample_mask(mask, 2)).tolist() == [[0, 1], [2, 3]]
-
-
-def test_a_path_table_stays_valid_while_the_map_grows_to_all_sides():
-    table = PathLengthTable(0.2, 1e9, 2)
-    frame = GridFrame(0.3, -0.5, 0.1)
-    allowed = np.ones((60, 80), dtype=np.bool_)
-    allowed[28:33, :70] = False
-    places = np.array([[1.05, 1.05], [1.05, 4.05], [7.05, 1.05], [7.95, 4.95]])
-    first = table.update(allowed, np.zeros_like(allowed), frame, places, 0)
-    assert np.allclose(first, first.T)
-    assert first[0, 1] > 12.0
-    grown = np.pad(allowed, ((3, 5), (7, 2)))
-    nothing = np.zeros_like(grown)
-    moved = frame.with_origin_at(-3, -7)
-    fresh = PathLengthTable(0.2, 1e9, 2).update(grown, nothing, moved, places, 0)
-    assert np.allclose(table.update(grown, nothing, moved, places, 5), first)
-    assert np.abs(fresh - first).max() < 0.7
-
-
-def test_an_old_path_is_computed_again():
-    table = PathLengthTable(0.2, 10.0, 2)
-    allowed = np.ones((60, 60), dtype=np.bool_)
-    frame = GridFrame(0.0, 0.0, 0.1)
-    allowed[28:33, 4:] = False
-    places = np.array([[5.0, 1.0], [5.0, 5.0]])
-    before = table.update(allowed, np.zeros_like(allowed), frame, places, 0)[0, 1]
-    allowed[:] = True
-    assert (
-        table.update(allowed, np.zeros_like(allowed), frame, places, 5_000_000_000)[0, 1] == before
-    )
-    later = table.update(allowed, np.zeros_like(allowed), frame, places, 15_000_000_000)
-    assert later[0, 1] == pytest.approx(4.0, abs=0.3)
-
-
-def test_a_path_through_unknown_space_costs_more_than_its_length():
-    allowed = np.ones((60, 60), dtype=np.bool_)
-    allowed[:, 28:32] = False
-    places = np.array([[1.0, 3.0], [5.0, 3.0]])
-    frame = GridFrame(0.0, 0.0, 0.1)
-    assert (
-        PathLengthTable(0.2, 10.0, 2).update(allowed, np.zeros_like(allowed), frame, places, 0)[
-            0, 1
-        ]
-        == math.inf
-    )
-    assert PathLengthTable(0.2, 10.0, 2).update(allowed, ~allowed, frame, places, 0)[
-        0, 1
-    ] == pytest.approx(4.4)
 
 
 def test_the_path_field_holds_the_path_to_each_cell():

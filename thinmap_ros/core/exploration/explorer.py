@@ -2,8 +2,8 @@
 
 - Only candidates are visited whose probability of hiding nothing is below a threshold, as in the
   paper. A candidate is dropped as soon as its probability passes the threshold on the way.
-- The next one is the one with which the cheapest open tour through all of them begins. Waiting
-  costs: what most probably hides little is best observed in passing.
+- The next one is that with the shortest path, the turn at its beginning included. A tour through
+  all of them saves nothing: what comes to light on the way changes it.
 - The target is kept unless another one saves a clear margin, so that the robot does not oscillate.
 - A target that stays as it is although the robot observes it is evidence that nothing is hidden.
 - What was tried is tried again when its frontier has changed, or once before the end.
@@ -34,7 +34,6 @@ from thinmap_ros.core.exploration.reachable import ReachableSpace
 from thinmap_ros.core.exploration.strategy import Decision, finish_reason
 from thinmap_ros.core.exploration.team.claims import SAME_PLACE_M, Claim
 from thinmap_ros.core.exploration.team.team import Team
-from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.exploration.unknown_space import hidden_area_m2
 from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.patch import GridPatch
@@ -54,8 +53,6 @@ _GONE_S = 0.35
 _START_S = 5.0  # the first scans are no graph yet
 _FINAL_PAUSE_S = 40.0  # a navigator that starts, or is blocked by people, refuses goals meanwhile
 _MAX_DOUBLINGS = 30
-_MAX_TOUR = 20  # the cost of a tour grows with the fourth power of its places
-_IMPROBABLE_WAIT = 3.0  # waiting costs so much more where most probably nothing is hidden
 
 
 @dataclass(frozen=True)
@@ -68,19 +65,6 @@ class ExplorerConfig(CandidateConfig):
         'coverage, lower it for shorter paths.',
         low=0.5,
         high=0.999,
-    )
-    waiting_cost: float = parameter(
-        0.5,
-        'Tour cost per metre for which a frontier stays unvisited. Raise it to finish near '
-        'frontiers first.',
-        low=0.0,
-        high=10.0,
-    )
-    waiting_horizon_m: float = parameter(
-        15.0,
-        'Tour length beyond which waiting costs nothing more (m). Lower: greedier.',
-        low=0.0,
-        high=1e3,
     )
     turn_cost_m_rad: float = parameter(
         0.2,
@@ -395,23 +379,11 @@ class Explorer:
         self._target.is_turn = False
 
     def _costs(self, candidates: list[Candidate], T_map_base: Array) -> dict[Candidate, float]:
-        """Cost, m, of the cheapest tour that begins with each of the nearest candidates."""
-        config = self.config
+        """Cost, m, of driving to each candidate: the path, and the turn with which it begins."""
         goals = np.array([candidate.goal for candidate in candidates])
         lengths = self._space.path_lengths(T_map_base, goals[:, :2])
-        first = lengths + config.turn_cost_m_rad * _turns(T_map_base, goals)
-        target = self._target.candidate
-        evidence_of_target = None if target is None else target.evidence
-        order = sorted(
-            range(len(candidates)),
-            key=lambda i: (candidates[i].evidence is not evidence_of_target, lengths[i]),
-        )
-        near = order[:_MAX_TOUR]
-        between = self._space.path_lengths_between(goals[near, :2], self._clock.now_ns)
-        probabilities = np.array([candidates[i].probability for i in near])
-        weights = config.waiting_cost * (1.0 + _IMPROBABLE_WAIT * probabilities)
-        costs = tours_by_first(first[near], between, weights, config.waiting_horizon_m)
-        return {candidates[i]: cost for i, cost in zip(near, costs.tolist(), strict=True)}
+        costs = lengths + self.config.turn_cost_m_rad * _turns(T_map_base, goals)
+        return dict(zip(candidates, costs.tolist(), strict=True))
 
     # The decision.
 

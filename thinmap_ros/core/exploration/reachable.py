@@ -9,7 +9,6 @@ from thinmap_ros.core.exploration.frontiers import NOTHING, FrontierMap
 from thinmap_ros.core.exploration.viewpoints import SQUARE
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.planning.grid_search import (
-    PathLengthTable,
     distance_field_from,
     downsample_mask,
     upsample_mask,
@@ -25,9 +24,6 @@ from thinmap_ros.core.se2 import Array
 Mask = NDArray[np.bool_]
 _ESCAPE_M = 0.6
 _DETOUR = 3.0  # of the straight line, where no path is known
-_COARSE_M = 0.3
-_FORGET_S = 20.0
-_UNKNOWN_COST = 2  # of a metre through the unknown: it may turn out to be blocked
 
 
 class Reachable(NamedTuple):
@@ -49,9 +45,7 @@ class ReachableSpace:
         self._radius_m = robot_radius_m
         self._recent_path = RecentPath()
         self._standing: Mask = np.zeros((0, 0), dtype=np.bool_)
-        self._maybe = self._standing  # if nothing stands in the unknown
         self._free = self._standing
-        self._between = PathLengthTable(_COARSE_M, _FORGET_S, _UNKNOWN_COST)
         nowhere = np.zeros((0, 0))
         self.now = Reachable(self._standing, self._standing, nowhere, GridFrame(0.0, 0.0, 1.0))
 
@@ -85,28 +79,14 @@ class ReachableSpace:
         lengths = distance_field_from(downsample_mask(allowed, SQUARE), (row, col))
         return _lengths_in(lengths, frame, T_map_base, goals)
 
-    def path_lengths_between(self, goals: Array, stamp_ns: int) -> Array:
-        """Path lengths (N, N), m, between goals (N, 2), also through the unknown, at higher cost.
-
-        A robot that enters the unknown in one place may come out in another one.
-        """
-        straight = np.hypot(*(goals[:, None] - goals[None]).transpose(2, 0, 1))
-        found = self._between.update(self.now.cells, self._maybe, self.now.frame, goals, stamp_ns)
-        return _with_estimates(found, straight)
-
     def _update_standing(self, frontiers: FrontierMap) -> None:
         radius_m = self._radius_m
         resolution = frontiers.frame.resolution
         part = frontiers.take_changes()
         if part is None:
             self._standing = traversable_cells(frontiers.free, radius_m, resolution)
-            self._maybe = traversable_cells(frontiers.passable, radius_m, resolution)
         elif part != NOTHING:
-            for standing, free in (
-                (self._standing, frontiers.free),
-                (self._maybe, frontiers.passable),
-            ):
-                update_traversable_cells(standing, free, part, radius_m, resolution)
+            update_traversable_cells(self._standing, frontiers.free, part, radius_m, resolution)
 
 
 def _lengths_in(squares: Array, frame: GridFrame, T_map_base: Array, goals: Array) -> Array:

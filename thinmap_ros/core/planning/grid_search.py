@@ -8,13 +8,11 @@ topological ordering", 1969; Borgefors, "Distance transformations in digital ima
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import kernel
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
-Key = tuple[int, int]
 # Enough buckets for steps of up to four times the diagonal one.
 _STRAIGHT = 5
 _DIAGONAL = 7
@@ -67,92 +65,6 @@ def upsample_mask(squares: Mask, factor: int, cells: Mask) -> Mask:
             for col in range(cols):
                 result[row, col] = cells[row, col] & line[col]
     return result
-
-
-class PathLengthTable:
-    """Path lengths between places of a growing map, on a coarse grid, cached for some time.
-
-    Most places do not move. Paths may cross unknown space, where each step counts unknown_cost
-    times: an unobserved connection is possible.
-    """
-
-    def __init__(self, cell_m: float, forget_s: float, unknown_cost: int) -> None:
-        self._cell_m = cell_m
-        self._forget_ns = forget_s * 1e9
-        self._unknown_weight = unknown_cost
-        self._known: dict[tuple[Key, Key], tuple[int, float]] = {}
-
-    def update(
-        self, allowed: Mask, unknown: Mask, frame: GridFrame, places: Array, stamp_ns: int
-    ) -> Array:
-        """Path lengths (N, N), m, between places (N, 2), m, over allowed cells (H, W).
-
-        frame: of the cells; unknown (H, W): cells that may be traversable. inf if there is no path.
-        """
-        factor = max(1, round(self._cell_m / frame.resolution))
-        # The lattice of squares does not move when the frame grows.
-        shift = [
-            round(origin / frame.resolution) % factor for origin in (frame.origin_y, frame.origin_x)
-        ]
-        weights: NDArray[np.uint8] | None = None
-        cells = (frame.cells_of(places) + shift) // factor
-        first = (
-            round(frame.origin_y / frame.resolution) // factor,
-            round(frame.origin_x / frame.resolution) // factor,
-        )
-        keys = [(int(row), int(col)) for row, col in cells + first]
-        known = self._still_known(keys, stamp_ns)
-        # One search from each new place to all others, not from all others to each new one.
-        for i in sorted(
-            range(len(keys)), key=lambda i: sum(_pair(keys[i], key) in known for key in keys)
-        ):
-            key = keys[i]
-            missing = [
-                j for j, other in enumerate(keys) if other != key and _pair(key, other) not in known
-            ]
-            if missing:
-                if weights is None:
-                    weights = self._weights(allowed, unknown, factor, shift)
-                goals = np.ascontiguousarray(cells[missing])
-                steps = _path_lengths_from(weights, int(cells[i, 0]), int(cells[i, 1]), goals)
-                lengths = (_cells(steps) * frame.resolution * factor).tolist()
-                for j, length in zip(missing, lengths, strict=True):
-                    known[_pair(key, keys[j])] = (stamp_ns, length)
-        self._known = known
-        below = [
-            [0.0 if a == b else known[_pair(a, b)][1] for b in keys[:i]] for i, a in enumerate(keys)
-        ]
-        return _table(below)
-
-    def _weights(
-        self, allowed: Mask, unknown: Mask, factor: int, shift: list[int]
-    ) -> NDArray[np.uint8]:
-        """Cost of a step in each square; 0: not traversable."""
-        maybe = _downsample(unknown, factor, shift[0], shift[1])
-        weights = self._unknown_weight * maybe.astype(np.uint8)
-        weights[_downsample(allowed, factor, shift[0], shift[1])] = 1
-        return weights
-
-    def _still_known(
-        self, keys: list[Key], stamp_ns: int
-    ) -> dict[tuple[Key, Key], tuple[int, float]]:
-        """Cached path lengths between these places that are not too old."""
-        since = stamp_ns - self._forget_ns
-        pairs = (_pair(a, b) for i, a in enumerate(keys) for b in keys[:i])
-        found = ((pair, self._known.get(pair)) for pair in pairs)
-        return {pair: known for pair, known in found if known is not None and known[0] > since}
-
-
-def _pair(a: Key, b: Key) -> tuple[Key, Key]:
-    return (a, b) if a < b else (b, a)
-
-
-def _table(below: list[list[float]]) -> Array:
-    """Symmetric table (N, N) of the numbers below its diagonal, on which it is 0."""
-    table = np.zeros((len(below), len(below)))
-    for i, row in enumerate(below):
-        table[i, :i] = table[:i, i] = row
-    return table
 
 
 def _cells(steps: NDArray[np.int32]) -> Array:

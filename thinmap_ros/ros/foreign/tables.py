@@ -41,7 +41,7 @@ _NO_RESPONSE = 'no: a match is judged by its inlier ratio'
 _NO_SOLVER = 'no: the pose graph has a solver of its own'
 _NO_BEAM_MODEL = 'no: poses are refined by scan matching, without a beam model'
 _NO_FILTER = 'no: there is no particle filter; samples are drawn only while the robot is lost'
-_NO_UTILITY = 'no: targets are ordered by a tour'
+_NO_UTILITY = 'no: the nearest target is next, by path'
 _REMAP = 'by remapping'
 
 SLAM_TOOLBOX = Package(
