@@ -9,6 +9,7 @@ import pytest
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.logs.bag import BagLog
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+from thinmap_ros.logs.log import Log
 from thinmap_ros.tools import cli
 
 
@@ -83,8 +84,14 @@ def test_other_programs_are_run_in_the_same_way(
 
 def parse(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
+    parser.add_argument('log', type=Path)
     cli.add_log_options(parser)
     return parser.parse_args(words)
+
+
+def opened(*words: str) -> Log:
+    arguments = parse(*words)
+    return cli.open_log(arguments.log, arguments)
 
 
 def test_an_option_that_is_not_given_is_the_configs() -> None:
@@ -101,9 +108,9 @@ def test_a_value_out_of_range_is_an_error() -> None:
 
 
 def test_logs_and_bags_are_told_apart(tmp_path: Path) -> None:
-    assert isinstance(cli.open_log(parse('a.clf')), CarmenLog)
-    assert isinstance(cli.open_log(parse('a.mcap')), BagLog)
-    bag = cli.open_log(parse(str(tmp_path), '--scan-topic', '/front', '--base-frame', 'base'))
+    assert isinstance(opened('a.clf'), CarmenLog)
+    assert isinstance(opened('a.mcap'), BagLog)
+    bag = opened(str(tmp_path), '--scan-topic', '/front', '--base-frame', 'base')
     assert isinstance(bag, BagLog)
     assert (bag.scan_topic, bag.base_frame, bag.T_base_laser) == ('/front', 'base', None)
 
@@ -112,6 +119,6 @@ def test_logs_and_bags_are_told_apart(tmp_path: Path) -> None:
 def test_an_offset_that_is_given_comes_before_tf_static(
     tmp_path: Path, word: str, offset: float
 ) -> None:
-    bag = cli.open_log(parse(str(tmp_path), word))
+    bag = opened(str(tmp_path), word)
     assert isinstance(bag, BagLog) and bag.T_base_laser is not None
     assert np.array_equal(bag.T_base_laser, [offset, 0.0, 0.0])

@@ -94,15 +94,15 @@ def test_two_robots_side_by_side_do_not_drive_to_one_place():
         now_ns = second * SECOND_NS
         for name, team in teams.items():
             target = targets[name]
-            remaining_m = abs(target.place[0] - x[name])
+            remaining_m = abs(target.middle[0] - x[name])
             team.sent = claim(name, x[name], target.middle, remaining_m, now_ns + 1)
         for name, team in teams.items():
             team.add_claim(teams['ba'['ab'.index(name)]].sent, now_ns)
         for name, team in teams.items():
-            x[name] += math.copysign(0.5, targets[name].place[0])
+            x[name] += math.copysign(0.5, targets[name].middle[0])
             own = claim(name, x[name], targets[name].middle, stamp_ns=now_ns)
             targets[name] = team.share(candidates, own, straight, MARGIN_M)[0]
-    assert [target.place[0] for target in targets.values()] == [10.0, -14.0]
+    assert [target.middle[0] for target in targets.values()] == [10.0, -14.0]
 
 
 def test_no_robot_waits_far_from_what_is_left():
