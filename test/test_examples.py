@@ -67,7 +67,7 @@ def test_slam_on_a_log_and_a_route_on_its_map(example, tmp_path: Path) -> None:
 def test_explore_in_simulation(example) -> None:
     said = example('explore_in_simulation')
     assert 'all end nodes resolved' in said
-    assert '100.0% seen, 0 collisions' in said
+    assert re.search(r'(100\.0|99\.\d)% seen, 0 collisions', said)
 
 
 def test_thinning(example) -> None:
