@@ -248,7 +248,7 @@ def assert_told(graph, saved):
     received.correct(newest.session, newest.revision, checked_poses(np.array(newest.poses)))
     known = received.known()
     np.testing.assert_allclose(known.poses, [frame.T_map_base for frame in saved.frames], atol=1e-5)
-    # Edges that came after the last keyframe are told with the next one.
+    # Edges that came after the last keyframe are sent with the next one.
     told = {(edge.a, edge.b) for edge in known.edges}
     assert {(step.a, step.b) for step in saved.steps} <= told
     assert told & {(edge.a, edge.b) for edge in saved.edges}, 'those of the loop'

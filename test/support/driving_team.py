@@ -55,7 +55,7 @@ class Radio:
     def _carry_from(self, sender, kind):
         def carry(message):
             # A request names the robot that it is for, all others that which sends them. What was
-            # carried here is heard again, and is of another robot.
+            # carried here is received again, and is of another robot.
             is_request = kind == 'tile_requests'
             if (message.robot == sender) == is_request or not self.is_on:
                 return

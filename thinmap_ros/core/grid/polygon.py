@@ -1,4 +1,4 @@
-"""A polygon as the border of a map."""
+"""Maps that are limited to a polygon."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Keyframes are told once each, and come to the same poses and edges, in whatever order."""
+"""Keyframes are sent once each, and come to the same poses and edges, in whatever order."""
 
 import math
 

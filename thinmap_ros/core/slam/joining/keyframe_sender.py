@@ -13,25 +13,25 @@ from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, Sen
 
 
 class KeyframeSender:
-    """Tells each keyframe of the published map once, and the poses of all after a correction.
+    """Sends each keyframe of the published map once, and the poses of all after a correction.
 
-    Keyframes that are apart are told after they are joined. They are numbered as they are told.
+    Keyframes that are apart are sent after they are joined. They are numbered as they are sent.
     """
 
     def __init__(self, loops: LoopClosure) -> None:
         """loops: the keyframes of the robot, and their graph."""
         self.loops = loops
-        self.revision = 0  # corrections that were told
+        self.revision = 0  # corrections that were sent
         self._seen_revision = loops.keyframes.revision
         self._is_corrected = False  # since the last message
         self._told: list[int] = []  # their numbers in the graph
         self._waiting: list[int] = []
         self._seen = 0  # keyframes of the graph
-        self._open: list[Edge] = []  # those that are not told
+        self._open: list[Edge] = []  # those that are not sent
         self._seen_edges = 0
 
     def corrected_poses(self) -> Array | None:
-        """Poses (N, 3) of all that are told, if they were corrected since the last call."""
+        """Poses (N, 3) of all that are sent, if they were corrected since the last call."""
         keyframes = self.loops.keyframes
         if keyframes.revision == self._seen_revision:
             return None
@@ -41,7 +41,7 @@ class KeyframeSender:
         return np.array([keyframes.frames[k].T_map_base for k in self._told]).reshape(-1, 3)
 
     def next_message(self) -> KeyframeMessage | None:
-        """The next keyframe, or the last one again with edges; None: all is told.
+        """The next keyframe, or the last one again with edges; None: all are sent.
 
         Call `corrected_poses` before.
         """

@@ -1,4 +1,4 @@
-"""The keyframes of a robot's map as another program knows them."""
+"""The keyframes of a robot's map as another program receives them."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
