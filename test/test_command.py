@@ -145,7 +145,7 @@ def test_the_installed_command_replays_explores_and_makes_a_route_graph(
     bag = str(ROOT / 'bags' / 'dead_end.mcap')
     assert '219 scans' in thinmap('replay', bag, '-o', 'out/dead_end', '--quiet')
     said = thinmap('explore_world', 'room_10x10', '-o', 'out', '--quiet')
-    assert re.search(r'coverage (100\.0|99\.\d)%', said)
+    assert re.search(r'coverage (100\.0|99\.[5-9])%', said)
     assert 'nodes' in thinmap('map_to_graph', 'out/map.yaml', '-o', 'route.geojson')
     assert (tmp_path / 'route.geojson').exists()
 

@@ -67,7 +67,8 @@ def test_slam_on_a_log_and_a_route_on_its_map(example, tmp_path: Path) -> None:
 def test_explore_in_simulation(example) -> None:
     said = example('explore_in_simulation')
     assert 'all end nodes resolved' in said
-    assert re.search(r'(100\.0|99\.\d)% seen, 0 collisions', said)
+    # Less than 0.5 m2 of nearly 100 are left: what is worth a visit is seen.
+    assert re.search(r'(100\.0|99\.[5-9])% seen, 0 collisions', said)
 
 
 def test_thinning(example) -> None:

@@ -35,7 +35,7 @@ def test_what_was_tried_is_the_same_place_until_half_of_its_frontier_has_changed
     (visited,) = followed(store, line(0))
     visited.visits = 1
     assert followed(store) == []
-    assert followed(store, line(0, 6)) == [visited], 'what is left of it'
+    assert followed(store, line(0, 6)) == [visited], 'the rest of its frontier'
     assert followed(store, line(6)) == [visited]
     assert followed(store, line(0, 30)) == [visited]
     # It is compared with the frontier of the try: many small changes make another place.
