@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from benchmarks.scoreboard.drives import samples
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import ROBOT_GRID
+from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.regions.segmentation import find_regions
@@ -24,9 +24,10 @@ from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.buildings import Building, generate_building
+from thinmap_ros.sim.buildings import Building, Wing, generate_building
 from thinmap_ros.sim.drives import DriveSample, world_to_grid
-from thinmap_ros.sim.floor_plan import FloorPlan
+from thinmap_ros.sim.floor_plan import FloorPart, FloorPlan, Kind
+from thinmap_ros.sim.world import World
 
 _DOOR_M = 0.5  # distance up to which a door is found
 _SEEN_M2 = 4.0  # of a part, from which it counts
@@ -65,32 +66,54 @@ class Score:
 
 
 def truth_of(made: Building) -> Truth:
-    """Parts of a building; corridors and halls that open into each other are one part."""
-    frame = made.world.frame
+    """Parts of a building; corridors that open into each other are one part, in one wing or two."""
     labels = np.zeros(made.world.occupied.shape, dtype=np.int32)
-    cells = np.argwhere(made.world.occupied == 0)
-    points = frame.centres_of(cells)
     kinds: list[str] = []
     doors = []
     for wing in made.wings:
-        own = se2.transform_points(se2.invert(wing.T_world_wing), points)
         numbers: dict[int, int] = {}
         for part, group in zip(wing.plan.parts, _groups(wing.plan), strict=True):
             if group not in numbers:
                 kinds.append(part.kind.value)
                 numbers[group] = len(kinds)
-            inside = (own >= (part.x0, part.y0)).all(axis=1) & (own < (part.x1, part.y1)).all(
-                axis=1
-            )
-            labels[tuple(cells[inside].T)] = numbers[group]
+            labels[tuple(_free_cells_of(part, wing, made.world).T)] = numbers[group]
         middles = [(0.5 * (d.x0 + d.x1), 0.5 * (d.y0 + d.y1)) for d in wing.plan.doors]
         doors.append(se2.transform_points(wing.T_world_wing, np.array(middles).reshape(-1, 2)))
     places = np.concatenate(doors)
+    labels, kinds = _linked(made, labels, kinds)
     return Truth(labels, kinds, places, np.ones(len(places), dtype=np.bool_))
 
 
+def _linked(
+    made: Building, labels: NDArray[np.int32], kinds: list[str]
+) -> tuple[NDArray[np.int32], list[str]]:
+    """Labels (H, W) and kinds of the parts, with corridors that links join as one part."""
+    group = np.arange(len(kinds) + 1)
+    for link in made.links:
+        row, col = made.world.frame.cells_of(np.stack([link.a, link.b])).T
+        low, high = sorted(labels[row, col].tolist())
+        if low and kinds[low - 1] == kinds[high - 1] == Kind.CORRIDOR.value:
+            group[group == group[high]] = group[low]
+    left, numbers = np.unique(group, return_inverse=True)
+    return numbers[labels].astype(np.int32), [kinds[number - 1] for number in left[1:]]
+
+
+def _free_cells_of(part: FloorPart, wing: Wing, world: World) -> NDArray[np.int64]:
+    """Free cells (N, 2) of the world whose centres lie in a part of a wing."""
+    corners = np.array([(x, y) for x in (part.x0, part.x1) for y in (part.y0, part.y1)])
+    around = world.frame.cells_of(se2.transform_points(wing.T_world_wing, corners))
+    low = (around.min(axis=0) - 1).clip(0)
+    high = around.max(axis=0) + 2
+    free = world.occupied[low[0] : high[0], low[1] : high[1]] == 0
+    cells = np.argwhere(free) + low
+    centres = world.frame.centres_of(cells)
+    own = se2.transform_points(se2.invert(wing.T_world_wing), centres)
+    inside = (own >= (part.x0, part.y0)) & (own < (part.x1, part.y1))
+    return np.asarray(cells[inside.all(axis=1)])
+
+
 def _groups(plan: FloorPlan) -> list[int]:
-    """Lowest part that each part is joined to by passages."""
+    """Lowest part that each part is joined to by passages: corridors that open into corridors."""
     group = list(range(len(plan.parts)))
     for passage in plan.passages:
         low, high = sorted((group[passage.a], group[passage.b]))
@@ -201,7 +224,7 @@ def _maps(drive: list[DriveSample]) -> list[GridPatch]:
     """Maps by SLAM along a drive, every _PERIOD_SCANS scans, and at its end."""
     x, y, yaw = drive[0].T_world_base.tolist()
     localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
-    config = PipelineConfig(localizer, ROBOT_GRID, scans_per_graph=len(drive))
+    config = PipelineConfig(localizer, OccupancyConfig(), scans_per_graph=len(drive))
     pipeline = Pipeline(config)
     patches = []
     for number, sample in enumerate(drive):

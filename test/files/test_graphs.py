@@ -1,7 +1,9 @@
 """Route graphs: the format of Nav2's reader, and lossless round trips."""
 
 import json
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from thinmap_ros.core.regions.membership import Membership, membership_of
 from thinmap_ros.core.regions.region_map import Door, Region, RegionKind, RegionMap
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.files.graphs import (
+    SpeedLimit,
     read_geojson,
     write_geojson,
     write_graph,
@@ -311,7 +314,10 @@ def test_geojson_holds_regions_and_is_read_as_without(tmp_path: Path) -> None:
     }
     assert (metadata[1]['region'], metadata[3]['region']) == (4, 8)
     for number in (2, 5):  # both directions of the edge
-        assert metadata[number]['region'] in (4, 8)
+        assert (metadata[number]['region'], metadata[number]['region_kind']) in (
+            (4, 'corridor'),
+            (8, 'room'),
+        )
         assert (metadata[number]['door'], metadata[number]['width_m']) == (True, 0.9)
     found = read_geojson(path)
     assert (found.nodes.keys(), found.edges.keys()) == ({1, 3}, {2})
@@ -324,12 +330,37 @@ def test_graphml_holds_the_regions_of_nodes_and_edges(tmp_path: Path) -> None:
     for line in (
         '<data key="node_region">4</data>',
         '<data key="node_region">8</data>',
+        '<data key="edge_region_kind">corridor</data>',
         '<data key="edge_door">true</data>',
         '<data key="edge_width_m">0.9</data>',
     ):
         assert line in text
     write_graph(path, small())
     assert '<data key="node_region">' not in path.read_text()
+
+
+def test_narrow_edges_have_a_speed_limit_and_all_others_the_full_speed(tmp_path: Path) -> None:
+    path = tmp_path / 'g.geojson'
+    nodes = [Node(i, NodeKind.CORNER, float(i), 0.0, 1.0) for i in (1, 2, 3)]
+    narrow, wide = (edge(i + 3, i, i + 1, (i, 0.0), (i + 1.0, 0.0)) for i in (1, 2))
+    graph = TopologicalMap(nodes, [narrow, replace(wide, clearance_m=0.6)])
+    write_graph(path, graph, speed_limit=SpeedLimit(1.0, 40.0))
+    features = json.loads(path.read_text())['features']
+    metadata = [f['properties']['metadata'] for f in features if 'startid' in f['properties']]
+    assert [(m['edge'], m['speed_limit']) for m in metadata] == [
+        (4, 40.0),
+        (4, 40.0),
+        (5, 100.0),
+        (5, 100.0),
+    ]
+    with pytest.raises(InputError, match='geojson'):
+        write_graph(tmp_path / 'g.graphml', graph, speed_limit=SpeedLimit(1.0, 40.0))
+
+
+@pytest.mark.parametrize('values', [(0.0, 50.0), (1.0, 0.0), (1.0, 101.0), (math.nan, 50.0)])
+def test_a_speed_limit_that_makes_no_sense_is_refused(values: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match='speed limit'):
+        SpeedLimit(*values)
 
 
 def test_a_path_is_written_once_and_a_feature_is_a_line(tmp_path: Path) -> None:

@@ -12,6 +12,9 @@ import pytest
 import yaml
 from PIL import Image
 
+from thinmap_ros.core.regions.tracker import RegionTracker
+from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.files.sessions import REGIONS
 from thinmap_ros.tools import map_to_graph
 
 YAML = {
@@ -87,21 +90,42 @@ def test_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return len(networkx.read_graphml(out))
 
     assert nodes() == 4
-    assert nodes('--robot-radius', 0.6) == 0
-    assert nodes('--min-clearance', 0.6) == 0
-    assert nodes('--prune', 2.0) == 2
+    assert nodes('--robot-radius-m', 0.6) == 0
+    assert nodes('--min-clearance-m', 0.6) == 0
+    assert nodes('--prune-m', 2.0) == 2
+    assert nodes('--detail-m', 0) == 4
     assert nodes('--start=3.0,6.5') == 4
     assert nodes('--start=-50,0') == 0
+
+
+def test_no_edge_of_a_file_crosses_the_unknown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grey = corridors()
+    grey[25:27, 40:50] = 205  # 0.2 m across the middle corridor
+    path = written(tmp_path, grey)
+    out = tmp_path / 'g.graphml'
+    assert run(monkeypatch, path, '-o', out) == 0
+    closed = networkx.read_graphml(out)
+    assert run(monkeypatch, path, '-o', out, '--max-unknown-gap-m', 0.2) == 0
+    crossed = networkx.read_graphml(out)
+    assert networkx.number_connected_components(closed) == 2
+    assert networkx.number_connected_components(crossed) == 1
 
 
 @pytest.mark.parametrize(
     ('words', 'said'),
     [
         (['-o', 'g.svg'], '.geojson'),
-        (['-o', 'g.graphml', '--robot-radius', '-1'], 'robot_radius_m'),
-        (['-o', 'g.graphml', '--robot-radius', 'nan'], 'robot_radius_m'),
-        (['-o', 'g.graphml', '--min-clearance', '0.1'], 'min-clearance'),
+        (['-o', 'g.graphml', '--robot-radius-m', '-1'], 'robot_radius_m'),
+        (['-o', 'g.graphml', '--robot-radius-m', 'nan'], 'robot_radius_m'),
+        (['-o', 'g.graphml', '--min-clearance-m', '0.1'], 'min-clearance-m'),
+        (['-o', 'g.graphml', '--max-unknown-gap-m', '-0.1'], 'max_unknown_gap_m'),
         (['-o', 'g.graphml', '--start', 'here'], 'start'),
+        (['-o', 'g.graphml', '--detail-m', '-1'], '--detail-m -1'),
+        (['-o', 'g.geojson', '--speed-limit', '1'], '--speed-limit=1'),
+        (['-o', 'g.geojson', '--speed-limit', '1,0'], 'speed limit of 0'),
+        (['-o', 'g.graphml', '--speed-limit', '1,50'], '.geojson'),
         (['-o', 'g.graphml', '--picture', 'g.jpg'], '.png'),
     ],
 )
@@ -205,3 +229,19 @@ def test_colour_and_16_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deep
     path = written(tmp_path, picture)
     assert run(monkeypatch, path, '-o', tmp_path / 'g.graphml') == 0
     assert len(networkx.read_graphml(tmp_path / 'g.graphml')) == 4
+
+
+def test_regions_of_a_saved_session_keep_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path, corridors())
+    tracker = RegionTracker()
+    regions = tracker.update(read_map(path))
+    (number,) = regions.regions
+    place = np.array([regions.regions[number].x, regions.regions[number].y])
+    tracker.names.put(regions, number, place, 'Südflur')
+    REGIONS.save(str(path), tracker)
+    assert run(monkeypatch, path, '-o', tmp_path / 'g.geojson') == 0
+    features = json.loads((tmp_path / 'g.geojson').read_text())['features']
+    names = [f['properties']['name'] for f in features if f['geometry']['type'] == 'Polygon']
+    assert names == ['Südflur']

@@ -7,13 +7,16 @@ unsigned and unique over nodes and edges. Metadata are flat and without nulls, b
 throws on them. `class`, by which the route server's SemanticScorer weighs, is end, branch or corner
 of a node, and dead_end (to an end node) or passage of an edge. Lengths and clearances are in m
 everywhere. Rooms, corridors and halls are polygons, which the route server skips; with them, a node
-has its `region`, and an edge its `region` and, where it passes one, `door` and `width_m`.
+has its `region`, and an edge its `region`, `region_kind` and, where it passes one, `door` and
+`width_m`. Narrow edges can have a `speed_limit` in per cent; then all others have one of 100, as
+the DistanceScorer divides lengths by it.
 """
 
 import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,35 +26,76 @@ import numpy as np
 import yaml
 
 from thinmap_ros.core import validation
-from thinmap_ros.core.errors import InputError, one_line_reason, quoted
+from thinmap_ros.core.errors import InputError, one_line_reason, quoted, require_type
 from thinmap_ros.core.regions.membership import Membership
 from thinmap_ros.core.regions.region_map import Region
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.files.atomic import atomic_write, read_text, write_text
 from thinmap_ros.files.limits import FILES
+from thinmap_ros.files.paths import path_of
 
 Writer = Callable[[Path, TopologicalMap, Membership | None], None]
 _MAX_ID = 2**32 - 1
 _REGION = 'Polygon'  # type of the geometry of regions
 _GRAPHML_KEYS = {
     'node': ('x', 'y', 'kind', 'clearance', 'region'),
-    'edge': ('length', 'clearance', 'path', 'region', 'door', 'width_m'),
+    'edge': ('length', 'clearance', 'path', 'region', 'region_kind', 'door', 'width_m'),
 }
-_GRAPHML_TYPES = {'kind': 'string', 'path': 'string', 'region': 'int', 'door': 'boolean'}
+_GRAPHML_TYPES = {
+    'kind': 'string',
+    'path': 'string',
+    'region': 'int',
+    'region_kind': 'string',
+    'door': 'boolean',
+}
 _BAD_FEATURE = (KeyError, TypeError, ValueError, InputError)
 _ARRIVED_M = 0.3  # distance at which topological_navigation counts a node as reached
 _UPRIGHT = {'w': 1.0, 'x': 0.0, 'y': 0.0, 'z': 0.0}
 _SIDES = 8  # of the polygon around a node in which the robot counts as arrived
 
 
-def write_graph(path: Path, topology: TopologicalMap, regions: Membership | None = None) -> None:
+@dataclass(frozen=True)
+class SpeedLimit:
+    """Per cent of the largest speed on edges with less free width than width_m.
+
+    Raises InputError if a value makes no sense.
+    """
+
+    width_m: float
+    percent: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.width_m < math.inf:
+            raise InputError(f'speed limit below {self.width_m} m: expected a width above 0 m')
+        if not 0.0 < self.percent <= 100.0:
+            raise InputError(f'speed limit of {self.percent} %: expected above 0, at most 100')
+
+    def of(self, edge: Edge) -> float:
+        """The limit on an edge, per cent."""
+        return self.percent if 2.0 * edge.clearance_m < self.width_m else 100.0
+
+
+def write_graph(
+    path: Path | str,
+    topology: TopologicalMap,
+    regions: Membership | None = None,
+    speed_limit: SpeedLimit | None = None,
+) -> None:
     """Write a topological map atomically, in the format given by the file name extension.
 
-    regions: written too, in GeoJSON and GraphML.
+    regions: written too, in GeoJSON and GraphML; speed_limit: in GeoJSON alone.
     Raises InputError if the extension is unknown, or the format cannot hold the map.
     """
-    writer_of(path)(path, topology, regions)
+    path = path_of(path)
+    require_type('topology', topology, TopologicalMap)
+    writer = writer_of(path)
+    if speed_limit is None:
+        writer(path, topology, regions)
+    elif writer is write_geojson:
+        write_geojson(path, topology, regions, speed_limit=speed_limit)
+    else:
+        raise InputError(f'{path}: a speed limit: expected a name that ends in .geojson')
 
 
 def writer_of(path: Path) -> Writer:
@@ -72,6 +116,7 @@ def write_geojson(
     frame_id: str = 'map',
     *,
     with_paths: bool = True,
+    speed_limit: SpeedLimit | None = None,
 ) -> None:
     """Write a topological map atomically.
 
@@ -86,7 +131,11 @@ def write_geojson(
     with atomic_write(path) as aside, aside.open('w', encoding='utf-8') as file:
         file.write(f'{{"type":"FeatureCollection","name":{json.dumps(path.stem)},"features":[')
         separator = '\n'
-        for feature in _features(topology, regions, frame_id, highest, with_paths):
+        metadata = {e.id: _edge_metadata(topology, e, regions) for e in topology.edges.values()}
+        if speed_limit is not None:
+            for edge in topology.edges.values():
+                metadata[edge.id]['speed_limit'] = speed_limit.of(edge)
+        for feature in _features(topology, regions, frame_id, metadata, with_paths):
             file.write(separator + json.dumps(feature, allow_nan=False, separators=(',', ':')))
             separator = ',\n'
         file.write('\n]}\n')
@@ -96,19 +145,18 @@ def _features(
     topology: TopologicalMap,
     regions: Membership | None,
     frame_id: str,
-    highest: int,
+    metadata: dict[int, dict[str, Any]],
     with_paths: bool,
 ) -> Iterator[dict[str, Any]]:
     """Nodes, edges in both directions, and regions; one at a time, as there may be many."""
+    highest = max([0, *topology.nodes, *topology.edges])
     for node in topology.nodes.values():
         yield _node_feature(node, frame_id, regions)
     for edge in topology.edges.values():
-        kinds = (topology.nodes[edge.a].kind, topology.nodes[edge.b].kind)
-        edge_class = 'dead_end' if NodeKind.END in kinds else 'passage'
         ends = edge.path[[0, -1]]
-        metadata = _edge_metadata(edge, edge_class, regions)
-        yield _edge_feature(edge, edge.path if with_paths else ends, edge.id, edge.a, metadata)
-        yield _edge_feature(edge, ends[::-1], highest + edge.id, edge.b, metadata)
+        line = edge.path if with_paths else ends
+        yield _edge_feature(edge, line, edge.id, edge.a, metadata[edge.id])
+        yield _edge_feature(edge, ends[::-1], highest + edge.id, edge.b, metadata[edge.id])
     if regions is not None:
         neighbours = regions.regions.all_neighbours()
         for region in regions.regions.regions.values():
@@ -335,9 +383,12 @@ def _edge_feature(
     }
 
 
-def _edge_metadata(edge: Edge, edge_class: str, regions: Membership | None) -> dict[str, Any]:
+def _edge_metadata(
+    topology: TopologicalMap, edge: Edge, regions: Membership | None
+) -> dict[str, Any]:
+    kinds = (topology.nodes[edge.a].kind, topology.nodes[edge.b].kind)
     return {
-        'class': edge_class,
+        'class': 'dead_end' if NodeKind.END in kinds else 'passage',
         'edge': int(edge.id),
         'length': round(float(edge.length_m), 3),
         'clearance': round(float(edge.clearance_m), 3),
@@ -352,6 +403,8 @@ def _region_feature(region: Region, neighbours: list[int]) -> dict[str, Any]:
         'area_m2': round(region.area_m2, 2),
         'neighbours': neighbours,
     }
+    if region.name:
+        properties['name'] = region.name
     ring = _rounded(np.concatenate([region.outline, region.outline[:1]]))
     geometry = {'type': _REGION, 'coordinates': [ring]}
     return {'type': 'Feature', 'properties': properties, 'geometry': geometry}
@@ -366,7 +419,9 @@ def _node_region(node: Node, regions: Membership | None) -> dict[str, Any]:
 def _edge_region(edge: Edge, regions: Membership | None) -> dict[str, Any]:
     if regions is None or edge.id not in regions.of_edge:
         return {}
-    found: dict[str, Any] = {'region': regions.of_edge[edge.id]}
+    region = regions.of_edge[edge.id]
+    found: dict[str, Any] = {'region': region}
+    found['region_kind'] = regions.regions.regions[region].kind.name.lower()
     door = regions.door_of.get(edge.id)
     if door is not None:
         found |= {'door': True, 'width_m': round(door.width_m, 2)}

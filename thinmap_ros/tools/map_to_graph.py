@@ -10,10 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.config import RegionConfig
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.segmentation import find_regions
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.builder import TopologyConfig, build_along
+from thinmap_ros.core.topology.free_space import select_free_space
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.routes.route_graph import DETAIL_M, route_graph
 from thinmap_ros.evaluation.batch import (
     REASON,
     Batch,
@@ -24,37 +28,62 @@ from thinmap_ros.evaluation.batch import (
 )
 from thinmap_ros.evaluation.parallel_jobs import Report, add_run_options
 from thinmap_ros.files import graphs, occupancy_maps
+from thinmap_ros.files.sessions import REGIONS
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser, check_place
 from thinmap_ros.view.summary import summary_figure
 
 _DEFAULTS = TopologyConfig()
 _DESCRIPTIONS = ('.yaml', '.yml')
 _FORMATS = ('geojson', 'graphml', 'tmap2.yaml')
 # Arguments that decide about a graph.
-_OPTIONS = ('robot_radius', 'min_clearance', 'prune', 'start', 'format')
+_OPTIONS = (
+    'robot_radius_m',
+    'min_clearance_m',
+    'prune_m',
+    'max_unknown_gap_m',
+    'detail_m',
+    'speed_limit',
+    'start',
+    'format',
+)
 
 
 def _start(given: str | None) -> tuple[float, float] | None:
+    return None if given is None else _pair(given, '--start', 'X,Y (m, map frame)')
+
+
+def _speed_limit(given: str | None) -> graphs.SpeedLimit | None:
     if given is None:
         return None
+    return graphs.SpeedLimit(*_pair(given, '--speed-limit', 'WIDTH,PERCENT (m, %)'))
+
+
+def _pair(given: str, option: str, expected: str) -> tuple[float, float]:
     try:
-        x, y = (float(word) for word in given.split(','))
+        first, second = (float(word) for word in given.split(','))
     except ValueError:
-        x = y = math.nan
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise InputError(f'--start={given}: expected two finite numbers X,Y (m, map frame)')
-    return x, y
+        first = second = math.nan
+    if not (math.isfinite(first) and math.isfinite(second)):
+        raise InputError(f'{option}={given}: expected two finite numbers {expected}')
+    return first, second
 
 
 def _config(arguments: argparse.Namespace) -> TopologyConfig:
     """Configuration from the arguments: a greater clearance is a wider robot."""
-    radius = arguments.robot_radius if arguments.min_clearance is None else arguments.min_clearance
-    if radius < arguments.robot_radius:
+    radius = (
+        arguments.robot_radius_m if arguments.min_clearance_m is None else arguments.min_clearance_m
+    )
+    if radius < arguments.robot_radius_m:
         raise InputError(
-            f'--min-clearance {radius}: '
-            f'expected at least the robot radius ({arguments.robot_radius} m)'
+            f'--min-clearance-m {radius}: '
+            f'expected at least the robot radius ({arguments.robot_radius_m} m)'
         )
-    return TopologyConfig(robot_radius_m=radius, min_branch_length_m=arguments.prune)
+    return TopologyConfig(
+        robot_radius_m=radius,
+        min_branch_length_m=arguments.prune_m,
+        max_unknown_gap_m=arguments.max_unknown_gap_m,
+    )
 
 
 @dataclass(frozen=True)
@@ -68,14 +97,26 @@ class _Graph:
     empty: str
 
 
+def _graph_of(
+    patch: GridPatch, start: tuple[float, float] | None, config: TopologyConfig, detail_m: float
+) -> TopologicalMap:
+    """The route graph of a map; detail_m 0: its whole skeleton."""
+    standing = select_free_space(patch, start, config)
+    whole = build_along(patch, standing, None, config)
+    return route_graph(whole, patch, standing, config, detail_m) if detail_m > 0.0 else whole
+
+
 def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Namespace) -> _Graph:
     """Write the graph of a map, and a picture of it."""
     start = _start(arguments.start)
     config = _config(arguments)
     patch = occupancy_maps.read_map(path, keeps_unknown=True)
-    topology = build(patch, start, config)
-    regions = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius))
-    graphs.write_graph(out, topology, membership_of(topology, regions))
+    topology = _graph_of(patch, start, config, arguments.detail_m)
+    found = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius_m))
+    session = REGIONS.load_optional(str(path))
+    regions = found if session is None else session.names.named(found)
+    limit = _speed_limit(arguments.speed_limit)
+    graphs.write_graph(out, topology, membership_of(topology, regions), limit)
     if picture is not None:
         summary_figure(
             picture,
@@ -84,7 +125,6 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
             np.empty((0, 2)),
             title=path.stem,
             regions=regions,
-            is_measured=False,
         )
     place = 'no free place' if start is None else f'no free place round {start}'
     empty = f'{place} for a robot of {config.robot_radius_m} m radius: the graph is empty'
@@ -125,7 +165,14 @@ _BATCH = Batch(run_job, ('nodes', 'edges', 'parts', 'regions', 'cpu_s'), 'Route 
 def _work(arguments: argparse.Namespace) -> None:
     _config(arguments)  # report a wrong value before the work
     _start(arguments.start)
+    _speed_limit(arguments.speed_limit)
+    if not 0.0 <= arguments.detail_m < math.inf:
+        raise InputError(f'--detail-m {arguments.detail_m}: expected 0 m or more')
     maps = _without_images(arguments.maps)
+    default = f'{maps[0].stem}.{arguments.format}' if len(maps) == 1 else 'graphs'
+    arguments.out = arguments.out or Path('out') / default
+    for path in filter(None, (arguments.out, arguments.picture)):
+        check_place(path)
     if len(maps) == 1:
         _convert_one(maps[0], arguments)
         return
@@ -162,13 +209,14 @@ def _convert_one(path: Path, arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='map_to_graph', description=__doc__)
+    parser = Parser('map_to_graph', __doc__)
     parser.add_argument('maps', type=Path, nargs='+', metavar='MAP', help='map_server YAML file')
     out_help = (
         'FILE.geojson (Nav2 route server), .graphml, or .tmap2.yaml (topological_navigation); of '
-        'several maps a folder with one for each, summary.csv and report.html'
+        'several maps a folder with one for each, summary.csv and report.html (default '
+        'out/MAP.geojson, out/graphs)'
     )
-    parser.add_argument('-o', '--out', type=Path, required=True, help=out_help)
+    parser.add_argument('-o', '--out', type=Path, help=out_help)
     add_run_options(parser)
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument(
@@ -178,14 +226,28 @@ def main() -> None:
         help=f'of the graphs of several maps (default {_FORMATS[0]})',
     )
     radius = _DEFAULTS.robot_radius_m
-    parser.add_argument('--robot-radius', type=float, default=radius, help=f'm (default {radius})')
+    parser.add_argument(
+        '--robot-radius-m', type=float, default=radius, help=f'm (default {radius})'
+    )
     clearance_help = 'how far nodes and edges stay from obstacles, m (default: the robot radius)'
-    parser.add_argument('--min-clearance', type=float, help=clearance_help)
+    parser.add_argument('--min-clearance-m', type=float, help=clearance_help)
     default = _DEFAULTS.min_branch_length_m
     prune_help = f'shorter branches of the skeleton are pruned, m (default {default})'
     parser.add_argument(
-        '--prune', type=float, default=_DEFAULTS.min_branch_length_m, help=prune_help
+        '--prune-m', type=float, default=_DEFAULTS.min_branch_length_m, help=prune_help
     )
+    # Of a saved map no later scan shows what is in a gap: no edge leads through one.
+    gap_help = 'unknown gaps up to this width between free cells count as free, m (default 0)'
+    parser.add_argument('--max-unknown-gap-m', type=float, default=0.0, help=gap_help)
+    detail_help = (
+        'smaller obstacles are passed on one side only, and nodes nearer to each other are one, m '
+        f'(default {DETAIL_M}; 0: the whole skeleton, as while a robot maps)'
+    )
+    parser.add_argument('--detail-m', type=float, default=DETAIL_M, help=detail_help)
+    speed_help = (
+        'WIDTH,PERCENT: speed_limit of edges narrower than WIDTH, m; of others it is 100 (GeoJSON)'
+    )
+    parser.add_argument('--speed-limit', help=speed_help)
     parser.add_argument(
         '--start', help='X,Y in m: only what a robot can reach from there (default: all parts)'
     )

@@ -79,6 +79,44 @@ def test_a_table_makes_no_door_and_a_thin_wall_does() -> None:
     assert len(find_regions(patch_of(cells)).regions) == 4
 
 
+def test_a_cabin_of_five_square_metres_is_a_room() -> None:
+    cells = office()
+    cells[48, 82:162] = 100
+    cells[48:73, 104] = 100
+    cells[48, 89:99] = 0
+    cabin, rest = at(find_regions(patch_of(cells)), (8.3, 8.2), (11.0, 5.0))
+    assert cabin != rest
+
+
+def test_a_niche_is_no_region_of_its_own() -> None:
+    cells = office()
+    cells[50:73, 2:70] = 100
+    cells[52:69, 20:36] = 0
+    cells[50:52, 25:31] = 0
+    room, niche = at(find_regions(patch_of(cells)), (3.0, 5.0), (1.7, 8.0))
+    assert room == niche
+
+
+def test_an_open_leaf_does_not_divide_a_corridor() -> None:
+    cells = office()
+    cells[10:22, 40] = 100
+    found = find_regions(patch_of(cells))
+    before, behind = at(found, CORRIDOR, (1.0, 3.2))
+    assert before == behind
+    assert len(found.doors) == 2
+
+
+def test_cupboards_along_the_walls_make_no_corridor_of_a_room() -> None:
+    cells = np.full((55, 110), 100, dtype=np.int8)
+    cells[2:53, 2:108] = 0
+    cells[2:8, 8:100:20] = 100
+    cells[2:6, 12:100:10] = 100
+    cells[45:53, 10:100:12] = 100
+    cells[49:53, 14:100:12] = 100
+    found = find_regions(patch_of(cells))
+    assert [region.kind for region in found.regions.values()] == [RegionKind.ROOM]
+
+
 def test_corridors_that_meet_are_one_region() -> None:
     cells = np.full((160, 200), 100, dtype=np.int8)
     cells[2:27, 2:198] = 0

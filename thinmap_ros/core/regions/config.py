@@ -33,15 +33,15 @@ class RegionConfig(Config):
     )
     min_region_area_m2: float = parameter(
         3.0,
-        'A smaller part of a room is no region of its own (m2). Raise it if niches become '
+        'A smaller part joins the region behind its widest passage (m2). Raise it if niches become '
         'regions, lower it for small cabins.',
         low=0.0,
         high=1000.0,
     )
     max_corridor_width_m: float = parameter(
         3.2,
-        'Largest mean width of a corridor (m); a wider region is a room or a hall. Raise it for '
-        'hospitals and malls, lower it if long rooms count as corridors.',
+        'Largest width of a corridor (m); a region that is wider in most of its area is a room or '
+        'a hall. Raise it for hospitals and malls, lower it if long rooms count as corridors.',
         low=0.5,
         high=20.0,
     )

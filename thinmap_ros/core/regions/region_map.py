@@ -24,7 +24,8 @@ class Region:
     """A room, corridor or hall.
 
     x, y: a free place far from walls, m, map frame; area_m2: free area; outline (K, 2): outer
-    boundary, counterclockwise and not closed, m, map frame.
+    boundary, counterclockwise and not closed, m, map frame; name: that a person has given, '' for
+    none.
     """
 
     id: int
@@ -33,6 +34,7 @@ class Region:
     y: float
     area_m2: float
     outline: Array
+    name: str = ''
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,17 @@ def clearance_m(space: Mask, resolution_m: float) -> NDArray[np.float64]:
     return _clearance_cells(space) * resolution_m
 
 
+def wide_cells(clearance: NDArray[np.float64], width_m: float, resolution_m: float) -> Mask:
+    """Cells (H, W) of a space that a disc of a diameter covers where it fits, by clearances, m.
+
+    Niches leave them as they are, where they lower the mean clearance of a room.
+    """
+    fits = clearance > 0.5 * width_m
+    if not fits.any():
+        return fits
+    return np.asarray(distance_cells(fits) * resolution_m < 0.5 * width_m) & (clearance > 0.0)
+
+
 def _clearance_cells(space: Mask) -> NDArray[np.float64]:
     return distance_cells(np.pad(~space, 1, constant_values=True))[1:-1, 1:-1]
 

@@ -10,7 +10,9 @@ from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.regions import names as region_names
 from thinmap_ros.core.regions.config import RegionConfig
+from thinmap_ros.core.regions.names import RegionNames
 from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.regions.segmentation import describe, segment
 from thinmap_ros.core.snapshot import MAX_COUNT, MAX_ID, Field
@@ -18,11 +20,12 @@ from thinmap_ros.core.snapshot import MAX_COUNT, MAX_ID, Field
 Labels = NDArray[np.int32]
 _UPDATES = 5  # after which a cell forgets its earlier id
 _STRIDE_M = 0.4  # between the cells that a state keeps
-FIELDS = {
+_OWN_FIELDS = {
     'region_frame': Field(np.float64, (3,), -snapshot.MAX_COORDINATE_M, snapshot.MAX_COORDINATE_M),
     'region_labels': Field(np.int32, ('r', 'c'), 0, MAX_ID),
     'next_region_id': Field(np.int64, (), 1, MAX_COUNT),
 }
+FIELDS = {**_OWN_FIELDS, **region_names.FIELDS}
 
 
 class _Memory:
@@ -75,11 +78,14 @@ class RegionTracker:
     larger region at a merge. No other region ever gets the id.
     Each cell remembers its id until it has had another one for some updates. So a region that is
     merged with another one for a moment, as a door closes, has its id again afterwards.
+
+    names: that people have given, which the regions here do not have yet.
     """
 
     def __init__(self, config: RegionConfig | None = None) -> None:
         self.config = config or RegionConfig()
         self.regions: RegionMap | None = None
+        self.names = RegionNames()
         self._memory: _Memory | None = None
         self._next_id = 1
 
@@ -109,6 +115,7 @@ class RegionTracker:
             'region_frame': coarse.as_array(),
             'region_labels': labels[stride // 2 :: stride, stride // 2 :: stride],
             'next_region_id': np.array(self._next_id),
+            **self.names.state(),
         }
 
     @staticmethod
@@ -122,7 +129,11 @@ class RegionTracker:
         tracker = RegionTracker(config)
         if not state:
             return tracker
-        checked = snapshot.validate(state, FIELDS, 'regions')
+        own = {name: array for name, array in state.items() if name not in region_names.FIELDS}
+        checked = snapshot.validate(own, _OWN_FIELDS, 'regions')
+        if len(own) < len(state):  # none where they were saved by an earlier version
+            named = {name: state[name] for name in state.keys() - own.keys()}
+            tracker.names = RegionNames.from_state(named)
         labels = checked['region_labels']
         tracker._next_id = int(checked['next_region_id'])
         if labels.max(initial=0) >= tracker._next_id:

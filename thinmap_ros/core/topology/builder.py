@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.config import config_or_default
+from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.motion import MapMotion
 from thinmap_ros.core.grid.patch import GridPatch
@@ -35,9 +36,18 @@ _OFF_LATTICE = 1e-3  # of a cell: windows farther off do not belong to the same 
 
 
 def build(
-    patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig
+    patch: GridPatch,
+    seed_xy: tuple[float, float] | None = None,
+    config: TopologyConfig | None = None,
 ) -> TopologicalMap:
-    """Topological map of a whole grid: what can be reached from seed_xy (m, map frame), or all."""
+    """Topological map of a whole grid: what can be reached from seed_xy (m, map frame), or all.
+
+    Raises InputError where it is no grid or seed_xy no place, ConfigError for another config.
+    """
+    require_type('patch', patch, GridPatch)
+    config = config_or_default(config, TopologyConfig)
+    if seed_xy is not None and np.shape(seed_xy) != (2,):
+        raise InputError(f'seed_xy = {quoted(seed_xy)}: expected x, y (m)')
     return build_along(patch, select_free_space(patch, seed_xy, config), None, config)
 
 
@@ -94,7 +104,7 @@ class TopologyBuilder:
     """
 
     def __init__(self, config: TopologyConfig | None = None) -> None:
-        self.config = config or TopologyConfig()
+        self.config = config_or_default(config, TopologyConfig)
         self._frame: GridFrame | None = None
         self._layers: Layers | None = None
         self._registry: Registry | None = None

@@ -6,7 +6,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.grid.spatial_hash import SpatialHash
 from thinmap_ros.core.se2 import Array
 
@@ -84,10 +84,16 @@ class TopologicalMap:
         self.edges: dict[int, Edge] = {}
         self._edges_at: dict[int, dict[int, None]] = {}
         self._places = SpatialHash(_BUCKET_M)
-        for node in nodes:
-            self.put_node(node)
-        for edge in edges:
-            self.put_edge(edge)
+        try:
+            for node in nodes:
+                self.put_node(node)
+            for edge in edges:
+                self.put_edge(edge)
+        except (AttributeError, TypeError) as error:
+            raise InputError(f'{one_line_reason(error)}: expected nodes and edges') from error
+
+    def __repr__(self) -> str:
+        return f'TopologicalMap({len(self.nodes)} nodes, {len(self.edges)} edges)'
 
     def copy(self) -> 'TopologicalMap':
         """A map of its own with the same nodes and edges."""

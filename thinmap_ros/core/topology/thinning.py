@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.jit import inlined, kernel
 
 KEPT = 32767  # deletion time of the cells of the skeleton
@@ -26,8 +27,11 @@ def thin(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     as not free. All deletions of a sub-iteration happen at once; the two alternate until neither
     deletes a cell.
     Source: topological map paper section 2.1, steps 1 and 2 (S(p1) counted cyclically, p2 p3 ... p9
-    p2).
+    p2). Raises InputError where it is no array (H, W) of truth values or whole numbers.
     """
+    free = np.asarray(free)
+    if free.ndim != 2 or free.dtype.kind not in 'biu':
+        raise InputError(f'free = {quoted(free)}: expected an array (H, W) of bool')
     words, stride = _pack(np.ascontiguousarray(free, dtype=np.bool_))
     _thin_words(words, stride, np.empty((0, 0), dtype=np.int16))
     return _unpack(words, stride, free.shape)

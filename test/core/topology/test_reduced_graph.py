@@ -1,0 +1,170 @@
+"""Graphs of saved maps: few nodes, straight edges, nothing that is not there."""
+
+import math
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.topology.builder import TopologyConfig, build_along
+from thinmap_ros.core.topology.free_space import select_free_space
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.routes import lines
+from thinmap_ros.core.topology.routes.editing import EditedGraph, is_drivable
+from thinmap_ros.core.topology.routes.route_graph import route_graph
+from thinmap_ros.evaluation.graph_metrics import drivable_share
+
+CONFIG = TopologyConfig(max_unknown_gap_m=0.0)
+
+
+def patch_of(cells: np.ndarray) -> GridPatch:
+    return GridPatch(GridFrame(0.0, 0.0, 0.1), cells.astype(np.int8))
+
+
+def room(rows: int, cols: int) -> np.ndarray:
+    cells = np.zeros((rows, cols))
+    cells[[0, -1]] = cells[:, [0, -1]] = 100
+    return cells
+
+
+def graphs_of(cells: np.ndarray) -> tuple[TopologicalMap, TopologicalMap]:
+    """The whole skeleton of a map, and the reduced graph."""
+    patch = patch_of(cells)
+    standing = select_free_space(patch, None, CONFIG)
+    whole = build_along(patch, standing, None, CONFIG)
+    before = (dict(whole.nodes), dict(whole.edges))
+    reduced = route_graph(whole, patch, standing, CONFIG)
+    assert before == (whole.nodes, whole.edges)
+    assert drivable_share(patch, reduced, CONFIG.robot_radius_m) == 1.0
+    return whole, reduced
+
+
+def rough_corridor() -> np.ndarray:
+    cells = np.full((40, 300), 100)
+    cells[8:32, 5:295] = 0
+    rng = np.random.default_rng(3)
+    for col in range(5, 295):
+        cells[8 : 8 + rng.integers(0, 7), col] = 100
+        cells[32 - rng.integers(0, 7) : 32, col] = 100
+    return cells
+
+
+def chairs() -> np.ndarray:
+    """A room of 8 m x 8 m with 30 chair legs, and a corridor along it."""
+    cells = np.full((130, 100), 100)
+    cells[5:85, 5:85] = 0
+    cells[100:120, 5:95] = 0
+    cells[85:100, 40:52] = 0
+    legs = np.random.default_rng(1).integers(15, 75, (30, 2))
+    cells[legs[:, 0], legs[:, 1]] = 100
+    return cells
+
+
+def test_a_corridor_with_rough_walls_is_a_line() -> None:
+    whole, reduced = graphs_of(rough_corridor())
+    assert len(whole.nodes) > 2
+    assert len(reduced.nodes) <= 4
+    assert len(reduced.components()) == 1
+    kinds = sorted(node.kind for node in reduced.nodes.values())
+    assert kinds == [NodeKind.END, NodeKind.END] + [NodeKind.CORNER] * (len(kinds) - 2)
+
+
+def test_a_room_with_chairs_is_no_thicket() -> None:
+    whole, reduced = graphs_of(chairs())
+    assert len(reduced.nodes) < 0.4 * len(whole.nodes)
+    assert len(reduced.components()) == len(whole.components()) == 1
+
+
+@pytest.mark.parametrize(('side', 'paths'), [(4, 1), (30, 2)])
+def test_both_paths_round_an_obstacle_smaller_than_a_table_are_one(side: int, paths: int) -> None:
+    cells = np.full((120, 120), 100)
+    cells[5:115, 5:115] = 0
+    # Corridors 2 m wide meet at an obstacle in the middle of a crossing.
+    cells[5:35, 5:35] = cells[5:35, 85:115] = cells[85:115, 5:35] = cells[85:115, 85:115] = 100
+    low = 60 - side // 2
+    cells[low : low + side, low : low + side] = 100
+    _, reduced = graphs_of(cells)
+    loops = len(reduced.edges) - len(reduced.nodes) + len(reduced.components())
+    assert loops == paths - 1
+
+
+def test_the_wider_path_stays() -> None:
+    cells = room(60, 140)
+    cells[26:34, 66:74] = 100
+    cells[34:50, 66:74] = 0
+    cells[50:59, 40:100] = 100
+    _, reduced = graphs_of(cells)
+    beside = [edge.path[np.abs(edge.path[:, 0] - 7.0) < 0.3, 1] for edge in reduced.edges.values()]
+    heights = np.concatenate(beside)
+    assert len(heights)
+    assert (heights < 2.6).all()
+
+
+def test_there_is_no_branch_into_rays_through_glass() -> None:
+    cells = np.full((160, 200), -1)
+    cells[19:41, 4:196] = 100
+    cells[20:40, 5:195] = 0
+    cells[40, 94:106] = 0  # a window
+    rows, cols = np.mgrid[:160, :200]
+    angle = np.degrees(np.arctan2(rows - 25, cols - 100))
+    # Dense near the window, single rays farther off.
+    is_ray = (np.abs(angle - 90) < 25) & (np.floor(angle) % 3 != 0) & (rows > 40)
+    cells[is_ray & (rows < 120)] = 0
+    cells[(rows > 40) & (rows < 75) & (np.abs(angle - 90) < 25)] = 0
+    whole, reduced = graphs_of(cells)
+    assert max(node.y for node in whole.nodes.values()) > 5.0
+    assert max(node.y for node in reduced.nodes.values()) < 4.2
+
+
+def test_places_see_the_node_that_is_nearest() -> None:
+    cells = np.full((80, 200), 100)
+    cells[5:35, 5:195] = 0
+    cells[37:75, 90:110] = 0  # a niche behind a wall of 0.2 m, with its door at the left
+    cells[35:37, 90:98] = 0
+    whole, reduced = graphs_of(cells)
+    patch = patch_of(cells)
+    standing = select_free_space(patch, None, CONFIG)
+    places = np.argwhere(standing)[::7]
+    seen = 0
+    for row, col in places:
+        x, y = patch.frame.centres_of(np.array([[row, col]]))[0]
+        node = reduced.nearest_node(x, y)
+        assert node is not None
+        to = patch.frame.cells_of(node.position)[0]
+        seen += is_drivable(patch.free, row, col, to[0], to[1])
+    assert len(reduced.nodes) <= len(whole.nodes) + 2
+    assert seen / len(places) > 0.97
+
+
+def test_one_room_has_an_edge() -> None:
+    whole, reduced = graphs_of(room(50, 50))
+    assert (len(whole.nodes), len(whole.edges)) == (1, 0)
+    assert (len(reduced.nodes), len(reduced.edges)) == (2, 1)
+    (edge,) = reduced.edges.values()
+    assert edge.length_m > 1.0
+
+
+def test_the_longer_of_two_parallel_edges_has_a_corner() -> None:
+    """Two paths between the same nodes, one bent round a pillar."""
+    cells = room(60, 100)
+    patch = patch_of(cells)
+    standing = select_free_space(patch, None, CONFIG)
+    nodes = [Node(i, NodeKind.CORNER, x, 3.05, 1.0) for i, x in ((1, 2.05), (2, 8.05))]
+    straight = np.column_stack([np.linspace(2.05, 8.05, 61), np.full(61, 3.05)])
+    bent = straight + np.column_stack([np.zeros(61), 2 * np.sin(np.linspace(0, math.pi, 61))])
+    edges = [Edge(3, 1, 2, straight, 6.0, 1.0), Edge(4, 1, 2, bent, 7.5, 0.9)]
+    graph = EditedGraph(TopologicalMap(nodes, edges), patch.frame, standing, patch.free)
+    lines.split_parallels(graph)
+    ends = {frozenset((edge.a, edge.b)) for edge in graph.map.edges.values()}
+    assert len(ends) == len(graph.map.edges) == 3
+    (corner,) = (node for node in graph.map.nodes.values() if node.id not in (1, 2))
+    assert corner.y == pytest.approx(5.05, abs=0.1)
+
+
+def test_a_straight_line_may_pass_a_corner_of_cells() -> None:
+    standing = np.eye(5, dtype=np.bool_)
+    assert is_drivable(standing, 0, 0, 4, 4)
+    assert not is_drivable(standing, 0, 0, 4, 3)
+    standing[2, 2] = False
+    assert not is_drivable(standing, 0, 0, 4, 4)
