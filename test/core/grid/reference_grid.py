@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, log_odds
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, log_odds
 
 FLAT_M = 0.06
 LONGEST_SURFACE_M = 3.0
@@ -35,7 +35,7 @@ class PlainGrid:
     """Log odds, in thousandths, of the observed cells (row, col)."""
 
     def __init__(self, config=None):
-        self.config = config or OccupancyConfig()
+        self.config = config or PAPER_GRID
         self.odds = {}
 
     def thousandths(self, probability):

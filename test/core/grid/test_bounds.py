@@ -6,7 +6,7 @@ import pytest
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.map_receiver import MapReceiver
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.odometry import OdometryBuffer
@@ -38,7 +38,7 @@ class Guarded:
 @pytest.mark.parametrize('far', [1e7, 1e15, 1e18, -1e18, 1e20, 1e300])
 @pytest.mark.parametrize('axis', [0, 1])
 def test_a_pose_far_away_is_rejected_before_anything_is_rendered(far, axis):
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     guard = Guarded(grid)
     before = grid.known_area()
     pose = np.zeros(3)
@@ -51,7 +51,7 @@ def test_a_pose_far_away_is_rejected_before_anything_is_rendered(far, axis):
 
 
 def test_a_map_that_would_get_too_large_keeps_nothing_of_the_scan():
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     grid.add_scan(SEEN, np.zeros(3))
     before = grid.state()
     with pytest.raises(InputError, match='tiles'):

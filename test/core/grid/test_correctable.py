@@ -13,7 +13,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid import rerendering
 from thinmap_ros.core.grid.correctable import MAX_OPEN, CorrectableGrid
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyConfig, OccupancyGrid, log_odds
 from thinmap_ros.core.grid.patch import UNKNOWN
 from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.tiles import TILE
@@ -64,7 +64,7 @@ class Drive:
     """The same drive and corrections with a grid re-rendered in slices or at once."""
 
     def __init__(self, in_one_go):
-        self.map = CorrectableGrid(OccupancyGrid())
+        self.map = CorrectableGrid(OccupancyGrid(PAPER_GRID))
         self.in_one_go = in_one_go
         self.moved = []
 
@@ -121,7 +121,7 @@ def test_a_correction_during_a_rerendering_starts_it_again():
 
 
 def drifted_map(count):
-    grid = CorrectableGrid(OccupancyGrid())
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
     for k, T in enumerate(drifted(TRUE[:count], 0.003)):
         grid.update(SCANS[k], T)
     return grid
@@ -145,7 +145,7 @@ def test_each_tile_shows_the_old_rendering_until_its_new_one_is_complete_near_on
     whole.finish()
     new = tiles_of(whole.shown)
     nothing = np.zeros((TILE, TILE), dtype=np.int16)
-    robot = tuple((OccupancyGrid().frame.cells_of(TRUE[250:251, :2])[0] // TILE).tolist())
+    robot = tuple((OccupancyGrid(PAPER_GRID).frame.cells_of(TRUE[250:251, :2])[0] // TILE).tolist())
     shown_at = {}
     step = 0
     while grid.is_rerendering:
@@ -168,7 +168,7 @@ def test_each_tile_shows_the_old_rendering_until_its_new_one_is_complete_near_on
 def test_new_scans_are_shown_at_once_and_stay_shown():
     grid = drifted_map(120)
     grid.apply_correction(np.arange(120), TRUE[:120], 120)
-    news = OccupancyGrid()
+    news = OccupancyGrid(PAPER_GRID)
     k = 120
     while grid.is_rerendering:
         grid.update(SCANS[k], TRUE[k])
@@ -185,9 +185,9 @@ def test_a_slice_does_a_bounded_part_of_the_work(monkeypatch):
     done = []
     pop = rerendering._Queue.pop
     monkeypatch.setattr(rerendering._Queue, 'pop', lambda self: done.append(pop(self)) or done[-1])
-    kept = [StoredScan.of(scan, OccupancyConfig()) for scan in SCANS]
-    work = Rerendering(OccupancyGrid(), kept * 2, np.tile(TRUE, (2, 1)), TRUE[0])
-    shown = OccupancyGrid()
+    kept = [StoredScan.of(scan, PAPER_GRID) for scan in SCANS]
+    work = Rerendering(OccupancyGrid(PAPER_GRID), kept * 2, np.tile(TRUE, (2, 1)), TRUE[0])
+    shown = OccupancyGrid(PAPER_GRID)
     slices = []
     while not work.is_complete:
         before = len(done)
@@ -234,14 +234,14 @@ def test_a_scan_touches_no_tile_beyond_those_that_it_is_thought_to(seed):
 def test_the_extent_of_a_scan_holds_whatever_its_beams_without_return_show():
     """Else a verdict on the laser would have to change all stored scans in one step."""
     scan = dropped(SCANS[0], np.random.default_rng(7))
-    config = OccupancyConfig()
+    config = PAPER_GRID
     extents = [StoredScan.of(replace(scan, drops_out=d), config).extent for d in (False, True)]
     np.testing.assert_array_equal(*extents)
 
 
 def test_what_is_rendered_again_at_the_same_poses_is_what_was_there():
     """All scans touch the tile of the robot: they are rendered in their original order."""
-    grid = CorrectableGrid(OccupancyGrid())
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
     poses = [se2.pose(3.0 + 0.3 * k, 1.2, 0.0) for k in range(12)]
     for k, T in enumerate(poses):
         grid.update(SCANS[k], T)
@@ -261,9 +261,9 @@ def dropped(scan, rng):
 @pytest.mark.parametrize('keeps_scans', [True, False])
 def test_once_a_laser_proves_to_drop_out_its_beams_without_return_clear_nothing(keeps_scans):
     rng = np.random.default_rng(5)
-    grid = CorrectableGrid(OccupancyGrid(), keeps_scans)
-    clean = OccupancyGrid()
-    trusted = OccupancyGrid()
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID), keeps_scans)
+    clean = OccupancyGrid(PAPER_GRID)
+    trusted = OccupancyGrid(PAPER_GRID)
     rebuilt = 0
     for k in range(40):
         scan = dropped(SCANS[k], rng)
@@ -286,8 +286,8 @@ def test_once_a_laser_proves_to_drop_out_its_beams_without_return_clear_nothing(
 
 def test_a_laser_proves_to_drop_out_while_a_correction_is_rendered(small_slices):
     rng = np.random.default_rng(6)
-    grid = CorrectableGrid(OccupancyGrid())
-    clean = OccupancyGrid()
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
+    clean = OccupancyGrid(PAPER_GRID)
     for k in range(30):
         scan = dropped(SCANS[k], rng)
         clean.add_scan(replace(scan, drops_out=True), TRUE[k])
@@ -304,7 +304,7 @@ def test_a_laser_proves_to_drop_out_while_a_correction_is_rendered(small_slices)
 
 
 def test_a_grid_whose_scans_are_not_known_stays_as_it_is():
-    grid = CorrectableGrid(OccupancyGrid(), keeps_scans=False)
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID), keeps_scans=False)
     grid.update(SCANS[0], TRUE[0])
     before = grid.shown.known_area()
     assert not grid.apply_correction(np.array([0]), TRUE[[5]], 1)
@@ -314,9 +314,9 @@ def test_a_grid_whose_scans_are_not_known_stays_as_it_is():
 
 
 def test_tiles_hold_the_sum_of_grids_within_the_limits():
-    one = OccupancyGrid()
-    other = OccupancyGrid()
-    total = OccupancyGrid()
+    one = OccupancyGrid(PAPER_GRID)
+    other = OccupancyGrid(PAPER_GRID)
+    total = OccupancyGrid(PAPER_GRID)
     for k in range(6):
         one.add_scan(SCANS[0], TRUE[0])
         if k % 2:
@@ -340,7 +340,7 @@ def test_tiles_hold_the_sum_of_grids_within_the_limits():
 
 
 def test_a_scan_that_is_too_far_away_is_left_out_and_named():
-    grid = CorrectableGrid(OccupancyGrid())
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
     grid.update(SCANS[0], TRUE[0])
     before = grid.shown.known_area().cells
     grid.update(SCANS[1], np.array([3e3, 3e3, 0.0]))
@@ -354,7 +354,7 @@ def test_a_scan_that_is_too_far_away_is_left_out_and_named():
 
 
 def test_a_scan_that_is_too_far_away_does_not_lose_a_correction():
-    grid = CorrectableGrid(OccupancyGrid())
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
     for k in range(20):
         grid.update(SCANS[k], TRUE[k])
     grid.apply_correction(np.array([0, 19]), TRUE[[0, 19]], since_ns=19)
@@ -365,7 +365,7 @@ def test_a_scan_that_is_too_far_away_does_not_lose_a_correction():
 
 
 def test_scans_that_a_correction_moves_too_far_away_are_left_out_and_named():
-    grid = CorrectableGrid(OccupancyGrid())
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
     for k in range(20):
         grid.update(SCANS[k], TRUE[k])
     far = TRUE[[0, 10, 19]] + [[0.0, 0.0, 0.0], [2e4, 2e4, 0.0], [0.0, 0.0, 0.0]]
@@ -378,7 +378,7 @@ def test_scans_that_a_correction_moves_too_far_away_are_left_out_and_named():
 
 def occupied_after(placements, correct_at=None):
     """Occupied cells of a grid after scans with these placements, each 50 scans later."""
-    grid = CorrectableGrid(OccupancyGrid())
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
     for k, placement in enumerate(placements):
         number = 50 * k
         if k == correct_at:
@@ -410,7 +410,7 @@ def test_scans_whose_placement_is_open_wait_until_it_is_decided():
 @pytest.mark.parametrize('first', [1, 2])
 def test_of_many_scans_whose_placement_is_open_the_latest_wait(first):
     """Their number is bounded: the one that was made elsewhere is dropped, or just not yet."""
-    grid = CorrectableGrid(OccupancyGrid())
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
     far = TRUE[0] + np.array([100.0, 0.0, 0.0])
     grid.update(SCANS[0], TRUE[0])
     for k in range(first, 2 + MAX_OPEN):
@@ -422,7 +422,7 @@ def test_of_many_scans_whose_placement_is_open_the_latest_wait(first):
 
 
 def test_scans_whose_placement_is_open_move_with_a_correction():
-    grid = CorrectableGrid(OccupancyGrid())
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
     shifted = np.array([1.0, 0.0, 0.0])
     grid.update(SCANS[0], TRUE[0] + shifted)
     grid.update(SCANS[50], TRUE[50] + shifted, OPEN)
@@ -457,7 +457,7 @@ def test_saved_scans_of_a_laser_that_dropped_out_clear_nothing_once_they_are_ren
         (replace(dropped(SCANS[k], rng), drops_out=True, stamp_ns=k + 1), TRUE[k])
         for k in range(20)
     ]
-    clean = OccupancyGrid()
+    clean = OccupancyGrid(PAPER_GRID)
     for scan, T in saved:
         clean.add_scan(scan, T)
     loaded = OccupancyGrid.from_state(clean.state())
@@ -468,7 +468,7 @@ def test_saved_scans_of_a_laser_that_dropped_out_clear_nothing_once_they_are_ren
     grid.finish()
     shown = grid.shown.known_area()
     assert shown.free.sum() == pytest.approx(clean.known_area().free.sum(), rel=0.05)
-    moved = OccupancyGrid()
+    moved = OccupancyGrid(PAPER_GRID)
     for scan, T in saved:
         moved.add_scan(scan, T + [0.0, 0.5, 0.0])
     assert (shown.cells == moved.known_area().cells).mean() > 0.999

@@ -8,7 +8,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.mapper import Mapper
-from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyConfig
 from thinmap_ros.core.stage import LocalizedScan, Trajectory
 
 POSES = [se2.pose(2.0 + 0.3 * k, 2.0, 0.0) for k in range(8)]
@@ -28,7 +28,7 @@ def corrected(mapper):
 
 
 def test_an_update_has_the_whole_map_once_all_of_it_is_corrected():
-    begun, complete = corrected(Mapper())
+    begun, complete = corrected(Mapper(PAPER_GRID))
     assert begun.is_rerendering and begun.whole is None and begun.corrected_ns == 0
     assert not complete.is_rerendering and complete.corrected_ns == 5
     whole = complete.whole
@@ -38,7 +38,7 @@ def test_an_update_has_the_whole_map_once_all_of_it_is_corrected():
 
 
 def test_a_correction_is_completed_at_the_end_and_described_as_long_as_it_is_the_newest():
-    mapper = Mapper()
+    mapper = Mapper(PAPER_GRID)
     for k in range(4):
         mapper.step(localized(k, POSES[k]))
     assert mapper.correct(Trajectory(np.arange(1, 5), np.array(POSES[:4]), 5))
@@ -50,16 +50,16 @@ def test_a_correction_is_completed_at_the_end_and_described_as_long_as_it_is_the
 
 
 def test_updates_come_with_every_nth_scan_and_show_what_has_changed_since_the_last():
-    mapper = Mapper(scans_per_update=3)
+    mapper = Mapper(PAPER_GRID, scans_per_update=3)
     updates = [mapper.step(localized(k, POSES[k])) for k in range(7)]
     assert [update is not None for update in updates] == [True, False, False] * 2 + [True]
-    assert Mapper(window_m=4.0).step(localized(0, POSES[0])).changes.shape == (40, 40)
+    assert Mapper(PAPER_GRID, window_m=4.0).step(localized(0, POSES[0])).changes.shape == (40, 40)
 
 
 def test_a_saved_map_is_continued_and_not_corrected():
-    mapper = Mapper()
+    mapper = Mapper(PAPER_GRID)
     mapper.step(localized(0, POSES[0]))
-    other = Mapper()
+    other = Mapper(PAPER_GRID)
     other.restore(mapper.state())
     patches = [each.whole_map().patch for each in (mapper, other)]
     np.testing.assert_array_equal(patches[0].cells, patches[1].cells)

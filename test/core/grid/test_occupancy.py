@@ -8,7 +8,7 @@ import pytest
 from reference_grid import PlainGrid
 
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyConfig, OccupancyGrid, log_odds
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.grid.tiles import TILE
@@ -57,7 +57,7 @@ def test_one_scan_marks_what_a_finely_sampled_reference_marks(seed):
     rng = np.random.default_rng(seed)
     scan = scan_of(np.where(rng.random(181) < 0.1, np.inf, rng.uniform(0.3, 7.0, 181)))
     T = np.array([*rng.uniform(-3, 3, 2), rng.uniform(-3, 3)])
-    config = OccupancyConfig()
+    config = PAPER_GRID
     grid = OccupancyGrid(config)
     grid.add_scan(scan, T)
     passed, hit = reference(scan, T, config)
@@ -74,7 +74,7 @@ def test_one_scan_marks_what_a_finely_sampled_reference_marks(seed):
 
 
 def test_each_cell_counts_once_a_scan_and_is_clamped():
-    config = OccupancyConfig()
+    config = PAPER_GRID
     grid = OccupancyGrid(config)
     wall = scan_of(np.full(181, 1.0))
     grid.add_scan(wall, pose(0.05, 0.05, 0))
@@ -87,7 +87,7 @@ def test_each_cell_counts_once_a_scan_and_is_clamped():
 
 
 def test_a_wall_that_went_away_is_unlearned():
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     for _ in range(100):
         grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
     for _ in range(12):
@@ -96,7 +96,7 @@ def test_a_wall_that_went_away_is_unlearned():
 
 
 def test_cells_beyond_a_hit_are_not_updated():
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
     assert percent(grid, 1.35, 0.05) == -1
     assert percent(grid, -0.55, 0.05) == -1
@@ -104,14 +104,14 @@ def test_cells_beyond_a_hit_are_not_updated():
 
 @pytest.mark.parametrize('value', [np.nan, 0.0, -1.0, 0.05, -np.inf])
 def test_invalid_beams_change_nothing(value):
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     grid.add_scan(scan_of(np.full(181, value)), pose(0, 0, 0))
     assert grid.known_area().unknown.all()
 
 
 @pytest.mark.parametrize('place', [(0.0, 0.0), (9.0, 0.0), (-9.0, 0.0), (0.0, 9.0), (300.0, -9.0)])
 def test_a_scan_that_shows_nothing_leaves_the_picture_as_it_was(place):
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     grid.add_scan(scan_of(np.full(181, 3.0)), pose(0.0, 0.0, 0.3))
     before = grid.known_area()
     grid.add_scan(scan_of(np.full(181, np.nan)), pose(*place, 0.3))
@@ -121,7 +121,7 @@ def test_a_scan_that_shows_nothing_leaves_the_picture_as_it_was(place):
 
 
 def test_a_beam_without_return_frees_up_to_the_configured_range():
-    grid = OccupancyGrid(OccupancyConfig(no_return_clear_range_m=3.0))
+    grid = OccupancyGrid(replace(PAPER_GRID, no_return_clear_range_m=3.0))
     for _ in range(2):
         grid.add_scan(scan_of(np.full(181, np.inf)), pose(0.05, 0.05, 0))
     assert grid.window(2.85, 0.05, 0.1).free.all()
@@ -130,7 +130,7 @@ def test_a_beam_without_return_frees_up_to_the_configured_range():
 
 
 def test_a_hit_beyond_the_usable_range_frees_cells_and_marks_no_wall():
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     for _ in range(2):
         scan = replace(scan_of(np.full(181, 5.0)), max_range_m=3.0)
         grid.add_scan(scan, pose(0.05, 0.05, 0))
@@ -139,7 +139,7 @@ def test_a_hit_beyond_the_usable_range_frees_cells_and_marks_no_wall():
 
 
 def test_the_map_grows_in_any_direction_in_memory_proportional_to_what_was_seen():
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     for x, y in [(0, 0), (500, 0), (-300, 400), (0, -900)]:
         grid.add_scan(scan_of(np.full(181, 1.0)), pose(x + 0.05, y + 0.05, 0))
         assert percent(grid, x + 1.05, y + 0.05) == 80
@@ -150,7 +150,7 @@ def test_the_map_grows_in_any_direction_in_memory_proportional_to_what_was_seen(
 @pytest.mark.parametrize('axis', range(3))
 @pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
 def test_a_pose_that_is_not_finite_changes_nothing(axis, value):
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     T = np.zeros(3)
     T[axis] = value
     grid.add_scan(scan_of(np.full(181, 1.0)), T)
@@ -158,7 +158,7 @@ def test_a_pose_that_is_not_finite_changes_nothing(axis, value):
 
 
 def test_a_window_is_aligned_with_the_map_and_unknown_where_nothing_is():
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
     window = grid.window(0.32, -0.17, 10.0)
     assert window.shape == (100, 100)
@@ -167,7 +167,7 @@ def test_a_window_is_aligned_with_the_map_and_unknown_where_nothing_is():
 
 
 def test_a_saved_map_is_resumed():
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     for _ in range(3):
         grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
     again = OccupancyGrid.from_patch(grid.known_area())
@@ -187,7 +187,7 @@ def test_the_resolution_of_a_finished_map_is_taken_over():
 
 def test_beams_that_graze_a_wall_do_not_erase_it():
     """A wall along y = 1.03, at the centre of its cells, passed repeatedly at a distance."""
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     angles = -math.pi / 2 + STEP * np.arange(181)
     for x in np.arange(-6.0, 0.0, 0.05):
         with np.errstate(divide='ignore'):
@@ -200,7 +200,7 @@ def test_beams_that_graze_a_wall_do_not_erase_it():
 
 
 def test_a_wall_on_the_boundary_of_two_cells_leaves_the_one_in_front_free():
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     rng = np.random.default_rng(4)
     bearings = np.radians(np.arange(-90.0, 91.0))
     for _ in range(30):
@@ -229,7 +229,7 @@ def seen_from(x, y, heading, wall_y, solid=True):
 
 @pytest.mark.parametrize('y', [1.98, 2.0, 2.02])
 def test_looking_along_a_wall_does_not_erase_it(y):
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     for _ in range(20):
         grid.add_scan(seen_from(1.5, 0.5, math.pi / 2, 2.0), pose(1.5, 0.5, math.pi / 2))
     wall = np.column_stack([np.arange(0.25, 2.3, 0.1), np.full(21, 1.95)])
@@ -242,7 +242,7 @@ def test_looking_along_a_wall_does_not_erase_it(y):
 
 
 def test_a_long_wall_that_went_away_is_unlearned_by_beams_that_cross_it():
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     for _ in range(20):
         grid.add_scan(seen_from(1.5, 0.5, math.pi / 2, 2.0), pose(1.5, 0.5, math.pi / 2))
     for x in np.linspace(0.5, 2.5, 30):
@@ -291,7 +291,7 @@ def known_cells(grid):
 @pytest.mark.parametrize(
     ('seed', 'config', 'max_range_m'),
     [
-        (0, OccupancyConfig(), 30.0),
+        (0, PAPER_GRID, 30.0),
         (
             1,
             OccupancyConfig(
@@ -318,7 +318,7 @@ def test_all_cells_are_those_of_the_plain_grid_bit_for_bit(seed, config, max_ran
 @pytest.mark.parametrize('seed', range(3))
 def test_the_whole_map_is_the_same_however_often_it_was_looked_at(seed):
     rng = np.random.default_rng(seed)
-    watched = OccupancyGrid()
+    watched = OccupancyGrid(PAPER_GRID)
     for _ in range(12):
         scan = scan_of(rng.uniform(0.5, 9.0, 181))
         watched.add_scan(scan, pose(*rng.uniform(-15.0, 15.0, 2), rng.uniform(-3.0, 3.0)))

@@ -25,7 +25,7 @@ def dijkstra(allowed, start):
             r = row + dr
             c = col + dc
             inside = 0 <= r < allowed.shape[0] and 0 <= c < allowed.shape[1]
-            if inside and allowed[r, c] and allowed[r, col] and allowed[row, c]:
+            if inside and allowed[r, c] and allowed[r, col] == allowed[row, c]:
                 reached = now + (7 if dr and dc else 5)
                 if reached < steps.get((r, c), math.inf):
                     steps[r, c] = reached

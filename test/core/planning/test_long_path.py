@@ -62,6 +62,20 @@ def test_the_path_is_the_wavefronts_and_only_part_of_the_map_is_searched():
     assert passes(path, SHORT_WAY)
 
 
+def test_from_the_rim_of_a_wide_hall_the_graph_is_reached():
+    cells = np.full((400, 700), 100, dtype=np.int8)
+    cells[10:390, 10:390] = 0
+    cells[190:210, 390:690] = 0
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
+    topology = graph_of(patch)
+    start = (4.0, 20.0)
+    goal = (66.0, 20.0)
+    paths = np.concatenate([edge.path for edge in topology.edges.values()])
+    assert np.hypot(*(paths - start).T).min() > 6.0
+    band = route_band(topology, patch, start, goal, CONFIG)
+    assert find_path(band.patch, start, goal, CONFIG, band=band.cells).is_exact
+
+
 def test_an_edge_that_the_grid_contradicts_is_left_out():
     patch = ring()
     path = along(route_band(graph_of(patch), with_wall(patch), START, GOAL, CONFIG))

@@ -1,4 +1,5 @@
 import heapq
+import itertools
 import math
 
 import numpy as np
@@ -6,12 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.graphs.doors import oblique_door, pass_door
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.traversability import nearest_true
+from thinmap_ros.core.planning.traversability import nearest_true, path_collides
 from thinmap_ros.core.planning.wavefront import (
     WavefrontConfig,
     cost_of_cells,
+    find_path,
     navigation_function,
     plan,
     trace_gradient_path,
@@ -42,7 +45,7 @@ def patch(cells):
 
 
 def reference(cost, goal):
-    """The same upwind equation, with Python's heap."""
+    """The same upwind equation, and steps over corners, with Python's heap."""
     rows, cols = cost.shape
     field = np.full(cost.shape, np.inf)
     done = set()
@@ -68,6 +71,13 @@ def reference(cost, goal):
             if value < field[r, c]:
                 field[r, c] = value
                 heapq.heappush(heap, (value, (r, c)))
+        for r, c in itertools.product((row - 1, row + 1), (col - 1, col + 1)):
+            if 0 <= r < rows and 0 <= c < cols and math.isinf(cost[row, c] + cost[r, col]):
+                value = field[row, col] + math.sqrt(2) * cost[r, c]
+                is_only_way = math.isinf(cost[row, c]) and math.isinf(cost[r, col])
+                if is_only_way and (r, c) not in done and value < field[r, c]:
+                    field[r, c] = value
+                    heapq.heappush(heap, (value, (r, c)))
     return field
 
 
@@ -183,6 +193,33 @@ def test_a_start_too_near_to_a_wall_escapes_but_not_through_the_wall():
     cells[30, :] = 100
     assert plan(patch(cells), (2.05, 2.85), (2.0, 1.0), PLAIN) is not None
     assert plan(patch(cells), (2.05, 2.85), (2.0, 5.0), PLAIN) is None
+
+
+@pytest.mark.parametrize('angle_deg', [10.0, 22.5, 30.0, 45.0])
+@pytest.mark.parametrize('offset_m', [0.0, 0.012, 0.025])
+@pytest.mark.parametrize('resolution', [0.05, 0.1])
+def test_the_planner_passes_the_doors_that_the_graph_passes(angle_deg, offset_m, resolution):
+    grid, point = oblique_door(angle_deg, offset_m, resolution, noise=0.0)
+    is_through, path = pass_door(grid, point, 0.35)
+    assert (path is not None) is is_through
+    assert path is None or not path_collides(grid, path, 0.35)
+
+
+def test_a_step_over_a_corner_leads_from_centre_to_centre():
+    cost = np.full((4, 4), np.inf)
+    cost[:2, :2] = cost[2:, 2:] = 1.0
+    path = trace_gradient_path(navigation_function(cost, (3, 3)), 0.5, 0.5, 3, 3).tolist()
+    k = path.index([1.5, 1.5])
+    assert path[k + 1] == [2.5, 2.5]
+
+
+def test_a_start_beside_a_diagonal_wall_of_single_cells_does_not_escape_through_it():
+    cells = room(60, 60)
+    cells[np.arange(1, 59), np.arange(1, 59)] = 100
+    across = (1.5, 4.5)
+    assert plan(patch(cells), (3.05, 2.95), across, PLAIN) is None
+    trail = np.array([[30, 29], [29, 30], [31, 29], [29, 31]])
+    assert find_path(patch(cells), (3.05, 2.95), across, PLAIN, trail=trail) is None
 
 
 def test_a_goal_too_near_to_a_wall_moves_a_little_and_no_more():

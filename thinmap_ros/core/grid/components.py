@@ -25,7 +25,7 @@ def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
 
 def reachable(cells: Mask, seeds: Cells) -> Mask:
     """True cells (H, W) in the same 8-connected component as one of the seeds (N, 2)."""
-    found: Mask = _reachable(np.ascontiguousarray(cells), seeds)
+    found: Mask = _reachable(np.ascontiguousarray(cells), np.ascontiguousarray(seeds))
     return found
 
 

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Placement
+from thinmap_ros.core.grid.edits import Erasures
+from thinmap_ros.core.grid.erasing import erase
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.scan_history import CorrectedPoses, PoseHistory
@@ -29,6 +31,8 @@ class CorrectableGrid:
     Scans whose placement is open wait: they are added once a scan belongs in the map, and dropped
     if the robot was lost. Those of a robot that maps apart are stored and not shown. They join the
     map if a correction comes before the robot is in the map again; otherwise they are dropped.
+    `erasures` are the parts of the map of which only later scans show anything, whenever it is
+    rendered again; a correction moves them.
     The stored scans take 10 kB per metre of new ground, at most 30 kB per square metre.
     """
 
@@ -38,19 +42,22 @@ class CorrectableGrid:
         keeps_scans: bool = True,
         corrected_ns: int = 0,
         scans: Sequence[tuple[Scan, Array]] = (),
+        erasures: Erasures | None = None,
     ) -> None:
         """Start with a grid. If keeps_scans is False, it is never corrected.
 
         scans: with poses (3,), from which a grid that is not empty can be rendered. It is shown as
-        it is until the first correction.
+        it is until the first correction. erasures: of the grid, among its scans by their stamps.
         """
         self.shown = grid
         self.corrected_ns = corrected_ns
+        self.erasures = erasures or Erasures()
         self._drops_out = False
         self._refusals: list[str] = []
         history: PoseHistory[StoredScan] = PoseHistory()
         for scan, T_scan in scans:
-            history.add_pose(scan.stamp_ns, T_scan, StoredScan.of(scan, grid.config))
+            count = self.erasures.count_before(scan.stamp_ns)
+            history.add_pose(scan.stamp_ns, T_scan, StoredScan.of(scan, grid.config, count))
         self._history = history if keeps_scans else None
         # With the poses (3,) at which they were made.
         self._open: deque[tuple[Scan, Array]] = deque(maxlen=MAX_OPEN)
@@ -76,7 +83,9 @@ class CorrectableGrid:
             self.corrected_ns = since_ns
             return False
         before = self._history.last_pose()
+        places = self._history.kept_poses()
         self._history.apply_correction(stamps_ns, poses, since_ns)
+        self.erasures.move(places, self._history.kept_poses())
         self._move_open(before, self._history.last_pose())
         if self._apart is not None:
             self._apart.apply_correction(stamps_ns, poses, since_ns)
@@ -116,6 +125,15 @@ class CorrectableGrid:
         elif placement is Placement.APART:
             self._open.clear()
             self._store_apart(scan, T_map_base)
+
+    def erase(self, corners: Array, stamp_ns: int) -> None:
+        """Set a polygon (M, 2), m, to unknown until later scans show it.
+
+        Only where no re-rendering is in progress. stamp_ns: of the newest scan. Raises InputError
+        where too many parts are erased.
+        """
+        self.erasures.add(corners, stamp_ns)
+        erase(self.shown, corners)
 
     def take_refusals(self) -> list[str]:
         """Why scans were left out since the last call, a reason for each."""
@@ -182,7 +200,8 @@ class CorrectableGrid:
 
     def _stored(self, scan: Scan) -> StoredScan:
         """The scan of a laser of which it is found out later whether it drops out."""
-        return StoredScan.of(replace(scan, drops_out=False), self.shown.config)
+        scan = replace(scan, drops_out=False)
+        return StoredScan.of(scan, self.shown.config, len(self.erasures))
 
     def _render_slice(self) -> CorrectedPoses | None:
         if self._history is None or self._pending_ns is None:
@@ -191,7 +210,12 @@ class CorrectableGrid:
             kept = self._history.kept()
             poses = self._history.kept_poses()
             self._rerendering = Rerendering(
-                self.shown, kept, poses, self._T_map_base, self._drops_out
+                self.shown,
+                kept,
+                poses,
+                self._T_map_base,
+                self._drops_out,
+                [item.corners for item in self.erasures.items],
             )
             # The step that closes a loop is already long: rendering starts with the next one.
             return None

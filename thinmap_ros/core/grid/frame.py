@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 
 MIN_RESOLUTION_M = 0.001
@@ -26,6 +26,9 @@ class GridFrame:
     resolution: float
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not isinstance(value, float | int | np.number):
+                raise InputError(f'{name} = {quoted(value)}: expected a number')
         if not (abs(self.origin_x) <= MAX_COORDINATE_M and abs(self.origin_y) <= MAX_COORDINATE_M):
             raise InputError(
                 f'map with its origin at {self.origin_x:g}, {self.origin_y:g} m: expected numbers '

@@ -6,9 +6,12 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.edits import MapEdits, split_edits
+from thinmap_ros.core.grid.keep_out import KeepOut, require_corners
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.scan_history import CorrectedPoses
+from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import LocalizedScan, Stage, Trajectory
 
@@ -48,7 +51,8 @@ class MapUpdate:
 class Mapper(Stage[LocalizedScan, MapUpdate]):
     """The stage of the map: each scan is added at its pose, and the map follows corrections.
 
-    grid: the map; refusals: why scans are not on it, a reason for each.
+    grid: the map; refusals: why scans are not on it, a reason for each. keep_out: areas that move
+    with the map when it is corrected, and do not change it.
     """
 
     def __init__(
@@ -73,28 +77,45 @@ class Mapper(Stage[LocalizedScan, MapUpdate]):
         self.replace(CorrectableGrid(OccupancyGrid(self._config), self._keeps_scans))
         self._is_given = False
 
-    def replace(self, grid: CorrectableGrid) -> None:
-        """Continue with another map, whose cells may have any size."""
+    def replace(self, grid: CorrectableGrid, keep_out: KeepOut | None = None) -> None:
+        """Continue with another map, whose cells may have any size, and its keep-out areas."""
         self.grid = grid
+        self.keep_out = keep_out or KeepOut()
         self.refusals: list[str] = []
         self._is_given = True
         self._scans = 0
         self._previous_ns = 0
         self._moved = _NOWHERE
 
+    @property
+    def edits(self) -> MapEdits:
+        """What a person has changed on the map."""
+        return MapEdits(self.keep_out, self.grid.erasures)
+
+    def erase(self, corners: Array, stamp_ns: int) -> None:
+        """Set a polygon (M, 2), m, to unknown, after a correction in progress is complete.
+
+        stamp_ns: of the newest scan. Raises InputError where it is none, or the last of too many.
+        """
+        require_corners('part to erase', corners)
+        self.finish()
+        self.grid.erase(corners, stamp_ns)
+
     def state(self) -> State:
-        """The cells of the map."""
-        return self.grid.shown.state()
+        """The cells of the map, and its edits."""
+        return {**self.grid.shown.state(), **self.edits.state()}
 
     def restore(self, state: State) -> None:
         """Continue with saved cells, which are not corrected. Raises InputError for others."""
-        grid = OccupancyGrid.from_state(state, self._config)
+        edits, cells = split_edits(state)
+        grid = OccupancyGrid.from_state(cells, self._config)
         expected_m = self._config.resolution_m
         if not self._is_given and grid.frame.resolution != expected_m:
             raise InputError(
                 f'map with {grid.frame.resolution} m a cell: expected {expected_m} m (resolution_m)'
             )
-        self.replace(CorrectableGrid(grid, keeps_scans=False))
+        erased = edits.erasures
+        self.replace(CorrectableGrid(grid, keeps_scans=False, erasures=erased), edits.keep_out)
 
     def correct(self, trajectory: Trajectory) -> bool:
         """Begin to follow a trajectory; returns whether the map can be corrected."""
@@ -145,6 +166,7 @@ class Mapper(Stage[LocalizedScan, MapUpdate]):
         if before_ns != self.grid.corrected_ns:
             self._previous_ns = before_ns
             self._moved = moved
+            self.keep_out = self.keep_out.moved(*moved)
 
     def _changes(self, localized: LocalizedScan, is_whole_new: bool) -> GridPatch | None:
         grid = self.grid.shown

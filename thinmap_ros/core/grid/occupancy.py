@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.config import Config, config_or_default, parameter
+from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import UNKNOWN, Bounds, GridPatch
 from thinmap_ros.core.grid.raytrace import fill_segment
 from thinmap_ros.core.grid.rendered_map import RenderedMap
 from thinmap_ros.core.grid.tiles import MAX_TILE_INDEX, TILE, TileStore
@@ -47,7 +47,7 @@ class OccupancyConfig(Config):
     """Parameters of the grid and of the laser's inverse sensor model."""
 
     resolution_m: float = parameter(
-        0.10,
+        0.05,
         'Edge of a cell of the grid (m). Lower: finer walls, more memory and computing time.',
         low=0.01,
         high=1.0,
@@ -99,8 +99,9 @@ class OccupancyConfig(Config):
     p_surely_occupied: float = 0.9
 
 
-# On a robot that drives through doors; the experiments of the papers and logs keep the default.
-ROBOT_GRID = OccupancyConfig(resolution_m=0.05)
+# Cells of the papers, and of all results that are compared with published ones: experiments,
+# explorations in the simulator, benchmarks.
+PAPER_GRID = OccupancyConfig(resolution_m=0.10)
 
 
 def log_odds(probability: float) -> float:
@@ -140,7 +141,7 @@ class OccupancyGrid:
         self, config: OccupancyConfig | None = None, frame: GridFrame | None = None
     ) -> None:
         """Start empty; frame: of the map to continue, which gives the resolution."""
-        self.config = config or OccupancyConfig()
+        self.config = config_or_default(config, OccupancyConfig)
         self.frame = frame or GridFrame(0.0, 0.0, self.config.resolution_m)
         self._tiles = TileStore()
         self._percent = _percent_table()
@@ -155,6 +156,7 @@ class OccupancyGrid:
     @staticmethod
     def from_patch(patch: GridPatch, config: OccupancyConfig | None = None) -> 'OccupancyGrid':
         """Start from a finished map, with the same cells and resolution."""
+        require_type('patch', patch, GridPatch)
         grid = OccupancyGrid(config, patch.frame)
         # A table takes a tenth of the memory that arithmetic on the cells of a large map takes.
         values = np.arange(1 << 8, dtype=np.uint8).view(np.int8)
@@ -196,8 +198,11 @@ class OccupancyGrid:
         """Add a scan made at a robot pose T_map_base (3,).
 
         Raises InputError, and leaves the map unchanged, if the laser is beyond MAX_COORDINATE_M or
-        the map would become too large.
+        the map would become too large, and for anything but a scan and a pose.
         """
+        require_type('scan', scan, Scan)
+        if np.shape(T_map_base) != (3,):
+            raise InputError(f'T_map_base = {quoted(T_map_base)}: expected a pose (3,)')
         if scan.ranges_m.size == 0 or not se2.is_finite(T_map_base):
             return
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
@@ -282,6 +287,16 @@ class OccupancyGrid:
         row, col = (tiles.min(axis=0) * TILE).tolist()
         end_row, end_col = ((tiles.max(axis=0) + 1) * TILE).tolist()
         self._mark_changed(row, col, end_row, end_col)
+
+    def odds(self, bounds: Bounds) -> NDArray[np.int16]:
+        """Copy of the log odds (H, W) within bounds, in thousandths; 0: unknown."""
+        row, col, end_row, end_col = bounds
+        return self._tiles.read(row, col, end_row - row, end_col - col)
+
+    def set_odds(self, bounds: Bounds, odds: NDArray[np.int16]) -> None:
+        """Set the log odds (H, W) within bounds, where there are tiles."""
+        self._tiles.overwrite(*bounds[:2], odds)
+        self._mark_changed(*bounds)
 
     def window(self, x: float, y: float, size_m: float) -> GridPatch:
         """Square of size_m around a point, aligned with the cells, copied out of the tiles."""

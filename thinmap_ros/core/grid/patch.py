@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
 
@@ -34,6 +34,18 @@ class GridPatch:
     frame: GridFrame
     cells: NDArray[np.int8]
     is_replaced: bool = False
+
+    def __post_init__(self) -> None:
+        require_type('frame', self.frame, GridFrame)
+        cells = self.cells
+        if not (isinstance(cells, np.ndarray) and cells.ndim == 2 and cells.dtype == np.int8):
+            raise InputError(f'cells = {quoted(cells)}: expected an array (H, W) of int8')
+
+    def __repr__(self) -> str:
+        rows, cols = self.shape
+        free_m2 = np.count_nonzero(self.free) * self.frame.resolution**2
+        size = f'{rows} x {cols} cells of {self.frame.resolution:g} m'
+        return f'GridPatch({size}, {free_m2:.1f} m2 free)'
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -145,3 +157,8 @@ def bounds_of(chosen: NDArray[np.bool_]) -> Bounds | None:
     end = int(rows[-1]) + 1
     cols = np.flatnonzero(chosen[first:end].any(axis=0))
     return first, int(cols[0]), end, int(cols[-1]) + 1
+
+
+def union(a: Bounds, b: Bounds) -> Bounds:
+    """Bounds of all cells in one of two rectangles."""
+    return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])

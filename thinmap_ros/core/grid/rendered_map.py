@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, Bounds, GridPatch, bounds_of
+from thinmap_ros.core.grid.patch import UNKNOWN, Bounds, GridPatch, bounds_of, union
 from thinmap_ros.core.grid.tiles import TileStore
 
 _BAND_ROWS = 256  # rendered at once: a large map needs little more memory than its cells
@@ -79,7 +79,7 @@ class RenderedMap:
 
 
 def _union(a: Bounds | None, b: Bounds) -> Bounds:
-    return b if a is None else (min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3]))
+    return b if a is None else union(a, b)
 
 
 def _intersection(a: Bounds, b: Bounds) -> Bounds:

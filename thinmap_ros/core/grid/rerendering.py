@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.erasing import add_scan_outside
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.tiles import TILE
@@ -28,14 +29,16 @@ _Cells = NDArray[np.int64]
 class StoredScan(NamedTuple):
     """A scan, and the bounding rectangle of its beams.
 
-    extent (4,): lowest x and y, highest x and y, robot frame, m.
+    extent (4,): lowest x and y, highest x and y, robot frame, m. erasures: how many parts of the
+    map had been erased when it was made.
     """
 
     scan: Scan
     extent: Array
+    erasures: int = 0
 
     @staticmethod
-    def of(scan: Scan, config: OccupancyConfig) -> 'StoredScan':
+    def of(scan: Scan, config: OccupancyConfig, erasures: int = 0) -> 'StoredScan':
         """Store a scan, with the extent that a grid of this configuration renders.
 
         Or would render if beams without return showed free space.
@@ -48,7 +51,7 @@ class StoredScan(NamedTuple):
         bearings = scan.angles_rad + scan.T_base_laser[2]
         x = np.append(reach * np.cos(bearings), 0.0) + scan.T_base_laser[0]
         y = np.append(reach * np.sin(bearings), 0.0) + scan.T_base_laser[1]
-        return StoredScan(scan, np.array([x.min(), y.min(), x.max(), y.max()]))
+        return StoredScan(scan, np.array([x.min(), y.min(), x.max(), y.max()]), erasures)
 
 
 class _Task(NamedTuple):
@@ -59,7 +62,7 @@ class _Task(NamedTuple):
 
     ring: int
     tiles: int
-    scan: Scan
+    stored: StoredScan
     T_map_base: Array
 
 
@@ -74,7 +77,7 @@ class _Queue:
     ) -> None:
         """Start with scans at poses (N, 3); nearest ring (N,) and number of tiles (N,) of each."""
         order = np.argsort(rings, kind='stable')
-        self._scans = [scans[k].scan for k in order.tolist()]
+        self._scans = [scans[k] for k in order.tolist()]
         self._poses = poses[order]
         self._rings = rings[order]
         self._tiles = tile_counts[order]
@@ -84,9 +87,9 @@ class _Queue:
     def __len__(self) -> int:
         return len(self._scans) - self._next + len(self._since)
 
-    def append(self, scan: Scan, T_map_base: Array, tiles: int) -> None:
+    def append(self, stored: StoredScan, T_map_base: Array, tiles: int) -> None:
         """Add a scan that was made since the correction."""
-        self._since.append(_Task(_LAST_RING, tiles, scan, T_map_base))
+        self._since.append(_Task(_LAST_RING, tiles, stored, T_map_base))
 
     @property
     def first(self) -> _Task:
@@ -123,13 +126,16 @@ class Rerendering:
         poses: Array,
         T_map_base: Array,
         drops_out: bool = False,
+        erased: Sequence[Array] = (),
     ) -> None:
         """Start with the stored scans at their poses (N, 3).
 
         like: a grid with the same cells and configuration; T_map_base (3,): pose of the robot;
-        drops_out: of the laser, as is known now, for all scans; those that have it, keep it.
+        drops_out: of the laser, as is known now, for all scans; those that have it, keep it;
+        erased: polygons (M, 2), m, of which only scans since show anything.
         """
         self._drops_out = drops_out
+        self._erased = erased
         self.grid = OccupancyGrid(like.config, like.frame)
         self._added = OccupancyGrid(like.config, like.frame)  # scans that arrived meanwhile
         self._robot_tile = like.frame.cells_of(T_map_base[None, :2])[0] // TILE
@@ -150,7 +156,7 @@ class Rerendering:
             self._added.add_scan(kept.scan, T_map_base)
         box = _tile_boxes([kept.extent], T_map_base[None], self.grid.frame)[0]
         tiles = int(np.prod(box[1] - box[0] + 1))
-        self._queue.append(kept.scan, T_map_base, tiles)
+        self._queue.append(kept, T_map_base, tiles)
 
     def render_slice(self, shown: OccupancyGrid) -> list[str]:
         """Render some scans, and update the shown grid, unless `grid` is complete now.
@@ -166,8 +172,10 @@ class Rerendering:
                 break
             task = self._queue.pop()
             try:
-                scan = replace(task.scan, drops_out=self._drops_out or task.scan.drops_out)
-                self.grid.add_scan(scan, task.T_map_base)
+                scan = task.stored.scan
+                scan = replace(scan, drops_out=self._drops_out or scan.drops_out)
+                erased = self._erased[task.stored.erasures :]
+                add_scan_outside(self.grid, scan, task.T_map_base, erased)
             except InputError as error:
                 refusals.append(str(error))
             scans += 1

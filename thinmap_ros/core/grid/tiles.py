@@ -210,6 +210,11 @@ class TileStore:
         tiles = tiles.reshape(2, -1).T
         self.grow_to(int(tiles[0, 0]), int(tiles[0, 1]), int(tiles[-1, 0]), int(tiles[-1, 1]))
         self.allocate(tiles)
+        self.overwrite(row, col, cells)
+
+    def overwrite(self, row: int, col: int, cells: NDArray[Any]) -> None:
+        """Set those of the cells (H, W, ...) from (row, col) on whose tiles exist."""
+        rows, cols = cells.shape[:2]
         for tile_row, tile_col, slot in self._tiles_within(row, col, rows, cols):
             top = tile_row * TILE
             left = tile_col * TILE

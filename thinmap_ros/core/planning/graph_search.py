@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thinmap_ros.core.errors import InputError, require_type
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, TopologicalMap
 
@@ -38,7 +39,15 @@ class GraphAccess:
 
 
 def shortest_path(topology: TopologicalMap, start_id: int, goal_id: int) -> Route | None:
-    """Shortest route between two nodes, by A*; None if no edges connect them."""
+    """Shortest route between two nodes, by A*; None if no edges connect them.
+
+    Raises InputError where the graph has no such node.
+    """
+    require_type('topology', topology, TopologicalMap)
+    for node_id in (start_id, goal_id):
+        require_type('node', node_id, int)
+        if node_id not in topology.nodes:
+            raise InputError(f'node {node_id}: expected a node of {topology!r}')
     goal = topology.nodes[goal_id]
     return shortest_route(topology, {start_id: 0.0}, {goal_id: 0.0}, (goal.x, goal.y))
 

@@ -50,23 +50,6 @@ def downsample_mask(allowed: Mask, factor: int) -> Mask:
     return np.asarray(_downsample(allowed, factor, 0, 0))
 
 
-@kernel
-def upsample_mask(squares: Mask, factor: int, cells: Mask) -> Mask:
-    """Cells of a mask (H, W) that lie in a true square of factor x factor cells."""
-    rows, cols = cells.shape
-    result = np.zeros((rows, cols), dtype=np.bool_)
-    line = np.zeros(squares.shape[1] * factor, dtype=np.bool_)
-    for square_row in range(squares.shape[0]):
-        for square in range(squares.shape[1]):
-            for k in range(factor):
-                line[square * factor + k] = squares[square_row, square]
-        # One line for all rows of a square: vectorized over columns.
-        for row in range(square_row * factor, min((square_row + 1) * factor, rows)):
-            for col in range(cols):
-                result[row, col] = cells[row, col] & line[col]
-    return result
-
-
 def _cells(steps: NDArray[np.int32]) -> Array:
     """Steps as lengths in cells."""
     return np.where(steps == _FAR, np.inf, steps / _STRAIGHT)
@@ -175,8 +158,8 @@ def _field(
                         continue
                     length = _STRAIGHT
                     if down and right:
-                        # No corner is cut: a diagonal step needs both cells beside it.
-                        if weight[cell + down] == 0 or weight[cell + right] == 0:
+                        # No corner is cut where a path over edges leads around it.
+                        if (weight[cell + down] == 0) != (weight[cell + right] == 0):
                             continue
                         length = _DIAGONAL
                     reached = now + weight[to] * length

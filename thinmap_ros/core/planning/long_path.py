@@ -27,7 +27,7 @@ XY = tuple[float, float]
 # Straight distance from which the wavefront in a band costs less than the wavefront alone.
 LONG_PATH_M = 20.0
 _BAND_M = 3.0  # half of its width: wide enough for the shortest path through most halls
-_ACCESS_M = 6.0  # the graph is looked for so far from the robot and from the goal
+_ACCESS_M = 6.0  # the graph is looked for so far from either end; in halls twice that, and so on
 _MAX_ROUTES = 6  # that are tried, each without the contradicted edges of those before
 
 
@@ -153,10 +153,10 @@ def route_band(
         (start_xy, config.start_escape_distance_m),
         (goal_xy, config.goal_search_radius_m),
     ):
-        around = _surroundings(patch, xy, reach_m, config)
-        if around is None:
+        entrance = _entrance(checked, xy, reach_m)
+        if entrance is None:
             return None
-        ends.append((around, checked.entries(around)))
+        ends.append(entrance)
     route = _route(checked, ends[0][1], ends[1][1], goal_xy)
     if route is None:
         return None
@@ -165,13 +165,33 @@ def route_band(
     return _band(patch, np.concatenate([[start_xy], path, [goal_xy]]), access, config)
 
 
+def _entrance(
+    checked: _Checked, xy: XY, reach_m: float
+) -> tuple[_Surroundings, list[_Entry]] | None:
+    """The smallest surroundings of a point through which edges pass, and where these are entered.
+
+    None if the point, or a traversable cell within reach_m, has no path to any edge.
+    """
+    patch = checked.patch
+    size = math.ceil(_ACCESS_M / patch.frame.resolution)
+    while True:
+        around = _surroundings(patch, xy, reach_m, size, checked.config)
+        if around is None:
+            return None
+        entries = checked.entries(around)
+        if entries:
+            return around, entries
+        if around.lengths_m.shape == patch.shape:
+            return None
+        size *= 2
+
+
 def _surroundings(
-    patch: GridPatch, xy: XY, reach_m: float, config: WavefrontConfig
+    patch: GridPatch, xy: XY, reach_m: float, size: int, config: WavefrontConfig
 ) -> _Surroundings | None:
-    """Path lengths around a point, or around the traversable cell nearest to it within reach_m."""
+    """Path lengths within `size` cells of a point, or of the nearest traversable cell in reach."""
     resolution = patch.frame.resolution
     row, col = patch.frame.cells_of(np.array([xy]))[0].tolist()
-    size = math.ceil(_ACCESS_M / resolution)
     part = _crop(patch, max(row - size, 0), max(col - size, 0), row + size + 1, col + size + 1)
     first_row = max(row - size, 0)
     first_col = max(col - size, 0)
@@ -250,9 +270,10 @@ def _band(
     # The costs of its cells depend on obstacles beside the band.
     beside_m = max(config.inflation_radius_m, config.robot_radius_m)
     margin = math.ceil((_BAND_M + beside_m) / resolution) + 1
-    margin = max(margin, math.ceil(_ACCESS_M / resolution) + 1)
-    low = np.maximum(at.min(axis=0) - margin, 0)
-    high = np.minimum(at.max(axis=0) + margin + 1, patch.shape)
+    first = np.array([(around.row, around.col) for around, _ in access])
+    last = first + [around.lengths_m.shape for around, _ in access]
+    low = np.maximum(np.minimum(at.min(axis=0) - margin, first.min(axis=0)), 0)
+    high = np.minimum(np.maximum(at.max(axis=0) + margin + 1, last.max(axis=0)), patch.shape)
     part = _crop(patch, *low.tolist(), *high.tolist())
     cells = np.zeros(part.shape, dtype=np.bool_)
     _paint_discs(cells, at - low, _BAND_M / resolution)

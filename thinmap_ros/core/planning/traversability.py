@@ -6,16 +6,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.grid.components import reachable
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
+from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, Bounds, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.free_space import column_distance, standing_room
 from thinmap_ros.jit import kernel
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
-# Rows and columns of cells: first row, first column, row after the last, column after the last.
-Part = tuple[int, int, int, int]
 
 
 def traversable_cells(free: Mask, radius_m: float, resolution: float) -> Mask:
@@ -27,7 +26,7 @@ def traversable_cells(free: Mask, radius_m: float, resolution: float) -> Mask:
 
 
 def update_traversable_cells(
-    standing: Mask, free: Mask, part: Part, radius_m: float, resolution: float
+    standing: Mask, free: Mask, part: Bounds, radius_m: float, resolution: float
 ) -> None:
     """Update traversable cells (H, W), in place, where free cells have changed within a part."""
     reach = math.ceil(radius_m / resolution) + 1
@@ -70,11 +69,13 @@ def escape_cells(
 
 
 def reachable_cells(allowed: Mask, start: tuple[int, int]) -> Mask:
-    """Allowed cells (H, W) that are reachable from a start (row, col), with 4-connectivity.
+    """Allowed cells (H, W) that are reachable from a start (row, col), with 8-connectivity.
 
     No cells if the start is outside the mask.
     """
-    return np.asarray(_reachable_cells(allowed, start[0], start[1]))
+    if not (0 <= start[0] < allowed.shape[0] and 0 <= start[1] < allowed.shape[1]):
+        return np.zeros_like(allowed)
+    return reachable(allowed, np.array([start]))
 
 
 def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[int, int] | None:
@@ -107,36 +108,6 @@ def disc(
     cols = slice(max(centre[1] - whole, 0), min(centre[1] + whole + 1, of.shape[1]))
     row, col = np.ogrid[rows, cols]
     return (rows, cols), np.asarray(np.hypot(row - centre[0], col - centre[1]) <= reach)
-
-
-@kernel
-def _reachable_cells(allowed: Mask, start_row: int, start_col: int) -> Mask:
-    rows = allowed.shape[0]
-    cols = allowed.shape[1] + 2
-    # A blocked margin of one cell makes bounds checks unnecessary.
-    left = np.zeros((rows + 2, cols), dtype=np.bool_)
-    left[1:-1, 1:-1] = allowed
-    found = np.zeros((rows + 2, cols), dtype=np.bool_)
-    if not (0 <= start_row < rows and 0 <= start_col < cols - 2):
-        return found[1:-1, 1:-1].copy()
-    flat = left.ravel()
-    reached = found.ravel()
-    stack = np.empty(flat.size, dtype=np.int64)
-    start = (start_row + 1) * cols + start_col + 1
-    stack[0] = start
-    count = int(flat[start])
-    reached[start] = flat[start]
-    flat[start] = False
-    while count > 0:
-        count -= 1
-        at = stack[count]
-        for to in (at - cols, at - 1, at + 1, at + cols):
-            if flat[to]:
-                flat[to] = False
-                reached[to] = True
-                stack[count] = to
-                count += 1
-    return found[1:-1, 1:-1].copy()
 
 
 @kernel
