@@ -45,7 +45,7 @@ def corrected(localizer, by=CORRECTION):
     other = deepcopy(localizer)
     loops = other._map.loops
     moved = np.array([se2.compose(by, T) for T in loops.keyframes.poses()])
-    loops.keyframes.move(moved, loops.graph.edges)
+    list(loops.keyframes.move(moved, loops.graph.edges))
     other._map.close_loops()
     return other
 

@@ -11,6 +11,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.active_map import ActiveMap
 from thinmap_ros.core.slam.atlas import Atlas
+from thinmap_ros.core.slam.graph.heading_table import heading_row
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, Step, heading_errors, with_heading
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Systematic
@@ -184,7 +185,7 @@ class LocalizerMap:
         # In a new submap the heading is unknown, also by multiples of 90 degrees.
         is_lost = loops.pieces.is_apart or tracker.track.evidence.is_lost
         heading = None if is_lost else self._heading.measured
-        (error,) = heading_errors([heading], T_map_base[None])
+        (error,) = heading_errors(np.array([heading_row(heading)]), T_map_base[None])
         covariance, systematic = with_heading(
             tracker.random_covariance(anchor), tracker.systematic(anchor), error
         )

@@ -18,6 +18,8 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.covariances import carried, rotation
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph.rows import Rows
+from thinmap_ros.jit import kernel
 
 _OUTLIER_SIGMAS = 3.0  # beyond which all innovations teach the same
 
@@ -243,26 +245,34 @@ class _Spans:
     """
 
     def __init__(self, parameters: Array, covariance: Array) -> None:
-        self._parameters = [parameters]
-        self._before = [covariance]  # prediction of each span
-        self._after = [covariance]
+        self._parameters = Rows(4)
+        self._parameters.append(parameters)
+        self._gains = Rows(4, 4)  # of the smoother, from each span to the previous
+        self._after = covariance  # of the last span
 
     def __len__(self) -> int:
-        return len(self._parameters) - 1
+        return len(self._gains)
 
     def add(self, parameters: Array, before: Array, after: Array) -> None:
         """Add a span: parameters (4,), covariances (4, 4) before and after its measurement."""
         self._parameters.append(parameters)
-        self._before.append(before)
-        self._after.append(after)
+        self._gains.append(self._after @ np.linalg.inv(before))
+        self._after = after
 
     def smoothed(self) -> Array:
         """Parameters (N, 4) of each number of spans, given all of them."""
-        found = np.array(self._parameters)
-        gains = np.array(self._after)[:-1] @ np.linalg.inv(np.array(self._before)[1:])
-        for k in range(len(found) - 2, -1, -1):
-            found[k] += gains[k] @ (found[k + 1] - self._parameters[k])
+        found: Array = _smoothed(self._parameters.values, self._gains.values)
         return found
+
+
+@kernel
+def _smoothed(parameters: Array, gains: Array) -> Array:
+    found = parameters.copy()
+    for k in range(len(gains) - 1, -1, -1):
+        for i in range(4):
+            for j in range(4):
+                found[k, i] += gains[k, i, j] * (found[k + 1, j] - parameters[k, j])
+    return found
 
 
 def _signed_length(increment: Array) -> float:

@@ -91,12 +91,6 @@ class Heading(NamedTuple):
         by_calibration = self.reference.systematic.derivative[2].tolist()
         return (self.yaw, self.variance, self.reference.variance, *by_calibration)
 
-    def calibrated(self, parameters: Array) -> 'Heading':
-        """The heading with parameters (N, 4) of the calibration, by the number of spans."""
-        reference = self.reference
-        yaw = self.yaw + reference.turn(parameters)
-        return Heading(yaw, self.variance, reference.calibrated(parameters))
-
 
 class WallCompass:
     """Histogram of wall lengths by direction in the map; measures the heading of a scan."""

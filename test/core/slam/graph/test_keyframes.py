@@ -10,10 +10,13 @@ from support.slam_room import ROOM, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.covariances import inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph import keyframes as module
+from thinmap_ros.core.slam.graph.edge_table import EdgeTable
+from thinmap_ros.core.slam.graph.heading_table import heading_row
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
     Keyframes,
+    Start,
     Step,
     covariances_from,
     heading_errors,
@@ -41,6 +44,11 @@ def along(poses, steps=STEP):
     for k, pose in enumerate(poses):
         keyframes.add(frame(pose, float(k), k), Step(steps))
     return keyframes
+
+
+def move(keyframes, poses, edges):
+    for _ in keyframes.move(poses, edges):
+        raise AssertionError('few keyframes move in one slice')
 
 
 def independent(variance):
@@ -97,7 +105,7 @@ def test_scans_for_which_a_keyframe_stands_go_where_it_goes():
     keyframes.reuse(1, frame([1.1, 1.05, 0.1], stamp_ns=77))
     offset = se2.between(keyframes.frames[1].T_map_base, np.array([1.1, 1.05, 0.1]))
     moved = keyframes.poses() + [0.5, -0.2, 0.4]
-    keyframes.move(moved, [])
+    move(keyframes, moved, EdgeTable())
     np.testing.assert_allclose(keyframes.path()[1][-1], se2.compose(moved[1], offset))
     assert keyframes.most_similar(moved[2]) == 2
 
@@ -161,7 +169,7 @@ def test_covariances_along_a_chain_are_those_of_sampling(rng):
     for k, (T, covariance) in enumerate(zip(chain, covariances, strict=True)):
         poses.append(se2.compose(poses[-1], T))
         keyframes.add(frame(poses[-1], float(k)), Step(covariance))
-    keyframes.move(np.array(poses), [])
+    move(keyframes, np.array(poses), EdgeTable())
     truth = sampled(chain, covariances, rng)
     found = keyframes.frames[-1].covariance
     scale = np.sqrt(np.outer(np.diag(truth), np.diag(truth)))
@@ -176,16 +184,16 @@ def test_an_edge_that_closes_a_loop_leaves_less_uncertainty():
     angles = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
     poses = np.column_stack([3 * np.cos(angles), 3 * np.sin(angles), se2.wrap(angles + np.pi / 2)])
     keyframes = along(poses)
-    keyframes.move(poses, [])
+    move(keyframes, poses, EdgeTable())
     alone = [np.trace(each.covariance[:2, :2]) for each in keyframes.frames]
     loop = Edge(0, 19, se2.between(poses[0], poses[19]), inverse(STEP), True)
-    keyframes.move(poses, [loop])
+    move(keyframes, poses, EdgeTable([loop]))
     closed = [np.trace(each.covariance[:2, :2]) for each in keyframes.frames]
     assert closed[19] == pytest.approx(alone[1], rel=0.3)
     assert np.argmax(closed) in (9, 10, 11)
     assert all(b <= a + 1e-12 for a, b in zip(alone, closed, strict=True))
     # Edges to keyframes that are not part of the optimization are ignored.
-    keyframes.move(poses[:10], [loop])
+    move(keyframes, poses[:10], EdgeTable([loop]))
     assert np.trace(keyframes.frames[9].covariance[:2, :2]) == pytest.approx(alone[9])
 
 
@@ -195,7 +203,7 @@ def test_a_loop_measured_the_other_way_is_turned_round(rng):
     T = se2.between(poses[1], poses[0])
     covariance = np.diag(np.square([0.02, 0.01, 0.05]))
     keyframes = along(poses, 1e6 * np.eye(3))
-    keyframes.move(poses, [Edge(1, 0, T, inverse(covariance), True)])
+    move(keyframes, poses, EdgeTable([Edge(1, 0, T, inverse(covariance), True)]))
     measured = T + rng.multivariate_normal(np.zeros(3), covariance, 20000)
     truth = np.cov([se2.compose(poses[0], se2.invert(each)) for each in measured], rowvar=False)
     found = keyframes.frames[1].covariance
@@ -244,13 +252,13 @@ def test_covariances_along_the_graph_are_the_same_in_plain_python(rng, monkeypat
         edges.append(Edge(a, b, se2.between(poses[a], poses[b]), information, False, share))
     headings = np.where(rng.random(12) < 0.5, rng.uniform(1e-5, 1e-2, 12), np.inf)
     errors = np.column_stack([headings, np.zeros((12, 5))])
-    compiled, derivatives = covariances_from(3, poses, edges, errors)
+    compiled, derivatives = covariances_from(Start(3), poses, [EdgeTable(edges)], errors)
     assert np.isinf(compiled[11]).all(), 'no chain leads there'
     assert (compiled[3] == 0.0).all()
     np.testing.assert_allclose(compiled, np.swapaxes(compiled, 1, 2), atol=1e-12)
     assert (compiled[:11, 2, 2] <= headings[:11] + 1e-12).all()
     monkeypatch.setattr(module, '_covariances', module._covariances.py_func)
-    covariances, by = covariances_from(3, poses, edges, errors)
+    covariances, by = covariances_from(Start(3), poses, [EdgeTable(edges)], errors)
     np.testing.assert_allclose(covariances, compiled, rtol=1e-12)
     np.testing.assert_allclose(by, derivatives, rtol=1e-9, atol=1e-12)
 
@@ -283,7 +291,9 @@ def test_measured_headings_are_no_better_than_the_walls_they_are_measured_by(rng
 def test_a_pose_off_its_measured_heading_is_as_uncertain_as_that():
     heading = Heading(3.1, 1e-4, REFERENCE)
     poses = np.array([[1.0, 2.0, 3.1], [1.0, 2.0, -3.1], [0.0, 0.0, 0.0]])
-    near, off, unmeasured = heading_errors([heading, heading, None], poses)
+    near, off, unmeasured = heading_errors(
+        np.array([heading_row(each) for each in (heading, heading, None)]), poses
+    )
     assert near[:2].tolist() == [pytest.approx(1e-4), MAP]
     assert off[0] == pytest.approx(1e-4 + (2.0 * np.pi - 6.2) ** 2)
     assert unmeasured[0] == np.inf
@@ -292,16 +302,16 @@ def test_a_pose_off_its_measured_heading_is_as_uncertain_as_that():
 def test_measured_headings_bound_the_covariance_along_the_path():
     """Without them the lateral error of a straight path grows with its length to the power 3/2."""
     poses = np.array([se2.pose(k, 0.0, 0.0) for k in range(40)])
-    blind = along(poses).covariances_from(0, poses, [])[0][-1]
+    blind = along(poses).covariances_from(0, poses, EdgeTable())[0][-1]
     keyframes = Keyframes(KeyframeConfig())
     for k, pose in enumerate(poses):
         kept = replace(frame(pose, float(k), k), heading=Heading(0.0, 0.005**2, REFERENCE))
         keyframes.add(kept, Step(STEP))
-    guided = keyframes.covariances_from(0, poses, [])[0][-1]
+    guided = keyframes.covariances_from(0, poses, EdgeTable())[0][-1]
     assert np.sqrt(blind[1, 1]) > 1.0
     assert np.sqrt(guided[1, 1]) < 0.2
     assert np.sqrt(guided[2, 2]) <= 0.0071
-    seen_from_there = keyframes.covariances_from(39, poses, [])[0][0]
+    seen_from_there = keyframes.covariances_from(39, poses, EdgeTable())[0][0]
     np.testing.assert_allclose(seen_from_there[0, 0], guided[0, 0], rtol=0.05)
     assert seen_from_there[2, 2] <= 4.0 * 0.005**2
 
@@ -312,10 +322,10 @@ def test_measured_headings_are_edges_from_the_first_keyframe():
         keyframes.add(
             replace(frame(se2.pose(k, 0.0, 0.4), float(k), k), heading=heading), Step(STEP)
         )
-    (edge,) = keyframes.headings
-    assert (edge.a, edge.b, edge.robust) == (0, 1, True)
-    np.testing.assert_allclose(edge.T_a_b[2], 0.05)
-    np.testing.assert_array_equal(edge.information, np.diag([0.0, 0.0, 1.0 / (1e-4 + MAP)]))
+    edges = keyframes.headings()
+    assert (edges.a.tolist(), edges.b.tolist(), edges.robust.tolist()) == ([0], [1], [True])
+    np.testing.assert_allclose(edges.T_a_b[0, 2], 0.05)
+    np.testing.assert_array_equal(edges.information[0], np.diag([0.0, 0.0, 1.0 / (1e-4 + MAP)]))
 
 
 def test_covariances_reach_what_lies_behind_a_pose_with_two_chains():
@@ -326,5 +336,71 @@ def test_covariances_reach_what_lies_behind_a_pose_with_two_chains():
         Edge(a, b, se2.between(poses[a], poses[b]), np.diag([1.0, 1.0, 1e6]) / variance, False)
         for (a, b), variance in variances.items()
     ]
-    found, _ = covariances_from(0, poses, edges, np.full((5, 6), np.inf))
+    found, _ = covariances_from(Start(0), poses, [EdgeTable(edges)], np.full((5, 6), np.inf))
     np.testing.assert_allclose(found[:, 0, 0], [0.0, 0.2, 0.1, 9.2, 9.3], atol=1e-6)
+
+
+def test_many_keyframes_move_in_slices_and_all_at_once(monkeypatch):
+    """One is reused meanwhile, and one is added, which moves with its anchor."""
+    poses = np.array([se2.pose(k, 0.0, 0.0) for k in range(10)])
+    whole = along(poses)
+    turned = np.array([se2.compose(np.array([1.0, 2.0, 1.5]), T) for T in poses])
+    move(whole, turned, EdgeTable())
+    monkeypatch.setattr(module, '_MOVED_PER_SLICE', 4)
+    keyframes = along(poses)
+    slices = keyframes.move(turned, EdgeTable())
+    next(slices)
+    keyframes.reuse(3, frame([3.0, 0.1, 0.0], path_m=30.0, stamp_ns=30))
+    next(slices)
+    keyframes.add(frame([4.0, 1.0, 0.5], path_m=31.0, stamp_ns=31), Step(STEP))
+    assert keyframes.revision == 0
+    np.testing.assert_array_equal(keyframes.poses()[:10], poses)
+    assert sum(1 for _ in slices) == 2
+    assert keyframes.revision == 1
+    np.testing.assert_array_equal(keyframes.poses()[:10], turned)
+    for one, other in zip(keyframes.frames[:10], whole.frames, strict=True):
+        np.testing.assert_array_equal(one.T_map_base, other.T_map_base)
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+    assert keyframes.frames[3].path_m == 30.0
+    T_3_new = np.array([1.0, 1.0, 0.5])
+    np.testing.assert_allclose(
+        keyframes.frames[10].T_map_base, se2.compose(turned[3], T_3_new), atol=1e-12
+    )
+    assert 10 in keyframes.near(keyframes.frames[10].T_map_base, 0.1)
+    assert keyframes.near(np.array([20.0, 20.0, 0.0]), 1.0) == []
+
+
+def test_a_search_for_some_poses_ends_early_and_finds_the_same(rng):
+    poses = np.column_stack([np.arange(30.0), rng.uniform(-1.0, 1.0, (30, 2))])
+    keyframes = along(poses)
+    whole, derivatives = keyframes.covariances_from(20, poses, EdgeTable())
+    some, by = keyframes.covariances_from(20, poses, EdgeTable(), [17, 22])
+    np.testing.assert_array_equal(some[[17, 22]], whole[[17, 22]])
+    np.testing.assert_array_equal(by[[17, 22]], derivatives[[17, 22]])
+    assert np.isinf(some[:16]).all() and np.isfinite(whole).all()
+
+
+def test_calibrated_headings_come_with_the_next_move():
+    share = Systematic(np.vstack([np.zeros((2, 4)), [0.0, 2.0, 0.0, 0.0]]), np.zeros(4), 1)
+    keyframes = Keyframes(KeyframeConfig())
+    for k in range(2):
+        heading = Heading(0.2, 1e-4, Reference(MAP, share)) if k else None
+        keyframes.add(
+            replace(frame([float(k), 0.0, 0.1], float(k), k), heading=heading), Step(STEP)
+        )
+    parameters = np.array([[0.0, 9.0, 0.0, 0.0], [0.0, 0.05, 0.0, 0.0]])
+    assert keyframes.headings(parameters).T_a_b[0, 2] == pytest.approx(0.2)
+    assert keyframes.headings().T_a_b[0, 2] == pytest.approx(0.1)
+    keyframes.calibrate(parameters)
+    keyframes.calibrate(parameters)  # they are already
+    assert keyframes.headings().T_a_b[0, 2] == pytest.approx(0.2)
+    move(keyframes, keyframes.poses(), EdgeTable())
+    assert keyframes.frames[0].heading is None
+    yaw, variance, reference = keyframes.frames[1].heading
+    assert (yaw, variance, reference.variance) == (pytest.approx(0.3), 1e-4, MAP)
+    np.testing.assert_array_equal(reference.systematic.derivative, share.derivative)
+    np.testing.assert_array_equal(reference.systematic.parameters, parameters[1])
+
+
+def test_without_keyframes_there_are_no_headings():
+    assert len(Keyframes(KeyframeConfig()).headings()) == 0

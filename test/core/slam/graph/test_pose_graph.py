@@ -7,7 +7,14 @@ import pytest
 from scipy.optimize import least_squares
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.graph.pose_graph import Edge, _Edges, _linearise, optimized, rounds
+from thinmap_ros.core.slam.graph import pose_graph
+from thinmap_ros.core.slam.graph.pose_graph import (
+    Edge,
+    EdgeArrays,
+    _linearise,
+    optimized,
+    rounds,
+)
 
 STEP = np.diag(1.0 / np.square([0.05, 0.05, 0.02]))
 CORRELATED = np.array([[400.0, 150.0, -80.0], [150.0, 300.0, 60.0], [-80.0, 60.0, 900.0]])
@@ -88,7 +95,7 @@ def test_jacobians_are_those_of_numeric_differences(rng):
         Edge(int(a), int(b), se2.between(poses[a], poses[b]) + rng.normal(0.0, 0.3, 3), STEP, True)
         for a, b in pairs
     ]
-    e, by_a, by_b = _linearise(poses, _Edges(edges))
+    e, by_a, by_b = _linearise(poses, EdgeArrays.of(edges))
     step = 1e-6
     for k, edge in enumerate(edges):
 
@@ -142,7 +149,7 @@ def test_the_last_round_is_the_optimum(rng):
     truth, poses, steps = ring(rng)
     edges = [*steps, loop(truth, 23, 0), loop(truth, 5, 15, off=(3.0, 0.0, 0.0))]
     given = poses.copy()
-    each = [T.copy() for T in rounds(poses, edges)]
+    each = [T.copy() for T in rounds(poses, EdgeArrays.of(edges))]
     assert 1 < len(each) <= 30
     np.testing.assert_array_equal(each[-1], optimized(poses, edges))
     np.testing.assert_array_equal(poses, given)
@@ -151,10 +158,32 @@ def test_the_last_round_is_the_optimum(rng):
     assert worst(again, each[-1]) < 0.01
 
 
+def test_slices_of_an_iteration_change_nothing_but_when_it_ends(rng, monkeypatch):
+    truth, poses, steps = ring(rng, 200)
+    edges = EdgeArrays.of([*steps, loop(truth, 199, 0), loop(truth, 30, 90, off=(3.0, 0.0, 0.0))])
+    whole = [T.copy() for T in rounds(poses, edges)]
+    monkeypatch.setattr(pose_graph, '_SLICE', 200)
+    sliced = [T.copy() for T in rounds(poses, edges)]
+    assert len(sliced) > 4 * len(whole)
+    np.testing.assert_array_equal(sliced[-1], whole[-1])
+    ends = [k for k in range(1, len(sliced)) if (sliced[k] != sliced[k - 1]).any()]
+    assert len(ends) == len(whole)
+
+
+def test_a_pose_that_nothing_measures_stays(rng):
+    truth, poses, steps = ring(rng)
+    free = np.vstack([poses, [7.0, 8.0, 0.5]])
+    heading = Edge(0, 24, np.array([0.0, 0.0, 1.0]), np.diag([0.0, 0.0, 1e4]), False)
+    found = optimized(free, [*steps, loop(truth, 23, 0), heading])
+    np.testing.assert_array_equal(found[24, :2], [7.0, 8.0])
+    assert found[24, 2] == pytest.approx(free[0, 2] + 1.0)
+    np.testing.assert_allclose(found[:24], optimized(poses, [*steps, loop(truth, 23, 0)]))
+
+
 def test_headings_stay_within_half_a_turn(rng):
     truth, poses, steps = ring(rng)
     turned = poses + [0.0, 0.0, 2.0 * np.pi]
-    for T in rounds(turned, [*steps, loop(truth, 23, 0)]):
+    for T in rounds(turned, EdgeArrays.of([*steps, loop(truth, 23, 0)])):
         assert (np.abs(T[1:, 2]) <= np.pi).all()
 
 

@@ -9,6 +9,7 @@ from support.slam_room import ROOM, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.covariances import inverse
 from thinmap_ros.core.slam.covariance import UNKNOWN
+from thinmap_ros.core.slam.graph.edge_table import EdgeTable
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Step
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
@@ -101,7 +102,7 @@ def test_a_correction_tells_the_poses_of_all_and_no_scan(loops):
     before = told(sender)
     assert sender.corrected_poses() is None
     moved = np.array(POSES[:3]) + (0.1, 0.2, 0.0)
-    loops.keyframes.move(moved, [])
+    list(loops.keyframes.move(moved, EdgeTable()))
     correction = (1, sender.corrected_poses())
     assert sender.revision == 1
     assert sender.corrected_poses() is None
@@ -119,7 +120,7 @@ def test_the_edges_of_a_loop_do_not_wait_for_the_next_keyframe(loops):
     messages = told(sender)
     T = se2.between(POSES[2], POSES[0])
     loops.graph.edges.append(Edge(2, 0, T, inverse(COVARIANCE), robust=True))
-    loops.keyframes.move(np.array(POSES[:3]), loops.graph.edges)
+    list(loops.keyframes.move(np.array(POSES[:3]), loops.graph.edges))
     correction = (1, sender.corrected_poses())
     again = told(sender)
     assert ends(again) == [[(2, 0)]]
@@ -136,7 +137,7 @@ def test_a_keyframe_waits_for_the_correction_that_it_follows(loops):
     for message in messages:
         found.add(7, 1, message)
     known = found.known()
-    loops.keyframes.move(np.array(POSES[:2]) + (0.1, 0.0, 0.0), [])
+    list(loops.keyframes.move(np.array(POSES[:2]) + (0.1, 0.0, 0.0), EdgeTable()))
     correction = sender.corrected_poses()
     add(loops, 2)
     (newest,) = told(sender)

@@ -8,8 +8,9 @@ graph", 2013.
 
 import heapq
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,10 @@ from thinmap_ros.core.covariances import (
 from thinmap_ros.core.grid.spatial_hash import SpatialHash
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, Systematic
+from thinmap_ros.core.slam.graph.edge_table import EdgeTable
+from thinmap_ros.core.slam.graph.heading_table import HeadingTable
+from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, EdgeArrays, Systematic
+from thinmap_ros.core.slam.graph.rows import Rows
 from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
 from thinmap_ros.core.slam.wall_compass import Heading
 from thinmap_ros.jit import inlined, kernel
@@ -35,7 +39,7 @@ _BUCKET_M = 4.0
 _NO_COVARIANCE = np.zeros((3, 3))
 _DETACHED = 1e-9 * np.eye(3)  # information of a step that says nothing
 _NO_DERIVATIVE = np.zeros((3, 4))
-_UNMEASURED = (0.0, math.inf, 0.0, 0.0, 0.0, 0.0, 0.0)  # row of a heading
+_MOVED_PER_SLICE = 2000  # keyframes: 10 ms on a desktop processor
 _RADIAN_M = 1.0  # distance that changes the view of a scan as much as a rotation by a radian
 
 
@@ -156,7 +160,9 @@ class Keyframes:
     def __init__(self, config: KeyframeConfig) -> None:
         self._config = config
         self.frames: list[Keyframe] = []
-        self.steps: list[Edge] = []  # from its anchor to each keyframe but the first
+        self.steps = EdgeTable()  # from its anchor to each keyframe but the first
+        self._poses = Rows(3)
+        self._headings = HeadingTable()
         self._buckets = SpatialHash(_BUCKET_M)
         self._path = KeyframeTrajectory()
         self.revision = 0
@@ -171,7 +177,7 @@ class Keyframes:
 
     def is_step(self, j: int, k: int) -> bool:
         """Whether keyframe j was the anchor of keyframe k."""
-        return k < len(self.frames) and self.steps[k - 1].a == j
+        return k < len(self.frames) and int(self.steps.ends[k - 1, 0]) == j
 
     @property
     def T_anchor_last(self) -> Array:  # noqa: N802
@@ -187,19 +193,22 @@ class Keyframes:
             self.steps.append(
                 Edge(anchor, number, T, inverse(step.covariance), False, step.systematic)
             )
+        self._append(frame)
+        return number
+
+    def _append(self, frame: Keyframe) -> None:
+        number = len(self.frames)
         self.frames.append(frame)
+        self._poses.append(frame.T_map_base)
+        self._headings.append(frame.heading)
         self._buckets.insert(number, float(frame.T_map_base[0]), float(frame.T_map_base[1]))
         self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
-        return number
 
     def detach(self, numbers: Container[int]) -> None:
         """Forget the steps to keyframes from others: they do not say how these lie."""
-        self.steps = [
-            replace(step, information=_DETACHED)
-            if step.b in numbers and step.a not in numbers
-            else step
-            for step in self.steps
-        ]
+        for step, (a, b) in enumerate(self.steps.ends.tolist()):
+            if b in numbers and a not in numbers:
+                self.steps.information[step] = _DETACHED
 
     def reuse(self, number: int, frame: Keyframe) -> None:
         """Reuse an earlier keyframe with nearly the same view (reduced pose graph)."""
@@ -210,11 +219,9 @@ class Keyframes:
 
     def load(self, frames: Sequence[Keyframe], steps: Sequence[Edge]) -> None:
         """Begin with saved keyframes, and the step to each but the first."""
-        self.frames = list(frames)
-        self.steps = list(steps)
-        for number, frame in enumerate(frames):
-            self._buckets.insert(number, float(frame.T_map_base[0]), float(frame.T_map_base[1]))
-            self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
+        self.steps.extend(steps)
+        for frame in frames:
+            self._append(frame)
 
     def return_to(self, number: int) -> None:
         """Make a keyframe the anchor that the robot has come to by no known motion."""
@@ -223,60 +230,93 @@ class Keyframes:
         self.frames[number] = replace(frame, path_m=path_m)
         self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
 
-    @property
-    def headings(self) -> list[Edge]:
-        """Measured headings as edges from the first keyframe, whose heading defines the map's."""
-        return [
-            _heading_edge(number, frame.heading, float(self.frames[0].T_map_base[2]))
-            for number, frame in enumerate(self.frames)
-            if number and frame.heading is not None
-        ]
+    def headings(self, parameters: Array | None = None) -> EdgeArrays:
+        """Measured headings as edges from the first keyframe, whose heading defines the map's.
 
-    def covariances_from(self, root: int, poses: Array, edges: list[Edge]) -> tuple[Array, Array]:
+        As they are, or would be with parameters (N, 4) of the calibration.
+        """
+        first = float(self._poses.values[0, 2]) if self.frames else 0.0
+        return self._headings.edges(first, parameters)
+
+    def covariances_from(
+        self, root: int, poses: Array, edges: EdgeTable, wanted: Sequence[int] = ()
+    ) -> tuple[Array, Array]:
         """Covariance (N, 3, 3) of each pose (N, 3) relative to pose `root`, map frame.
 
         Of independent errors; also returns the derivatives (N, 3, 4) by the calibration.
 
-        edges: edges of the graph besides the steps.
+        edges: edges of the graph besides the steps; wanted: poses of which alone the result is
+        needed; none: of all.
         """
-        frames = self.frames[: len(poses)]
-        headings = heading_errors([frame.heading for frame in frames], poses)
-        edges = self.steps + edges
+        headings = heading_errors(self._headings.rows[: len(poses)], poses)
+        start = Start(root)
         if root:
             # Both headings are measured by one direction, and its error is in neither difference.
             headings[:, 0] += headings[root, 0]
             headings[:, 1:] = 0.0
-            return covariances_from(root, poses, edges, headings)
-        origin = frames[0]
-        return covariances_from(0, poses, edges, headings, origin.covariance, origin.systematic)
+        else:
+            start = Start(0, self.frames[0].covariance, self.frames[0].systematic)
+        return covariances_from(start, poses, [self.steps, edges], headings, wanted)
 
     def poses(self) -> Array:
         """Poses (N, 3) of the keyframes."""
-        return np.array([frame.T_map_base for frame in self.frames]).reshape(-1, 3)
+        return np.array(self._poses.values)
 
     def calibrate(self, parameters: Array) -> None:
         """Correct steps and headings by parameters (N, 4) of the calibration.
 
-        The poses follow by `move`.
+        The poses follow by `move`, and with them the headings of `frames`.
         """
-        self.steps = [step.calibrated(parameters) for step in self.steps]
-        for number, frame in enumerate(self.frames):
-            if frame.heading is not None:
-                heading = frame.heading.calibrated(parameters)
-                self.frames[number] = replace(frame, heading=heading)
+        self.steps.calibrate(parameters)
+        self._headings.calibrate(parameters)
 
-    def move(self, poses: Array, edges: list[Edge]) -> None:
-        """Set the poses (N, 3) of the first N keyframes; `edges`: besides the steps."""
-        self.revision += 1
+    def move(self, poses: Array, edges: EdgeTable) -> Iterator[None]:
+        """Set the poses (N, 3) of the first N keyframes, in slices; `edges`: besides the steps.
+
+        All move at once, with the last slice. Keyframes that are added before that move with their
+        anchors.
+        """
         covariances, derivatives = self.covariances_from(0, poses, edges)
-        for number, T in enumerate(poses):
-            self.frames[number] = replace(
-                self.frames[number],
-                T_map_base=T,
-                covariance=covariances[number],
-                systematic=derivatives[number],
+        before = self.frames[: len(poses)]
+        moved: list[Keyframe] = []
+        for number, frame in enumerate(before):
+            if len(before) > _MOVED_PER_SLICE and number % _MOVED_PER_SLICE == 0:
+                yield
+            heading = self._headings.of(number)
+            moved.append(
+                Keyframe(
+                    frame.scan,
+                    frame.points,
+                    poses[number],
+                    frame.path_m,
+                    covariances[number],
+                    frame.submap,
+                    heading,
+                    derivatives[number],
+                )
             )
-            self._buckets.insert(number, float(T[0]), float(T[1]))
+        if len(before) > _MOVED_PER_SLICE:
+            yield
+        for number, frame in enumerate(before):
+            if self.frames[number] is not frame:  # reused meanwhile
+                moved[number] = replace(moved[number], path_m=self.frames[number].path_m)
+        for step, frame in zip(
+            self.steps[len(poses) - 1 :], self.frames[len(poses) :], strict=True
+        ):
+            poses = np.vstack([poses, se2.compose(poses[step.a], step.T_a_b)])
+            moved.append(replace(frame, T_map_base=poses[-1]))
+        self._set(moved, poses)
+
+    def _set(self, frames: list[Keyframe], poses: Array) -> None:
+        """Replace all keyframes, and their poses (N, 3)."""
+        self.revision += 1
+        before = self.poses()
+        self.frames = frames
+        self._poses.values[:] = poses
+        are_elsewhere = before[:, :2] // _BUCKET_M != self._poses.values[:, :2] // _BUCKET_M
+        for number in np.flatnonzero(are_elsewhere.any(axis=1)).tolist():
+            x, y, _ = self._poses.values[number].tolist()
+            self._buckets.insert(number, x, y)
 
     def path(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (N,) in ns and poses (N, 3) of all keyframe scans, with those that reused one."""
@@ -307,14 +347,14 @@ def view_difference_m(T_a: Array, T_b: Array) -> float:
     return float(math.hypot(x, y) + _RADIAN_M * abs(turn))
 
 
-def heading_errors(headings: Sequence[Heading | None], poses: Array) -> Array:
+def heading_errors(rows: Array, poses: Array) -> Array:
     """Errors (N, 6) of the headings that wall directions measure for poses (N, 3).
 
-    Columns: variance of the measurement and of its difference from the pose, infinite without one;
-    variance of the main direction; its derivative (4,) by the calibration.
+    rows (N, 7): as in `heading_row`. Columns: variance of the measurement and of its difference
+    from the pose, infinite without one; variance of the main direction; its derivative (4,) by the
+    calibration.
     """
-    rows = np.array([_UNMEASURED if heading is None else heading.row for heading in headings])
-    errors = rows[:, 1:]
+    errors = np.array(rows[:, 1:])
     errors[:, 0] += se2.wrap(rows[:, 0] - poses[:, 2]) ** 2
     return errors
 
@@ -325,98 +365,156 @@ def with_heading(covariance: Array, derivative: Array, error: Array) -> tuple[Ar
     error (6,): of the measurement, as in `heading_errors`. The error of the main direction is that
     of earlier headings: it is in both, and stays.
     """
-    found: tuple[Array, Array] = _with_heading(covariance, derivative, error)
+    found = (np.array(covariance), np.array(derivative))
+    _measure_heading(*found, error)
     return found
 
 
 @inlined
-def _with_heading(covariance: Array, derivative: Array, error: Array) -> tuple[Array, Array]:
+def _measure_heading(covariance: Array, derivative: Array, error: Array) -> None:
+    """`with_heading`, in place."""
     own = covariance[2, 2] - error[1]  # not in common with the main direction
     if own <= 0.0 or not np.isfinite(error[0]):
-        return covariance, derivative
-    shared = covariance[2] * (own / covariance[2, 2])
-    gain = shared / (own + error[0])
-    change = error[2:] - derivative[2]
-    return covariance - np.outer(gain, shared), derivative + np.outer(gain, change)
+        return
+    share = own / covariance[2, 2]
+    shared = (share * covariance[2, 0], share * covariance[2, 1], share * covariance[2, 2])
+    gain = 1.0 / (own + error[0])
+    for j in range(4):
+        change = gain * (error[2 + j] - derivative[2, j])
+        for i in range(3):
+            derivative[i, j] += shared[i] * change
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] -= gain * shared[i] * shared[j]
 
 
-def _heading_edge(number: int, heading: Heading, first: float) -> Edge:
-    information = np.zeros((3, 3))
-    reference = heading.reference
-    information[2, 2] = 1.0 / (reference.variance + heading.variance)
-    T = np.array([0.0, 0.0, heading.yaw - first])
-    return Edge(0, number, T, information, True, reference.systematic)
+class Start(NamedTuple):
+    """A pose from which covariances grow, with its own covariance and derivative."""
+
+    root: int
+    covariance: Array = _NO_COVARIANCE
+    derivative: Array = _NO_DERIVATIVE
 
 
 def covariances_from(
-    root: int,
+    start: Start,
     poses: Array,
-    edges: list[Edge],
+    tables: Sequence[EdgeTable],
     headings: Array,
-    covariance: Array = _NO_COVARIANCE,
-    derivative: Array = _NO_DERIVATIVE,
+    wanted: Sequence[int] = (),
 ) -> tuple[Array, Array]:
-    """Covariance (N, 3, 3) of each pose (N, 3) relative to pose `root`, map frame.
+    """Covariance (N, 3, 3) of each pose (N, 3) relative to a start, map frame.
 
     Of independent errors; also returns the derivatives (N, 3, 4) by the calibration.
-    covariance (3, 3), derivative (3, 4): those of the root; zero without.
 
     Along the chain of edges with the smallest variance: an upper bound, because other chains are
     ignored. It is infinite for poses that are not connected. Edges to poses beyond N are ignored.
-    headings (N, 6): as in `heading_errors`.
+    headings (N, 6): as in `heading_errors`; wanted: poses of which alone the result is needed;
+    none: of all.
     """
-    edges = [edge for edge in edges if edge.b < len(poses)]
-    a = np.array([edge.a for edge in edges], dtype=np.int64)
-    b = np.array([edge.b for edge in edges], dtype=np.int64)
-    covariances = np.linalg.inv(np.array([edge.information for edge in edges]).reshape(-1, 3, 3))
-    c = np.cos(poses[a, 2])
-    s = np.sin(poses[a, 2])
-    R = np.zeros((len(edges), 3, 3))
-    R[:, 0, 0] = c
-    R[:, 0, 1] = -s
-    R[:, 1, 0] = s
-    R[:, 1, 1] = c
-    R[:, 2, 2] = 1.0
-    order = np.argsort(np.concatenate([a, b]), kind='stable')
-    first = np.searchsorted(np.concatenate([a, b])[order], np.arange(len(poses) + 1))
-    own = R @ covariances @ R.transpose(0, 2, 1)
-    by_calibration = np.array([edge.systematic.derivative for edge in edges])
-    own_by_calibration = np.ascontiguousarray(R @ by_calibration.reshape(-1, 3, 4))
+    ends = np.concatenate([table.ends for table in tables])
+    are_known = ends[:, 1] < len(poses)
+    is_wanted = np.zeros(len(poses), dtype=np.bool_)
+    is_wanted[list(wanted) if len(wanted) else slice(None)] = True
     found: tuple[Array, Array] = _covariances(
-        root,
-        covariance,
-        derivative,
+        start.root,
+        start.covariance,
+        start.derivative,
         poses,
-        first,
-        order,
-        a,
-        b,
-        own,
-        own_by_calibration,
+        ends[are_known],
+        np.concatenate([table.information for table in tables])[are_known],
+        np.concatenate([table.derivatives for table in tables])[are_known],
         headings,
+        is_wanted,
     )
     return found
 
 
 @inlined
-def _carry(covariance: Array, x: float, y: float) -> Array:
-    """`propagated_covariance` with a lever (x, y)."""
-    # Without products of matrices: for these small ones their calls take most of the time.
-    carried_there: Array = covariance.copy()
-    carried_there[0] -= y * covariance[2]
-    carried_there[1] += x * covariance[2]
-    carried_there[:, 0] -= y * carried_there[:, 2]
-    carried_there[:, 1] += x * carried_there[:, 2]
-    return carried_there
+def _set_inverse(C: Array, W: Array) -> None:
+    """Make C (3, 3) the inverse of a symmetric matrix W (3, 3)."""
+    C[0, 0] = W[1, 1] * W[2, 2] - W[1, 2] * W[1, 2]
+    C[0, 1] = C[1, 0] = W[0, 2] * W[1, 2] - W[0, 1] * W[2, 2]
+    C[0, 2] = C[2, 0] = W[0, 1] * W[1, 2] - W[0, 2] * W[1, 1]
+    C[1, 1] = W[0, 0] * W[2, 2] - W[0, 2] * W[0, 2]
+    C[1, 2] = C[2, 1] = W[0, 2] * W[0, 1] - W[0, 0] * W[1, 2]
+    C[2, 2] = W[0, 0] * W[1, 1] - W[0, 1] * W[0, 1]
+    determinant = W[0, 0] * C[0, 0] + W[0, 1] * C[0, 1] + W[0, 2] * C[0, 2]
+    for i in range(3):
+        for j in range(3):
+            C[i, j] /= determinant
 
 
 @inlined
-def _carry_derivative(derivative: Array, x: float, y: float) -> Array:
-    """`carried` with a lever (x, y)."""
-    moved: Array = derivative.copy()
-    moved[0] -= y * derivative[2]
-    moved[1] += x * derivative[2]
-    return moved
+def _turn_rows(matrix: Array, c: float, s: float) -> None:
+    """Turn what has rows x and y by an angle of that cosine and sine, in place."""
+    for j in range(matrix.shape[1]):
+        x = matrix[0, j]
+        y = matrix[1, j]
+        matrix[0, j] = c * x - s * y
+        matrix[1, j] = s * x + c * y
+
+
+@inlined
+def _carry_rows(matrix: Array, x: float, y: float) -> None:
+    """`carried` with a lever (x, y), in place."""
+    for j in range(matrix.shape[1]):
+        matrix[0, j] -= y * matrix[2, j]
+        matrix[1, j] += x * matrix[2, j]
+
+
+@inlined
+def _set_turned(own: Array, share: Array, W: Array, derivative: Array, yaw: float) -> None:
+    """Make `own` (3, 3) and `share` (3, 4) covariance and derivative of an edge, map frame.
+
+    W (3, 3): its information; derivative (3, 4), frame of its keyframe a with heading yaw, rad.
+    """
+    c = np.cos(yaw)
+    s = np.sin(yaw)
+    _set_inverse(own, W)
+    _turn_rows(own, c, s)
+    _turn_rows(own.T, c, s)
+    share[:] = derivative
+    _turn_rows(share, c, s)
+
+
+@inlined
+def _add_edge(
+    new: Array, by: Array, own: Array, share: Array, x: float, y: float, is_forward: bool
+) -> None:
+    """Carry covariance `new` and derivative `by` over an edge with a lever (x, y), in place."""
+    # In reverse direction the error of the edge, and so of its heading, acts at its other end.
+    if not is_forward:
+        new += own
+        by -= share
+    _carry_rows(new, x, y)
+    _carry_rows(new.T, x, y)
+    _carry_rows(by, x, y)
+    if is_forward:
+        new += own
+        by += share
+
+
+@kernel
+def _edges_of_poses(
+    count: int, ends: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Ties of the poses: those of pose k are numbers first[k] to first[k + 1].
+
+    A tie n >= M is edge n - M of M (M, 2) in reverse direction.
+    """
+    first = np.zeros(count + 1, dtype=np.int64)
+    for edge in range(len(ends)):
+        first[ends[edge, 0] + 1] += 1
+        first[ends[edge, 1] + 1] += 1
+    first = np.cumsum(first)
+    free = first[:-1].copy()
+    ties = np.empty(2 * len(ends), dtype=np.int64)
+    for side in range(2):
+        for edge in range(len(ends)):
+            ties[free[ends[edge, side]]] = edge + side * len(ends)
+            free[ends[edge, side]] += 1
+    return first, ties
 
 
 @kernel
@@ -425,19 +523,17 @@ def _covariances(
     covariance: Array,
     derivative: Array,
     poses: Array,
-    first: NDArray[np.int64],
-    order: NDArray[np.int64],
-    a: NDArray[np.int64],
-    b: NDArray[np.int64],
-    own: Array,
-    own_by_calibration: Array,
+    ends: NDArray[np.int64],
+    information: Array,
+    by_calibration: Array,
     headings: Array,
+    is_wanted: NDArray[np.bool_],
 ) -> tuple[Array, Array]:
-    """Dijkstra's algorithm, by the variance of the position.
+    """Dijkstra's algorithm, by the variance of the position, until all wanted poses are final.
 
-    The M edges at pose k have the numbers order[first[k]] to order[first[k + 1]]. A number n >= M
-    is edge n - M in reverse direction. headings (N, 6): as in `heading_errors`.
+    ends (M, 2): poses of the edges; headings (N, 6): as in `heading_errors`.
     """
+    first, ties = _edges_of_poses(len(poses), ends)
     found = np.full((len(poses), 3, 3), np.inf)
     best = np.full(len(poses), np.inf)
     done = np.zeros(len(poses), dtype=np.bool_)
@@ -446,26 +542,33 @@ def _covariances(
     derivatives[root] = derivative
     best[root] = 0.0
     heap = [(0.0, root)]
-    while len(heap):
+    waiting = is_wanted.sum()
+    # Without temporary arrays: for these small ones they take most of the time.
+    own = np.empty((3, 3))
+    share = np.empty((3, 4))
+    new = np.empty((3, 3))
+    by = np.empty((3, 4))
+    while len(heap) and waiting:
         _, k = heapq.heappop(heap)
         if done[k]:
             continue
         done[k] = True
-        for tie in order[first[k] : first[k + 1]]:
-            edge = tie % len(a)
-            other = b[edge] if tie < len(a) else a[edge]
+        if is_wanted[k]:
+            waiting -= 1
+        for tie in ties[first[k] : first[k + 1]]:
+            edge = tie % len(ends)
+            is_forward = tie < len(ends)
+            other = ends[edge, 1] if is_forward else ends[edge, 0]
             if done[other]:
                 continue
             x = poses[other, 0] - poses[k, 0]
             y = poses[other, 1] - poses[k, 1]
-            # In reverse direction the heading error of the edge acts at its other end.
-            step = own[edge] if tie < len(a) else _carry(own[edge], x, y)
-            new = _carry(found[k], x, y) + step
-            if tie < len(a):
-                by = _carry_derivative(derivatives[k], x, y) + own_by_calibration[edge]
-            else:
-                by = _carry_derivative(derivatives[k] - own_by_calibration[edge], x, y)
-            new, by = _with_heading(new, by, headings[other])
+            yaw = poses[ends[edge, 0], 2]
+            _set_turned(own, share, information[edge], by_calibration[edge], yaw)
+            new[:] = found[k]
+            by[:] = derivatives[k]
+            _add_edge(new, by, own, share, x, y, is_forward)
+            _measure_heading(new, by, headings[other])
             variance = new[0, 0] + new[1, 1]
             if variance < best[other]:
                 best[other] = variance

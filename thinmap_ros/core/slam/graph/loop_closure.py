@@ -172,7 +172,7 @@ class LoopClosure:
     def load(self, saved: SavedKeyframes) -> None:
         """Begin with the saved keyframes of a map."""
         self.keyframes.load(saved.frames, saved.steps)
-        self.graph.edges = list(saved.edges)
+        self.graph.edges.extend(saved.edges)
         self.pieces.load(1 + max(frame.submap for frame in saved.frames))
 
     def saved(self, since_ns: int = 0) -> SavedKeyframes | None:
@@ -276,7 +276,7 @@ class LoopClosure:
         keyframes = self.keyframes
         poses = keyframes.poses()
         anchor = keyframes.anchor
-        covariances, derivatives = keyframes.covariances_from(anchor, poses, self.graph.edges)
+        covariances, derivatives = keyframes.covariances_from(anchor, poses, self.graph.edges, near)
         step = self._pending.step
         yaw = float(poses[anchor, 2])
         moved = rotation(yaw) @ step.systematic.derivative
@@ -316,7 +316,8 @@ class LoopClosure:
         correction = self.graph.step()
         if correction is not None:
             self._submaps.clear()
-            self.pieces.join(self.keyframes.frames, self.graph.edges)
+            if self.pieces.current:  # there is more than one submap
+                self.pieces.join(self.keyframes.frames, self.graph.edges)
         return correction
 
     def _close(self) -> None:
@@ -326,7 +327,7 @@ class LoopClosure:
         if edges := self._closing_edges():
             self._add_pending()
             self._requested.clear()
-            self.graph.edges += edges
+            self.graph.edges.extend(edges)
             self.graph.optimize()
 
     def join(self, T: Array, edges: Sequence[Edge]) -> None:
@@ -341,7 +342,7 @@ class LoopClosure:
         poses = self.keyframes.poses()
         poses[here] = [se2.compose(T, own) for own in poses[here]]
         self.keyframes.detach(set(here))
-        self.graph.edges += edges
+        self.graph.edges.extend(edges)
         self.graph.optimize(poses)
 
     @property

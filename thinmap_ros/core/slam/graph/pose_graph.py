@@ -4,17 +4,20 @@ Source: Grisetti, Kuemmerle, Stachniss and Burgard, "A tutorial on graph-based S
 Edges that may be outliers have the robust loss of Geman and McClure. Its width decreases in each
 iteration, so that true loops with a large error close first: Yang et al., "Graduated non-convexity
 for robust spatial perception", 2020.
+An iteration takes slices of work: of a graph of kilometres, each is a small part of it.
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.slam.graph.block_cholesky import Factorization, Pattern
+from thinmap_ros.jit import kernel
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,11 @@ class OptimizerConfig:
 
 
 _CONFIG = OptimizerConfig()
+# Work of a slice, in products of blocks: 2 ms on a desktop processor. An iteration of a graph of
+# up to 2,000 keyframes is one slice.
+_SLICE = 60_000
+_PER_EDGE = 15  # products that take as long as the share of an edge in the equations
+_PER_POSE = 40  # and that of a pose in the order of elimination
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,17 +83,6 @@ class Edge:
     systematic: Systematic = NO_SHARE
     inlier_ratio: float = 0.0
 
-    def calibrated(self, parameters: Array) -> 'Edge':
-        """The edge with other parameters (N, 4) of the calibration, by the number of spans."""
-        T_a_b = self.T_a_b + self.systematic.change(parameters)
-        return replace(self, T_a_b=T_a_b, systematic=self.systematic.calibrated(parameters))
-
-    def settled(self, poses: Array, parameters: Array) -> 'Edge':
-        """The edge as the poses (N, 3) have it, with its robust weight, then calibrated."""
-        T = se2.between(poses[self.a], poses[self.b])
-        there = replace(self, T_a_b=T, information=self.weight_at(T) * self.information)
-        return there.calibrated(parameters)
-
     def weight_at(self, T_a_b: Array) -> float:
         """The weight, 0 to 1, that the robust loss leaves it at a relative pose (3,)."""
         if not self.robust:
@@ -96,25 +93,90 @@ class Edge:
         return float((1.0 + squared / _CONFIG.large) ** -2)
 
 
-def optimized(poses: Array, edges: list[Edge]) -> Array:
+@dataclass(frozen=True, eq=False)
+class EdgeArrays:
+    """M edges as arrays.
+
+    a, b (M,), T_a_b (M, 3), information (M, 3, 3), robust (M,): as in `Edge`.
+    """
+
+    a: NDArray[np.int64]
+    b: NDArray[np.int64]
+    T_a_b: Array
+    information: Array
+    robust: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+    @staticmethod
+    def of(edges: Sequence[Edge]) -> 'EdgeArrays':
+        """The arrays of some edges."""
+        return EdgeArrays(
+            np.array([edge.a for edge in edges], dtype=np.int64),
+            np.array([edge.b for edge in edges], dtype=np.int64),
+            np.array([edge.T_a_b for edge in edges]).reshape(-1, 3),
+            np.array([edge.information for edge in edges]).reshape(-1, 3, 3),
+            np.array([edge.robust for edge in edges], dtype=np.bool_),
+        )
+
+    @staticmethod
+    def joined(parts: Sequence['EdgeArrays']) -> 'EdgeArrays':
+        """All edges of some arrays."""
+        return EdgeArrays(
+            np.concatenate([part.a for part in parts]),
+            np.concatenate([part.b for part in parts]),
+            np.concatenate([part.T_a_b for part in parts]),
+            np.concatenate([part.information for part in parts]),
+            np.concatenate([part.robust for part in parts]),
+        )
+
+    def settled(self, poses: Array) -> 'EdgeArrays':
+        """The edges as the poses (N, 3) have them, with the robust weights that they have there."""
+        e, _, _ = _linearise(poses, self)
+        squared = _squared(e, self.information)
+        weight = np.where(self.robust, (1.0 + squared / _CONFIG.large) ** -2, 1.0)
+        information = weight[:, None, None] * self.information
+        return replace(self, T_a_b=self.T_a_b + e, information=information)
+
+
+def optimized(poses: Array, edges: Sequence[Edge]) -> Array:
     """Optimize poses (N, 3); the first is fixed."""
-    return deque(rounds(poses, edges), maxlen=1)[0]
+    return last(rounds(poses, EdgeArrays.of(edges)))
 
 
-def rounds(poses: Array, edges: list[Edge]) -> Iterator[Array]:
-    """Yield the poses (N, 3) after each Gauss-Newton iteration; the first pose is fixed."""
+def last(moving: Iterator[Array]) -> Array:
+    """The poses (N, 3) after the last iteration."""
+    return deque(moving, maxlen=1)[0]
+
+
+def rounds(poses: Array, edges: EdgeArrays) -> Iterator[Array]:
+    """Yield the poses (N, 3) after each Gauss-Newton iteration; the first pose is fixed.
+
+    And, as they were, after each slice of an iteration that has more than one.
+    """
     poses = poses.copy()
-    if len(poses) < 2 or not edges:
+    if len(poses) < 2 or not len(edges):
         yield poses
         return
-    arrays = _Edges(edges)
+    equations = _Equations(len(poses), edges)
+    if len(poses) * _PER_POSE > _SLICE:
+        equations.pattern  # noqa: B018  # found once, in a slice of its own
+        yield poses
     width: float | None = None
     for _ in range(_CONFIG.max_iterations):
-        e, by_a, by_b = _linearise(poses, arrays)
-        squared = np.einsum('ki,kij,kj->k', e, arrays.information, e)
+        e, by_a, by_b = _linearise(poses, edges)
+        squared = _squared(e, edges.information)
         width = 2.0 * float(squared.max()) if width is None else width / _CONFIG.narrowing
-        scale = np.where(arrays.robust, (1.0 + squared / max(width, _CONFIG.large)) ** -2, 1.0)
-        step = _step(arrays, e, by_a, by_b, scale[:, None, None] * arrays.information)
+        scale = np.where(edges.robust, (1.0 + squared / max(width, _CONFIG.large)) ** -2, 1.0)
+        gradient, factor = equations.at(e, by_a, by_b, edges.information, scale)
+        left = _SLICE - _PER_EDGE * len(edges)
+        while not factor.is_complete:
+            if left <= 0:
+                yield poses
+                left = _SLICE
+            left -= factor.eliminate(left)
+        step = factor.solve(gradient)
         poses[1:] += step
         poses[:, 2] = wrap(poses[:, 2])
         yield poses
@@ -122,74 +184,131 @@ def rounds(poses: Array, edges: list[Edge]) -> Iterator[Array]:
             break
 
 
-class _Edges:
-    """Edges as arrays."""
+class _Equations:
+    """The normal equations of a graph of N poses, of which the first is fixed."""
 
-    def __init__(self, edges: list[Edge]) -> None:
-        self.a = np.array([edge.a for edge in edges])
-        self.b = np.array([edge.b for edge in edges])
-        self.T_a_b = np.array([edge.T_a_b for edge in edges])
-        self.information = np.array([edge.information for edge in edges])
-        self.robust = np.array([edge.robust for edge in edges])
+    def __init__(self, count: int, edges: EdgeArrays) -> None:
+        # Unknowns, of which the fixed pose is none: -1.
+        self._count = count - 1
+        self._a = edges.a - 1
+        self._b = edges.b - 1
+        self._is_pair = (self._a >= 0) & (self._b >= 0)
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        """Where the equations have entries; the same in all iterations."""
+        return Pattern.of(self._count, self._a[self._is_pair], self._b[self._is_pair])
+
+    def at(
+        self, e: Array, by_a: Array, by_b: Array, information: Array, weights: Array
+    ) -> tuple[Array, Factorization]:
+        """Right side (N - 1, 3), and matrix.
+
+        e (M, 3): errors; by_a, by_b (M, 3, 3): Jacobians; weights (M,): of the information.
+        """
+        pattern = self.pattern
+        slots = np.full(len(self._a), -1, dtype=np.int64)
+        slots[self._is_pair] = pattern.slots
+        blocks = np.zeros((len(pattern.rows), 3, 3))
+        gradient = np.zeros((self._count, 3))
+        _assemble(
+            self._a,
+            self._b,
+            e,
+            by_a,
+            by_b,
+            information,
+            weights,
+            pattern.place,
+            pattern.diagonal,
+            slots,
+            blocks,
+            gradient,
+        )
+        return gradient, Factorization(pattern, blocks)
 
 
-def _linearise(poses: Array, edges: _Edges) -> tuple[Array, Array, Array]:
+@kernel
+def _assemble(
+    a: NDArray[np.int64],
+    b: NDArray[np.int64],
+    e: Array,
+    by_a: Array,
+    by_b: Array,
+    information: Array,
+    weights: Array,
+    place: NDArray[np.int64],
+    diagonal: NDArray[np.int64],
+    slots: NDArray[np.int64],
+    blocks: Array,
+    gradient: Array,
+) -> None:
+    """Add the edges to the blocks (L, 3, 3) of the matrix, and to the right side (N, 3)."""
+    W = np.empty((3, 3))
+    weighted = np.empty((3, 3))
+    for k in range(len(a)):
+        for i in range(3):
+            for j in range(3):
+                W[i, j] = weights[k] * information[k, i, j]
+        for one, other, J, K in ((a[k], b[k], by_a[k], by_b[k]), (b[k], a[k], by_b[k], by_a[k])):
+            if one < 0:
+                continue
+            for i in range(3):
+                for j in range(3):
+                    weighted[i, j] = J[0, i] * W[0, j] + J[1, i] * W[1, j] + J[2, i] * W[2, j]
+            own = blocks[diagonal[one]]
+            for i in range(3):
+                for j in range(3):
+                    gradient[one, i] -= weighted[i, j] * e[k, j]
+                    for m in range(3):
+                        own[i, j] += weighted[i, m] * J[m, j]
+            if other >= 0 and place[one] > place[other]:
+                pair = blocks[slots[k]]
+                for i in range(3):
+                    for j in range(3):
+                        for m in range(3):
+                            pair[i, j] += weighted[i, m] * K[m, j]
+
+
+@kernel
+def _squared(e: Array, information: Array) -> Array:
+    """Squared errors (M,), in sigmas, of errors (M, 3)."""
+    squared = np.zeros(len(e))
+    for k in range(len(e)):
+        for i in range(3):
+            for j in range(3):
+                squared[k] += e[k, i] * information[k, i, j] * e[k, j]
+    return squared
+
+
+def _linearise(poses: Array, edges: EdgeArrays) -> tuple[Array, Array, Array]:
     """Error (M, 3) of each edge, frame of a, and its Jacobians (M, 3, 3) w.r.t. a and b."""
-    a = poses[edges.a]
-    b = poses[edges.b]
-    c = np.cos(a[:, 2])
-    s = np.sin(a[:, 2])
-    dx = (b - a)[:, 0]
-    dy = (b - a)[:, 1]
-    e = np.column_stack([c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]]) - edges.T_a_b
-    e[:, 2] = wrap(e[:, 2])
-    by_b = np.zeros((len(e), 3, 3))
-    by_b[:, 0, 0] = c
-    by_b[:, 0, 1] = s
-    by_b[:, 1, 0] = -s
-    by_b[:, 1, 1] = c
-    by_b[:, 2, 2] = 1.0
-    by_a = -by_b
-    by_a[:, 0, 2] = -s * dx + c * dy
-    by_a[:, 1, 2] = -c * dx - s * dy
+    found: tuple[Array, Array, Array] = _errors(poses, edges.a, edges.b, edges.T_a_b)
+    return found
+
+
+@kernel
+def _errors(
+    poses: Array, a: NDArray[np.int64], b: NDArray[np.int64], T_a_b: Array
+) -> tuple[Array, Array, Array]:
+    e = np.empty((len(a), 3))
+    by_a = np.zeros((len(a), 3, 3))
+    by_b = np.zeros((len(a), 3, 3))
+    for k in range(len(a)):
+        c = np.cos(poses[a[k], 2])
+        s = np.sin(poses[a[k], 2])
+        dx = poses[b[k], 0] - poses[a[k], 0]
+        dy = poses[b[k], 1] - poses[a[k], 1]
+        turn = poses[b[k], 2] - poses[a[k], 2] - T_a_b[k, 2]
+        e[k, 0] = c * dx + s * dy - T_a_b[k, 0]
+        e[k, 1] = -s * dx + c * dy - T_a_b[k, 1]
+        e[k, 2] = np.pi - (np.pi - turn) % (2.0 * np.pi)
+        by_b[k, 0, 0] = c
+        by_b[k, 0, 1] = s
+        by_b[k, 1, 0] = -s
+        by_b[k, 1, 1] = c
+        by_b[k, 2, 2] = 1.0
+        by_a[k, :, :] = -by_b[k]
+        by_a[k, 0, 2] = -s * dx + c * dy
+        by_a[k, 1, 2] = -c * dx - s * dy
     return e, by_a, by_b
-
-
-def _step(edges: _Edges, e: Array, by_a: Array, by_b: Array, W: Array) -> Array:
-    """Gauss-Newton step (N - 1, 3) of all poses but the first.
-
-    e (M, 3), by_a, by_b (M, 3, 3): errors and Jacobians; W (M, 3, 3): weights.
-    """
-    # Imported here: without a loop closure they are not needed, and they take 18 MB.
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.linalg import spsolve
-
-    number = int(max(edges.a.max(), edges.b.max())) + 1
-    size = 3 * number
-    gradient = np.zeros((number, 3))
-    blocks = []
-    rows = []
-    cols = []
-    sides = ((edges.a, by_a), (edges.b, by_b))
-    for i, J_i in sides:
-        weighted = np.swapaxes(J_i, 1, 2) @ W
-        np.add.at(gradient, i, -(weighted @ e[:, :, None])[:, :, 0])
-        for j, J_j in sides:
-            row, col = _places(i, j)
-            blocks.append((weighted @ J_j).ravel())
-            rows.append(row)
-            cols.append(col)
-    H = coo_matrix(
-        (np.concatenate(blocks), (np.concatenate(rows), np.concatenate(cols))), shape=(size, size)
-    ).tocsc()
-    return np.asarray(spsolve(H[3:, 3:], gradient.ravel()[3:]).reshape(-1, 3))
-
-
-def _places(
-    i: NDArray[np.int64], j: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns, each (9 M,), of blocks (3, 3) at block rows i and columns j, (M,)."""
-    along = np.arange(3)
-    row = np.broadcast_to(3 * i[:, None, None] + along[:, None], (len(i), 3, 3))
-    col = np.broadcast_to(3 * j[:, None, None] + along, (len(j), 3, 3))
-    return row.ravel(), col.ravel()

@@ -16,6 +16,9 @@ from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.config import TopologyConfig
 
+# Coarser than the map: recognition compares pieces, and nobody sees them.
+_CELL_M = 0.1
+
 
 class GrowingPiece:
     """Keyframes in the frame of the first of them, with their grid, graph and views.
@@ -28,7 +31,7 @@ class GrowingPiece:
         self.frames: list[Keyframe] = []
         self.views: list[View] = []
         self._origin = np.zeros(3)
-        self._grid = OccupancyGrid(OccupancyConfig())
+        self._grid = OccupancyGrid(OccupancyConfig(resolution_m=_CELL_M))
         self._topology = TopologyBuilder(TopologyConfig())
         self._views = ViewBuilder()
 
