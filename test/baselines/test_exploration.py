@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.baselines.exploration import (
+    BoundedTour,
     DistanceAdvantage,
     ExploreLite,
     FrontierExplorer,
@@ -157,8 +158,11 @@ def test_an_edge_is_followed_to_its_end_though_another_end_comes_nearer() -> Non
     assert goes_to(1.2, 1.2) == 14.0
 
 
-def test_explore_lite_gives_up_targets_without_progress_also_when_it_oscillates() -> None:
-    strategy = ExploreLite()
+@pytest.mark.parametrize('kind', [ExploreLite, InformationGain, DistanceAdvantage, BoundedTour])
+def test_targets_without_progress_are_given_up_also_by_a_robot_that_oscillates(
+    kind: type[FrontierExplorer],
+) -> None:
+    strategy = kind()
     patch = GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
     places = []
     failed = []

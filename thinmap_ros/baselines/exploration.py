@@ -17,6 +17,8 @@ from thinmap_ros.core.exploration.strategy import (
     FIRST_FRONTIER_ID,
     Decision,
     FinishCode,
+    Streak,
+    is_at,
     unobserved,
 )
 from thinmap_ros.core.grid.patch import GridPatch
@@ -35,10 +37,8 @@ class TargetConfig:
 
     choice_period_s: float = 1.0
     goal_tolerance_m: float = 0.3
-    goal_tolerance_rad: float = 0.35
     same_place_m: float = 1.0
     visit_radius_m: float = 0.5  # an end node is visited where the robot comes nearer
-    max_looks: int = 3  # scans without change, at the goal or without any target
     max_failures: int = 3
     progress_m: float = 0.1
     progress_timeout_s: float = 30.0  # without this progress
@@ -93,7 +93,9 @@ class FrontierExplorer(ABC):
         self.target: Frontier | None = None
         self._survey_ns = 0
         self._frame = self.finder.map.frame
-        self._at_goal = self._nothing_left = self._number = 0
+        self._number = 0
+        self._visit = Streak()
+        self._end = Streak()
         self._failures: list[tuple[float, float]] = []
 
     @abstractmethod
@@ -110,14 +112,8 @@ class FrontierExplorer(ABC):
             self._survey_ns = scan.stamp_ns
             self._frame = self.finder.map.frame
             self._choose(T_map_base)
-        self._nothing_left = self._nothing_left + 1 if self.target is None else 0
-        return _decision(
-            topology,
-            self.target,
-            self._number,
-            self._nothing_left >= self.config.max_looks,
-            bool(self._failures),
-        )
+        is_over = self._end.add(self.target is None)
+        return _decision(topology, self.target, self._number, is_over, bool(self._failures))
 
     def target_failed(self, reason: str) -> None:
         """Store the position of a target that could not be reached."""
@@ -167,14 +163,10 @@ class FrontierExplorer(ABC):
         """Drop a target that stays unknown although the robot is at its viewpoint."""
         if self.target is None or self._frame != self.finder.map.frame:
             return
-        goal = self.target.goal
-        near = math.dist(T_map_base[:2], goal[:2]) <= self.config.goal_tolerance_m
-        looks = near and _turn(T_map_base, goal[2]) <= self.config.goal_tolerance_rad
-        self._at_goal = self._at_goal + 1 if looks else 0
-        if self._at_goal >= self.config.max_looks:
+        if self._visit.add(is_at(T_map_base, self.target.goal)):
             self.finder.give_up(self.target, T_map_base[:2])
             self.target = None
-            self._at_goal = 0
+            self._visit = Streak()
 
 
 class NearestFrontier(FrontierExplorer):
@@ -190,18 +182,11 @@ class NearestFrontier(FrontierExplorer):
         return np.array([f.path_length_m for f in frontiers])
 
 
-class ExploreLite(FrontierExplorer):
-    """explore_lite's cost: potential_scale * straight distance - gain_scale * size.
+class ImpatientExplorer(FrontierExplorer):
+    """Gives up a target without progress for progress_timeout_s, also after an interruption.
 
-    Both are scaled by the cell size. Scales as in its launch file; size in cells, distance that of
-    the nearest frontier cell, m; the target is the centroid of the frontier. A goal without
-    progress for progress_timeout_s is blacklisted; here also after an interruption, because the
-    package would oscillate between two goals for ever.
-    Source: Hörner, "Map-merging for multi-robot system", 2016, package explore_lite.
+    Where costs are other than the path length, two targets may alternate for ever.
     """
-
-    potential_scale = 3.0
-    gain_scale = 1.0
 
     def __init__(self, config: TargetConfig | None = None) -> None:
         super().__init__(config)
@@ -219,6 +204,19 @@ class ExploreLite(FrontierExplorer):
             self.target_failed('no progress')
         return decision
 
+
+class ExploreLite(ImpatientExplorer):
+    """explore_lite's cost: potential_scale * straight distance - gain_scale * size.
+
+    Both are scaled by the cell size. Scales as in its launch file; size in cells, distance that of
+    the nearest frontier cell, m; the target is the centroid of the frontier. The package blacklists
+    a goal without progress, too, but not after an interruption: it would oscillate between two.
+    Source: Hörner, "Map-merging for multi-robot system", 2016, package explore_lite.
+    """
+
+    potential_scale = 3.0
+    gain_scale = 1.0
+
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
         """Weighted distance minus weighted size."""
         frame = self.finder.map.frame
@@ -231,7 +229,7 @@ class ExploreLite(FrontierExplorer):
         ) * frame.resolution
 
 
-class InformationGain(FrontierExplorer):
+class InformationGain(ImpatientExplorer):
     """The largest area visible from a place, discounted by the path length: A exp(-lambda L).
 
     Source: Gonzalez-Banos and Latombe, "Navigation strategies for exploring indoor environments",
@@ -252,7 +250,7 @@ class InformationGain(FrontierExplorer):
         )
 
 
-class DistanceAdvantage(FrontierExplorer):
+class DistanceAdvantage(ImpatientExplorer):
     """The frontier with the largest distance advantage: near the robot, far from other frontiers.
 
     Cost: path length from the robot minus the mean path length from the other frontiers, from which
@@ -270,7 +268,7 @@ class DistanceAdvantage(FrontierExplorer):
         return np.asarray(lengths - between.sum(axis=0) / (len(frontiers) - 1))
 
 
-class BoundedTour(FrontierExplorer):
+class BoundedTour(ImpatientExplorer):
     """The frontier with which the shortest open path through the nearest ones begins.
 
     The order of the `max_places` nearest frontiers is exact, by dynamic programming over the sets
@@ -382,10 +380,6 @@ def _place(xy: Array) -> tuple[float, float]:
     return float(xy[0]), float(xy[1])
 
 
-def _turn(T_map_base: Array, heading_rad: float) -> float:
-    return abs(se2.wrap(float(heading_rad - T_map_base[2])))
-
-
 def _decision(
     topology: TopologicalMap,
     target: Frontier | Array | None,
@@ -402,8 +396,7 @@ def _decision(
     goal = target.goal if isinstance(target, Frontier) else target
     chosen = None
     if goal is not None:
-        chosen = unobserved(FIRST_FRONTIER_ID + number, _place(goal), 0.5)
-        chosen = chosen._replace(is_target=True, goal=goal)
+        chosen = unobserved(FIRST_FRONTIER_ID + number, _place(goal), 0.5, goal, is_target=True)
     code = FinishCode.NONE
     reason = 'targets remain'
     if finished:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.frontiers import FrontierMap
-from thinmap_ros.core.exploration.viewpoints import place_beside
+from thinmap_ros.core.exploration.viewpoints import search_beside
 from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import downsample_mask, path_lengths_from
@@ -145,5 +145,5 @@ class FrontierFinder:
         frame = self.map.frame
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
         max_steps = int(_EXPLORER.frontier_assignment_radius_m / frame.resolution)
-        cell = place_beside(self.map.free, cells, allowed, max_steps, (row, col))
+        cell, _ = search_beside(self.map.free, cells, allowed, allowed, max_steps, (row, col))
         return None if cell is None else np.asarray(frame.centres_of(np.array([cell]))[0])

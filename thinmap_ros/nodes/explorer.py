@@ -42,10 +42,11 @@ _CHECK_PERIOD_S = 1.0
 class ExplorerNode(ThinmapNode):
     """Maps, /topology, /pose or /tf, /scan in; goals of navigate_to_pose, /end_nodes, ... out.
 
-    Without thinmap's other nodes, /map and /tf are enough. An exploration is started by the action
-    explore, by explore/resume, or by itself. Service save_exploration saves what was learned beside
-    the map and the graph of a session. An explorer that was killed and is started again continues
-    with the exploration, and with the goal of its client, who has to ask again for the result.
+    Without thinmap's other nodes, /map and /tf are enough. Areas of /keep_out count as walls. An
+    exploration is started by the action explore, by explore/resume, or by itself. Service
+    save_exploration saves what was learned beside the map and the graph of a session. An explorer
+    that was killed and is started again continues with the exploration, and with the goal of its
+    client, who has to ask again for the result.
 
     With team: true it shares the unknown area with the other robots of /join_status, by
     /team/claims, and their maps, by /team/tiles.
@@ -180,8 +181,8 @@ class ExplorerNode(ThinmapNode):
         is_exploring = self._mission.state == MissionState.EXPLORING
         if is_exploring and not self._mission.is_paused:
             completed = self._team.completed(observation)
-            is_completed = completed.patch is not observation.patch
-            observation = self._source.with_graph(completed, is_completed)
+            is_joined = completed.patch is not observation.patch
+            observation = self._source.completed(completed, is_joined)
         with self.diagnostics.time_step('explorer'):
             action = self._mission.step(observation)
         if is_exploring:

@@ -11,10 +11,11 @@ from thinmap_ros.core.exploration.candidates import CandidateConfig, CandidateFi
 from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.reachable import ReachableSpace
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
-from thinmap_ros.core.exploration.viewpoints import place_beside
+from thinmap_ros.core.exploration.viewpoints import search_beside
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
@@ -202,6 +203,65 @@ def test_a_frontier_behind_a_passage_that_looks_too_narrow_is_observed_from_befo
             candidate.examined_ns = -1
 
 
+def cluttered(seed):
+    """A hall of 16 x 8 m, known up to x = 13 m, with furniture a little too close for the robot."""
+    rng = np.random.default_rng(seed)
+    cells = np.full((80, 160), -1)
+    cells[:, :130] = 0
+    cells[[0, -1]] = 100
+    cells[:, 0] = 100
+    for row, col in rng.integers([2, 25], [76, 140], size=(70, 2)).tolist():
+        cells[row : row + int(rng.integers(1, 9)), col : col + int(rng.integers(1, 9))] = 100
+    return cells
+
+
+def test_what_can_be_reached_is_what_the_navigator_finds_a_way_to():
+    here = (float(AT[0]), float(AT[1]))
+    config = WavefrontConfig(goal_search_radius_m=0.0)
+    answers = set()
+    for seed in range(8):
+        cells = cluttered(seed)
+        room = Room(cells)
+        room.find()
+        patch = GridPatch(FRAME, cells.astype(np.int8))
+        now = room.space.now
+        rows, cols = np.nonzero(now.standing)
+        for k in range(0, len(rows), 40):
+            goal = FRAME.centres_of(np.array([[rows[k], cols[k]]]))[0].tolist()
+            is_reachable = bool(now.cells[rows[k], cols[k]])
+            assert is_reachable == (plan(patch, here, goal, config) is not None), (seed, goal)
+            answers.add(is_reachable)
+    assert answers == {True, False}
+
+
+def test_no_place_is_visited_twice_and_a_place_that_can_be_reached_later_is_visited():
+    """A room with a door of 0.3 m, too narrow for the robot, and a wide one that opens later."""
+    cells = np.full((60, 120), -1)
+    cells[:, :60] = 0
+    cells[[0, -1]] = 100
+    cells[:, 0] = 100
+    cells[:, 60] = 100
+    cells[18:21, 60] = 0
+    cells[5:35, 61:75] = 0
+    cells[4, 61:] = cells[35, 61:] = 100
+    room = Room(cells)
+    seen_from = []
+    for second in range(10):
+        (candidate,) = (c for c in room.find(seconds=10.0 * second) if c.length_m > 2.0)
+        if candidate.goal is None:
+            break
+        assert all(math.dist(candidate.goal[:2], place) > 0.5 for place in seen_from)
+        seen_from.append((float(candidate.goal[0]), float(candidate.goal[1])))
+        candidate.evidence.add_visit(seen_from[-1])
+    assert candidate.goal is None and not candidate.is_enclosed
+    assert seen_from and all(x < 6.0 for x, _ in seen_from)
+    cells[24:32, 60] = 0
+    room.set_cells(cells)
+    (candidate,) = (c for c in room.find(seconds=200.0) if c.length_m > 2.0)
+    assert candidate.evidence.visits == len(seen_from)
+    assert candidate.goal[0] > 6.0
+
+
 def test_no_place_is_beside_a_frontier_across_a_wall():
     free = np.zeros((40, 60), dtype=np.bool_)
     free[1:39, 1:59] = True
@@ -209,6 +269,9 @@ def test_no_place_is_beside_a_frontier_across_a_wall():
     frontier = np.array([[20, 33], [21, 33]])
     allowed = free.copy()
     allowed[:, 31:] = False
-    assert place_beside(free, frontier, allowed, 30, (20, 33)) is None
+    assert search_beside(free, frontier, allowed, allowed, 30, (20, 33)) == (None, True)
     free[5, 30] = True
-    assert place_beside(free, frontier, allowed, 30, (20, 33))[1] < 30
+    place, is_enclosed = search_beside(free, frontier, allowed, allowed, 30, (20, 33))
+    assert place[1] < 30 and not is_enclosed
+    allowed[:, 25:] = False
+    assert search_beside(free, frontier, allowed, allowed, 10, (20, 33)) == (None, False)

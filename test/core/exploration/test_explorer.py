@@ -16,7 +16,7 @@ from thinmap_ros.core.exploration.look_around import TURN_ID
 from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision, FinishCode
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
@@ -56,7 +56,7 @@ class Run:
         self.simulation = Simulation(
             world, start, PRESETS['2dx'], laser or LaserScannerConfig(), seed
         )
-        self.grid = OccupancyGrid()
+        self.grid = OccupancyGrid(PAPER_GRID)
         self.topology = TopologyBuilder()
         self.explorer = strategy or Explorer()
         self.navigator = Navigator(
@@ -168,6 +168,53 @@ def comb(doors=45):
     for door in range(doors):
         cells[50, 20 + 20 * door : 30 + 20 * door] = 0
     return GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
+
+
+def niches(count, depth):
+    """A corridor with openings to niches, unknown inside, in front of a wall that is known."""
+    cells = np.full((60, 30 + 20 * count), -1, dtype=np.int8)
+    cells[[9, 30], :] = 100
+    cells[10:30, :] = 0
+    cells[10:30, [0, -1]] = 100
+    for niche in range(count):
+        cells[30, 20 + 20 * niche : 30 + 20 * niche] = 0
+        cells[31 + depth, 15 + 20 * niche : 35 + 20 * niche] = 100
+    return GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
+
+
+@pytest.mark.parametrize('depth', [2, 3, 4])
+@pytest.mark.parametrize('count', [1, 4, 12, 30])
+def test_all_is_never_said_to_be_resolved_where_much_is_expected_to_be_missing(count, depth):
+    explorer = Explorer()
+    scan = Scan.create(0, np.full(181, np.inf), -math.pi / 2, math.pi / 180, 0.02, 3.0)
+    for second in range(200):
+        decision = explorer.step(
+            TopologicalMap(),
+            niches(count, depth),
+            replace(scan, stamp_ns=second * 1_000_000_000),
+            np.array([2.0, 2.0, 0.0]),
+        )
+        if decision.finished:
+            break
+        explorer.target_failed('no path')
+    expected_m2 = decision.missing.expected_m2
+    assert decision.finished and len(explorer.candidates) == count
+    assert all(c.probability >= explorer.config.probability_threshold for c in explorer.candidates)
+    assert (decision.code == FinishCode.ALL_RESOLVED) == (expected_m2 <= 2.0), expected_m2
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_at_the_end_of_small_worlds_little_is_missing_or_something_is_left(seed):
+    rng = np.random.default_rng(seed)
+    walls = [(slice(0, 25), 30), (slice(35, 60), 30)]
+    for _ in range(6):
+        row, col = rng.integers(8, 50, 2)
+        long = int(rng.integers(3, 9))
+        walls.append((slice(row, row + 1), slice(col, col + long)))
+        walls.append((slice(row, row + long), slice(col, col + 1)))
+    last = Run(world_of(walls), seed=seed, start=np.array([0.5, 0.5, 0.8])).go().last
+    assert last.finished
+    assert last.code == FinishCode.UNREACHABLE or last.missing.expected_m2 <= 2.0
 
 
 def test_of_many_places_the_target_is_a_near_one_and_stays():

@@ -8,10 +8,11 @@ frontiers, too: they are no candidates.
 
 import math
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter, robot_radius
@@ -21,12 +22,11 @@ from thinmap_ros.core.exploration.frontiers import Cells, FrontierMap
 from thinmap_ros.core.exploration.reachable import Reachable
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode, unobserved
 from thinmap_ros.core.exploration.unknown_space import depth_behind_m, hidden_area_m2
-from thinmap_ros.core.exploration.viewpoints import is_enclosed, place_beside, place_for
+from thinmap_ros.core.exploration.viewpoints import Cell, place_for, search_beside
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
-from thinmap_ros.jit import kernel
 
 SETTLED = 0.999  # probability of an end node without a frontier
 _RIM_M = 0.5  # at the end of its range the laser sees little
@@ -94,17 +94,23 @@ class Candidate:
         """Id with which it is published: of its end node, or else its own."""
         return self.evidence.id if self.end_node is None else self.end_node.id
 
+    @property
+    def expected_area_m2(self) -> float:
+        """Area that is hidden behind it, as a mean over both cases."""
+        return (1.0 - self.probability) * self.mean_area_m2
+
     def published(self, target_goal: Array | None) -> EndNode:
         """End node of a decision; target_goal (3,): where the robot drives if it is the target."""
         node = self.end_node
         place = self.middle if node is None else (node.x, node.y)
-        end_node = unobserved(self.node_id, place, self.probability)
-        goal = end_node.goal if self.goal is None else self.goal
-        return end_node._replace(
-            frontier_length_m=self.length_m,
-            expected_area_m2=(1.0 - self.probability) * self.mean_area_m2,
-            is_target=target_goal is not None,
-            goal=goal if target_goal is None else target_goal,
+        return unobserved(
+            self.node_id,
+            place,
+            self.probability,
+            self.goal if target_goal is None else target_goal,
+            target_goal is not None,
+            self.length_m,
+            self.expected_area_m2,
         )
 
 
@@ -136,12 +142,18 @@ class CandidateFinder:
         T_map_base (3,): pose of the robot; range_max_m: of the laser.
         """
         before = {id(c.evidence): c for c in self._found}
-        self._found = self._find(topology, frontiers)
-        for candidate in self._found:
-            known = before.get(id(candidate.evidence))
-            if known is None or not _may_keep(candidate, known, stamp_ns, T_map_base):
-                self._examine(candidate, frontiers, reachable, range_max_m)
-                candidate.examined_ns = stamp_ns
+        found = []
+        for new in self._find(topology, frontiers):
+            known = before.get(id(new.evidence))
+            if known is not None and _is_as_it_was(new, known, stamp_ns, T_map_base):
+                known.cells = new.cells
+                known.end_node = new.end_node
+                found.append(known)
+            else:
+                self._examine(new, frontiers, reachable, range_max_m)
+                new.examined_ns = stamp_ns
+                found.append(new)
+        for candidate in found:
             candidate.probability = self._model.probability(
                 candidate.length_m,
                 candidate.hidden_m2,
@@ -149,12 +161,14 @@ class CandidateFinder:
                 candidate.evidence.visits,
             )
             candidate.mean_area_m2 = self._model.mean_area(candidate.hidden_m2)
-        self.candidates = [c for c in self._found if not c.is_enclosed]
+        self._found = found
+        self.candidates = [c for c in found if not c.is_enclosed]
 
     def _find(self, topology: TopologicalMap, frontiers: FrontierMap) -> list[Candidate]:
         nodes = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
         clusters = frontiers.clusters(self._config.min_frontier_size)
-        owners = self._owners(frontiers, clusters, nodes)
+        middles = [frontiers.middle_of(cells) for cells in clusters]
+        owners = self._owners(frontiers, middles, nodes)
         self.settled = [
             unobserved(node.id, (node.x, node.y), SETTLED)
             for i, node in enumerate(nodes)
@@ -175,21 +189,18 @@ class CandidateFinder:
             for item, cells, middle, node in zip(evidence, found, middles, end_nodes, strict=True)
         ]
 
-    def _owners(
-        self, frontiers: FrontierMap, clusters: list[Cells], nodes: list[Node]
-    ) -> list[int]:
+    def _owners(self, frontiers: FrontierMap, middles: list[Place], nodes: list[Node]) -> list[int]:
         """Index of the nearest end node that sees the middle of each frontier; -1: none."""
-        middles = np.array([frontiers.middle_of(cells) for cells in clusters]).reshape(-1, 2)
+        points = np.array(middles).reshape(-1, 2)
         places = np.array([(node.x, node.y) for node in nodes]).reshape(-1, 2)
-        frame = frontiers.frame
-        owners: list[int] = _nearest_in_sight(
-            frontiers.free,
-            middles,
-            places,
-            frame.cells_of(middles),
-            frame.cells_of(places),
-            self._config.frontier_assignment_radius_m,
-        ).tolist()
+        at = frontiers.frame.cells_of(places)
+        cells = frontiers.frame.cells_of(points)
+        away_m = cdist(points, places)
+        pairs = np.argwhere(away_m <= self._config.frontier_assignment_radius_m)
+        owners = [-1] * len(middles)
+        for i, k in pairs[away_m[tuple(pairs.T)].argsort(kind='stable')].tolist():
+            if owners[i] < 0 and line_is_clear(frontiers.free, *at[k], *cells[i]):
+                owners[i] = k
         return owners
 
     def _examine(
@@ -203,18 +214,21 @@ class CandidateFinder:
         """
         candidate.hidden_m2 = hidden_area_m2(frontiers, candidate.middle)
         candidate.depth_m = depth_behind_m(frontiers, candidate.cells)
-        cell = self._viewpoint(candidate, frontiers, reachable, range_max_m)
         candidate.goal = None
-        if cell is None:
-            candidate.is_enclosed = is_enclosed(frontiers.free, reachable.standing, candidate.cells)
-        else:
-            x, y = frontiers.frame.centres_of(np.array([cell]))[0]
-            candidate.goal = _facing((float(x), float(y)), candidate.middle)
+        candidate.is_enclosed = False
+        has_view = False
+        for cell in self._views(candidate, frontiers, reachable, range_max_m):
+            has_view = True
+            if _drives_to(candidate, cell, frontiers):
+                return
+        beside, is_enclosed = self._beside(candidate, frontiers, reachable)
+        if beside is None or not _drives_to(candidate, beside, frontiers):
+            candidate.is_enclosed = is_enclosed and not has_view
 
-    def _viewpoint(
+    def _views(
         self, candidate: Candidate, frontiers: FrontierMap, reachable: Reachable, range_max_m: float
-    ) -> tuple[int, int] | None:
-        """Cell (row, col) from which to observe a candidate; None: there is none."""
+    ) -> Iterator[Cell]:
+        """Cells that see behind a frontier, the best one first."""
         resolution = frontiers.frame.resolution
         views = [(range_max_m - _RIM_M, self._config.view_depth_m), (_NEAR_M, 0.0)]
         for reach_m, depth_m in views[min(candidate.evidence.visits, 1) :]:
@@ -228,54 +242,40 @@ class CandidateFinder:
                 reach_m / resolution,
             )
             if cell is not None:
-                return cell
-        steps = int(self._config.frontier_assignment_radius_m / resolution)
+                yield cell
+
+    def _beside(
+        self, candidate: Candidate, frontiers: FrontierMap, reachable: Reachable
+    ) -> tuple[Cell | None, bool]:
+        """The nearest cell on the way to a frontier, None without one; whether it is enclosed."""
+        steps = int(self._config.frontier_assignment_radius_m / frontiers.frame.resolution)
         row, col = frontiers.frame.cells_of(np.array([candidate.middle]))[0]
-        towards = (int(row), int(col))
-        return place_beside(frontiers.free, candidate.cells, reachable.cells, steps, towards)
+        return search_beside(
+            frontiers.free,
+            candidate.cells,
+            reachable.cells,
+            reachable.standing,
+            steps,
+            (int(row), int(col)),
+        )
 
 
-@kernel
-def _nearest_in_sight(
-    free: NDArray[np.bool_],
-    points: Array,
-    nodes: Array,
-    point_cells: Cells,
-    node_cells: Cells,
-    radius_m: float,
-) -> NDArray[np.int64]:
-    """Index of the nearest node (N, 2), m, within a radius of each point (M, 2), m; -1: none.
-
-    All cells between are free. point_cells (M, 2), node_cells (N, 2): the cells of both.
-    """
-    nearest = np.full(points.shape[0], -1, dtype=np.int64)
-    for i in range(points.shape[0]):
-        best_m = np.inf
-        for k in range(nodes.shape[0]):
-            away_m = math.hypot(nodes[k, 0] - points[i, 0], nodes[k, 1] - points[i, 1])
-            if away_m > radius_m or away_m >= best_m:
-                continue
-            row, col = node_cells[k]
-            if line_is_clear(free, row, col, point_cells[i, 0], point_cells[i, 1]):
-                best_m = away_m
-                nearest[i] = k
-    return nearest
-
-
-def _may_keep(candidate: Candidate, known: Candidate, stamp_ns: int, T_map_base: Array) -> bool:
-    """Adopt viewpoint and hidden area of the last time, if the frontier is still the same."""
-    same = len(known.cells) == len(candidate.cells) and known.middle == candidate.middle
-    away_m = math.dist(candidate.middle, T_map_base[:2])
-    renew_s = max(_RENEW_S, _RENEW_S_M * away_m)
-    recent = 0 <= stamp_ns - known.examined_ns < renew_s * SECOND_NS
-    if not (same and recent and known.examined_ns >= 0):
+def _drives_to(candidate: Candidate, cell: Cell, frontiers: FrontierMap) -> bool:
+    """Make a cell the viewpoint, unless a visit there showed nothing; returns whether it is."""
+    x, y = frontiers.frame.centres_of(np.array([cell]))[0].tolist()
+    if candidate.evidence.was_seen_from((x, y)):
         return False
-    candidate.goal = known.goal
-    candidate.hidden_m2 = known.hidden_m2
-    candidate.depth_m = known.depth_m
-    candidate.examined_ns = known.examined_ns
-    candidate.is_enclosed = known.is_enclosed
+    candidate.goal = _facing((x, y), candidate.middle)
     return True
+
+
+def _is_as_it_was(new: Candidate, known: Candidate, stamp_ns: int, T_map_base: Array) -> bool:
+    """Whether a frontier is the same, and was examined so lately that nothing has changed."""
+    age_s = (stamp_ns - known.examined_ns) / SECOND_NS
+    is_same = len(known.cells) == len(new.cells) and known.middle == new.middle
+    away_m = math.dist(new.middle, T_map_base[:2])
+    is_recent = 0.0 <= age_s < max(_RENEW_S, _RENEW_S_M * away_m)
+    return is_same and is_recent and known.examined_ns >= 0
 
 
 def _facing(place: Place, towards: Place) -> Array:

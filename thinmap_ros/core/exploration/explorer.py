@@ -2,6 +2,8 @@
 
 - Only candidates are visited whose probability of hiding nothing is below a threshold, as in the
   paper. A candidate is dropped as soon as its probability passes the threshold on the way.
+- Many small chances are one large one: an exploration does not end as long as all candidates above
+  the threshold together are expected to hide more than 2 m2.
 - The next one is that with the shortest path, the turn at its beginning included. A tour through
   all of them saves nothing: what comes to light on the way changes it.
 - The target is kept unless another one saves a clear margin, so that the robot does not oscillate.
@@ -14,24 +16,31 @@ Source: exploration paper sections 3.2 and 4.
 """
 
 import math
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.config import parameter
+from thinmap_ros.core.config import config_or_default, parameter
 from thinmap_ros.core.exploration.belief import evidence
 from thinmap_ros.core.exploration.belief.fitted import FITTED
-from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2, BeliefModel
+from thinmap_ros.core.exploration.belief.model import BeliefModel
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
-from thinmap_ros.core.exploration.frontiers import FrontierMap, Place
+from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.look_around import LookAround, turn_target
 from thinmap_ros.core.exploration.reachable import ReachableSpace
-from thinmap_ros.core.exploration.strategy import Decision, finish_reason
+from thinmap_ros.core.exploration.strategy import (
+    Decision,
+    Start,
+    Streak,
+    decide,
+    is_at,
+    is_near,
+)
 from thinmap_ros.core.exploration.team.claims import SAME_PLACE_M, Claim
 from thinmap_ros.core.exploration.team.team import Team
 from thinmap_ros.core.exploration.unknown_space import hidden_area_m2
@@ -43,16 +52,13 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-_NEAR_M = 0.3
-_NEAR_RAD = 0.35
-_SAME_PLACE_M = 1.5  # a target whose middle moves less is the same one
+_TURN_FROM_M = 0.3  # paths that are shorter begin with no turn
+_SAME_PLACE_M = 1.5  # a target or viewpoint that moves less is the same one
 _MAX_VISITS = 3  # until a candidate is given up
 _MAX_FAILURES = 2
-_SCANS = 3  # at the goal, or with nothing left
+_MAX_RESOLVED_M2 = 2.0  # of area that candidates may hide of which none is worth a visit
 _GONE_S = 0.35
-_START_S = 5.0  # the first scans are no graph yet
 _FINAL_PAUSE_S = 40.0  # a navigator that starts, or is blocked by people, refuses goals meanwhile
-_MAX_DOUBLINGS = 30
 
 
 @dataclass(frozen=True)
@@ -90,48 +96,21 @@ class ExplorerConfig(CandidateConfig):
 
 @dataclass
 class _Target:
-    """Where the robot drives: the candidate, the goal (3,), and scans made at the goal.
+    """Where the robot drives: the candidate, the goal (3,), and the scans made there.
 
     is_turn: whether the goal is a part of a turn in place.
     """
 
     candidate: Candidate | None = None
-    middle: Place = (math.inf, math.inf)
     goal: Array | None = None
-    scans_at_goal: int = 0
+    visit: Streak = field(default_factory=Streak)
     is_turn: bool = False
 
 
 @dataclass
-class _LeftTargets:
-    """How often targets were left for cheaper ones since the robot last saw something new.
-
-    known_area_m2: largest area that was known then; times: by id of the evidence.
-    """
-
-    known_area_m2: float = 0.0
-    times: Counter[int] = field(default_factory=Counter)
-
-    def update(self, known_area_m2: float) -> None:
-        """Forget all if something worth seeing was seen."""
-        if known_area_m2 >= self.known_area_m2 + WORTH_SEEING_M2:
-            self.known_area_m2 = known_area_m2
-            self.times.clear()
-
-    def add(self, evidence_id: int) -> None:
-        """Count that a target was left."""
-        self.times[evidence_id] += 1
-
-    def factor(self, evidence_id: int) -> float:
-        """Factor of the saving for which a target is taken: 2 for each time that it was left."""
-        return 2.0 ** min(self.times[evidence_id], _MAX_DOUBLINGS)
-
-
-@dataclass
 class _Clock:
-    """Stamps, ns: of the first scan, of this one, and of the last search for candidates."""
+    """Stamps, ns: of this scan, and of the last search for candidates."""
 
-    began_ns: int = -1
     now_ns: int = 0
     found_ns: int = -(10**18)
 
@@ -146,17 +125,17 @@ class Explorer:
         team: Team | None = None,
     ) -> None:
         """team: the robots that explore together; None: this one alone."""
-        self.config = config or ExplorerConfig()
+        self.config = config_or_default(config, ExplorerConfig)
         self.team = team or Team()
         self.frontier_map = FrontierMap()
         self._finder = CandidateFinder(self.config, model)
         self._space = ReachableSpace(self.config.robot_radius_m)
         self._target = _Target()
-        self._left = _LeftTargets()
         self._look = LookAround()
         self._clock = _Clock()
         self._frame = self.frontier_map.frame
-        self._scans_without_target = 0
+        self._start = Start()
+        self._end = Streak()
 
     @property
     def candidates(self) -> list[Candidate]:
@@ -189,7 +168,6 @@ class Explorer:
         """
         clock = self._clock
         clock.now_ns = scan.stamp_ns
-        clock.began_ns = scan.stamp_ns if clock.began_ns < 0 else clock.began_ns
         self._space.add_pose(T_map_base)
         self.frontier_map.update(patch, box_of_scan(scan, T_map_base), *self.team.take_changes())
         self._add_visit(T_map_base)
@@ -220,9 +198,7 @@ class Explorer:
             # A robot or a person in the way is no property of the place.
             if reason.startswith(NO_PATH):
                 self.team.add_settled(candidate.evidence)
-        if candidate is not None:
-            self._drop_target()
-            self._target.goal = None
+        self._target = _Target()
 
     def claim(self, stamp_ns: int, T_map_base: Array, remaining_m: float = 0.0) -> Claim:
         """What to send the other robots of the team, at a pose (3,); remaining_m: of the path."""
@@ -245,15 +221,11 @@ class Explorer:
         target = self._target
         if target.candidate is None or target.goal is None or target.is_turn:
             return
-        is_there = _is_at(T_map_base, target.goal)
-        target.scans_at_goal = target.scans_at_goal + 1 if is_there else 0
-        if target.scans_at_goal >= _SCANS:
-            target.candidate.evidence.visits += 1
-            target.candidate.evidence.failures = 0
+        if target.visit.add(is_at(T_map_base, target.goal)):
+            target.candidate.evidence.add_visit((float(target.goal[0]), float(target.goal[1])))
             self.team.add_settled(target.candidate.evidence)
             target.candidate.examined_ns = -1
-            self._drop_target()
-            target.goal = None
+            self._target = _Target()
 
     # The target.
 
@@ -274,34 +246,40 @@ class Explorer:
     def _choose(self, topology: TopologicalMap, T_map_base: Array) -> None:
         """Choose the target among the candidates."""
         worth = [c for c in self._doubtful if not _is_given_up(c)]
-        waits = not topology.nodes and self._clock.now_ns - self._clock.began_ns < (
-            _START_S * SECOND_NS
-        )
+        starts = self._start.lasts(topology, self._clock.now_ns)
         if not worth:
-            self._drop_target()
-            is_over = self.frontier_map.free_cells > 0 and not waits
-            if not (is_over and self._turns_in_place(T_map_base)):
-                self._scans_without_target += is_over
+            self._target = _Target()
+            may_end = self.frontier_map.free_cells > 0 and not starts
+            if not (may_end and self._turns_in_place(T_map_base)):
+                self._end.add(may_end)
             return
-        self._scans_without_target = 0
+        self._end = Streak()
         self._look.stop()
         own = self.claim(self._clock.now_ns, T_map_base)
         ready = self.team.share(
             self._ready(worth), own, self._space.path_lengths_from, self.config.switch_margin_m
         )
-        if not ready:
-            self._drop_target()
-            return
-        self._left.update(self.frontier_map.known_area_m2)
-        costs = self._costs(ready, T_map_base)
+        if ready:
+            self._drive_to(self._best(self._costs(ready, T_map_base)), T_map_base)
+        else:
+            self._target = _Target()
+
+    def _best(self, costs: dict[Candidate, float]) -> Candidate:
+        """The target, unless another candidate saves the margin; else the cheapest one.
+
+        The margin is twice as large for each time that the other one was left, so that the robot
+        never oscillates without end, whatever the costs are.
+        """
         best = min(costs, key=lambda candidate: costs[candidate])
-        kept = self._kept(list(costs))
-        if kept is not None and kept is not best:
-            if costs[best] >= costs[kept] - self._switch_margin_m(best):
-                best = kept
-            else:
-                self._left.add(kept.evidence.id)
-        self._drive_to(best, T_map_base)
+        kept = self._kept(costs)
+        if kept is None or kept is best:
+            return best
+        known_area_m2 = self.frontier_map.known_area_m2
+        margin_m = self.config.switch_margin_m * 2.0 ** best.evidence.times_left(known_area_m2)
+        if costs[best] >= costs[kept] - margin_m:
+            return kept
+        kept.evidence.leave(known_area_m2)
+        return best
 
     def _turns_in_place(self, T_map_base: Array) -> bool:
         """Begin to turn, or turn on, if that can show anything; returns whether it can."""
@@ -315,18 +293,18 @@ class Explorer:
         self._target = _Target(turn_target(goal), goal=goal, is_turn=True)
         return True
 
-    def _switch_margin_m(self, candidate: Candidate) -> float:
-        """Saving for which the target is changed, larger for one that was left.
-
-        The robot never oscillates without end, whatever the costs are.
-        """
-        return self.config.switch_margin_m * self._left.factor(candidate.evidence.id)
-
     @property
     def _doubtful(self) -> list[Candidate]:
-        """Candidates that are not resolved: worth a visit, or given up."""
+        """Candidates that are not resolved: worth a visit, or given up.
+
+        They are below the threshold. Where none is, but all together are expected to hide more than
+        _MAX_RESOLVED_M2, those that hide most are not resolved either.
+        """
         threshold = self.config.probability_threshold
-        return [candidate for candidate in self.candidates if candidate.probability < threshold]
+        below = [candidate for candidate in self.candidates if candidate.probability < threshold]
+        by_area = sorted(self.candidates, key=lambda candidate: candidate.expected_area_m2)
+        sums_m2 = accumulate(candidate.expected_area_m2 for candidate in by_area)
+        return below or [c for c, m2 in zip(by_area, sums_m2, strict=True) if m2 > _MAX_RESOLVED_M2]
 
     def _ready(self, worth: list[Candidate]) -> list[Candidate]:
         """Candidates to which no drive failed; if there are none, all others after a pause.
@@ -337,27 +315,23 @@ class Explorer:
         since_ns = self._clock.now_ns - _FINAL_PAUSE_S * SECOND_NS
         return untried or [c for c in worth if c.evidence.failed_ns < since_ns]
 
-    def _kept(self, candidates: list[Candidate]) -> Candidate | None:
-        """The target, or the candidate to which its frontier belongs now."""
-        target = self._target
-        if target.candidate is not None:
-            for candidate in candidates:
-                if candidate.evidence is target.candidate.evidence:
-                    return candidate
-        near = min(candidates, key=lambda candidate: math.dist(candidate.middle, target.middle))
-        return near if math.dist(near.middle, target.middle) <= _SAME_PLACE_M else None
+    def _kept(self, candidates: Iterable[Candidate]) -> Candidate | None:
+        """The candidate that continues the target, or what came to light instead of it."""
+        target = self._target.candidate
+        if target is None:
+            return None
+        same = [c for c in candidates if c.evidence is target.evidence]
+        near = same or [c for c in candidates if _moved_m(c, target) <= _SAME_PLACE_M]
+        return min(near, key=lambda c: _moved_m(c, target), default=None)
 
     def _drive_to(self, candidate: Candidate, T_map_base: Array) -> None:
         """Make a candidate the target; the goal stays while its frontier does."""
-        target = self._target
         goal = candidate.goal
         if goal is None:
             return
-        if not self._goal_stays(candidate, goal, T_map_base):
-            target.goal = goal
-        target.candidate = candidate
-        target.middle = candidate.middle
-        target.is_turn = False
+        if self._goal_stays(candidate, goal, T_map_base):
+            goal = self._target.goal
+        self._target = _Target(candidate, goal, self._target.visit)
 
     def _goal_stays(self, candidate: Candidate, goal: Array, T_map_base: Array) -> bool:
         """Whether the goal stays although another viewpoint of the same frontier is nearer now.
@@ -366,17 +340,12 @@ class Explorer:
         turns with the place of the robot, none would ever be reached.
         """
         target = self._target
-        if target.goal is None:
+        if target.goal is None or target.candidate is None:
             return False
-        moved_m = math.dist(candidate.middle, target.middle)
+        moved_m = _moved_m(candidate, target.candidate)
         gap_m = math.dist(goal[:2], target.goal[:2])
-        is_on_the_way = math.dist(T_map_base[:2], target.goal[:2]) > _NEAR_M
-        return max(moved_m, gap_m) <= _SAME_PLACE_M and (is_on_the_way or moved_m == 0.0)
-
-    def _drop_target(self) -> None:
-        self._target.candidate = None
-        self._target.scans_at_goal = 0
-        self._target.is_turn = False
+        is_same = max(moved_m, gap_m) <= _SAME_PLACE_M
+        return is_same and (moved_m == 0.0 or not is_near(T_map_base, target.goal))
 
     def _costs(self, candidates: list[Candidate], T_map_base: Array) -> dict[Candidate, float]:
         """Cost, m, of driving to each candidate: the path, and the turn with which it begins."""
@@ -393,21 +362,13 @@ class Explorer:
         if target.is_turn and target.candidate is not None:
             places = [*places, target.candidate]
         published = [c.published(target.goal if c is target.candidate else None) for c in places]
-        chosen = next((end_node for end_node in published if end_node.is_target), None)
         doubtful = self._doubtful
-        aside = sorted(c.node_id for c in doubtful if c.evidence.failures or _is_given_up(c))
-        finished = self._scans_without_target >= _SCANS
-        left = len(doubtful) or int(self._look.is_in_the_dark)
-        code, reason = finish_reason(finished, left)
-        return Decision(
-            chosen,
-            finished,
-            reason,
-            code,
+        return decide(
             self._finder.settled + published,
-            aside,
+            self._end.is_over,
+            len(doubtful) or int(self._look.is_in_the_dark),
+            (c.node_id for c in doubtful if c.evidence.failures or _is_given_up(c)),
             self.frontier_map.known_area_m2,
-            left,
             [(c.probability, c.mean_area_m2) for c in self.candidates],
         )
 
@@ -419,13 +380,13 @@ def _is_given_up(candidate: Candidate) -> bool:
     return candidate.goal is None or is_tried
 
 
+def _moved_m(candidate: Candidate, target: Candidate) -> float:
+    """Distance from the middle of a target to that of a candidate."""
+    return math.dist(candidate.middle, target.middle)
+
+
 def _turns(T_map_base: Array, goals: Array) -> Array:
     """Size of the turns (N,), rad, with which the paths to goals (N, 3) begin; 0 at the goal."""
     offsets = goals[:, :2] - T_map_base[:2]
     turns = np.abs(se2.wrap(np.arctan2(offsets[:, 1], offsets[:, 0]) - T_map_base[2]))
-    return np.where(np.hypot(*offsets.T) > _NEAR_M, turns, 0.0)
-
-
-def _is_at(T_map_base: Array, goal: Array) -> bool:
-    near = math.dist(T_map_base[:2], goal[:2]) <= _NEAR_M
-    return near and abs(se2.wrap(float(goal[2] - T_map_base[2]))) <= _NEAR_RAD
+    return np.where(np.hypot(*offsets.T) > _TURN_FROM_M, turns, 0.0)

@@ -254,9 +254,8 @@ class Mission:
         )
         if self.decision.finished:
             return self._finish_exploring(self._end_of(self.decision))
-        target = self.decision.target
-        self.drives.follow(target)
-        return None if target is None else DriveTo(target.goal)
+        goal = self.drives.follow(self.decision.target, self.strategy)
+        return None if goal is None else DriveTo(goal)
 
     def check(self, now_s: float, is_driving: bool) -> Action:
         """Check inputs and budgets, about once a second.

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.position_probability import (
@@ -25,7 +25,6 @@ from thinmap_ros.core.exploration.position_probability import (
 )
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Node
-from thinmap_ros.jit import kernel
 
 Place = tuple[float, float]
 PRIOR = 0.5
@@ -134,7 +133,7 @@ class PaperEndNodes:
             np.array([item.place for item in earlier]).reshape(-1, 2),
             np.array(places, dtype=np.float64).reshape(-1, 2),
             reset_distance_m,
-        ).tolist()
+        )
         found = []
         for node, place, index in zip(nodes, places, indices, strict=True):
             if index < 0:
@@ -151,25 +150,16 @@ class PaperEndNodes:
         return found
 
 
-@kernel
-def _continued(earlier: Array, places: Array, radius_m: float) -> NDArray[np.int64]:
+def _continued(earlier: Array, places: Array, radius_m: float) -> list[int]:
     """Index of the earlier place (N, 2), m, that each place (M, 2), m, continues; -1: none.
 
     It is the nearest one within a radius; each is continued once, by the first place.
     """
-    taken = np.zeros(earlier.shape[0], dtype=np.bool_)
-    indices = np.full(places.shape[0], -1, dtype=np.int64)
-    for i in range(places.shape[0]):
-        best_m = np.inf
-        for k in range(earlier.shape[0]):
-            dx = earlier[k, 0] - places[i, 0]
-            # Most are far away, and a comparison is faster than a distance.
-            if taken[k] or abs(dx) > radius_m:
-                continue
-            away_m = math.hypot(dx, earlier[k, 1] - places[i, 1])
-            if away_m <= radius_m and away_m < best_m:
-                best_m = away_m
-                indices[i] = k
-        if indices[i] >= 0:
-            taken[indices[i]] = True
+    away_m = np.pad(cdist(places, earlier), ((0, 0), (0, 1)), constant_values=radius_m)
+    indices = []
+    for own in away_m:
+        nearest = int(own.argmin())
+        is_new = nearest == len(earlier)
+        indices.append(-1 if is_new else nearest)
+        away_m[:, nearest] = radius_m if is_new else np.inf
     return indices

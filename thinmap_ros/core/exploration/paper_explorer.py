@@ -25,18 +25,21 @@ from thinmap_ros.core.exploration.paper_evidence import (
     PaperEndNodes,
 )
 from thinmap_ros.core.exploration.position_probability import bayes_update
-from thinmap_ros.core.exploration.strategy import Decision, EndNode, finish_reason, unobserved
+from thinmap_ros.core.exploration.strategy import (
+    Decision,
+    EndNode,
+    Start,
+    Streak,
+    decide,
+    is_near,
+    unobserved,
+)
 from thinmap_ros.core.exploration.visibility import box_of_scan, visible_places
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
-
-_NEAR_M = 0.3
-_SCANS = 3
-_START_S = 5.0  # the first scans are no graph yet
 
 
 class PaperExplorer:
@@ -48,24 +51,23 @@ class PaperExplorer:
         self._followed = PaperEndNodes()
         self._end_nodes: list[PaperEndNode] = []
         self._target: PaperEndNode | None = None
-        self._goal = np.zeros(3)
+        self._goal: Array | None = None
         self._is_first = True
-        self._began_ns = -1
-        self._scans_at_goal = self._scans_without_target = 0
+        self._start = Start()
+        self._visit = Streak()
+        self._end = Streak()
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
         """Choose where to drive; see strategy.Strategy."""
-        self._began_ns = scan.stamp_ns if self._began_ns < 0 else self._began_ns
         self._frontier_map.update(patch, box_of_scan(scan, T_map_base))
         nodes = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
         self._end_nodes = self._followed.follow(nodes, self.config.node_reset_distance_m)
         self._add_views(scan, T_map_base)
         self._add_visit(T_map_base)
-        waits = not topology.nodes and scan.stamp_ns - self._began_ns < _START_S * SECOND_NS
         left = [node for node in self._doubtful if not node.tries]
-        self._scans_without_target = 0 if left or waits else self._scans_without_target + 1
+        self._end.add(not self._start.lasts(topology, scan.stamp_ns) and not left)
         self._choose(left, topology, T_map_base)
         return self._decision()
 
@@ -93,11 +95,9 @@ class PaperExplorer:
         target = self._target
         if target is None:
             return
-        is_there = math.dist(T_map_base[:2], target.place) <= _NEAR_M
-        self._scans_at_goal = self._scans_at_goal + 1 if is_there else 0
-        if self._scans_at_goal >= _SCANS:
+        if self._visit.add(is_near(T_map_base, target.place)):
             target.visits += 1
-            self._scans_at_goal = 0
+            self._visit = Streak()
 
     @property
     def _doubtful(self) -> list[PaperEndNode]:
@@ -110,11 +110,11 @@ class PaperExplorer:
     ) -> None:
         if self._target not in left:
             self._target = self._next(left, topology, T_map_base) if left else None
-            self._goal = np.full(3, np.inf)
+            self._goal = None
         if self._target is None:
             return
         place = self._target.place
-        if math.dist(place, self._goal[:2]) > _NEAR_M:  # it moves as the map grows
+        if self._goal is None or not is_near(self._goal, place):  # it moves as the map grows
             heading = math.atan2(place[1] - T_map_base[1], place[0] - T_map_base[0])
             self._goal = se2.pose(*place, heading)
 
@@ -132,26 +132,22 @@ class PaperExplorer:
             _published(node, self._goal if node is self._target else None)
             for node in self._end_nodes
         ]
-        chosen = next((end_node for end_node in end_nodes if end_node.is_target), None)
         doubtful = self._doubtful
-        given_up = sorted(node.node_id for node in doubtful if node.tries)
-        finished = self._scans_without_target >= _SCANS
-        left = len(doubtful)
-        code, reason = finish_reason(finished, left)
+        given_up = (node.node_id for node in doubtful if node.tries)
         area_m2 = self._frontier_map.known_area_m2
-        return Decision(chosen, finished, reason, code, end_nodes, given_up, area_m2, left)
+        return decide(end_nodes, self._end.is_over, len(doubtful), given_up, area_m2)
 
 
 def _published(node: PaperEndNode, target_goal: Array | None) -> EndNode:
     """End node of a decision; target_goal (3,): where the robot drives if it is the target."""
-    end_node = unobserved(node.node_id, node.place, node.probability)
+    end_node = unobserved(
+        node.node_id, node.place, node.probability, target_goal, target_goal is not None
+    )
     return end_node._replace(
         distance_index=node.distance_index,
         angle_index=node.angle_index,
         min_distance_m=node.min_distance_m,
         angle_span_deg=node.angle_span_deg,
-        is_target=target_goal is not None,
-        goal=end_node.goal if target_goal is None else target_goal,
     )
 
 

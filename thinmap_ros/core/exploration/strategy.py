@@ -1,20 +1,27 @@
 """Exploration strategy: chooses where the robot drives next, from graph, map and scan."""
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.belief.model import MissingArea, missing_area
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 # Ids from here on are those of frontier candidates that no end node sees.
 FIRST_FRONTIER_ID = 2_000_000_000
+_NEAR_M = 0.3
+_NEAR_RAD = 0.35
+_MIN_SCANS = 3
+_START_S = 5.0
 
 
 class FinishCode(IntEnum):
@@ -55,10 +62,29 @@ class EndNode(NamedTuple):
     goal: Array
 
 
-def unobserved(node_id: int, place: tuple[float, float], probability: float) -> EndNode:
-    """End node at a place (x, y), m, without counted observations: no target, no frontier."""
-    goal = np.array([*place, 0.0])
-    return EndNode(node_id, *place, probability, 0.0, 0.0, math.inf, 0.0, 0.0, 0.0, False, goal)
+def unobserved(
+    node_id: int,
+    place: tuple[float, float],
+    probability: float,
+    goal: Array | None = None,
+    is_target: bool = False,
+    frontier_length_m: float = 0.0,
+    expected_area_m2: float = 0.0,
+) -> EndNode:
+    """End node at a place (x, y), m, without counted observations; see EndNode."""
+    return EndNode(
+        node_id,
+        *place,
+        probability,
+        0.0,
+        0.0,
+        math.inf,
+        0.0,
+        frontier_length_m,
+        expected_area_m2,
+        is_target,
+        np.array([*place, 0.0]) if goal is None else goal,
+    )
 
 
 @dataclass(frozen=True)
@@ -116,14 +142,65 @@ class ShowsFrontiers(Protocol):
         """Cells of each frontier, (N, 2), m, map frame."""
 
 
-def finish_reason(finished: bool, left: int) -> tuple[FinishCode, str]:
-    """Code and words for the state of an exploration with a number of unresolved end nodes.
+@dataclass
+class Streak:
+    """How many scans in a row something was so: what one scan shows may be noise."""
 
-    When it is finished, each of these is given up.
+    scans: int = 0
+
+    def add(self, is_so: bool) -> bool:
+        """Add a scan; returns whether it was so often enough."""
+        self.scans = self.scans + 1 if is_so else 0
+        return self.is_over
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it was so often enough."""
+        return self.scans >= _MIN_SCANS
+
+
+@dataclass
+class Start:
+    """The first seconds of an exploration, in which there need not be a graph yet."""
+
+    began_ns: float = math.inf
+
+    def lasts(self, topology: TopologicalMap, stamp_ns: int) -> bool:
+        """Whether nothing can be said at a stamp, with a graph."""
+        self.began_ns = min(self.began_ns, stamp_ns)
+        return not topology.nodes and stamp_ns - self.began_ns < _START_S * SECOND_NS
+
+
+def is_near(T_map_base: Array, place: Sequence[float] | Array) -> bool:
+    """Whether a robot at a pose (3,) is at a place (x, y, ...), m."""
+    return math.dist(T_map_base[:2], place[:2]) <= _NEAR_M
+
+
+def is_at(T_map_base: Array, goal: Array) -> bool:
+    """Whether a robot at a pose (3,) is at a goal (3,), and looks where it should."""
+    is_turned = abs(se2.wrap(float(goal[2] - T_map_base[2]))) <= _NEAR_RAD
+    return is_turned and is_near(T_map_base, goal)
+
+
+def decide(
+    end_nodes: list[EndNode],
+    is_finished: bool,
+    left: int,
+    aside: Iterable[int] = (),
+    known_area_m2: float = 0.0,
+    hidden: list[tuple[float, float]] | None = None,
+) -> Decision:
+    """Decision for the end node that is the target; see there.
+
+    left: how many are not resolved; when the exploration is finished, each of these is given up.
     """
+    target = next((node for node in end_nodes if node.is_target), None)
+    code = FinishCode.NONE
     words = f'{left} end node{"" if left == 1 else "s"} left'
-    if not finished:
-        return FinishCode.NONE, words
-    if left:
-        return FinishCode.UNREACHABLE, f'{words}, which the robot cannot reach or see into'
-    return FinishCode.ALL_RESOLVED, 'all end nodes resolved'
+    if is_finished:
+        code = FinishCode.UNREACHABLE if left else FinishCode.ALL_RESOLVED
+        gone = f'{words}, which the robot cannot reach or see into'
+        words = gone if left else 'all end nodes resolved'
+    return Decision(
+        target, is_finished, words, code, end_nodes, sorted(aside), known_area_m2, left, hidden
+    )

@@ -40,57 +40,24 @@ def place_for(
     the robot would stand in its middle; depth: of the space behind the frontier, in cells;
     reach: range of the laser, in cells.
     """
-    points, need = _wanted(free, passable, cells, depth)
+    most = max(_POINTS, len(cells) // _SPACING)
+    points = _hidden_points(free, passable, cells, depth, most)
+    need = math.ceil(_SHARE * min(len(points), _POINTS))
     row, col = _view_place(ways, SQUARE, allowed, passable, points, reach, need)
     return None if row < 0 else (int(row), int(col))
 
 
-def place_beside(
-    free: Mask, cells: Cells, allowed: Mask, max_steps: int, towards: Cell
-) -> Cell | None:
-    """The allowed cell beside a frontier (N, 2) that is nearest to another cell.
+def search_beside(
+    free: Mask, cells: Cells, allowed: Mask, standing: Mask, max_steps: int, towards: Cell
+) -> tuple[Cell | None, bool]:
+    """The allowed cell beside a frontier (N, 2) that is nearest to another cell; None: none.
 
     Of the allowed cells whose path to the frontier over free cells has at most max_steps cells, and
-    is nearly the shortest: around a pillar all sides are equally near.
+    is nearly the shortest: around a pillar all sides are equally near. Also whether the frontier is
+    enclosed: no path leads from it to a cell where the robot could stand. free, standing (H, W).
     """
-    row, col = _place_beside(free, cells, allowed, max_steps, towards[0], towards[1])
-    return None if row < 0 else (int(row), int(col))
-
-
-@kernel
-def is_enclosed(free: Mask, standing: Mask, cells: Cells) -> bool:
-    """Whether the free cells around a frontier (N, 2) connect to none where the robot could stand.
-
-    free, standing (H, W).
-    """
-    rows, cols = free.shape
-    seen = np.zeros((rows, cols), dtype=np.bool_)
-    stack = np.empty((rows * cols, 2), dtype=np.int64)
-    count = 0
-    for i in range(cells.shape[0]):
-        if not seen[cells[i, 0], cells[i, 1]]:
-            seen[cells[i, 0], cells[i, 1]] = True
-            stack[count] = cells[i]
-            count += 1
-    while count > 0:
-        count -= 1
-        row, col = stack[count]
-        if standing[row, col]:
-            return False
-        for r in range(max(row - 1, 0), min(row + 2, rows)):
-            for c in range(max(col - 1, 0), min(col + 2, cols)):
-                if free[r, c] and not seen[r, c]:
-                    seen[r, c] = True
-                    stack[count, 0] = r
-                    stack[count, 1] = c
-                    count += 1
-    return True
-
-
-def _wanted(free: Mask, passable: Mask, cells: Cells, depth: int) -> tuple[Cells, int]:
-    """Points (M, 2) behind a frontier (N, 2), and how many of them have to be in sight."""
-    points = _hidden_points(free, passable, cells, depth, max(_POINTS, len(cells) // _SPACING))
-    return points, math.ceil(_SHARE * min(len(points), _POINTS))
+    row, col, is_enclosed = _search_beside(free, cells, allowed, standing, max_steps, towards)
+    return (None if row < 0 else (int(row), int(col))), bool(is_enclosed)
 
 
 @kernel
@@ -172,16 +139,16 @@ def _sees_enough(
         if seen + points.shape[0] - i < need:
             break
         away = math.hypot(points[i, 0] - row, points[i, 1] - col)
-        if away < reach and line_is_clear(passable, row, col, points[i, 0], points[i, 1]):
+        if away < reach and line_is_clear(passable, points[i, 0], points[i, 1], row, col):
             seen += 1
     return seen >= need
 
 
 @kernel
-def _place_beside(
-    free: Mask, cells: Cells, allowed: Mask, most_steps: int, to_row: int, to_col: int
-) -> tuple[int, int]:
-    """Breadth first over free cells, from all border cells at once.
+def _search_beside(
+    free: Mask, cells: Cells, allowed: Mask, standing: Mask, most_steps: int, towards: Cell
+) -> tuple[int, int, bool]:
+    """Breadth first over free cells, from all frontier cells at once; see search_beside.
 
     It goes _SLACK_CELLS steps on after the first find.
     """
@@ -189,35 +156,27 @@ def _place_beside(
     seen = np.zeros((rows, cols), dtype=np.bool_)
     queue = np.empty((rows * cols, 3), dtype=np.int64)
     tail = 0
-    for i in range(cells.shape[0]):
-        queue[tail, 0] = cells[i, 0]
-        queue[tail, 1] = cells[i, 1]
-        queue[tail, 2] = 0
-        seen[cells[i, 0], cells[i, 1]] = True
+    for row, col in cells:
+        queue[tail] = row, col, 0
+        seen[row, col] = True
         tail += 1
     head = 0
     best = np.inf
-    best_row = -1
-    best_col = -1
-    while head < tail and queue[head, 2] <= most_steps:
-        row = queue[head, 0]
-        col = queue[head, 1]
-        steps = queue[head, 2]
+    place = (-1, -1)
+    is_enclosed = True
+    while head < tail and (is_enclosed or queue[head, 2] <= most_steps):
+        row, col, steps = queue[head]
         head += 1
-        away = math.hypot(row - to_row, col - to_col)
-        if allowed[row, col] and away < best:
-            if best_row < 0:
+        is_enclosed &= not standing[row, col]
+        away = math.hypot(row - towards[0], col - towards[1])
+        if allowed[row, col] and steps <= most_steps and away < best:
+            if place[0] < 0:
                 most_steps = min(most_steps, steps + _SLACK_CELLS)
             best = away
-            best_row = row
-            best_col = col
-        for side in range(4):
-            r = row + (side == 0) - (side == 1)
-            c = col + (side == 2) - (side == 3)
+            place = (row, col)
+        for r, c in ((row + 1, col), (row - 1, col), (row, col + 1), (row, col - 1)):
             if 0 <= r < rows and 0 <= c < cols and free[r, c] and not seen[r, c]:
                 seen[r, c] = True
-                queue[tail, 0] = r
-                queue[tail, 1] = c
-                queue[tail, 2] = steps + 1
+                queue[tail] = r, c, steps + 1
                 tail += 1
-    return best_row, best_col
+    return place[0], place[1], is_enclosed

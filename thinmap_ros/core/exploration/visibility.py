@@ -34,9 +34,14 @@ def visible_places(
     They lie in its range and field of view, with free cells (H, W) of a frame all the way.
     """
     low, high = field_of_view(scan)
-    at = (frame.origin_x, frame.origin_y, frame.resolution)
-    view = (scan.range_max_m, 0.5 * (low + high), 0.5 * (high - low))
-    return np.asarray(_visible(free, at, T_map_laser, places, view))
+    offsets = places - T_map_laser[:2]
+    bearings = np.arctan2(offsets[:, 1], offsets[:, 0]) - T_map_laser[2]
+    is_ahead = np.abs(se2.wrap(bearings - 0.5 * (low + high))) <= 0.5 * (high - low)
+    seen = is_ahead & (np.hypot(*offsets.T) < scan.range_max_m)
+    laser = frame.cells_of(T_map_laser[:2])[0]
+    cells = frame.cells_of(places)
+    seen[seen] = [line_is_clear(free, *laser, *cell) for cell in cells[seen]]
+    return np.asarray(seen)
 
 
 def box_of_scan(scan: Scan, T_map_base: Array) -> Array:
@@ -74,33 +79,3 @@ def _box(
     box[1, 0] = laser[0] + right + _RIM_M
     box[1, 1] = laser[1] + top + _RIM_M
     return box
-
-
-@kernel
-def _visible(
-    free: Mask,
-    frame: tuple[float, float, float],
-    laser: Array,
-    places: Array,
-    view: tuple[float, float, float],
-) -> Mask:
-    """Which places a laser sees, see visible_places.
-
-    frame: origin and resolution, m; view: range, m, middle and half of the field of view, rad.
-    """
-    x, y, resolution = frame
-    reach_m, middle, half = view
-    seen = np.zeros(places.shape[0], dtype=np.bool_)
-    row = int(math.floor((laser[1] - y) / resolution))
-    col = int(math.floor((laser[0] - x) / resolution))
-    for i in range(places.shape[0]):
-        dx = places[i, 0] - laser[0]
-        dy = places[i, 1] - laser[1]
-        if dx * dx + dy * dy >= reach_m * reach_m:
-            continue
-        off = math.pi - (math.pi - (math.atan2(dy, dx) - (laser[2] + middle))) % (2.0 * math.pi)
-        if abs(off) <= half:
-            to_row = int(math.floor((places[i, 1] - y) / resolution))
-            to_col = int(math.floor((places[i, 0] - x) / resolution))
-            seen[i] = line_is_clear(free, row, col, to_row, to_col)
-    return seen

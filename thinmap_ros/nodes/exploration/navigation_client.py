@@ -10,7 +10,7 @@ from rclpy.action.client import ClientGoalHandle
 from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 
-from thinmap_ros.core.exploration.live.drive_progress import Arrivals, DriveProgress
+from thinmap_ros.core.exploration.live.drive_progress import DriveProgress
 from thinmap_ros.core.exploration.live.drive_request import DriveRequest, Retries
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.nodes.exploration.driver import OnResult
@@ -71,7 +71,6 @@ class NavigationClient:
         self.goal: Array | None = None
         self._drive: _Drive | None = None
         self._retries = Retries()
-        self._arrivals = Arrivals()
         wall = Clock(clock_type=ClockType.STEADY_TIME)
         # Only while there is a goal.
         self._timer = node.create_active_timer(_PERIOD_S, self._advance, clock=wall)
@@ -105,16 +104,11 @@ class NavigationClient:
         """Set the goal (3,), unless the server has about the same."""
         self.goal = goal
         self._timer.reset()
-        if self._arrivals.are_repeated(goal):
-            self._arrivals.clear()
-            self._end(False, 'reached, but the target stays')
-            return
         self._advance()
 
     def cancel(self) -> None:
         """Cancel the goal; there is no result."""
         self.goal = None
-        self._arrivals.clear()
         self._withdraw()
 
     def robot_moved(self, T_map_base: Array) -> None:
@@ -234,7 +228,6 @@ class NavigationClient:
         ended = future.result()
         if ended.status == GoalStatus.STATUS_SUCCEEDED:
             self._drive = None
-            self._arrivals.add(drive.request.goal)
             self._end(True, '')
             return
         status = _STATUS_NAMES.get(ended.status, f'ended with status {ended.status}')

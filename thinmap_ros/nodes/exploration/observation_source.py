@@ -5,16 +5,19 @@ from dataclasses import dataclass
 
 from sensor_msgs.msg import LaserScan
 
+from thinmap_msgs.msg import KeepOut as KeepOutMsg
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid, TopologicalMap
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.mission import InputWatchdog
 from thinmap_ros.core.exploration.observations import Observation
+from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.core.topology.map_graph import MapGraph
+from thinmap_ros.logs import decode
 from thinmap_ros.nodes.exploration.foreign_map import ForeignMap
 from thinmap_ros.nodes.exploration.publishers import PublisherCheck
 from thinmap_ros.nodes.exploration.robot_view import RobotView
@@ -103,7 +106,7 @@ class ObservationSource:
         robot_radius_m: float,
         on_observation: Callable[[Observation], None],
     ) -> None:
-        """on_observation: receives each observation; its graph is complete after `with_graph`."""
+        """on_observation: receives each observation; it is complete after `completed`."""
         self._node = node
         self._on_observation = on_observation
         self._graph_config = TopologyConfig(robot_radius_m=robot_radius_m)
@@ -111,12 +114,15 @@ class ObservationSource:
         self._topologies = _TopologyPublisher(node)
         self._view = RobotView(node, settings, frames.map_frame, frames.laser_transform)
         self._map = ForeignMap(node, settings, frames.map_frame, self._uses_foreign_map)
+        self._keep_out = KeepOut()
         self.reset()
         on_topology = self._topologies.received
         subscribe_guarded(node, TopologicalMap, 'topology', on_topology, qos.LATCHED)
         subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
+        subscribe_guarded(node, KeepOutMsg, 'keep_out', self._on_keep_out, qos.LATCHED)
         subscribe_guarded(node, LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
-        subscribe_guarded(node, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        scan_topic = frames.laser_transform.scan_topic
+        subscribe_guarded(node, LaserScan, scan_topic, self._on_scan, qos.SENSOR)
         node.create_active_timer(_LOOK_PERIOD_S, self._look)
 
     def reset(self) -> None:
@@ -148,12 +154,17 @@ class ObservationSource:
             return None
         return last.scan.stamp_ns, last.T_map_base
 
-    def with_graph(self, observation: Observation, is_completed: bool = False) -> Observation:
-        """Observation with the graph of its map, if nobody publishes a topological map.
+    def completed(self, observation: Observation, is_joined: bool = False) -> Observation:
+        """Observation with keep-out areas as walls, and with the graph of its map.
 
-        is_completed: whether the map is more than the one whose graph is published.
+        The graph is found here if nobody publishes a topological map.
+        is_joined: whether the map is more than the one whose graph is published.
         """
-        if self._topologies.is_found() and not is_completed:
+        patch = self._keep_out.laid_on(observation.patch, observation.T_map_base)
+        return self._with_graph(observation, is_joined)._replace(patch=patch)
+
+    def _with_graph(self, observation: Observation, is_joined: bool) -> Observation:
+        if self._topologies.is_found() and not is_joined:
             return observation
         T_map_base = observation.T_map_base
         with self._node.diagnostics.time_step('graph of the map'):
@@ -186,6 +197,9 @@ class ObservationSource:
             self._on_observation(
                 Observation(self._topologies.graph, patch, localized.scan, localized.T_map_base)
             )
+
+    def _on_keep_out(self, message: KeepOutMsg) -> None:
+        self._keep_out = decode.keep_out(message)
 
     def _on_scan(self, message: LaserScan) -> None:
         if self._uses_foreign_map():

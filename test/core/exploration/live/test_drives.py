@@ -1,11 +1,14 @@
 """Progress of drives, repeated arrivals, and goals at a server that answers late or refuses."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
-from thinmap_ros.core.exploration.live.drive_progress import Arrivals, DriveProgress
+from thinmap_ros.core.exploration.live.drive_progress import DriveProgress
 from thinmap_ros.core.exploration.live.drive_request import DriveRequest, Retries
+from thinmap_ros.core.exploration.live.drives import Drives
+from thinmap_ros.core.exploration.strategy import unobserved
 from thinmap_ros.core.se2 import pose
 
 GOAL = pose(10.0, 0.0, 0.0)
@@ -50,16 +53,33 @@ def test_missing_inputs_are_no_standstill():
     assert progress.idle_s == 10.0
 
 
+class Told:
+    """A strategy that keeps why its targets failed."""
+
+    def __init__(self):
+        self.failures = []
+
+    def target_failed(self, reason):
+        self.failures.append(reason)
+
+
 def test_arrivals_are_repeated_when_the_goal_stays_the_same():
-    arrivals = Arrivals()
+    target = unobserved(1, (10.0, 0.0), 0.5, GOAL)
+    drives = Drives()
+    strategy = Told()
     for _ in range(5):
-        arrivals.add(GOAL)
-        assert not arrivals.are_repeated(GOAL)
-    arrivals.add(pose(10.05, 0.0, 0.1))
-    assert arrivals.are_repeated(GOAL)
-    assert not arrivals.are_repeated(pose(9.0, 0.0, 0.0))
-    arrivals.clear()
-    assert not arrivals.are_repeated(GOAL)
+        assert drives.follow(target, strategy) is GOAL
+        drives.add_result(True, '')
+    moved = target._replace(goal=pose(10.05, 0.0, 0.1))
+    assert drives.follow(moved, strategy) is moved.goal
+    drives.add_result(True, '')
+    other = target._replace(goal=pose(9.0, 0.0, 0.0))
+    assert replace(drives).follow(other, strategy) is other.goal
+    assert replace(drives).follow(None, strategy) is None
+    assert not strategy.failures
+    assert drives.follow(target, strategy) is None
+    assert strategy.failures == [drives.failure] == ['reached, but the target stays']
+    assert drives.follow(target, strategy) is GOAL
 
 
 def test_a_goal_is_sent_again_when_it_changes():

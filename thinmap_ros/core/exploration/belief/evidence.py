@@ -3,9 +3,13 @@
 - *The same place.* A frontier continues an earlier one if at least half of its cells lie on it. A
   cell lies on a frontier up to `_SAME_M` away, as corrections of the map move cells.
 - *Tries* are visits that showed nothing, and failed drives. They are about the frontier as it was
-  then: once half of it has changed, it is another place, and is tried anew.
+  then: once half of it has changed, it is another place, and is tried anew. A visit is one from a
+  place: where nothing has changed, another one from there shows nothing, either.
+- *Left* is a place to which the robot was on its way when another one became cheaper. It counts
+  until the robot has seen something new.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
+from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2
 from thinmap_ros.core.snapshot import (
     MAX_CELL_INDEX,
     MAX_COORDINATE_M,
@@ -47,20 +52,44 @@ class Evidence:
 
     id: from FIRST_FRONTIER_ID on; cells (N, 2): of its frontier, on the lattice of the map, as it
     was at the first try; visits: how often the robot was there and the frontier stayed as it was;
-    failures: how often the robot could not get there, the last time at failed_ns.
+    seen_from: where it was then, m; failures: how often the robot could not get there, the last
+    time at failed_ns; left: how often for a cheaper one, the last time when left_area_m2 were
+    known.
     """
 
     id: int
     place: Place
     cells: Cells = field(default_factory=_no_cells)
     visits: int = 0
+    seen_from: tuple[Place, ...] = ()
     failures: int = 0
     failed_ns: int = 0
+    left: int = 0
+    left_area_m2: float = 0.0
+
+    def times_left(self, known_area_m2: float) -> int:
+        """How often it was left since the robot saw something new."""
+        return self.left if known_area_m2 < self.left_area_m2 + WORTH_SEEING_M2 else 0
+
+    def leave(self, known_area_m2: float) -> None:
+        """Count that it was left."""
+        self.left = self.times_left(known_area_m2) + 1
+        self.left_area_m2 = known_area_m2
 
     @property
     def is_tried(self) -> bool:
         """Whether it is kept when its place has no frontier for a while."""
         return self.visits > 0 or self.failures > 0
+
+    def add_visit(self, place: Place) -> None:
+        """Add a visit that showed nothing, at a place, m; it is reachable, whatever failed."""
+        self.visits += 1
+        self.seen_from += (place,)
+        self.failures = 0
+
+    def was_seen_from(self, place: Place) -> bool:
+        """Whether a visit to a place, m, or beside it, showed nothing."""
+        return any(math.dist(place, earlier) <= _SAME_M for earlier in self.seen_from)
 
 
 class EvidenceStore:
@@ -98,9 +127,9 @@ class EvidenceStore:
         return found
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """All evidence but failures as arrays by name, for `restore`.
+        """All evidence but failures and `seen_from` as arrays by name, for `restore`.
 
-        What could not be reached is worth another try.
+        What could not be reached, or seen from there, is worth another try.
         """
         items = self.items
         cells, ends = _joined([item.cells for item in items])

@@ -1,4 +1,4 @@
-"""Whether a drive makes progress, and whether arriving changes anything."""
+"""Whether a drive makes progress."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,7 +12,6 @@ _MAX_DETOURS = 3
 _MAX_GAP_S = 10.0
 _SAME_M = 0.1
 _SAME_RAD = 0.2
-_MAX_ARRIVALS = 6
 
 
 def is_same_goal(a: Array, b: Array) -> bool:
@@ -67,27 +66,3 @@ class DriveProgress:
         if remaining_m > self._path.nearest_m + _DETOUR_M and self._detours < _MAX_DETOURS:
             self._detours += 1
             self._path = _Approach()
-
-
-@dataclass
-class Arrivals:
-    """Consecutive arrivals at one goal: a strategy that repeats it does not see it as reached."""
-
-    _goal: Array | None = None
-    _count: int = 0
-
-    def add(self, goal: Array) -> None:
-        """Register an arrival at a goal (3,)."""
-        is_repeated = self._goal is not None and is_same_goal(self._goal, goal)
-        self._count = self._count + 1 if is_repeated else 1
-        self._goal = goal
-
-    def are_repeated(self, goal: Array) -> bool:
-        """Whether a goal (3,) was reached so often that another drive changes nothing."""
-        is_repeated = self._goal is not None and is_same_goal(self._goal, goal)
-        return is_repeated and self._count >= _MAX_ARRIVALS
-
-    def clear(self) -> None:
-        """Forget all arrivals."""
-        self._goal = None
-        self._count = 0

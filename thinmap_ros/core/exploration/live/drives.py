@@ -2,8 +2,12 @@
 
 from dataclasses import dataclass
 
-from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
+from thinmap_ros.core.exploration.live.drive_progress import is_same_goal
+from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode, Strategy
+from thinmap_ros.core.se2 import Array
 
+_MAX_ARRIVALS = 6
+STAYS = 'reached, but the target stays'
 # Within the distance at which a goal counts as reached: turns in place, and corrections of a pose.
 _DRIVEN_M = 0.3
 
@@ -18,20 +22,35 @@ class Drives:
 
     has_settled: bool = False
     failure: str = ''
-    _target_id: int | None = None
+    _target: EndNode | None = None
+    _arrivals: int = 0
 
-    def follow(self, target: EndNode | None) -> None:
-        """Register the target of a decision."""
-        target_id = None if target is None else target.node_id
-        self.has_settled |= self._target_id is not None and target_id != self._target_id
-        self._target_id = target_id
+    def follow(self, target: EndNode | None, strategy: Strategy) -> Array | None:
+        """Goal (3,) to drive to for the target of a strategy's decision; None: nowhere.
+
+        A target that is where it was although the robot has arrived there again and again has
+        failed: the strategy does not see it as reached.
+        """
+        last = self._target
+        self._target = target
+        self.has_settled |= last is not None and (target is None or target.node_id != last.node_id)
+        if target is None:
+            return None
+        if last is None or not is_same_goal(target.goal, last.goal):
+            self._arrivals = 0
+        if self._arrivals < _MAX_ARRIVALS:
+            return target.goal
+        self.add_result(False, STAYS)
+        strategy.target_failed(STAYS)
+        return None
 
     def add_result(self, is_success: bool, reason: str) -> None:
         """Register how the drive to the present target ended."""
         self.has_settled |= is_success
+        self._arrivals += is_success
         if not is_success:
             self.failure = reason
-            self._target_id = None
+            self._target = None
 
     def shortcoming(self, end: Decision, distance_m: float) -> str:
         """Why an exploration that leaves something has explored nothing; else empty.
