@@ -1,0 +1,136 @@
+"""The page in Chromium, driven by Playwright: `pip install playwright`, `apt install chromium`."""
+
+import re
+import shutil
+
+import pytest
+from geometry_msgs.msg import PoseStamped, Twist
+
+from thinmap_ros.ros import messages
+
+playwright = pytest.importorskip(
+    'playwright.sync_api', reason='needs Playwright, which is not installed'
+)
+CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser')
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason='needs Chromium, which is not installed'),
+]
+AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.0}
+CELL_M = 0.05
+# Time waits for the nodes, which a busy machine delays: three subscribe to scans.
+PACED = {'lockstep': 'local_topology', 'wait_for_subscribers': 3}
+
+
+@pytest.fixture
+def browser():
+    with playwright.sync_playwright() as library:
+        opened = library.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox'])
+        yield opened
+        opened.close()
+
+
+class Tab:
+    """A page; errors: what its console says."""
+
+    def __init__(self, graph, browser, address, width=1280):
+        self.graph = graph
+        self.page = browser.new_page(viewport={'width': width, 'height': 800})
+        self.errors = []
+        self.page.on('console', lambda said: self._hear(said.type, said.text))
+        self.page.on('pageerror', lambda error: self.errors.append(str(error)))
+        self.page.goto(address)
+
+    def _hear(self, kind, text):
+        if kind in ('error', 'warning'):
+            self.errors.append(text)
+
+    def item(self, name):
+        return self.page.evaluate('name => thinmap.items.get(name)', name)
+
+    def until(self, condition, what):
+        self.graph.until(condition, what)
+
+    def text(self, name):
+        return self.page.locator(f'#{name}').inner_text()
+
+    def place_on_screen(self, x, y):
+        box = self.page.locator('#map').bounding_box()
+        px, py = self.page.evaluate('([x, y]) => thinmap.view.toScreen(x, y)', [x, y])
+        return box['x'] + px, box['y'] + py
+
+
+def address_of(graph):
+    graph.until(lambda: 'page at' in graph.log('web'), 'the address')
+    return re.search(r'page at (\S+)', graph.log('web'))[1]
+
+
+def names_of_regions(tab):
+    return [region['name'] for region in tab.item('regions')]
+
+
+def test_a_person_sees_the_robot_sends_it_and_stops_it(graph, browser):
+    commands = graph.heard('cmd_vel', Twist)
+    truth = graph.heard('ground_truth', PoseStamped)
+    graph.start('web', use_sim_time=True, port=0)
+    for name in ('grid_mapper', 'topology_builder', 'navigator'):
+        graph.start(name, use_sim_time=True)
+    graph.start('localizer', use_sim_time=True, **AT_START)
+    graph.start('sim', start='2.0,2.0,0.0', real_time_factor=4.0, **PACED)
+    tab = Tab(graph, browser, address_of(graph))
+    tab.until(lambda: tab.item('robot') and tab.item('graph') and tab.item('map'), 'the map')
+    tab.until(lambda: tab.text('slam-state') == 'TRACKING', 'the state')
+
+    tab.page.get_by_role('button', name='Goal').click()
+    x, y = tab.place_on_screen(2.6, 2.2)
+    tab.page.mouse.move(x, y)
+    tab.page.mouse.down()
+    tab.page.mouse.move(x, y - 60, steps=4)
+    tab.page.mouse.up()
+    tab.until(lambda: tab.item('goal'), 'the goal')
+    assert tab.item('goal') == pytest.approx([2.6, 2.2, 1.571], abs=CELL_M)
+    tab.until(lambda: tab.text('news').startswith('goal done'), 'the robot arrives')
+    # What the test receives comes later than what the page shows.
+    there = pytest.approx([2.6, 2.2], abs=0.25)
+    graph.until(lambda: messages.pose_from_msg(truth[-1].pose)[:2] == there, 'the robot is there')
+
+    narrow = Tab(graph, browser, address_of(graph), width=400)
+    narrow.until(lambda: narrow.item('robot'), 'the robot on the other page')
+    assert narrow.page.evaluate('document.documentElement.scrollWidth') <= 400
+    assert narrow.page.locator('#stop').is_visible()
+    tab.page.keyboard.press('Space')
+    for each in (tab, narrow):
+        each.until(lambda each=each: each.text('stop') == 'STOPPED', 'stopped')
+    narrow.page.get_by_role('button', name='Release').click()
+    tab.until(lambda: tab.text('stop') == 'STOP', 'released')
+
+    tab.until(lambda: tab.item('regions'), 'the rooms')
+    # In this field the space bar types, and does not stop the robot.
+    tab.page.locator('#region-name').press_sequentially('my room')
+    tab.page.get_by_role('button', name='Name it').click()
+    for each in (tab, narrow):
+        each.until(lambda each=each: 'my room' in names_of_regions(each), 'its name')
+    assert tab.text('stop') == 'STOP'
+    assert 'my room' in tab.text('regions')
+
+    commands.clear()
+    box = tab.page.locator('#joystick').bounding_box()
+    tab.page.mouse.move(box['x'] + box['width'] / 2, box['y'] + 5)
+    tab.page.mouse.down()
+    tab.until(lambda: commands and commands[-1].linear.x > 0.2, 'it drives')
+    assert not tab.errors and not narrow.errors
+    tab.page.close()
+    graph.until(lambda: commands[-1].linear.x == 0.0, 'it stops when the page is gone')
+
+
+def test_a_wrong_token_sees_nothing(graph, browser):
+    graph.start('web', port=0, web_token_file='tokens')
+    address = address_of(graph)
+    tab = Tab(graph, browser, f'{address}#wrong')
+    tab.until(lambda: tab.text('link') == 'wrong token', 'the refusal')
+    assert tab.page.evaluate('thinmap.items.size') == 0
+    watch = re.search(r'to watch: (\S+)', graph.log('web'))[1]
+    watcher = Tab(graph, browser, watch)
+    watcher.until(lambda: watcher.text('link') == 'watching', 'the page')
+    assert not watcher.page.locator('#stop').is_visible()
+    assert not tab.errors and not watcher.errors

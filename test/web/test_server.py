@@ -1,0 +1,213 @@
+"""The server with real sockets: who sees what, what is passed on, and what is closed."""
+
+import http.client
+import json
+import re
+import socket
+
+import pytest
+from support.web_client import WebClient
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.web.access import Gate, Tokens
+from thinmap_ros.web.board import Board
+from thinmap_ros.web.pages import MAX_PAGES, Pages
+from thinmap_ros.web.server import Address, Server
+
+TOKENS = Tokens('s' * 20, 'w' * 20)
+
+
+class Taken:
+    """What pages asked for."""
+
+    def __init__(self):
+        self.requests = []
+        self.gone = []
+
+    def requested(self, page, request):
+        if request.action == 'load':
+            raise InputError('load: not now')
+        self.requests.append((page, request.action))
+
+    def page_closed(self, page):
+        self.gone.append(page)
+
+
+class Site:
+    """A server, and the pages of a test."""
+
+    def __init__(self, tokens=None):
+        self.board = Board()
+        self.robot = Taken()
+        self.pages = Pages(self.board, Gate(tokens), self.robot)
+        self.server = Server(Address('127.0.0.1', 0), self.pages)
+        self.port = int(re.search(r':(\d+)/', self.server.url)[1])
+        self.clients = []
+
+    def open(self, **settings):
+        self.clients.append(WebClient(self.port, **settings))
+        return self.clients[-1]
+
+    def get(self, path, host=None, method='GET', body=None):
+        connection = http.client.HTTPConnection('127.0.0.1', self.port, timeout=10)
+        headers = {} if host is None else {'Host': host}
+        connection.request(method, path, body=body, headers=headers)
+        answer = connection.getresponse()
+        return answer, answer.read()
+
+
+@pytest.fixture
+def site():
+    made = []
+
+    def make(tokens=None):
+        made.append(Site(tokens))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.server.close()
+
+
+def test_pages_see_what_is_shown_and_agree(site):
+    one = site()
+    one.board.put('robot', 1)
+    first = one.open()
+    second = one.open()
+    for page in (first, second):
+        page.until(lambda page=page: page.items.get('robot') == 1, 'the robot')
+    one.board.put('robot', 2)
+    for page in (first, second):
+        page.until(lambda page=page: page.items.get('robot') == 2, 'the robot of later')
+    first.ask('stop')
+    first.until(lambda: one.robot.requests, 'the stop')
+    assert one.robot.requests == [(1, 'stop')]
+    second.close()
+    first.until(lambda: one.robot.gone == [2], 'the end of a page')
+    first.drop()
+    first.until(lambda: one.robot.gone == [2, 1], 'the end of a page without a word')
+
+
+def test_a_request_that_cannot_be_done_is_answered_to_its_page_alone(site):
+    one = site()
+    first = one.open()
+    second = one.open()
+    first.ask('load', name='x')
+    first.ask('goal', x='here')
+    first.until(lambda: len(first.refusals) == 2, 'two refusals')
+    assert first.refusals[0] == 'load: not now' and 'expected x, y, theta' in first.refusals[1]
+    assert not second.refusals and not one.robot.requests
+
+
+@pytest.mark.parametrize('token', ['', 'x', 'S' * 20, 's' * 19, '\x00' * 5000, 7, None])
+def test_a_wrong_token_sees_nothing(site, token):
+    one = site(TOKENS)
+    one.board.put('robot', 1)
+    page = one.open(token=token)
+    if token is None:  # it says nothing, and then asks at once
+        page.ask('stop')
+    assert page.closed.wait(10)
+    assert not page.items and not one.robot.requests
+
+
+def test_a_link_to_watch_shows_all_and_does_nothing(site):
+    one = site(TOKENS)
+    one.board.put('robot', 1)
+    watcher = one.open(token=TOKENS.watch)
+    watcher.until(lambda: 'robot' in watcher.items, 'the robot')
+    assert watcher.items['hello'] == {'role': 'watch'}
+    for action in ('stop', 'pause', 'cancel'):
+        watcher.ask(action)
+    watcher.until(lambda: len(watcher.refusals) == 3, 'refusals')
+    assert all('watching only' in text for text in watcher.refusals) and not one.robot.requests
+    driver = one.open(token=TOKENS.steer)
+    driver.ask('stop')
+    driver.until(lambda: one.robot.requests, 'the stop')
+
+
+def test_on_this_machine_a_page_may_ask_to_watch_only(site):
+    one = site()
+    page = one.open(token='watch')
+    page.until(lambda: 'hello' in page.items, 'the answer')
+    assert page.items['hello'] == {'role': 'watch'}
+
+
+def test_pages_and_names_of_others_are_refused(site):
+    one = site()
+    one.board.put('robot', 1)
+    for origin in ('http://evil.example', 'null', f'http://127.0.0.1:{one.port + 1}'):
+        page = one.open(origin=origin)
+        assert '403' in str(page.error) and not page.items
+    assert one.open(origin=f'http://127.0.0.1:{one.port}').error is None
+    assert one.get('/', host='evil.example')[0].status == 403
+    assert one.get('/socket', host='evil.example')[0].status == 403
+
+
+def test_the_files_of_the_page_and_no_others(site):
+    one = site()
+    answer, text = one.get('/')
+    assert answer.status == 200 and b'<canvas' in text
+    assert "default-src 'self'" in answer.headers['Content-Security-Policy']
+    assert answer.headers['Content-Type'].startswith('text/html')
+    for name in re.findall(rb'(?:src|href)="([^"]+)"', text):
+        assert one.get('/' + name.decode())[0].status == 200
+    for path in (
+        '/page/',
+        '/../access.py',
+        '/%2e%2e/access.py',
+        '/index.html/',
+        '/server.py',
+        '//',
+    ):
+        assert one.get(path)[0].status in (403, 404)
+    assert one.get('/', method='POST')[0].status == 405
+    assert one.get('/', method='PUT', body=b'x' * 10)[0].status in (400, 413)
+
+
+def test_too_many_messages_too_long_ones_and_too_many_pages_are_ended(site):
+    one = site()
+    fast = one.open()
+    for _ in range(300):
+        fast.ask('cancel')
+    assert fast.closed.wait(10) and len(one.robot.requests) <= 100
+    long = one.open()
+    long.send_text('x' * 100_000)
+    assert long.closed.wait(10)
+    pages = [one.open() for _ in range(MAX_PAGES + 1)]
+    assert '503' in str(pages[-1].error) and all(page.error is None for page in pages[:-1])
+    pages[0].close()
+    pages[1].until(lambda: not one.pages.is_full, 'room for a page')
+    assert one.open().error is None
+
+
+def test_a_page_that_takes_nothing_does_not_fill_the_memory(site):
+    """What is not yet sent is one message; what changes meanwhile is sent once, as it is then."""
+    one = site()
+    slow = socket.create_connection(('127.0.0.1', one.port))
+    slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    slow.sendall(
+        b'GET /socket HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n'
+        b'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n'
+    )
+    hello = json.dumps({'token': ''}).encode()
+    mask = b'\x00\x00\x00\x00'
+    slow.sendall(bytes([0x81, 0x80 | len(hello)]) + mask + hello)
+    quick = one.open()
+    for number in range(8):
+        one.board.put('large', [number, 'x' * 8_000_000])
+        quick.until(lambda n=number: quick.items.get('large', [-1])[0] == n, 'the large item')
+
+    def stuck_pages():
+        return [page for page in one.pages.open if page._state.is_stuck()]
+
+    # The server hears after the quick page that this has taken the last one.
+    quick.until(lambda: len(stuck_pages()) == 1, 'one stuck page')
+    (stuck,) = stuck_pages()
+    assert len(stuck.ws_connection.stream._write_buffer) < 20_000_000
+    slow.close()
+
+
+def test_an_address_that_is_taken_is_one_clear_line(site):
+    one = site()
+    with pytest.raises(InputError, match=f'127.0.0.1:{one.port}: .*in use'):
+        Server(Address('127.0.0.1', one.port), one.pages)

@@ -1,0 +1,1 @@
+"""Requests of a page as goals, calls, poses and velocities."""

@@ -1,0 +1,276 @@
+"""What pages ask for, done by the node."""
+
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.client import Client
+from rclpy.task import Future
+from std_msgs.msg import Bool
+
+from thinmap_msgs.srv import (
+    AddKeepOut,
+    EraseArea,
+    LoadMap,
+    NameRegion,
+    RemoveKeepOut,
+    SaveMap,
+)
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.nodes.steering.node_queue import NodeQueue
+from thinmap_ros.nodes.steering.session_merge import SessionMerge
+from thinmap_ros.nodes.steering.tasks import RobotTasks
+from thinmap_ros.nodes.steering.teleoperation import Teleoperation
+from thinmap_ros.ros import messages, qos, stop_topic
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.web.picture import Picture
+from thinmap_ros.web.requests import Request
+
+_RESUME = 'explore/resume'
+# Standard deviations of a pose that a person has drawn, as of RViz: 0.5 m, 15 degrees.
+_DRAWN = np.diag([0.25, 0.25, 0.0685])
+# What a robot that is held may be asked for.
+_ALWAYS = (
+    'cancel',
+    'pause',
+    'save',
+    'initial_pose',
+    'name_region',
+    'sessions',
+    'merge',
+    'merge_save',
+    'merge_drop',
+    'keep_out',
+    'remove_keep_out',
+    'erase',
+)
+
+
+class TopSpeeds:
+    """Velocity of a joystick that is pushed to its end: ahead m/s, turn rad/s."""
+
+    def __init__(self, ahead: float, turn: float) -> None:
+        self.ahead = ahead
+        self.turn = turn
+
+
+class Hold:
+    """Whether the robot is held, and by which stop: a page ends the one that it shows."""
+
+    def __init__(self) -> None:
+        self.is_on = False
+        self._stops = 0
+
+    @property
+    def number(self) -> int:
+        """Number of the stop that holds the robot; 0: none."""
+        return self._stops if self.is_on else 0
+
+    def begin(self) -> None:
+        """Hold the robot; one that is held, by a later stop."""
+        self._stops += 1
+        self.is_on = True
+
+    def end(self, stop: int) -> None:
+        """End a stop. Raises InputError where there was a later one."""
+        if self.is_on and stop != self._stops:
+            raise InputError('release: the robot was stopped again')
+        self.is_on = False
+
+
+class Steering:
+    """Does what pages ask for, in the node's thread; stop and release at once, in the server's."""
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        picture: Picture,
+        frames: tuple[str, str],
+        top: TopSpeeds,
+    ) -> None:
+        """frames: of the map and of the robot."""
+        self._node = node
+        self._picture = picture
+        self._map_frame, base_frame = frames
+        self._top = top
+        self._held = Hold()
+        self._drive = Teleoperation(node, base_frame)
+        self._tasks = RobotTasks(node, self._map_frame, self.tell, self._show_goal)
+        self._publishers = {
+            stop_topic.TOPIC: node.create_publisher(Bool, stop_topic.TOPIC, qos.LATCHED),
+            _RESUME: node.create_publisher(Bool, _RESUME, qos.STREAM),
+            'initialpose': node.create_publisher(
+                PoseWithCovarianceStamped, 'initialpose', qos.STREAM
+            ),
+        }
+        self._clients = {
+            'save': node.create_client(SaveMap, 'save_map'),
+            'load': node.create_client(LoadMap, 'load_map'),
+            'name': node.create_client(NameRegion, 'name_region'),
+            'keep out': node.create_client(AddKeepOut, 'add_keep_out'),
+            'remove': node.create_client(RemoveKeepOut, 'remove_keep_out'),
+            'erase': node.create_client(EraseArea, 'erase_area'),
+        }
+        self._merge = SessionMerge(node, picture.board, self.tell)
+        self._later = NodeQueue(node, self.tell).put
+        self._news = 0
+        self._show_held()
+
+    # In the server's thread.
+
+    def requested(self, page: int, request: Request) -> None:
+        """Take a request of a page. Raises InputError where it cannot be done now."""
+        action = request.action
+        if action == 'stop':
+            self.stop()
+            return
+        if action == 'release':
+            self._release(**request.values)
+            return
+        if self._held.is_on and action not in _ALWAYS:
+            raise InputError(f'{action}: the robot is stopped: expected it to be released first')
+        if action == 'drive' and self._drive.take(page):
+            self._later(self._tasks.cancel_all)
+        self._later(lambda: self._do(request))
+
+    def page_closed(self, page: int) -> None:
+        """Stop the robot if this page drives it."""
+        self._drive.let_go(page)
+
+    def stop(self) -> None:
+        """Stop the robot, and hold it: it is published, and no goal is followed."""
+        self._held.begin()
+        self._publishers[stop_topic.TOPIC].publish(Bool(data=True))
+        self._drive.halt()
+        self._later(self._hold)
+
+    def _release(self, stop: int) -> None:
+        """End a stop, at once as it begins: a queued release could end a later one."""
+        self._held.end(stop)
+        self._publishers[stop_topic.TOPIC].publish(Bool(data=False))
+        self._later(self._hold)
+
+    # In the node's thread.
+
+    def tell(self, news: str) -> None:
+        """Show what has happened on all pages."""
+        self._news += 1
+        self._picture.board.put('news', [self._news, news])
+
+    def stop_heard(self, is_stopped: bool) -> None:
+        """Follow a stop that somebody else has published; a page releases the robot."""
+        if is_stopped and not self._held.is_on:
+            self._held.begin()
+            self._hold()
+
+    def tick(self) -> None:
+        """Keep a robot that is held standing; called ten times a second."""
+        self._merge.tick()
+        if self._held.is_on:
+            self._drive.keep_standing()
+        else:
+            self._drive.tidy()
+
+    def close(self) -> None:
+        """Stop the robot, if a page drives it, and a merge."""
+        self._drive.close()
+        self._merge.close()
+
+    def _hold(self) -> None:
+        self._tasks.hold(self._held.is_on)
+        self._show_held()
+
+    def _show_held(self) -> None:
+        self._picture.board.put('held', self._held.number)
+
+    def _show_goal(self, pose: Array | None) -> None:
+        self._picture.board.put('goal', None if pose is None else pose.tolist())
+
+    def _do(self, request: Request) -> None:
+        if self._held.is_on and request.action not in _ALWAYS:
+            return  # stopped since it was taken
+        getattr(self, f'_do_{request.action}')(**request.values)
+
+    def _do_goal(self, x: float, y: float, theta: float) -> None:
+        self._tasks.drive_to(np.array([x, y, theta]))
+
+    def _do_go_to_region(self, region: int) -> None:
+        centre = self._picture.centres.get(region)
+        if centre is None:
+            raise InputError(f'region {region}: expected one of the map')
+        self._tasks.drive_to(np.array([*centre, 0.0]))
+
+    def _do_home(self) -> None:
+        start = self._picture.path.start
+        if start is None:
+            raise InputError('home: no pose of the robot yet')
+        self._tasks.drive_to(np.array([*start, 0.0]))
+
+    def _do_initial_pose(self, x: float, y: float, theta: float) -> None:
+        now_ns = int(self._node.get_clock().now().nanoseconds)
+        pose = np.array([x, y, theta])
+        self._publishers['initialpose'].publish(
+            messages.pose_with_covariance_msg(pose, _DRAWN, self._map_frame, now_ns)
+        )
+        self.tell(f'initial pose {x:.2f}, {y:.2f}')
+
+    def _do_explore(self, area: list[tuple[float, float]], return_home: bool) -> None:
+        self._tasks.explore(area, return_home)
+
+    def _do_pause(self) -> None:
+        self._publishers[_RESUME].publish(Bool(data=False))
+        self.tell('exploration paused')
+
+    def _do_resume(self) -> None:
+        self._publishers[_RESUME].publish(Bool(data=True))
+        self.tell('exploration continues')
+
+    def _do_cancel(self) -> None:
+        self._tasks.cancel_all()
+
+    def _do_drive(self, ahead: float, left: float) -> None:
+        self._drive.drive(ahead * self._top.ahead, left * self._top.turn)
+
+    def _do_save(self, name: str) -> None:
+        self._call('save', SaveMap.Request(path=name))
+
+    def _do_load(self, name: str) -> None:
+        self._call('load', LoadMap.Request(path=name))
+
+    def _do_name_region(self, region: int, name: str) -> None:
+        self._call('name', NameRegion.Request(id=region, name=name))
+
+    def _do_sessions(self) -> None:
+        self._merge.list_sessions()
+
+    def _do_merge(self, first: str, second: str) -> None:
+        self._merge.begin(first, second)
+
+    def _do_merge_save(self, name: str) -> None:
+        self._merge.save(name)
+
+    def _do_merge_drop(self) -> None:
+        self._merge.drop()
+
+    def _do_keep_out(self, corners: list[tuple[float, float]], is_wall: bool) -> None:
+        request = AddKeepOut.Request(corners=messages.polygon_msg(corners), is_wall=is_wall)
+        self._call('keep out', request)
+
+    def _do_remove_keep_out(self, area: int) -> None:
+        self._call('remove', RemoveKeepOut.Request(id=area))
+
+    def _do_erase(self, corners: list[tuple[float, float]]) -> None:
+        self._call('erase', EraseArea.Request(corners=messages.polygon_msg(corners)))
+
+    def _call(self, name: str, request: Any) -> None:
+        client: Client = self._clients[name]
+        if not client.service_is_ready():
+            owner = 'topology_builder' if name == 'name' else 'grid_mapper'
+            raise InputError(f'no service {client.srv_name}: expected {owner} to run')
+
+        def answered(future: Future) -> None:
+            answer = future.result()
+            self.tell(f'{name}: {answer.message if answer else "no answer"}')
+
+        client.call_async(request).add_done_callback(answered)

@@ -1,0 +1,112 @@
+"""Driving by hand: a velocity holds only while a page asks for it again and again."""
+
+from threading import Lock
+from time import monotonic
+
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.velocity.commands import TOPIC, declare_stamped
+from thinmap_ros.ros.velocity.watchdog import CommandTimeout, CommandWatchdog
+
+# With the period of the watchdog, 0.1 s, the robot is stopped 0.3 s after the last request.
+_TIMEOUT_S = 0.2
+# After the last command the publisher stays as long as a stop may need to be received.
+_LINGER_S = 2.0
+_ACKNOWLEDGEMENT_S = 1.0
+
+
+class HoldTimeout(CommandTimeout):
+    """Whether a velocity is no longer asked for, whatever the clock of the node."""
+
+    def __init__(self) -> None:
+        super().__init__(is_simulated=False)
+
+    @property
+    def limit_s(self) -> float:
+        """Longest time without a request."""
+        return _TIMEOUT_S
+
+
+class Teleoperation:
+    """Publishes the velocity that one page at a time asks for.
+
+    The publisher exists while somebody drives, or the robot is held: another one of cmd_vel is
+    reported by the navigator.
+    """
+
+    def __init__(self, node: ThinmapNode, base_frame: str) -> None:
+        self._node = node
+        self._frame = base_frame
+        self._kind = TwistStamped if declare_stamped(node) else Twist
+        self._lock = Lock()
+        self._publisher: Publisher | None = None
+        self._sent_s = 0.0
+        self._holder: int | None = None
+        self._watchdog = CommandWatchdog(self._send, lambda seconds: None, HoldTimeout())
+
+    def take(self, page: int) -> bool:
+        """Let a page drive; returns whether it begins to. Raises InputError where another does."""
+        with self._lock:
+            is_free = self._holder is None or monotonic() - self._sent_s > _LINGER_S
+            if not is_free and self._holder != page:
+                raise InputError('drive: another page drives: expected it to let go')
+            self._holder = page
+            self._sent_s = monotonic()
+        return is_free
+
+    def let_go(self, page: int) -> None:
+        """Stop the robot if this page drives: it is gone."""
+        if self._holder == page:
+            self.halt()
+            self._holder = None
+
+    def drive(self, v: float, w: float) -> None:
+        """Publish a velocity, m/s and rad/s; it holds for 0.3 s."""
+        self._open()
+        self._watchdog.send(v, w)
+
+    def halt(self) -> None:
+        """Stop the robot, if somebody drives; from any thread."""
+        self._watchdog.send(0.0, 0.0)
+
+    def keep_standing(self) -> None:
+        """Stop the robot, whatever drives it."""
+        self._open()
+        self._watchdog.send(0.0, 0.0)
+
+    def tidy(self) -> None:
+        """Destroy the publisher when nobody has driven for a while."""
+        with self._lock:
+            if self._publisher is not None and monotonic() - self._sent_s > _LINGER_S:
+                self._node.destroy_publisher(self._publisher)
+                self._publisher = None
+
+    def close(self) -> None:
+        """Stop the robot, if somebody drives, and wait until that is received."""
+        self._watchdog.close()
+        self.halt()
+        with self._lock:
+            if self._publisher is not None:
+                self._publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGEMENT_S))
+
+    def _open(self) -> None:
+        with self._lock:
+            if self._publisher is None:
+                self._publisher = self._node.create_publisher(self._kind, TOPIC, qos.STREAM)
+
+    def _send(self, v: float, w: float) -> None:
+        with self._lock:
+            if self._publisher is None:
+                return
+            twist = messages.twist_msg(v, w)
+            if self._kind is TwistStamped:
+                header = messages.header(self._frame, self._node.get_clock().now().nanoseconds)
+                self._publisher.publish(TwistStamped(header=header, twist=twist))
+            else:
+                self._publisher.publish(twist)
+            self._sent_s = monotonic()

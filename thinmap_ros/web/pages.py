@@ -1,0 +1,107 @@
+"""The pages that are open, and what is known of each."""
+
+import asyncio
+import json
+from time import monotonic
+from typing import Any, Protocol
+
+from thinmap_ros.web.access import Gate, Role
+from thinmap_ros.web.board import Board
+from thinmap_ros.web.requests import Request
+
+PERIOD_S = 0.1
+MAX_PAGES = 16
+_MAX_REQUESTS_PER_S = 50
+_HELLO_S = 5.0
+# A page that takes nothing for so long is gone.
+_STUCK_S = 10.0
+
+
+class Robot(Protocol):
+    """What the server tells about the pages; called in its thread."""
+
+    def requested(self, page: int, request: Request) -> None:
+        """A page asks for something. Raises InputError where it cannot be done."""
+
+    def page_closed(self, page: int) -> None:
+        """A page is gone, with what it held."""
+
+
+class PageState:
+    """What is known of an open page; times are monotonic, s."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self.role: Role | None = None
+        self.change = 0
+        self._opened_s = monotonic()
+        self._second = 0
+        self._requests = 0
+        self._writing: asyncio.Future[None] | None = None
+        self._since_s = 0.0
+
+    def is_within_rate(self) -> bool:
+        """Count a request: whether there are not too many in this second."""
+        second = int(monotonic())
+        if second != self._second:
+            self._second = second
+            self._requests = 0
+        self._requests += 1
+        return self._requests <= _MAX_REQUESTS_PER_S
+
+    def sent(self, writing: 'asyncio.Future[None]') -> None:
+        """Note what is being written."""
+        self._writing = writing
+        self._since_s = monotonic()
+
+    def is_stuck(self) -> bool:
+        """Whether the page has not taken what was last written."""
+        return self._writing is not None and not self._writing.done()
+
+    def is_overdue(self) -> bool:
+        """Whether it is to be closed: it says no token, or takes nothing."""
+        if self.role is None:
+            return monotonic() - self._opened_s > _HELLO_S
+        return monotonic() - self._since_s > _STUCK_S
+
+
+class Pages:
+    """The pages that are open, and what each of them has received."""
+
+    def __init__(self, board: Board, gate: Gate, robot: Robot) -> None:
+        self.board = board
+        self.gate = gate
+        self.robot = robot
+        self.open: set[Any] = set()
+        self._last = 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no other page may be opened."""
+        return len(self.open) >= MAX_PAGES
+
+    def new_number(self) -> int:
+        """Number of a page."""
+        self._last += 1
+        return self._last
+
+    async def send_for_ever(self) -> None:
+        """Send to each page, ten times a second, what has changed."""
+        while True:
+            await asyncio.sleep(PERIOD_S)
+            encoded: dict[int, tuple[int, str]] = {}
+            for page in list(self.open):
+                page.send(encoded)
+
+
+def role_of(message: str | bytes, gate: Gate) -> Role | None:
+    """Role of a page by its first message, {"token": "..."}; a link may ask to watch only."""
+    try:
+        content = json.loads(message)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(content, dict) or not isinstance(content.get('token'), str):
+        return None
+    role = gate.role(content['token'])
+    is_modest = role is not None and content['token'] == Role.WATCH.value
+    return Role.WATCH if is_modest else role
