@@ -81,15 +81,15 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     assert np.loadtxt(out / 'trajectory.tum').shape[1] == 8
     assert (out / 'summary.png').stat().st_size > 10_000
     page = (out / 'report.html').read_text()
-    assert 'room_10x10' in page and 'thinmap_ros.tools.demo' in page
+    assert 'room_10x10' in page and 'thinmap demo ' in page
     assert f'pictures and figures: {out / "report.html"}' in stdout
     steps = [shlex.split(line) for line in stdout.partition('try next')[2].splitlines()[1:]]
-    assert [step[2] for step in steps] == [
-        f'thinmap_ros.tools.{name}' for name in ('explore_world', 'replay', 'demo')
+    assert [step[:2] for step in steps] == [
+        ['thinmap', name] for name in ('explore_world', 'replay', 'demo')
     ]
     # The first two are quick, and need no graph.
     for step in steps[:2]:
-        subprocess.run([sys.executable, *step[1:]], check=True, timeout=PROGRAM_S)
+        subprocess.run(step, check=True, timeout=PROGRAM_S)
         assert (Path(step[-1]) / 'report.html').exists()
     bag = Bag(out / 'bag')
     assert set(bag.topics) >= TOPICS
@@ -114,7 +114,7 @@ def test_ctrl_c_ends_everything(ros_domain, tmp_path, robots, nodes):
 def test_two_robots_join_their_maps_and_nothing_is_left(ros_domain, tmp_path):
     """With real localizers and mappers, which do not know the starts of each other."""
     out = tmp_path / 'demo'
-    office = ['--world', 'office', '--speed', '0.4', '--rate', '20', '--time-limit', '25']
+    office = ['--world', 'office', '--speed-m-s', '0.4', '--rate', '20', '--time-limit-s', '25']
     process = demo(out, '--robots', '2', *office)
     stdout, stderr = process.communicate(timeout=PROGRAM_S)
     assert process.returncode == 0, stderr
@@ -198,6 +198,6 @@ def test_without_rerun_a_view_is_refused_before_anything_is_started(
     said = process.communicate(timeout=PATIENCE_S)[1].splitlines()
     assert process.returncode == 2
     assert said == [
-        'demo: error: --view: rerun is not installed: pip install "thinmap_ros[viewer]"'
+        "demo: error: --view: rerun is not installed: pip install 'rerun-sdk>=0.41,<0.42'"
     ]
     assert not (tmp_path / 'out').exists()

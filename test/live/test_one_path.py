@@ -18,7 +18,7 @@ from support.timeouts import PATIENCE_S
 from thinmap_msgs.msg import Keyframe, KeyframePoses, SlamStatus
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, checked_poses
 from thinmap_ros.core.slam.joining.robot_keyframes import ReceivedKeyframes
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
@@ -37,6 +37,8 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.tools.carmen_to_bag import convert
 
 pytestmark = pytest.mark.live
+# Cells of 10 cm, which take a quarter of the time.
+COARSE = PipelineConfig(grid=PAPER_GRID)
 MAPPERS = ('localizer', 'grid_mapper', 'topology_builder')
 # The test subscribes to the poses, too, and the player to the local graph.
 CONNECTIONS = {
@@ -108,15 +110,17 @@ class LoopLog:
 
     is_sorted = True
 
-    def __init__(self, first=0, end=None):
-        """first, end: of the scans, all without them."""
+    def __init__(self, first=0, end=None, every=1):
+        """first, end: of the scans, all without them. every: of how many scans one is kept."""
         self.skipped = SkippedRecords()
         self.steps = list(drive_round_the_block())[first:end]
+        self.every = every
 
     def events(self):
-        for scan, odom, _ in self.steps:
+        for number, (scan, odom, _) in enumerate(self.steps):
             yield OdometryEvent(scan.stamp_ns, odom)
-            yield ScanEvent(scan)
+            if number % self.every == 0:
+                yield ScanEvent(scan)
 
 
 def assert_same(one, other):
@@ -165,9 +169,9 @@ def play(graph, bag, count, poses, **own):
 
 
 def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
-    own = {'localizer': localizer, 'grid_mapper': {'resolution_m': 0.1}}
     poses = graph.heard('pose', PoseWithCovarianceStamped)
-    play(graph, bag, len(expected.poses), poses, **own)
+    grid = {'resolution_m': expected.pipeline.grid.frame.resolution}
+    play(graph, bag, len(expected.poses), poses, localizer=localizer, grid_mapper=grid)
     assert [messages.stamp_ns(pose.header.stamp) for pose in poses] == expected.stamps_ns
     live = np.array([messages.pose_from_msg(pose.pose.pose) for pose in poses])
     assert np.abs(live - expected.poses).max() <= 1e-9
@@ -187,7 +191,7 @@ def test_simulated_log_bag_and_live_graph_agree(graph, tmp_path):
 
 
 def test_the_filter_of_the_paper_gives_the_same_live_and_replayed(graph, tmp_path):
-    config = PipelineConfig(localizer=EkfConfig(slam='ekf_ti'))
+    config = replace_fields(COARSE, localizer=EkfConfig(slam='ekf_ti'))
     expected = replay(SimulatedLog(), config)
     assert len(expected.pipeline.localizer.features) > 3
     convert(SimulatedLog(), tmp_path / 'bag')
@@ -195,12 +199,9 @@ def test_the_filter_of_the_paper_gives_the_same_live_and_replayed(graph, tmp_pat
 
 
 def test_a_laser_that_sweeps_and_drops_out_is_treated_alike(graph, tmp_path):
-    expected = replay(CheapLaserLog(), PipelineConfig())
+    expected = replay(CheapLaserLog(), COARSE)
     free = expected.pipeline.grid.known_area().free
-    assert (
-        free.sum()
-        < 1.05 * replay(SimulatedLog(), PipelineConfig()).pipeline.grid.known_area().free.sum()
-    )
+    assert free.sum() < 1.05 * replay(SimulatedLog(), COARSE).pipeline.grid.known_area().free.sum()
     convert(CheapLaserLog(), tmp_path / 'bag')
     statuses = graph.heard('slam_status', SlamStatus)
     assert_live_is_same(graph, tmp_path / 'bag', expected, tmp_path)
@@ -217,9 +218,10 @@ def places(topology):
 
 def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, tmp_path):
     start = {'initial_x_m': 3.0, 'initial_y_m': 1.2}
-    expected = replay(LoopLog(), PipelineConfig(localizer=LocalizerConfig(**start)))
+    config = replace_fields(COARSE, localizer=LocalizerConfig(**start))
+    expected = replay(LoopLog(every=2), config)
     assert 'rebuild' in expected.pipeline.stage_seconds
-    convert(LoopLog(), tmp_path / 'bag')
+    convert(LoopLog(every=2), tmp_path / 'bag')
     trajectories = graph.heard('trajectory', Path, qos.LATCHED)
     assert_live_is_same(graph, tmp_path / 'bag', expected, tmp_path, **start)
     assert len(trajectories) == expected.pipeline.corrections
@@ -270,7 +272,8 @@ def test_a_loop_that_closes_in_a_loaded_session_corrects_it(graph, tmp_path):
     keyframes = graph.heard('trajectory', Path, qos.LATCHED)
     start = {'initial_x_m': 3.0, 'initial_y_m': 1.2}
     poses = graph.heard('pose', PoseWithCovarianceStamped)
-    play(graph, tmp_path / 'one', 420, poses, localizer=start)
+    grid = {'resolution_m': COARSE.grid.resolution_m}
+    play(graph, tmp_path / 'one', 420, poses, localizer=start, grid_mapper=grid)
 
     def save():
         return graph.call(SaveMap, 'save_map', SaveMap.Request(path=stem))
@@ -281,7 +284,7 @@ def test_a_loop_that_closes_in_a_loaded_session_corrects_it(graph, tmp_path):
         assert graph.stop(name) == 0
     before = sessions.KEYFRAMES.load(stem).frames
     offline = LocalizerConfig(**start)
-    replayed = replay(halves[0], PipelineConfig(localizer=offline)).pipeline.localizer
+    replayed = replay(halves[0], replace_fields(COARSE, localizer=offline)).pipeline.localizer
     truth_at = {scan.stamp_ns: truth[:2] for scan, _, truth in halves[0].steps}
     truths = np.array([truth_at[frame.scan.stamp_ns] for frame in replayed.keyframes])
     assert len(truths) == len(before)
@@ -292,6 +295,7 @@ def test_a_loop_that_closes_in_a_loaded_session_corrects_it(graph, tmp_path):
     there = {'initial_x_m': x, 'initial_y_m': y, 'initial_yaw_rad': yaw}
     own = {name: {'session_path': stem} for name in MAPPERS}
     own['localizer'] |= there
+    own['grid_mapper'] |= grid
     play(graph, tmp_path / 'two', len(halves[1].steps), poses, **own)
     for name in MAPPERS:
         assert 'not corrected' not in graph.log(name)
@@ -316,8 +320,8 @@ def test_a_loop_that_closes_in_a_loaded_session_corrects_it(graph, tmp_path):
 
 def test_real_log_bag_and_live_graph_agree(graph, shared_data, tmp_path):
     log = CarmenLog(shared_data / 'logs' / 'sena' / 'log.clf', LaserOptions(offset_m=0.78))
-    from_log = replay(log, PipelineConfig())
+    from_log = replay(log, COARSE)
     convert(log, tmp_path / 'bag')
-    from_bag = replay(BagLog(tmp_path / 'bag'), PipelineConfig())
+    from_bag = replay(BagLog(tmp_path / 'bag'), COARSE)
     assert_same(from_log, from_bag)
     assert_live_is_same(graph, tmp_path / 'bag', from_log, tmp_path)

@@ -168,15 +168,31 @@ def test_a_running_global_localizer_keeps_its_parameters(graph):
 @pytest.mark.parametrize(
     ('arguments', 'said'),
     [
-        (['--params-file', '/nowhere.yaml'], '/nowhere.yaml'),
-        (['-p', 'robot_radius_m:=[1'], 'robot_radius_m:=[1'),
-        (['-r', 'scan'], '-r scan'),
+        (['--params-file', 'nothere.yaml'], "error: --params-file 'nothere.yaml': no such file\n"),
+        (
+            ['-p', 'robot_radius_m=0.2'],
+            "error: -p 'robot_radius_m=0.2' (did you mean robot_radius_m:=0.2?): "
+            'expected NAME:=VALUE\n',
+        ),
+        (['-r', 'scan'], "error: -r 'scan': expected FROM:=TO\n"),
     ],
 )
-def test_arguments_that_ros_cannot_read_end_the_start_with_a_line(arguments, said):
+def test_a_typing_error_after_ros_args_is_one_line(arguments, said):
     done = forked.run('thinmap_ros.nodes.navigator', '--ros-args', *arguments)
+    assert (done.returncode, done.stderr, done.stdout) == (2, said, '')
+
+
+def test_arguments_that_ros_cannot_read_end_the_start_with_a_line():
+    done = forked.run('thinmap_ros.nodes.navigator', '--ros-args', '-p', 'robot_radius_m:=[1')
     assert done.returncode == 2
     line = done.stderr.splitlines()[-1]  # after one of rcl's log
     assert 'Traceback' not in done.stderr
     assert line.startswith('error: arguments after --ros-args: ')
-    assert said in line
+    assert 'robot_radius_m:=[1' in line
+
+
+def test_help_is_of_the_node_and_names_its_parameters():
+    done = forked.run('thinmap_ros.nodes.navigator', '--help')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.startswith('usage: ros2 run thinmap_ros navigator ')
+    assert done.stdout.endswith('config/navigator.yaml\n')

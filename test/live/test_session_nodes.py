@@ -7,14 +7,15 @@ import os
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped, Twist
+from geometry_msgs.msg import Point, PoseStamped, Twist
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
+from support.timeouts import PATIENCE_S
 
-from thinmap_msgs.msg import TopologicalMap
-from thinmap_msgs.srv import LoadMap, SaveMap
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_msgs.msg import RegionArray, TopologicalMap
+from thinmap_msgs.srv import LoadMap, NameRegion, SaveMap
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.se2 import pose
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.flat import topology_from_msg
@@ -40,13 +41,14 @@ def heard_maps(graph):
     )
 
 
-def drive(graph, x, y, yaw, metres):
+def drive(graph, x, y, yaw, metres, **localizer):
     """Nodes of a robot that has driven along a path and stands still.
 
-    Then only the robot is stopped.
+    Then only the robot is stopped. localizer: more of its parameters.
     """
     truth = graph.heard('ground_truth', PoseStamped)
-    graph.start('localizer', use_sim_time=True, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
+    start = {'initial_x_m': x, 'initial_y_m': y, 'initial_yaw_rad': yaw}
+    graph.start('localizer', use_sim_time=True, **start, **localizer)
     graph.start(
         'sim',
         remap=graph.paced(),
@@ -72,11 +74,49 @@ def drive(graph, x, y, yaw, metres):
     return T
 
 
+def names_of(regions):
+    """Names by id, of the newest message."""
+    newest = regions[-1].regions if regions else []
+    return {region.id: region.name for region in newest if region.name}
+
+
+def refuse_names(graph):
+    """What is no region, or no name, gets a line and changes nothing."""
+    for request, said in (
+        (NameRegion.Request(id=99, name='x'), 'region 99: expected the id of a region'),
+        (NameRegion.Request(point=Point(x=500.0), name='x'), 'point 500, 0: expected a point'),
+        (NameRegion.Request(point=Point(x=np.nan), name='x'), 'point'),
+        (NameRegion.Request(point=Point(x=2.0, y=2.0), name='x' * 65), 'at most 64 characters'),
+    ):
+        response = graph.call(NameRegion, 'name_region', request)
+        assert not response.success and said in response.message
+
+
+def give_name(graph, regions, name):
+    """Name the region around the way by its place, then by its id; returns the id."""
+    # Ahead of the start, which the laser sees from the first poses alone: their scans may be lost.
+    by_place = NameRegion.Request(point=Point(x=3.2, y=3.6), name='first')
+    graph.until(
+        lambda: graph.call(NameRegion, 'name_region', by_place).success, 'a region on the way'
+    )
+    graph.until(lambda: names_of(regions), 'the first name')
+    ((number, first),) = names_of(regions).items()
+    assert first == 'first'
+    assert graph.call(NameRegion, 'name_region', NameRegion.Request(id=number, name=name)).success
+    graph.until(lambda: names_of(regions) == {number: name}, 'the other name')
+    return number
+
+
 def test_ids_and_cells_survive_a_restart_and_mapping_continues(graph, tmp_path):
     maps, graphs, local = heard_maps(graph)
+    regions = graph.heard('regions', RegionArray, qos.LATCHED)
+    often = {'grid_mapper': {}, 'topology_builder': {'region_update_period_s': 0.5}}
     for name in MAPPERS:
-        graph.start(name, use_sim_time=True)
+        graph.start(name, use_sim_time=True, **often[name])
     T = drive(graph, 2.0, 2.0, 0.9, 3.2)
+    graph.until(lambda: regions and regions[-1].regions, 'regions')
+    refuse_names(graph)
+    named = give_name(graph, regions, 'the laboratory')
     stem = tmp_path / 'today' / 'room'
 
     def save_all():
@@ -96,9 +136,10 @@ def test_ids_and_cells_survive_a_restart_and_mapping_continues(graph, tmp_path):
     edges = set(graphs[-1].edge_ids)
     known = sessions.load_grid(str(stem)).known_area()
     assert len(before) > 3
-    maps.clear(), graphs.clear(), local.clear()
+    maps.clear(), graphs.clear(), local.clear(), regions.clear()
     for name in MAPPERS:
-        graph.start(name, use_sim_time=True, session_path=str(stem))
+        graph.start(name, use_sim_time=True, session_path=str(stem), **often[name])
+    graph.until(lambda: names_of(regions) == {named: 'the laboratory'}, 'the name of the region')
     graph.until(lambda: maps and graphs, 'the saved map and graph, without a scan')
     assert not local
     assert places(graphs[-1]) == before and set(graphs[-1].edge_ids) == edges
@@ -117,6 +158,32 @@ def test_ids_and_cells_survive_a_restart_and_mapping_continues(graph, tmp_path):
     assert all(k > max(before.keys() | edges) for k in after.keys() - before.keys())
 
 
+def test_a_session_is_saved_when_the_nodes_end_and_not_by_those_without_a_map(graph):
+    stem = graph.folder / 'maps' / 'room'
+    own = {'save_on_exit': 'maps/room', 'use_sim_time': True}
+    graph.start('grid_mapper', **own, autosave_period_s=0.5)
+    graph.start('topology_builder', **own)
+    drive(graph, 2.0, 2.0, 0.9, 0.3, save_on_exit='maps/room')
+    saved = f'saved {stem}.pgm'
+    graph.until(lambda: graph.log('grid_mapper').count(saved) > 1, 'maps, while the node runs')
+    for name in MAPPERS:
+        assert graph.stop(name) == 0
+    ends = ['.grid.npz', '.keyframes.npz', '.pgm', '.regions.npz', '.slam.npz', '.topology.npz']
+    files = sorted(file.name for file in stem.parent.iterdir())
+    assert files == [f'room{end}' for end in (*ends, '.yaml')]
+    assert sessions.load_grid(str(stem)).known_area().free.sum() > 500
+    before = {file.name: file.read_bytes() for file in stem.parent.iterdir()}
+    for name in ('localizer', *MAPPERS):
+        graph.start(name, **own)
+        graph.until(lambda name=name: 'ready' in graph.log(name), 'the node')
+        assert graph.stop(name) == 0
+    assert {file.name: file.read_bytes() for file in stem.parent.iterdir()} == before
+    refused = graph.start('localizer', save_on_exit='../elsewhere')
+    assert refused.wait(PATIENCE_S) == 2
+    graph.processes.pop('localizer')
+    assert 'expected a file below' in graph.log('localizer')
+
+
 def room_of(resolution=0.1):
     """Grid and graph of a room of 6 x 6 m as observed from its centre."""
     occupied = np.zeros((60, 60), dtype=np.uint8)
@@ -125,7 +192,7 @@ def room_of(resolution=0.1):
     occupied[20:25, 35:40] = 1
     grid = OccupancyGrid(OccupancyConfig(resolution_m=resolution))
     builder = TopologyBuilder()
-    world = World('room', occupied, OccupancyGrid().frame, pose(2.0, 2.0, 0.0))
+    world = World('room', occupied, OccupancyGrid(PAPER_GRID).frame, pose(2.0, 2.0, 0.0))
     laser = LaserScanner(LaserScannerConfig(), 1)
     for k in range(12):
         T = pose(2.0 + 0.1 * k, 3.0, 0.4 * k)

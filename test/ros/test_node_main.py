@@ -34,6 +34,39 @@ def test_the_collector_need_not_look_at_what_the_start_has_made():
     assert (done.returncode, done.stdout) == (0, 'True\n'), done.stderr
 
 
+EXECUTORS = """
+import gc
+from rclpy.executors import Executor
+from rclpy.node import Node
+from thinmap_ros.ros import node_main
+
+
+class Short(Node):
+    def __init__(self, name):
+        super().__init__(name)
+        self.finished = False
+        self.create_timer(0.01, self.end_soon)
+
+    def end_soon(self):
+        self.finished = True
+
+
+gc.disable()
+node_main.run_all([lambda: Short('one'), lambda: Short('other')])
+gc.unfreeze()
+left = [each for each in gc.get_objects() if isinstance(each, Executor)]
+print([each._sigint_gc for each in left if each._sigint_gc is not None])
+"""
+
+
+@pytest.mark.usefixtures('ros_domain')
+def test_executors_are_ended_before_the_collector_ends_their_parts():
+    """It may do so in an order in which the executor writes a traceback."""
+    command = [sys.executable, '-c', EXECUTORS]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '[]\n', '')
+
+
 CLOSING = """
 from rclpy.node import Node
 from thinmap_ros.ros import node_main

@@ -288,6 +288,8 @@ class GlobalLocalizerNode(ThinmapNode):
             self._patch = occupancy_maps.read_map(file, report=self.get_logger().warning)
             self._topology = build(self._patch, None, TopologyConfig())
         warm_up.global_localizer()
+        if self._settings.node.drive:
+            warm_up.active_search()
         self._output = _LocalizationPublishers(self, self._settings.map_frame)
         self._driver = self._create_driver()
         self.reset_state()
@@ -296,7 +298,8 @@ class GlobalLocalizerNode(ThinmapNode):
             subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._odometry.subscribe()
-        subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        scan_topic = self._laser_transform.scan_topic
+        subscribe_guarded(self, LaserScan, scan_topic, self._on_scan, qos.SENSOR)
         self.create_service(LocalizeGlobally, 'localize_globally', self._on_request)
         self.create_active_timer(1.0, self._report_missing_inputs)
 

@@ -19,13 +19,15 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.mapper import Mapper
-from thinmap_ros.core.grid.occupancy import ROBOT_GRID, OccupancyConfig, WindowConfig
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import Trajectory
 from thinmap_ros.core.start import LOCALIZATION, MAPPING
 from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.mapping.map_editing import MapEditing
 from thinmap_ros.nodes.mapping.map_output import MapPublishers
 from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
 from thinmap_ros.nodes.mapping.scan_queue import ScanQueue
@@ -34,6 +36,7 @@ from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.diagnostics import ERROR
+from thinmap_ros.ros.exit_save import ExitSave
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import ReceivedScan, localized_scan_from_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
@@ -72,7 +75,7 @@ class _Settings:
     def declare(node: Node, changed: Callable[[MapOutputConfig], None]) -> '_Settings':
         """changed: is called with another output, which can be set at run time."""
         return _Settings(
-            grid=parameters.declare_config(node, OccupancyConfig, base=ROBOT_GRID),
+            grid=parameters.declare_config(node, OccupancyConfig),
             output=parameters.declare_config(node, MapOutputConfig, changed),
             local_map_size_m=parameters.declare_config(node, WindowConfig).local_map_size_m,
             mapping=parameters.declare_config(node, ModeConfig).mode == MAPPING,
@@ -80,7 +83,7 @@ class _Settings:
 
 
 class GridMapperNode(ThinmapNode):
-    """/localized_scan in; /map, /grid and /local_grid out.
+    """/localized_scan in; /map, /grid, /local_grid and /keep_out out.
 
     /local_grid follows every scan, and holds it. /map and /grid are published when they have
     changed: once in map_update_interval, and at once after a reset, a load and a correction. As
@@ -88,7 +91,9 @@ class GridMapperNode(ThinmapNode):
     where its size, origin or identity changes, when a subscriber comes, and 10 intervals after an
     update; where it has more than 400 kB, later, so that this is at most 40 kB/s.
 
-    Services save_map, load_map; map and dynamic_map return the present map.
+    Services save_map, load_map; map and dynamic_map return the present map. add_keep_out and
+    remove_keep_out edit areas in which no robot is to drive; erase_area sets cells to unknown.
+    /keepout_filter_mask and /costmap_filter_info are for Nav2's keepout filter.
 
     After a /trajectory the map is re-rendered, a slice with each scan, near tiles first; meanwhile
     tiles that are not complete are shown as they were. correction_stamp of grid and local_grid is
@@ -104,10 +109,18 @@ class GridMapperNode(ThinmapNode):
         self._team = TeamInScans(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
+        ExitSave(self, self._save_directory, sessions.GRID, self._save_at_end)
         parameters.reject_unknown(self)
         warm_up.grid_mapper()
         self._stamp = StateStamp()
         self._mapper = Mapper(self._settings.grid, window_m=self._settings.local_map_size_m)
+        self._editing = MapEditing(
+            self,
+            self._output.frame_id,
+            self._mapper,
+            lambda: self._stamp.latest_ns,
+            self._publish_map,
+        )
         self.reset_state()
         self.enable_checkpoint(self._state, self._restore)
         self.create_pause_service()
@@ -149,16 +162,24 @@ class GridMapperNode(ThinmapNode):
         self._stamp.latest_ns = None
         self._mapper.reset()
         if self._session:
-            self._mapper.replace(self._load_map(self._session))
+            self._mapper.replace(*self._load_map(self._session))
+            patch = self._mapper.grid.shown.known_area()
+            free_m2 = np.count_nonzero(patch.free) * patch.frame.resolution**2
+            self.get_logger().info(f'loaded {self._session}: {free_m2:.0f} m2 free')
         if has_map:
             self._stamp.latest_ns = self.get_clock().now().nanoseconds
-            self._publish_map()
+        self._publish_map()
 
-    def _load_map(self, path: str, folder: pathlib.Path | None = None) -> CorrectableGrid:
+    def _load_map(
+        self, path: str, folder: pathlib.Path | None = None
+    ) -> tuple[CorrectableGrid, KeepOut]:
         """The map of a session, or any map_server map; corrected if the session has keyframes."""
         grid = sessions.load_grid(path, self._settings.grid, folder, self.get_logger().warning)
         scans = sessions.load_scans(path) if self._settings.mapping else []
-        return CorrectableGrid(grid, keeps_scans=bool(scans), scans=scans)
+        edits = sessions.load_edits(path)
+        erased = edits.erasures
+        correctable = CorrectableGrid(grid, bool(scans), scans=scans, erasures=erased)
+        return correctable, edits.keep_out
 
     def _state(self) -> State | None:
         if self._stamp.latest_ns is None:
@@ -230,6 +251,7 @@ class GridMapperNode(ThinmapNode):
         return not self._fault and origin is not Origin.STALE
 
     def _publish_map(self) -> None:
+        self._editing.publish()
         if self._stamp.latest_ns is not None:
             self._output.publish_map(self._mapper.whole_map(), self._stamp.latest_ns)
 
@@ -258,9 +280,9 @@ class GridMapperNode(ThinmapNode):
         self._stamp.latest_ns = self._stamp.latest_ns or self._output.load_ns
         self._publish_map()
 
-    def _load(self, grid: CorrectableGrid) -> None:
+    def _load(self, grid: CorrectableGrid, keep_out: KeepOut) -> None:
         grid.corrected_ns = self._mapper.grid.corrected_ns
-        self._mapper.replace(grid)
+        self._mapper.replace(grid, keep_out)
         self._map_replaced()
 
     def _save_grid(self, path: str) -> str:
@@ -268,7 +290,13 @@ class GridMapperNode(ThinmapNode):
         if self._mapper.finish() is not None:
             self._publish_map()
         shown = self._settings.output.trinary(self._mapper.whole_map().patch)
-        return f'saved {sessions.save_grid(path, self._mapper.grid.shown, shown)}'
+        mapper = self._mapper
+        return f'saved {sessions.save_grid(path, mapper.grid.shown, shown, mapper.edits)}'
+
+    def _save_at_end(self, path: str) -> str:
+        is_changed = self._settings.mapping or self._editing.is_edited
+        has_map = is_changed and self._stamp.latest_ns is not None
+        return self._save_grid(path) if has_map else ''
 
     async def _on_save(
         self, request: SaveMap.Request, response: SaveMap.Response
@@ -290,8 +318,8 @@ class GridMapperNode(ThinmapNode):
         """Load grid and graph, or neither."""
         try:
             path = self._save_directory.resolve(request.path)
-            grid = self._load_map(path, self._save_directory.path)
-            result = await self._session_client.load(path, lambda: self._load(grid))
+            loaded = self._load_map(path, self._save_directory.path)
+            result = await self._session_client.load(path, lambda: self._load(*loaded))
         except ThinmapError as error:
             response.success = False
             response.message = str(error)

@@ -36,7 +36,7 @@ from thinmap_ros.core.slam.localizers import (
     parameters_elsewhere,
 )
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.start import StartConfig
+from thinmap_ros.core.start import SCAN_MATCHING, StartConfig
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.files.sessions import LOCALIZER, save_localizer
@@ -52,6 +52,7 @@ from thinmap_ros.nodes.localization.recovery import Recovery, restored, saved_po
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN, new_map_id
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
+from thinmap_ros.ros.exit_save import ExitSave
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_msg
@@ -195,8 +196,11 @@ class LocalizerNode(ThinmapNode):
         )
         self._given = GivenMap(self, self._config)
         self._save_directory = SaveDirectory(self)
+        ExitSave(self, self._save_directory, LOCALIZER, self._save_at_end)
         parameters.reject_unknown(self, parameters_elsewhere(slam))
         warm_up.localizer()
+        if slam != SCAN_MATCHING:
+            warm_up.ekf_localizer()
         self._map_ids: _MapIds | None = _MapIds() if self._config.is_mapping else None
         self._begin()
         self.enable_checkpoint(self._state, self._restore, self._map_state)
@@ -209,7 +213,8 @@ class LocalizerNode(ThinmapNode):
         # last scan first.
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         self._odometry.subscribe()
-        subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        scan_topic = self._laser_transform.scan_topic
+        subscribe_guarded(self, LaserScan, scan_topic, self._on_scan, qos.SENSOR)
         poses = InitialPoses(
             self, self._output.map_frame, self._on_initial_pose, self._broadcaster.received
         )
@@ -357,6 +362,11 @@ class LocalizerNode(ThinmapNode):
             return f'saved {save_localizer(path, self._localizer)}'
 
         return fill_response(response, save)
+
+    def _save_at_end(self, path: str) -> str:
+        if self._map_ids is None or self._recovery.last is None:
+            return ''
+        return f'saved {save_localizer(path, self._localizer)}'
 
     def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         return fill_response(response, lambda: self._load(request.path))

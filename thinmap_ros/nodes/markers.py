@@ -11,7 +11,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, Region, RegionArray, TopologicalMap
 from thinmap_ros.core import validation
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, one_line
 from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import NodeKind
@@ -104,12 +104,12 @@ def regions(message: RegionArray) -> MarkerArray:
 
 
 def _region_name(header: Header, region: Region) -> Marker:
-    """Id of a region, as text at its centre."""
+    """Name of a region, or its kind and id, as text at its centre."""
     place = (region.center.x, region.center.y)
     validation.require_bounded(f'region {region.id}', place)
     text = _marker(header, 'region_names', Marker.TEXT_VIEW_FACING, _TEXT.size_m, _TEXT_COLOUR)
     text.id = region.id % 2**31
-    text.text = f'{_KINDS[region.kind].name.lower()} {region.id}'
+    text.text = one_line(region.name) or f'{_KINDS[region.kind].name.lower()} {region.id}'
     text.pose.position = _point(*place, _TEXT.z_m)
     return text
 

@@ -7,7 +7,7 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import SlamStatus, TopologicalMap
+from thinmap_msgs.msg import KeepOut, SlamStatus, TopologicalMap
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.planning.navigator import (
     CONTROL_PERIOD_S,
@@ -19,16 +19,23 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.logs import decode
 from thinmap_ros.logs.frames.bag_odometry import NONE
 from thinmap_ros.nodes.navigation.map_input import MapInput
 from thinmap_ros.nodes.navigation.robot_state import RobotState
-from thinmap_ros.nodes.navigation.tasks import ErrorCode, NavigationTask, TaskReader
+from thinmap_ros.nodes.navigation.tasks import (
+    STOPPED,
+    ErrorCode,
+    NavigationTask,
+    TaskReader,
+)
 from thinmap_ros.nodes.navigation.team_driving import TeamDriving
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.diagnostics import OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.stop_topic import subscribe_to_stop
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.tf.odometry_source import OdometrySource
 from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
@@ -80,7 +87,8 @@ class NavigatorNode(ThinmapNode):
     Actions navigate_to_pose and navigate_through_poses, as Nav2's: one goal at a time, a newer one
     replaces it. /goal_pose sends a goal to navigate_to_pose. Goals in other frames than the map's
     are transformed when they arrive. Where somebody publishes /topology, distant goals are planned
-    on it.
+    on it. While /stop is true, the robot stands, and all goals are aborted. It does not drive into
+    areas of /keep_out, and aborts goals inside; a robot that is in one may leave it.
 
     With team: true it plans over the ground that the other robots of /team/tiles know, too, and
     gives way to those of /team/claims.
@@ -93,22 +101,25 @@ class NavigatorNode(ThinmapNode):
         self._laser_transform = LaserTransform(self)
         base_frame = self._laser_transform.base_frame
         self._output = _NavigatorPublishers(self, map_frame, base_frame)
-        self._tasks = TaskReader(self, map_frame)
+        self._map = MapInput()
+        self._tasks = TaskReader(self, map_frame, self._map)
         self._odometry = OdometrySource(
             self, base_frame, lambda ns, T_odom_base: self._robot.add_odometry(ns, T_odom_base)
         )
-        self._map = MapInput()
         self._team = TeamDriving(self)
         parameters.reject_unknown(self)
         warm_up.navigator()
         self.reset_state()
         self._odometry.subscribe()
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
-        subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        scan_topic = self._laser_transform.scan_topic
+        subscribe_guarded(self, LaserScan, scan_topic, self._on_scan, qos.SENSOR)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._map.subscribe(self)
+        subscribe_guarded(self, KeepOut, 'keep_out', self._on_keep_out, qos.LATCHED)
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, PoseStamped, 'goal_pose', self._on_goal_pose, qos.STREAM)
+        subscribe_to_stop(self, self._on_stop)
         self._goals = SingleGoalServer(
             self,
             NavigateToPose,
@@ -175,6 +186,22 @@ class NavigatorNode(ThinmapNode):
             )
         self._navigator.topology = topology_from_msg(message)
 
+    def _on_keep_out(self, message: KeepOut) -> None:
+        self._map.keep_out = decode.keep_out(message)
+        if not self._goals.active:
+            return
+        try:
+            self._tasks.require_open(self._task.poses[-self._navigator.waypoints_remaining - 1 :])
+        except InputError as error:
+            self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, str(error))
+
+    def _on_stop(self, is_stopped: bool) -> None:
+        self._tasks.is_stopped = is_stopped
+        if is_stopped:
+            self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, STOPPED)
+        else:
+            self.diagnostics.set_state(OK, 'released')
+
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._tasks.pose(message)  # raises for an invalid one, which is counted
         self._own_client.send_goal_async(NavigateToPose.Goal(pose=message))
@@ -239,7 +266,7 @@ class NavigatorNode(ThinmapNode):
             return None
         self.diagnostics.set_state(OK, 'driving')
         with self.diagnostics.time_step('navigator'):
-            patch = self._team.completed(patch)
+            patch = self._map.keep_out.laid_on(self._team.completed(patch), T_map_base)
             command = self._navigator.step(T_map_base, patch, scan, CONTROL_PERIOD_S)
             return self._team.allowed(self._navigator, T_map_base, command, CONTROL_PERIOD_S)
 

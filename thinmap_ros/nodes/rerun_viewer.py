@@ -72,10 +72,13 @@ class RerunViewerNode(Node):
         self._view = self._open(config)
         self._feed = MessageView(self._view, mount.pose, self.get_namespace())
         self._diagnostics = NodeDiagnostics(self)
+        names = {
+            'diagnostics': '/diagnostics',  # all robots share it
+            'map_updates': updates_topic(self, 'map'),
+            'scan': mount.scan_topic,
+        }
         for topic, (kind, profile) in _TOPICS.items():
-            # A topic that all robots share has an absolute name.
-            name = f'/{topic}' if topic == 'diagnostics' else topic
-            name = updates_topic(self, 'map') if topic == 'map_updates' else name
+            name = names.get(topic, topic)
             self.create_subscription(kind, name, self._callback(topic), profile)
 
     def close(self) -> None:

@@ -5,12 +5,12 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
-
-from rclpy.node import Node
-from rclpy.utilities import remove_ros_args
+from typing import TYPE_CHECKING
 
 from thinmap_ros import nodes
-from thinmap_ros.ros import node_main
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 _NO_CHOICE = ('demo_monitor', 'thinmap')
@@ -19,17 +19,19 @@ _OTHERS = [
     for module in pkgutil.iter_modules(nodes.__path__)
     if not module.ispkg and module.name not in (*_NODES, *_NO_CHOICE)
 ]
-_USAGE = f"""usage: {{program}} [NODE ...] [--ros-args ...]
+_WITH_PAGE = 'web:=true'
+_USAGE = f"""usage: {{program}} [NODE ...] [{_WITH_PAGE}] [--ros-args ...]
 
 Runs nodes in one process. Without names: {', '.join(_NODES)}.
+{_WITH_PAGE}: with web, the page in the browser, beside them.
 There are also: {', '.join(_OTHERS)}.
 A parameter goes to every node that has it; -p localizer:slam:=ekf_ti sets that of one."""
 
 
-def node_factories(names: list[str]) -> list[Callable[[], Node]]:
+def node_factories(names: list[str]) -> list['Callable[[], Node]']:
     """Functions that create the nodes of these modules, one each."""
 
-    def make(name: str) -> Node:
+    def make(name: str) -> 'Node':
         # Imported here: a node that is not chosen costs nothing. All are imported before the first
         # is created, so that the kernels of all are counted.
         modules = {each: import_module(f'thinmap_ros.nodes.{each}') for each in names}
@@ -38,14 +40,25 @@ def node_factories(names: list[str]) -> list[Callable[[], Node]]:
     return [partial(make, name) for name in names]
 
 
+def chosen_nodes(words: list[str]) -> list[str]:
+    """Names of the nodes that the words of a command line choose."""
+    names = [word for word in words if word != _WITH_PAGE] or list(_NODES)
+    return [*names, 'web'] if _WITH_PAGE in words else names
+
+
 def main() -> None:
     """Run the nodes that the command line names."""
-    program, *names = remove_ros_args(sys.argv)
-    names = names or list(_NODES)
+    program = sys.argv[0]
     usage = _USAGE.format(program=program if program.startswith('thinmap ') else 'thinmap')
-    if {'-h', '--help'} & set(names):
+    if {'-h', '--help'} & set(sys.argv):
         print(usage)
         return
+    # Only now: the help needs no ROS.
+    from rclpy.utilities import remove_ros_args
+
+    from thinmap_ros.ros import node_main
+
+    names = chosen_nodes(remove_ros_args(sys.argv)[1:])
     unknown = [name for name in names if name not in (*_NODES, *_OTHERS)]
     if unknown or len(set(names)) < len(names):
         print(

@@ -10,6 +10,7 @@ from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
+from thinmap_ros.core.errors import counted
 from thinmap_ros.core.regions.tracker import FIELDS as REGION_FIELDS
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.snapshot import State
@@ -18,11 +19,13 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.topology import Topology
 from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.mapping.region_naming import RegionNaming
 from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
 from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN, FollowedMap, Origin
+from thinmap_ros.ros.exit_save import ExitSave
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import map_update_from_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
@@ -89,9 +92,10 @@ class TopologyBuilderNode(ThinmapNode):
     """/local_grid and /grid in; /local_topology, /topology and /regions out.
 
     Services save_topology, load_topology and check_topology, which reads a saved graph without
-    replacing the present one. A graph is published when it has changed, /local_topology for each
-    scan while somebody subscribes to it. Where Nav2's route server runs, it is given the graph
-    when it has changed, and when it is saved: client of route_server/set_route_graph.
+    replacing the present one; name_region, which gives a region a name. A graph is published when
+    it has changed, /local_topology for each scan while somebody subscribes to it. Where Nav2's
+    route server runs, it is given the graph when it has changed, and when it is saved: client of
+    route_server/set_route_graph.
     Cells outside of the windows are those of /grid. After a correction the graph is rebuilt from
     the /grid that has undergone it, in a thread; until then the graph stays as it is. Nodes keep
     their ids.
@@ -103,12 +107,14 @@ class TopologyBuilderNode(ThinmapNode):
         self._output = _TopologyPublishers(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
+        ExitSave(self, self._save_directory, TOPOLOGY, self._save_at_end)
         self._route_graph = RouteGraphUpdates(
             self, self._output.frame_id, lambda: self._topology.map
         )
         self._regions = RegionUpdates(
             self, self._output.frame_id, self._config.robot_radius_m, lambda: self._topology.map
         )
+        self._naming = RegionNaming(self, self._regions)
         parameters.reject_unknown(self)
         warm_up.topology_builder()
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
@@ -149,6 +155,9 @@ class TopologyBuilderNode(ThinmapNode):
         if self._session:
             self._topology.replace(load_topology(self._session, self._config))
             self._regions.reset(REGIONS.load_optional(self._session, self._regions.config))
+            graph = self._topology.map
+            counts = f'{counted(len(graph.nodes), "node")}, {counted(len(graph.edges), "edge")}'
+            self.get_logger().info(f'loaded {self._session}: {counts}')
         else:
             self._regions.reset()
         if self._session or self._output.has_published:
@@ -183,6 +192,7 @@ class TopologyBuilderNode(ThinmapNode):
             return
         stamp_ns = messages.stamp_ns(message.header.stamp)
         whole = messages.whole_map_from_msg(message)
+        self._naming.follow(whole)
         self._regions.add_grid(stamp_ns, whole.patch)
         with self.diagnostics.time_step('whole map'):
             changed = self._topology.add_map(whole)
@@ -204,12 +214,19 @@ class TopologyBuilderNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve_for_saving(request.path, TOPOLOGY)
-            saved = TOPOLOGY.save(path, self._topology.builder)
-            REGIONS.save(path, self._regions.tracker)
+            saved = self._save(path)
             self._route_graph.graph_saved()
-            return f'saved {saved}'
+            return saved
 
         return fill_response(response, save)
+
+    def _save(self, path: str) -> str:
+        saved = TOPOLOGY.save(path, self._topology.builder)
+        REGIONS.save(path, self._regions.tracker)
+        return f'saved {saved}'
+
+    def _save_at_end(self, path: str) -> str:
+        return self._save(path) if self._topology.map.nodes else ''
 
     def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         return fill_response(response, lambda: self._load(request.path))

@@ -1,5 +1,7 @@
 """The pose of the laser on the robot, from /tf_static or from a parameter."""
 
+import math
+
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
@@ -15,13 +17,39 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 _MAX_FRAMES = 1000
 
 
+class _FirstScans:
+    """Logs what the first scans are, once there are two: with one, their rate is unknown."""
+
+    def __init__(self, node: Node, topic: str) -> None:
+        self._node = node
+        self._topic = topic
+        self._first_ns: int | None = None
+        self._is_reported = False
+
+    def report(self, scan: Scan) -> None:
+        """Take a scan into account."""
+        if self._is_reported:
+            return
+        if self._first_ns is None or scan.stamp_ns <= self._first_ns:
+            self._first_ns = scan.stamp_ns
+            return
+        self._is_reported = True
+        beams = scan.ranges_m.size
+        angle_deg = math.degrees(abs(scan.angle_increment_rad)) * (beams - 1)
+        rate_hz = 1e9 / (scan.stamp_ns - self._first_ns)
+        self._node.get_logger().info(
+            f'first scans on {self._node.resolve_topic_name(self._topic)}: {beams} beams over '
+            f'{angle_deg:.0f} degrees, {rate_hz:.3g} Hz, up to {scan.range_max_m:.3g} m'
+        )
+
+
 class LaserTransform:
     """The pose of each laser frame on the robot.
 
     It is looked up in the static transforms, as for bags. For a robot that does not publish them,
     the parameter `laser_pose` [x m, y m, yaw rad] is used for every frame. There is no default.
     The first pose of a frame is kept: the map was made with it. Another one is reported on
-    /diagnostics. base_frame: value of the parameter of this name.
+    /diagnostics. base_frame, scan_topic: values of the parameters of these names.
     """
 
     def __init__(self, node: Node) -> None:
@@ -36,11 +64,17 @@ class LaserTransform:
             '',
             'Pose of the laser on the robot as "x,y,yaw" (m, m, rad). Empty: from /tf_static.',
         )
+        self.scan_topic = str(
+            parameters.declare_parameter(
+                node, 'scan_topic', 'scan', 'Topic of the scans, as for slam_toolbox and AMCL.'
+            )
+        )
         self._laser = parameters.declare_config(node, LaserConfig)
         self._fixed = Mount(parse_laser_pose(str(given)), upside_down=False) if given else None
         self._transforms = StaticTransforms()
         self._mounts: dict[str, Mount] = {}
         self._changes: dict[str, str] = {}
+        self._first = _FirstScans(node, self.scan_topic)
         if isinstance(node, ThinmapNode):
             node.diagnostics.add_check(WARN, lambda: '; '.join(self._changes.values()))
         if self._fixed is None:
@@ -61,6 +95,7 @@ class LaserTransform:
                 'laser_pose'
             )
         scan = messages.scan_from_msg(message, mount.T_base_laser, self._laser)
+        self._first.report(scan)
         return mount.apply(scan)
 
     def pose(self, frame_id: str) -> Array | None:

@@ -34,8 +34,12 @@ class ThinmapNode(LifecycleNode):
     """
 
     def __init__(self, name: str, recovers: bool = False) -> None:
-        """Create a node; one that recovers calls `enable_checkpoint` at the end of its own."""
+        """Create a node; one that recovers calls `enable_checkpoint` at the end of its own.
+
+        name: before remapping, kept as `program`.
+        """
         super().__init__(name)
+        self.program = name
         translate(self, name)
         parameters.declare_strict(self)
         self._autostart = bool(
@@ -51,6 +55,7 @@ class ThinmapNode(LifecycleNode):
         self.elapsed_time = ElapsedTime(self.get_clock())
         self._checkpoints: list[PeriodicCheckpoint] = []
         self._activation_callbacks: list[Callable[[], None]] = []
+        self._end_callbacks: list[Callable[[], None]] = []
         self.diagnostics.add_update_callback(self.handle_time_jump)
         self.create_service(Trigger, '~/reset', self._on_reset)
         self._reject_invalid_transitions()
@@ -60,8 +65,10 @@ class ThinmapNode(LifecycleNode):
         if self._autostart:
             self.trigger_configure()
             self.trigger_activate()
+            self.get_logger().info('ready')
         else:
             self.diagnostics.set_state(OK, 'unconfigured')
+            self.get_logger().info('unconfigured: waits for transitions')
 
     def reset_state(self) -> None:
         """Discard what was learned from messages."""
@@ -142,6 +149,15 @@ class ThinmapNode(LifecycleNode):
     def add_activation_callback(self, work: Callable[[], None]) -> None:
         """Call `work` each time that the node becomes active."""
         self._activation_callbacks.append(work)
+
+    def add_end_callback(self, work: Callable[[], None]) -> None:
+        """Call `work` when the process ends in order, before `close`."""
+        self._end_callbacks.append(work)
+
+    def end(self) -> None:
+        """The process ends in order."""
+        for work in self._end_callbacks:
+            work()
 
     def handle_time_jump(self) -> None:
         """Reset the state if the clock has jumped back: before messages of the new time."""

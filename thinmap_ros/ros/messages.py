@@ -3,6 +3,7 @@
 import math
 import re
 from array import array
+from collections.abc import Iterable
 from importlib import import_module
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import (
     Point,
+    Point32,
+    Polygon,
     Pose,
     PoseStamped,
     PoseWithCovarianceStamped,
@@ -182,6 +185,11 @@ def odometry_msg(
     message.pose.pose = pose_msg(T)
     message.twist.twist.linear.x, message.twist.twist.angular.z = velocity
     return message
+
+
+def polygon_msg(corners: Iterable[tuple[float, float]]) -> Polygon:
+    """Polygon of corners x, y, m."""
+    return Polygon(points=[Point32(x=x, y=y) for x, y in corners])
 
 
 def twist_msg(v: float, w: float) -> Twist:

@@ -20,6 +20,7 @@ from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.ros import parameters
+from thinmap_ros.ros.command_line import check_arguments, show_help, warn_of_files
 
 _SECURITY = 'ROS_SECURITY_ENABLE'
 _KEYSTORE = 'ROS_SECURITY_KEYSTORE'
@@ -41,11 +42,12 @@ class _Running:
     _closed: list[Node] = field(default_factory=list)
 
     def close(self, node: Node) -> None:
-        """Call `close()` of a node, once; an error does not keep other nodes from being closed."""
+        """Call `end()` and `close()` of a node, once; others are closed whatever error this has."""
         if node in self._closed:
             return
         self._closed.append(node)
         try:
+            getattr(node, 'end', lambda: None)()
             getattr(node, 'close', lambda: None)()
         except Exception as error:
             node.get_logger().error(f'error at the end: {one_line_reason(error)}')
@@ -57,10 +59,11 @@ def run(make_node: Callable[[], Node]) -> None:
 
     The process ends with 0, or with 2 where the start fails with a ThinmapError.
 
-    A node may have a method `start()`, called after its creation, and a method `close()`, called
-    once, last, whatever ended the node.
+    A node may have a method `start()`, called after its creation, and methods `end()` and
+    `close()`, called once, last, whatever ended the node.
     """
-    run_all([make_node])
+    if not show_help(make_node):
+        run_all([make_node])
 
 
 def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
@@ -76,6 +79,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
     try:
         with parameters.shared_process(len(make_nodes)):
             nodes.extend(_made(make) for make in make_nodes)
+        warn_of_files(nodes, sys.argv)
         for node in nodes:
             parameters.freeze_clock(node)
             getattr(node, 'start', lambda: None)()
@@ -100,6 +104,7 @@ def _init() -> None:
     """Parse the arguments after --ros-args; ends with 2 and an error line where they are wrong."""
     try:
         enforce_security(os.environ)
+        check_arguments(sys.argv)
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except InputError as error:
         _fail(str(error))
@@ -182,6 +187,8 @@ def _spin_one(
     finally:
         stop_event.set()
         running.close(node)  # now: a robot that drives does not wait for the other nodes
+        # The garbage collector may end its parts first; then it ends with a traceback.
+        executor.shutdown()
 
 
 def _on_signals(handler: Any) -> None:

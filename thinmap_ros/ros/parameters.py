@@ -41,6 +41,7 @@ ROBOT = (
     'odom_frame',
     'odom_source',
     'base_frame',
+    'scan_topic',
 )
 
 AnyConfig = TypeVar('AnyConfig', bound=Config)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
@@ -33,7 +34,8 @@ _TIMEOUT_S = 3.0
 _SCANS = (LaserScan, LocalizedScan)
 # Data of one sensor: those of two mixed are of none. Positions of two odometries jump.
 _SOLE_SOURCE = (*_SCANS, Odometry)
-_MANY_SOURCES = (TeamClaim,)  # stamps by different clocks: losses are not counted
+# Stamps by different clocks: losses are not counted.
+_MANY_SOURCES = (TeamClaim, DiagnosticArray)
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 

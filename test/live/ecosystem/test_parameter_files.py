@@ -54,6 +54,34 @@ def test_files_of_other_packages_start_our_nodes_under_their_names(graph, tmp_pa
         assert graph.stop(name) == 0
 
 
+def test_sections_of_other_packages_are_read_under_our_names(graph):
+    """A file is used as it is: with the names of the nodes that ours replace, and for Gazebo."""
+    file = graph.folder / 'mapper_params.yaml'
+    file.write_text(
+        'slam_toolbox:\n  ros__parameters:\n    use_sim_time: true\n    scan_topic: /front/scan\n'
+        '    minimum_travel_distance: 0.7\n    use_scan_matching: true\n'
+        '/robot2/slam_toolbox:\n  ros__parameters: {minimum_travel_distance: 0.9}\n'
+        'bt_navigator:\n  ros__parameters: {plugin_lib_names: [one]}\n'
+    )
+    arguments = ('--ros-args', '--params-file', str(file), '--')
+    graph.start('localizer', arguments=arguments)
+    graph.start('topology_builder', arguments=arguments)
+    expected = {'keyframes.distance_m': 0.7, 'scan_topic': '/front/scan', 'use_sim_time': True}
+    for parameter, value in expected.items():
+        assert current(graph, 'localizer', parameter) == value
+    ready = ('localizer', 'topology_builder')
+    graph.until(lambda: all('ready' in graph.log(name) for name in ready), 'ready')
+    assert 'ignored parameters that node localizer does not have: use_scan' in graph.log(
+        'localizer'
+    )
+    assert graph.node.count_subscribers('/front/scan') == 1
+    missing = f'{file}: no section for topology_builder: expected topology_builder: or /**:, found'
+    assert missing in graph.log('topology_builder')
+    assert 'no section' not in graph.log('localizer')
+    for name in ready:
+        assert graph.stop(name) == 0
+
+
 def test_grid_mapper_publishes_the_map_of_map_server(graph, tmp_path):
     path = write_foreign_map(tmp_path, 'room_10x10')
     graph.start(

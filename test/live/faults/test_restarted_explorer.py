@@ -86,6 +86,7 @@ def test_the_goal_of_a_killed_explorer_ends_with_the_result_of_the_whole_explora
         'demo_monitor', time_limit_s=TIME_LIMIT_S, result=str(result), use_sim_time=True
     )
     exploration.until_elapsed(10.0)
+    graph.until(lambda: exploration.explores, 'the status of the goal')
     goal, _ = last(exploration.explores)
     drive = exploration.until_driving()
     exploration.kill()

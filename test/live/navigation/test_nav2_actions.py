@@ -206,7 +206,10 @@ def test_goal_pose_of_rviz_is_a_goal_of_the_action(client):
     client.drives_to(3.0, 4.0)
     assert client.ended(client.first) == (GoalStatus.STATUS_ABORTED, 0, 'replaced by a newer goal')
     graph.until(
-        lambda: [s.status for s in statuses[-1].status_list][-1:] == [GoalStatus.STATUS_EXECUTING],
+        lambda: (
+            [s.status for m in statuses[-1:] for s in m.status_list][-1:]
+            == [GoalStatus.STATUS_EXECUTING]
+        ),
         'the goal is the one of the action',
     )
     publisher.publish(pose_at(2.0, 2.0, 'moon'))

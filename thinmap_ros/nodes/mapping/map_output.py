@@ -17,15 +17,15 @@ from thinmap_ros.ros.localized_scan import ReceivedScan
 class MapPublishers:
     """Publishes the map for others, and the exact grid for thinmap's own nodes, when they change.
 
-    load_ns: time at which the map was begun or loaded; followed: knows its id.
+    frame_id: of the map; load_ns: time at which it was begun or loaded; followed: knows its id.
     """
 
     def __init__(self, node: Node, config: MapOutputConfig) -> None:
         self.config = config
-        self._frame = parameters.declare_map_frame(node)
+        self.frame_id = parameters.declare_map_frame(node)
         self.load_ns = 0
         self.followed = FollowedMap()
-        self._map = MapTopic(node, self._frame)
+        self._map = MapTopic(node, self.frame_id)
         self._grid = node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
         self._local_grid = node.create_publisher(LocalGrid, 'local_grid', qos.LATCHED)
         self._published: MapVersion | None = None
@@ -38,14 +38,16 @@ class MapPublishers:
         self._published = version
         if changed is not None:
             self._grid.publish(
-                messages.whole_map_msg(whole, self._frame, stamp_ns, self.load_ns, self.followed.id)
+                messages.whole_map_msg(
+                    whole, self.frame_id, stamp_ns, self.load_ns, self.followed.id
+                )
             )
         self._map.publish(version, changed)
 
     def map_message(self, patch: GridPatch, stamp_ns: int) -> OccupancyGrid:
         """Message of the topic map."""
         shown = self.config.shown(patch)
-        return messages.grid_msg(shown, self._frame, stamp_ns, self.load_ns)
+        return messages.grid_msg(shown, self.frame_id, stamp_ns, self.load_ns)
 
     def publish_local_grid(self, update: MapUpdate, localized: ReceivedScan) -> None:
         """Publish the part of a grid that a scan has changed, and the scan."""
@@ -53,7 +55,7 @@ class MapPublishers:
             return
         cells = messages.probability_grid_msg(
             update.changes,
-            self._frame,
+            self.frame_id,
             localized.scan.stamp_ns,
             self.load_ns,
             update.corrected_ns,

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from geometry_msgs.msg import Point, Point32, Polygon
+from geometry_msgs.msg import Point
 
 from thinmap_msgs.msg import Door as DoorMsg
 from thinmap_msgs.msg import Region as RegionMsg
@@ -38,10 +38,11 @@ def _ids_by_region(of: Mapping[int, int]) -> dict[int, list[int]]:
 def _region_msg(region: Region, node_ids: list[int], edge_ids: list[int]) -> RegionMsg:
     return RegionMsg(
         id=region.id,
+        name=region.name,
         kind=int(region.kind),
         center=Point(x=region.x, y=region.y),
         area_m2=region.area_m2,
-        outline=Polygon(points=[Point32(x=x, y=y) for x, y in region.outline.tolist()]),
+        outline=messages.polygon_msg(region.outline.tolist()),
         node_ids=node_ids,
         edge_ids=edge_ids,
     )

@@ -135,6 +135,11 @@ class RegionUpdates:
         """The graph has other nodes or edges, which are to be published with their regions."""
         self._is_graph_newer = True
 
+    def publish_again(self) -> None:
+        """Publish the regions, if there are any: their names are others."""
+        if self.tracker.regions is not None:
+            self._publish(self.tracker.regions)
+
     def _begin(self) -> None:
         """Begin to compute the regions of the newest grid; of the same grid with a new graph."""
         if self._pending is not None:
@@ -160,10 +165,10 @@ class RegionUpdates:
             self._publish(regions)
 
     def _publish(self, regions: RegionMap) -> None:
-        """Publish regions with the nodes and edges of the present graph."""
+        """Publish regions with their names, and the nodes and edges of the present graph."""
         self._is_graph_newer = False
         self._published = regions
         with self._node.diagnostics.time_step('regions published'):
-            membership = membership_of(self._topology(), regions)
+            membership = membership_of(self._topology(), self.tracker.names.named(regions))
             message = region_array_msg(membership, self._frame_id, self._pending_ns)
         self._publisher.publish(message)

@@ -1,6 +1,7 @@
 """The map that the navigator plans on: thinmap's grid, or the map of another node."""
 
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
+from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.ros import messages, qos
@@ -14,10 +15,11 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 class MapInput:
     """The newest map: grid and local_grid of grid_mapper, or else map, of whatever SLAM.
 
-    pose_map_id: id of the map that the pose of the robot is in.
+    pose_map_id: id of the map that the pose of the robot is in; keep_out: where it must not drive.
     """
 
     def __init__(self) -> None:
+        self.keep_out = KeepOut()
         self.reset()
 
     @property
@@ -32,7 +34,7 @@ class MapInput:
         subscribe_to_map(node, 'map', self._on_map)
 
     def reset(self) -> None:
-        """Discard the map."""
+        """Discard the map, and not the keep-out areas: they are published where they change."""
         self._map = MapReceiver()
         self._has_grid = False
         self._map_id = UNKNOWN

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
 
@@ -12,11 +13,13 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.nodes.navigation.map_input import MapInput
 from thinmap_ros.ros import messages, parameters
 from thinmap_ros.ros.action_server import InvalidGoalError
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.tf.transform_listener import TransformListener
 
+STOPPED = 'the robot is stopped: topic stop'
 _MAX_POSES = 10_000
 _LOOKUP_STEP_NS = 20_000_000
 
@@ -52,12 +55,17 @@ class _TransformError(InputError):
 
 
 class TaskReader:
-    """Reads goals in any frame that is connected to the map by transforms."""
+    """Reads goals in any frame that is connected to the map by transforms.
 
-    def __init__(self, node: ThinmapNode, map_frame: str) -> None:
-        """Declare the parameter `transform_tolerance`."""
+    is_stopped: whether it refuses all of them.
+    """
+
+    def __init__(self, node: ThinmapNode, map_frame: str, map_input: MapInput) -> None:
+        """Declare the parameter `transform_tolerance`; map_input: has the keep-out areas."""
+        self.is_stopped = False
         self._node = node
         self._map_frame = map_frame
+        self._map = map_input
         self._transforms = TransformListener(node)
         tolerance_s = parameters.declare_parameter(
             node,
@@ -99,6 +107,10 @@ class TaskReader:
             return pose
         return se2.compose(self._lookup(frame, messages.stamp_ns(message.header.stamp)), pose)
 
+    def require_open(self, poses: tuple[Array, ...]) -> None:
+        """Raise InputError where one of the poses (3,) is in a keep-out area."""
+        self._map.keep_out.require_open(np.array([pose[:2] for pose in poses]))
+
     def _lookup(self, frame: str, stamp_ns: int) -> Array:
         """T_map_frame (3,) at a stamp, or shortly before it; the newest for stamp 0, as in tf2."""
         reason = ''
@@ -121,7 +133,11 @@ class TaskReader:
             logger.warning(f'behavior_tree {quoted(request.behavior_tree)} ignored: there is none')
         start_ns = self._node.elapsed_time.now_ns()
         try:
-            return NavigationTask(action, poses(), start_ns)
+            if self.is_stopped:
+                raise InputError(STOPPED)
+            task = NavigationTask(action, poses(), start_ns)
+            self.require_open(task.poses)
+            return task
         except InputError as error:
             is_frame = isinstance(error, _TransformError)
             code = ErrorCode.TF_ERROR if is_frame else ErrorCode.UNKNOWN

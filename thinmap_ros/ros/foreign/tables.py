@@ -23,9 +23,13 @@ class ForeignParameter:
 
 @dataclass(frozen=True)
 class Package:
-    """Another package, with the node names of ours that take its place."""
+    """Another package, with the node names of ours that take its place.
+
+    sections: names of its nodes, as of the sections of its parameter files.
+    """
 
     name: str
+    sections: tuple[str, ...]
     nodes: tuple[str, ...]
     parameters: tuple[ForeignParameter, ...]
 
@@ -46,6 +50,7 @@ _REMAP = 'by remapping'
 
 SLAM_TOOLBOX = Package(
     'slam_toolbox',
+    ('slam_toolbox',),
     ('localizer', 'grid_mapper'),
     (
         _row('mode', 'mapping', 'localizer/mode', 'grid_mapper/mode'),
@@ -57,7 +62,7 @@ SLAM_TOOLBOX = Package(
             'localizer/base_frame',
             note='default base_link',
         ),
-        _row('scan_topic', '/scan', note=f'{_REMAP}: `-r scan:=/front/scan`'),
+        _row('scan_topic', '/scan', 'localizer/scan_topic'),
         _row('laser_frame', '-', note='no: the frame of each scan is looked up in `/tf_static`'),
         _row(
             'map_file_name',
@@ -139,6 +144,7 @@ SLAM_TOOLBOX = Package(
 
 AMCL = Package(
     'nav2_amcl',
+    ('amcl',),
     ('localizer', 'global_localizer'),
     (
         _row('alpha1', '0.2', note='no: `odometry.noise_ratio`; the noise is learned'),
@@ -184,7 +190,7 @@ AMCL = Package(
         _row('resample_interval', '1', note=_NO_FILTER),
         _row('robot_model_type', 'nav2_amcl::DifferentialMotionModel', note='no: planar motion'),
         _row('save_pose_rate', '0.5', 'localizer/save_pose_rate'),
-        _row('scan_topic', 'scan', note=f'{_REMAP}: `-r scan:=/front/scan`'),
+        _row('scan_topic', 'scan', 'localizer/scan_topic', 'global_localizer/scan_topic'),
         _row('set_initial_pose', 'false', 'localizer/set_initial_pose'),
         _row('sigma_hit', '0.2', note='no: `matching.noise_m`'),
         _row('tf_broadcast', 'true', 'localizer/publish_tf'),
@@ -200,6 +206,7 @@ AMCL = Package(
 
 EXPLORE_LITE = Package(
     'explore_lite',
+    ('explore_node', 'explore'),
     ('explorer',),
     (
         _row('robot_base_frame', 'base_link', 'explorer/robot_base_frame'),
@@ -219,6 +226,7 @@ EXPLORE_LITE = Package(
 
 MAP_MERGE = Package(
     'map_merge of m-explore',
+    ('map_merge',),
     ('map_joiner',),
     (
         _row('robot_map_topic', 'map', 'map_joiner/robot_map_topic'),
@@ -236,6 +244,7 @@ MAP_MERGE = Package(
 
 NAV2 = Package(
     'Nav2 controller and bt_navigator',
+    ('controller_server', 'bt_navigator', 'local_costmap', 'global_costmap'),
     ('navigator',),
     (
         _row('global_frame', 'map', 'navigator/map_frame'),
@@ -257,6 +266,7 @@ NAV2 = Package(
 
 MAP_SERVER = Package(
     'map_server and map_saver',
+    ('map_server', 'map_saver'),
     ('localizer', 'grid_mapper'),
     (
         _row(

@@ -1,18 +1,31 @@
 """Translation of the parameters of other packages before a node declares its own."""
 
+import sys
+
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from thinmap_ros.ros.foreign.sections import foreign_values, given_files
 from thinmap_ros.ros.foreign.values import translated
+
+_CLOCK = 'use_sim_time'
 
 
 def translate(node: Node, program: str) -> None:
     """Give a node its own parameters for those of other packages that it was started with.
 
-    program: name of the node before remapping.
+    program: name of the node before remapping. Sections of parameter files for the nodes that it
+    replaces are read, too. Raises InputError where a parameter file is none.
     """
     # rclpy has no public way to change what was given.
     given = node._parameter_overrides
+    for file in given_files(sys.argv):
+        for name, value in foreign_values(file, program, node.get_namespace()).items():
+            if value is not None:
+                given.setdefault(name, Parameter(name, value=value))
+    if _CLOCK in given:
+        # Of a foreign section: the node has declared it before.
+        node.set_parameters([given[_CLOCK]])
     own = translated(program, {name: parameter.value for name, parameter in given.items()})
     for name in given.keys() - own.keys():
         del given[name]

@@ -1,0 +1,201 @@
+"""What a robot publishes, compared with what thinmap needs."""
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import rclpy
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import LaserScan
+from tf2_msgs.msg import TFMessage
+
+from thinmap_ros.ros import messages, qos
+
+_MAX_DELAY_S = 1.0  # of a stamp against the clock, beyond which clocks differ
+_MIN_RATE_HZ = 2.0
+_MAX_MESSAGES = 10_000
+_SPIN_S = 0.1
+_LISTENING = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+@dataclass(frozen=True)
+class RobotNames:
+    """Topics and frames of a robot, as of the parameters of the nodes."""
+
+    scan_topic: str
+    odom_topic: str
+    base_frame: str
+    odom_frame: str
+    map_frame: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the table: what was looked at, what was seen, and what to do if it is wrong."""
+
+    what: str
+    is_good: bool
+    seen: str
+    advice: str = ''
+
+
+def check_robot(names: RobotNames, seconds: float) -> list[Finding]:
+    """What a robot publishes within some seconds, compared with what is needed."""
+    rclpy.init()
+    node = rclpy.create_node('doctor')
+    try:
+        check = RobotCheck(node, names)
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            rclpy.spin_once(node, timeout_sec=_SPIN_S)
+        return list(check.findings())
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+class RobotCheck:
+    """Receives what a robot publishes; `findings` compares it with what is needed."""
+
+    def __init__(self, node: Node, names: RobotNames) -> None:
+        self._node = node
+        self._names = names
+        self._scans: list[tuple[LaserScan, float]] = []
+        self._odometry: list[tuple[Odometry, float]] = []
+        self._clock: list[Clock] = []
+        self._transforms: dict[tuple[str, str], bool] = {}
+        self._listen(LaserScan, names.scan_topic, self._scans)
+        self._listen(Odometry, names.odom_topic, self._odometry)
+        node.create_subscription(Clock, '/clock', self._clock.append, qos.SENSOR)
+        node.create_subscription(TFMessage, 'tf', self._on_moving, _LISTENING)
+        node.create_subscription(TFMessage, 'tf_static', self._on_static, qos.STATIC_TRANSFORMS)
+
+    def findings(self) -> Iterator[Finding]:
+        """All lines, the sensors first."""
+        names = self._names
+        yield from self._stream(names.scan_topic, 'sensor_msgs/msg/LaserScan', self._scans)
+        if self._scans:
+            yield self._laser(self._scans[-1][0])
+        yield from self._stream(names.odom_topic, 'nav_msgs/msg/Odometry', self._odometry)
+        yield self._frame(names.odom_frame, names.base_frame, 'odometry', 'odom_frame, base_frame')
+        if self._scans:
+            laser = self._scans[-1][0].header.frame_id
+            advice = 'publish it on /tf_static (robot_state_publisher), or set laser_pose'
+            yield self._frame(names.base_frame, laser, 'mount of the laser', advice)
+        yield self._one_map()
+        yield self._time()
+
+    def _listen(self, kind: type, topic: str, heard: list[tuple[Any, float]]) -> None:
+        def hear(message: Any) -> None:
+            if len(heard) < _MAX_MESSAGES:
+                heard.append((message, time.time()))
+
+        self._node.create_subscription(kind, topic, hear, qos.SENSOR)
+
+    def _on_moving(self, message: TFMessage) -> None:
+        for each in message.transforms:
+            self._transforms.setdefault((each.header.frame_id, each.child_frame_id), False)
+
+    def _on_static(self, message: TFMessage) -> None:
+        for each in message.transforms:
+            self._transforms[each.header.frame_id, each.child_frame_id] = True
+
+    def _stream(self, topic: str, kind: str, heard: list[tuple[Any, float]]) -> Iterator[Finding]:
+        """A topic of a sensor: who publishes it, its type and its rate."""
+        name = self._node.resolve_topic_name(topic)
+        publishers = self._node.get_publishers_info_by_topic(name)
+        what = f'topic {name}'
+        if not publishers:
+            others = self._of_type(kind)
+            meant = f'; of its type: {", ".join(others)}' if others else ''
+            advice = 'start the driver; other names: --scan-topic, --odom-topic'
+            yield Finding(what, False, f'no publisher{meant}', advice)
+            return
+        wrong = sorted({each.topic_type for each in publishers} - {kind})
+        if wrong:
+            yield Finding(what, False, f'type {", ".join(wrong)}', f'expected {kind}')
+            return
+        if not heard:
+            yield Finding(what, False, 'a publisher, and no message', 'look at the driver')
+            return
+        stamps_ns = [messages.stamp_ns(message.header.stamp) for message, _ in heard]
+        steps_s = np.diff(stamps_ns) / 1e9
+        if steps_s.size and steps_s.min() <= 0.0:
+            yield Finding(what, False, 'stamps that do not grow', 'two drivers, or a driver error')
+            return
+        rate_hz = 1.0 / float(np.median(steps_s)) if steps_s.size else 0.0
+        reliability = publishers[0].qos_profile.reliability.name.lower().replace('_', ' ')
+        seen = f'{rate_hz:.3g} Hz, {len(publishers)} publisher, {reliability}'
+        is_good = rate_hz >= _MIN_RATE_HZ and len(publishers) == 1
+        advice = f'expected one publisher of at least {_MIN_RATE_HZ:g} Hz'
+        yield Finding(what, is_good, seen, advice)
+
+    def _of_type(self, kind: str) -> list[str]:
+        found = self._node.get_topic_names_and_types()
+        return [
+            name for name, kinds in found if kind in kinds and self._node.count_publishers(name)
+        ]
+
+    def _laser(self, scan: LaserScan) -> Finding:
+        ranges = np.asarray(scan.ranges, dtype=float)
+        hits = np.isfinite(ranges) & (ranges >= scan.range_min) & (ranges <= scan.range_max)
+        share = float(hits.mean()) if ranges.size else 0.0
+        angle_deg = math.degrees(abs(scan.angle_increment)) * max(ranges.size - 1, 0)
+        seen = (
+            f'{ranges.size} beams over {angle_deg:.0f} degrees, {scan.range_min:.3g} to '
+            f'{scan.range_max:.3g} m, {share:.0%} of them hit'
+        )
+        advice = 'a covered laser, or a wrong range_min or range_max'
+        return Finding('laser', share >= 0.1, seen, advice)
+
+    def _frame(self, parent: str, child: str, what: str, advice: str) -> Finding:
+        chain = self._chain(parent, child)
+        name = f'transform {parent} -> {child}'
+        if chain is None:
+            known = sorted({frame for pair in self._transforms for frame in pair})
+            seen = f'none; frames: {", ".join(known[:8]) or "none"}'
+            return Finding(name, False, seen, f'{what}: {advice}')
+        kinds = {self._transforms[pair] for pair in pairwise(chain)}
+        return Finding(name, True, 'static' if kinds <= {True} else 'moving')
+
+    def _chain(self, parent: str, child: str) -> list[str] | None:
+        """Frames from one down to another; None where they are not connected."""
+        parents = {below: above for above, below in self._transforms}
+        chain = [child]
+        while chain[-1] != parent:
+            above = parents.get(chain[-1])
+            if above is None or above in chain:
+                return None
+            chain.append(above)
+        return chain[::-1]
+
+    def _one_map(self) -> Finding:
+        names = self._names
+        pair = (names.map_frame, names.odom_frame)
+        what = f'transform {pair[0]} -> {pair[1]}'
+        own = [name for name in self._node.get_node_names() if name == 'localizer']
+        if pair in self._transforms and not own:
+            advice = 'end it, or set publish_tf:=false: thinmap publishes this one'
+            return Finding(what, False, 'another localization publishes it', advice)
+        return Finding(
+            what, True, 'of the localizer' if own else 'none yet: the localizer makes it'
+        )
+
+    def _time(self) -> Finding:
+        heard = self._scans or self._odometry
+        if self._clock:
+            return Finding('clock', True, '/clock is published: use_sim_time:=true for all nodes')
+        if not heard:
+            return Finding('clock', True, 'of the machine')
+        message, heard_s = heard[-1]
+        delay_s = heard_s - messages.stamp_ns(message.header.stamp) / 1e9
+        advice = 'synchronize the clocks of the machines (chrony), or play a bag with --clock'
+        seen = f'stamps are {delay_s:.3f} s old'
+        return Finding('clock', abs(delay_s) <= _MAX_DELAY_S, seen, advice)
