@@ -1,13 +1,15 @@
 """The command `thinmap`: all programs of the package, each as a subcommand."""
 
 import sys
+from difflib import get_close_matches
 from importlib import import_module
 from typing import NamedTuple
 
 import thinmap_ros.startup  # isort: skip  # noqa: F401  before all other modules
 from thinmap_ros import __version__
 from thinmap_ros.core.errors import ThinmapError
-from thinmap_ros.tools.cli import BAD_INPUT
+from thinmap_ros.tools import completion
+from thinmap_ros.tools.arguments import BAD_INPUT
 from thinmap_ros.tools.ros_check import require_ros
 
 
@@ -31,13 +33,18 @@ PROGRAMS = {
     'carmen_to_bag': _Program('tools.carmen_to_bag', 'a CARMEN log into a bag'),
     'bag_repair': _Program('tools.bag_repair', 'a damaged bag (MCAP) into a whole one'),
     'experiment': _Program('tools.experiment', "the papers' figures and tables"),
+    'fetch_logs': _Program(
+        'tools.fetch_logs', 'check published logs in a folder, convert them for the benchmarks'
+    ),
     'record_bags': _Program('tools.record_bags', 'the drives of the experiments as bags'),
     'warm_up': _Program('tools.warm_up', 'compile all kernels, once, so that programs start fast'),
+    'doctor': _Program('tools.doctor', 'what a running robot lacks, in one table', True),
     'demo': _Program('tools.demo', 'a simulated robot explores a room on a live ROS 2 graph', True),
     'nodes': _Program('nodes.thinmap', 'ROS 2 nodes in one process', True),
 }
 
 _SHORT = {'merge': 'merge_sessions'}
+_HELP = {'-h', '--help'}
 
 
 def _usage() -> str:
@@ -49,7 +56,7 @@ def _usage() -> str:
     return '\n'.join(
         [
             'usage: thinmap SUBCOMMAND [ARGUMENT ...]',
-            '       thinmap --help | --version',
+            '       thinmap help [SUBCOMMAND] | --version',
             '',
             *lines,
             '',
@@ -66,7 +73,7 @@ def _fail(message: str) -> None:
 
 def _run(name: str, arguments: list[str]) -> None:
     program = PROGRAMS[name]
-    if program.needs_ros:
+    if program.needs_ros and not _HELP & set(arguments):
         try:
             require_ros()
         except ThinmapError as error:
@@ -80,18 +87,43 @@ def main() -> None:
 
     Ends with 2, after one line on what is wrong, where there is no such subcommand.
     """
+    if completion.is_asked():
+        _complete()
     arguments = sys.argv[1:]
     if not arguments:
-        _fail('expected a subcommand: thinmap --help lists them')
-    name = _SHORT.get(arguments[0], arguments[0])
-    if name in ('-h', '--help'):
+        _fail('expected a subcommand: thinmap help lists them')
+    if arguments[0] == 'help':
+        arguments = [*arguments[1:2], '--help']
+    name = _full(arguments[0])
+    if name in _HELP:
         print(_usage())
     elif name == '--version':
         print(f'thinmap {__version__}')
     elif name in PROGRAMS:
         _run(name, arguments[1:])
     else:
-        _fail(f'{name!r}: no such subcommand: expected one of {", ".join(PROGRAMS)}')
+        _fail(f'{name!r}: no such subcommand{_meant(name)}: expected one of {", ".join(PROGRAMS)}')
+
+
+def _full(name: str) -> str:
+    """Name of a subcommand that may be short, or have hyphens."""
+    underscored = name if name.startswith('-') else name.replace('-', '_')
+    return _SHORT.get(underscored, underscored)
+
+
+def _complete() -> None:
+    """Complete the command line with Tab, and end."""
+    name = _full(completion.subcommand([*PROGRAMS, 'help']))
+    # The nodes have no parser: running their module would start them.
+    if name in PROGRAMS and name != 'nodes':
+        _run(name, ['--help'])  # which needs no ROS
+    sys.exit()
+
+
+def _meant(name: str) -> str:
+    """The subcommand that a word is most like."""
+    likely = get_close_matches(name, [*PROGRAMS, *_SHORT], n=1)
+    return f' (did you mean {likely[0]}?)' if likely else ''
 
 
 if __name__ == '__main__':

@@ -25,6 +25,7 @@ from support.bag_maker import (
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.bag import Bag, BagLog
+from thinmap_ros.logs.bag_directory import bag_files
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
 
@@ -390,3 +391,14 @@ def test_a_scan_with_angles_in_degrees_is_skipped_with_the_reason(tmp_path: Path
     log = BagLog(write(tmp_path / 'bag', fill))
     assert len(scans(list(log.events()))) == 3
     assert log.skipped.count == 1 and 'degrees' in log.skipped.first
+
+
+def test_a_folder_of_several_bags_is_refused(tmp_path):
+    """Their scans would be taken for those of one drive, up to where the clock jumps back."""
+    for name in ('office', 'hall_10', 'hall_2'):
+        (tmp_path / f'{name}.mcap').write_bytes(b'')
+    with pytest.raises(InputError, match=r'3 files of several bags \(office.mcap, ') as error:
+        Bag(tmp_path)
+    assert str(error.value).endswith(f'or the names of the files: {tmp_path}/*.mcap')
+    (tmp_path / 'office.mcap').unlink()
+    assert [file.name for file in bag_files(tmp_path).files] == ['hall_2.mcap', 'hall_10.mcap']

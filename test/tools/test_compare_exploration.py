@@ -11,6 +11,9 @@ from support.timeouts import PROGRAM_S
 
 from benchmarks.exploration.page import page
 from thinmap_ros.evaluation.strategy_comparison import markdown, relative_saving
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.sim.world import World
+from thinmap_ros.tools.compare_exploration import _starts
 
 ROOT = Path(__file__).resolve().parents[2]
 WORLD = {
@@ -76,15 +79,19 @@ def test_the_page_has_a_section_for_each_way_of_exploring_and_names_every_fault(
     far = options | {'laser': laser | {'range_max_m': 20.0}}
     stuck = {'finished': False, 'reason': 'time limit of 20000 s', 'coverage': 0.5, 'options': far}
     reports.append(report('position_probability', 'kth-a', 1, 50.0) | stuck)
-    text = page(reports)
-    assert '## Dungeons (3): 181 beams over 180 degrees, 8 m, 0.5 m/s, poses known' in text
+    text = page([each | {'made': 'Commit 1234567'} for each in reports])
+    assert text.count('\nCommit 1234567.\n') == 2
+    assert (
+        '## Random worlds of 50 x 50 m (3): 181 beams over 180 degrees, 8 m, 0.5 m/s, poses known'
+        in text
+    )
     assert 'position_probability: 3 of 3 runs stopped by themselves' in text
     assert 'After a coverage of 99.5%, position_probability drove 10.0% of its path (mean).' in text
     assert (
         'nearest_frontier has a shorter path in 1 of 3 pairs; '
         'that of position_probability is up to 33% longer.' in text
     )
-    assert '## KTH floors (1): 181 beams over 180 degrees, 20 m' in text
+    assert '## Real floors of a university (1): 181 beams over 180 degrees, 20 m' in text
     assert '**kth-a, start 1**: time limit of 20000 s; coverage 50.00%, 0 collisions.' in text
 
 
@@ -129,7 +136,7 @@ def test_it_runs_all_writes_all_and_resumes(world: Path, tmp_path: Path) -> None
     assert '1234.5' in again.stdout
     assert files[1].stat().st_mtime_ns > stamp
     # Results of other options are not used.
-    faster = compare(*words, '--speed', '0.3')
+    faster = compare(*words, '--speed-m-s', '0.3')
     assert faster.returncode == 2
     assert 'other options' in faster.stderr
 
@@ -159,3 +166,11 @@ def test_a_cluster_gives_what_one_machine_gives(world: Path, tmp_path: Path) -> 
         for measured in ('wall_s', 'cpu_s', 'decision_ms'):
             del one[measured]
     assert reports[0] == reports[1]
+
+
+def test_starts_are_those_of_the_world_file_or_its_only_one(world: Path) -> None:
+    alone = World.from_patch(*read_world(world))
+    assert [start.tolist() for start in _starts(world, alone, 3)] == [[1.0, 1.0, 0.0]]
+    others = [[1.0, 1.0, 0.0], [3.0, 1.0, 1.5], [3.0, 2.0, 0.0]]
+    world.write_text(yaml.safe_dump(WORLD | {'starts': others}))
+    assert [start.tolist() for start in _starts(world, alone, 2)] == others[:2]

@@ -49,7 +49,7 @@ def world(tmp_path: Path) -> Path:
 def test_a_room_is_explored_and_everything_written(world: Path, tmp_path: Path) -> None:
     out = tmp_path / 'out'
     result = explore(
-        str(world), '-o', str(out), '--localization', 'slam', '--seed', '3', '--speed', '0.3'
+        str(world), '-o', str(out), '--localization', 'slam', '--seed', '2', '--speed-m-s', '0.3'
     )
     assert result.returncode == 0, result.stderr
     assert 'finished (all end nodes resolved)' in result.stdout
@@ -76,7 +76,7 @@ def test_a_room_is_explored_and_everything_written(world: Path, tmp_path: Path) 
 @pytest.mark.programs
 def test_two_robots_explore_together_and_everything_is_written(world: Path, tmp_path: Path) -> None:
     out = tmp_path / 'out'
-    result = explore(str(world), '-o', str(out), '--robots', '2', '--speed', '0.3')
+    result = explore(str(world), '-o', str(out), '--robots', '2', '--speed-m-s', '0.3')
     assert result.returncode == 0, result.stderr
     report = json.loads((out / 'report.json').read_text())
     assert report['finished'] is True
@@ -110,19 +110,25 @@ def test_a_map_without_a_start_can_be_explored_from_a_given_one(tmp_path: Path) 
     [
         (['nowhere.yaml'], 'nowhere.yaml'),
         (['atlantis'], "world 'atlantis': expected a file, or one of dead_end, "),
-        (['WORLD', '--start=1,2'], '--start=1,2: expected three numbers'),
+        (['WORLD', '--start=1'], '--start=1: expected X,Y or X,Y,THETA'),
+        (['WORLD', '--start', '-1,-1,0,0'], '--start=-1,-1,0,0: expected X,Y or X,Y,THETA'),
+        (['WORLD', '--sped-m-s', '1'], '--sped-m-s (did you mean --speed-m-s?)'),
+        (['WORLD', '--strategy', 'neerest'], "strategy = 'neerest': expected one of"),
         (['WORLD', '--start=1,nan,0'], '--start=1,nan,0: expected finite numbers'),
         (['WORLD', '--start=2.2,0.5,0'], 'expected a place where a robot'),
         (['WORLD', '--range-max-m', '-1'], 'range_max_m = -1.0: expected'),
-        (['WORLD', '--speed', '0'], 'max_speed_m_s = 0.0: expected'),
-        (['WORLD', '--kidnap-at', '5'], 'expected --localization=slam'),
+        (['WORLD', '--speed-m-s', '0'], 'speed_m_s = 0.0: expected'),
+        (['WORLD', '--kidnap-at-s', '5'], 'expected --localization=slam'),
         (['WORLD', '--robots', '0'], '--robots=0: expected 1 to 10'),
         (['WORLD', '--robots', '9'], 'expected room for 9 robots 0.8 m apart, found room for'),
         (['WORLD', '--robots', '2', '--strategy', 'paper'], 'the only one that shares candidates'),
-        (['WORLD', '--robots', '2', '--kidnap-at', '5'], '--robots=2: expected no --kidnap-at'),
-        (['WORLD', '--robots', '2', '--claim-delay', 'nan'], '--claim-delay=nan: expected 0 to'),
+        (['WORLD', '--robots', '2', '--kidnap-at-s', '5'], '--robots=2: expected no --kidnap-at-s'),
+        (
+            ['WORLD', '--robots', '2', '--claim-delay-s', 'nan'],
+            '--claim-delay-s=nan: expected 0 to',
+        ),
         (['WORLD', '--own-maps'], '--own-maps: expected --robots of 2 or more'),
-        (['WORLD', '--claim-delay', '3'], 'expected --robots of 2 or more'),
+        (['WORLD', '--claim-delay-s', '3'], 'expected --robots of 2 or more'),
     ],
 )
 def test_bad_input_is_reported_in_one_line(

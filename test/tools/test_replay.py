@@ -350,11 +350,10 @@ def test_a_clock_that_is_set_back_while_the_robot_drives_on_loses_nothing(tmp_pa
 
 @pytest.mark.programs
 @pytest.mark.parametrize(
-    'arguments', [['--slam', 'magic'], ['--resolution-m', '0'], ['--offset-m', 'nan'], []]
+    'arguments', [['--slam', 'magic'], ['--resolution-m', '0'], ['--offset-m', 'nan'], ['-x']]
 )
 def test_wrong_options_end_with_two(log, tmp_path, arguments):
-    out = [] if not arguments else ['-o', tmp_path / 'out']
-    done = run(log, *out, *arguments)
+    done = run(log, '-o', tmp_path / 'out', *arguments)
     assert done.returncode == 2
     assert 'Traceback' not in done.stderr and done.stderr.strip()
 

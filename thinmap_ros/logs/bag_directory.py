@@ -33,7 +33,7 @@ def bag_files(path: Path) -> BagFiles:
     """Files of a bag: the given file, or those of a folder.
 
     Files are found even if metadata.yaml is missing or unreadable: a killed recorder does not write
-    it. Raises InputError if there are no files.
+    it. Raises InputError if there are no files, or those of several bags.
     """
     if not path.is_dir():
         is_sqlite = path.suffixes[:1] == ['.db3']
@@ -44,9 +44,10 @@ def bag_files(path: Path) -> BagFiles:
         return _listed(path, _information(metadata))
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
         reason = f'{metadata}: {one_line_reason(error).removeprefix(f"{metadata}: ")}'
+    bare = sorted([*path.glob('*.db3'), *path.glob('*.db3.zstd')], key=_number)
+    _require_one_bag(path, found or bare)
     if found:
         return BagFiles(found, without_metadata=reason)
-    bare = sorted([*path.glob('*.db3'), *path.glob('*.db3.zstd')], key=_number)
     if bare:
         return BagFiles(bare, note=f'{reason}: its SQLite files are read without it')
     raise InputError(
@@ -57,6 +58,23 @@ def bag_files(path: Path) -> BagFiles:
 def mcap_files_in(folder: Path) -> list[Path]:
     """MCAP files of a folder in the order of recording."""
     return sorted(folder.glob('*.mcap'), key=_number)
+
+
+def _require_one_bag(folder: Path, files: list[Path]) -> None:
+    """Raises InputError where files have other names than the parts of one bag."""
+    if len({_bag_name(file) for file in files}) > 1:
+        first, second = (file.name for file in files[:2])
+        raise InputError(
+            f'{folder}: {len(files)} files of several bags ({first}, {second}, ...): expected one '
+            f'bag, or the names of the files: {folder}/*{files[0].suffix}'
+        )
+
+
+def _bag_name(file: Path) -> str:
+    """Name of the bag that a file is a part of: rosbag2 names them name_0, name_1, ..."""
+    stem = Path(file.name.removesuffix('.zstd')).stem
+    name, _, number = stem.rpartition('_')
+    return name if number.isdecimal() else stem
 
 
 def _number(file: Path) -> tuple[int, str]:

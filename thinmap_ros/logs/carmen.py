@@ -143,7 +143,7 @@ class CarmenLog:
         if is_mcap(self.path):
             raise InputError(f'{self.path}: an MCAP file, which is a bag: expected a CARMEN log')
         try:
-            with _open(self.path) as stream:
+            with open_unpacked(self.path) as stream:
                 # One byte more than the limit: no more of a longer line is ever read.
                 lines = iter(lambda: stream.readline(LOGS.line_bytes + 1), b'')
                 unread = _unpacked_bytes(self.path)
@@ -289,7 +289,8 @@ def _check_length(words: list[str], count: int, expected: str) -> None:
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[IO[bytes] | gzip.GzipFile]:
+def open_unpacked(path: Path) -> Iterator[IO[bytes] | gzip.GzipFile]:
+    """Open a log, plain or gzip, as the bytes of its text."""
     with open_regular_file(path) as stream, _unpacked(stream) as unpacked:
         yield unpacked
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.keep_out import KeepOut, KeepOutArea
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
@@ -117,6 +118,20 @@ def map_update(message: Any) -> tuple[int, int, NDArray[np.int8]]:
 
 def outline(region: Any) -> Array:
     """Outline (K, 2) of a thinmap_msgs/Region. Raises InputError where it is not finite."""
-    points = np.array([[p.x, p.y] for p in region.outline.points], dtype=np.float64).reshape(-1, 2)
+    points = corners(region.outline)
     validation.require_bounded(f'region {region.id}', points.ravel().tolist())
     return points
+
+
+def corners(polygon: Any) -> Array:
+    """Corners (K, 2) of a geometry_msgs/Polygon."""
+    return np.array([[p.x, p.y] for p in polygon.points], dtype=np.float64).reshape(-1, 2)
+
+
+def keep_out(message: Any) -> KeepOut:
+    """Areas of a thinmap_msgs/KeepOut. Raises InputError where one is invalid."""
+    areas = [
+        KeepOutArea(int(area.id), corners(area.corners), bool(area.is_wall))
+        for area in message.areas
+    ]
+    return KeepOut([area.checked() for area in areas])

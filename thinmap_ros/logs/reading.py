@@ -4,9 +4,13 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
+from thinmap_ros.core.config import config_or_default
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
+from thinmap_ros.core.validation import pose_of
+from thinmap_ros.files.paths import path_of
 from thinmap_ros.logs.carmen import LaserOptions
 from thinmap_ros.logs.log import Event, Log, OdometryEvent
 from thinmap_ros.logs.log_format import LogOptions, format_of
@@ -39,16 +43,16 @@ def open_log(
     source that a CARMEN log does not have.
     """
     options = LogOptions(
-        laser or LaserOptions(),
+        config_or_default(laser, LaserOptions),
         scan_topic,
         odometry_topic,
-        T_base_laser,
+        None if T_base_laser is None else pose_of('T_base_laser', T_base_laser),
         base_frame,
         odometry_source,
         odom_frame,
-        laser_config or LaserConfig(),
+        config_or_default(laser_config, LaserConfig),
     )
-    path = Path(path)
+    path = path_of(path)
     return format_of(path).log(path, options)
 
 
@@ -68,6 +72,8 @@ def paired_scans(log: Log) -> Iterator[tuple[Scan, Array]]:
     A scan without odometry around its stamp is left out. Another recording in the same log is left
     out with a warning (see `recording_events`). Raises InputError where the log cannot be read.
     """
+    if not hasattr(log, 'events'):
+        raise InputError(f'log = {quoted(log)}: expected a log, as of open_log')
     pairing = ScanOdometrySynchronizer(WAITING_SCANS)
     try:
         for event in recording_events(log):

@@ -9,6 +9,7 @@ from thinmap_ros.logs.bag_writer import temporary_bag
 from thinmap_ros.logs.formats import is_mcap, refuse_foreign
 from thinmap_ros.logs.repair import RepairReport, repair
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser
 
 
 def files_of(bag: Path) -> list[Path]:
@@ -56,7 +57,7 @@ def _work(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='bag_repair', description=__doc__)
+    parser = Parser('bag_repair', __doc__)
     parser.add_argument('bag', type=Path, help='MCAP file, or rosbag2 folder of MCAP files')
     parser.add_argument(
         '-o', '--out', type=Path, help='folder or .mcap file to write (default: BAG_repaired)'

@@ -9,6 +9,7 @@ from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.logs.encode import BagObjects
 from thinmap_ros.logs.log import Event, OdometryEvent
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser
 
 
 def convert(log: CarmenLog, bag: Path) -> int:
@@ -61,7 +62,7 @@ def _work(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='carmen_to_bag', description=__doc__)
+    parser = Parser('carmen_to_bag', __doc__)
     parser.add_argument('log', type=Path, help='CARMEN log, plain or gzip')
     parser.add_argument(
         'bag', type=Path, help='rosbag2 folder to write, or a file that ends in .mcap'

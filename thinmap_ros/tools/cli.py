@@ -1,7 +1,6 @@
 """Common parts of command line programs: arguments, errors in one line, exit codes."""
 
 import argparse
-import re
 import shlex
 import signal
 import sys
@@ -22,9 +21,9 @@ from thinmap_ros.logs.carmen import LaserOptions
 from thinmap_ros.logs.frames.bag_odometry import SOURCES
 from thinmap_ros.logs.frames.laser_mount import parse_laser_pose
 from thinmap_ros.logs.log import Log
+from thinmap_ros.tools.arguments import BAD_INPUT
 from thinmap_ros.tools.parameter_file import NodeParameters
 
-BAD_INPUT = 2
 INTERRUPTED = 130
 AnyConfig = TypeVar('AnyConfig', bound=Config)
 _NO_PARAMETERS = NodeParameters()
@@ -35,13 +34,8 @@ Options = argparse._ActionsContainer
 def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentParser) -> None:
     """Parse the arguments, run the work, and exit.
 
-    0, 2 after one line on what is wrong, or 130 on Ctrl-C. The program has the name by which the
-    command `thinmap` calls it, if it does.
+    0, 2 after one line on what is wrong, or 130 on Ctrl-C.
     """
-    if sys.argv[0].startswith('thinmap '):
-        parser.prog = sys.argv[0]
-    # A list of numbers may begin with a minus sign, as in --laser-pose -0.1,0,0.
-    parser._negative_number_matcher = re.compile(r'-[\d.]')
     arguments = parser.parse_args()
     _print_warnings(parser.prog)
     compilation = report_compilation()
@@ -84,16 +78,8 @@ def command_line() -> str:
 
 
 def command_of(program: str, *words: str) -> str:
-    """The command that runs a program of this package in the way this one was run, for a shell."""
-    called = Path(sys.argv[0])
-    how = [program]
-    if sys.argv[0].startswith('thinmap '):
-        how = ['thinmap', program]
-    elif is_module():
-        how = ['python', '-m', f'thinmap_ros.tools.{program}']
-    elif called.parent.name == 'thinmap_ros':  # where colcon installs programs
-        how = ['ros2', 'run', 'thinmap_ros', program]
-    return shlex.join([*how, *words])
+    """The command that runs a program of this package, for a shell."""
+    return shlex.join(['thinmap', program, *words])
 
 
 def is_module() -> bool:

@@ -26,10 +26,11 @@ from thinmap_ros.evaluation.parallel_jobs import (
 from thinmap_ros.evaluation.strategy_comparison import markdown
 from thinmap_ros.files import package_data
 from thinmap_ros.files.atomic import read_text, write_text
-from thinmap_ros.files.worlds import read_world
+from thinmap_ros.files.worlds import read_starts, read_world
 from thinmap_ros.sim.world import World
-from thinmap_ros.strategies import NAMES
+from thinmap_ros.strategies import NAMES, check_strategy
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 from thinmap_ros.tools.explore_world import WORLD_HELP, add_options, options_from
 from thinmap_ros.view import figures
 
@@ -71,7 +72,10 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
 
 
 def _starts(path: Path, world: World, count: int) -> list[Array]:
-    """First starts of a world, of worlds.json in the parent folder, or else of the world file."""
+    """First starts of a world, of worlds.json in the parent folder, or else of the world file.
+
+    That one may have several, or one.
+    """
     listing = path.resolve().parent.parent / 'worlds.json'
     key = f'{path.resolve().parent.name}/{path.stem}'
     if listing.exists():
@@ -82,6 +86,9 @@ def _starts(path: Path, world: World, count: int) -> list[Array]:
             raise InputError(
                 f'{listing}: {key}: expected starts as lists of x, y, theta'
             ) from error
+    starts = read_starts(path)[:count]
+    if len(starts):
+        return list(starts)
     if not np.isfinite(world.start).all():
         raise InputError(f'{path}: the world has no start, and there is no {listing}')
     return [world.start]
@@ -92,6 +99,9 @@ def _report_file(out: Path, job: Job) -> Path:
 
 
 def _work(arguments: argparse.Namespace) -> None:
+    for name in arguments.strategies:
+        check_strategy(name)
+    arguments.out = out_folder(arguments.out, 'comparison')
     jobs = _jobs(arguments)
     failures = run_pending(
         run_job, jobs, lambda job: _report_file(arguments.out, job), arguments, arguments.quiet
@@ -109,12 +119,21 @@ def _work(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='compare_exploration', description=__doc__)
+    parser = Parser('compare_exploration', __doc__)
     parser.add_argument('worlds', nargs='+', help=WORLD_HELP)
-    parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
-    parser.add_argument('--strategies', nargs='+', default=sorted(NAMES), choices=sorted(NAMES))
+    add_out(parser, 'out/comparison')
     parser.add_argument(
-        '--starts', type=int, default=3, help='how many of the starts in worlds.json (default 3)'
+        '--strategies',
+        nargs='+',
+        default=sorted(NAMES),
+        metavar='NAME',
+        help=f'some of {", ".join(NAMES)}, or your own as package.module:factory (default: all)',
+    )
+    parser.add_argument(
+        '--starts',
+        type=int,
+        default=3,
+        help='how many starts of a world, of worlds.json or else of the world file (default 3)',
     )
     add_run_options(parser)
     add_options(parser)

@@ -5,7 +5,6 @@ A process per node; of several robots a process per robot.
 
 import argparse
 import contextlib
-import importlib.util
 import json
 import os
 import random
@@ -15,6 +14,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +31,9 @@ from thinmap_ros.sim.other_robots import MAX_ROBOTS, starts_in
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 from thinmap_ros.tools.ros_check import require_ros
-from thinmap_ros.view import report_page
+from thinmap_ros.view import report_page, rerun_sinks
 
 # On a busy machine nodes need time to exit; a killed recorder leaves a truncated bag.
 _PATIENCE_S = 20.0
@@ -41,6 +42,7 @@ _SIM_TIME = ['-p', 'use_sim_time:=true']
 # Subscribers of the scans of a robot: simulated time waits for all of them.
 _SCAN_LISTENERS = 4
 _SLEEP_S = 0.05
+_PAGE = 'http://127.0.0.1:8480/'
 
 
 @dataclass(eq=False)
@@ -104,9 +106,10 @@ def explore(arguments: argparse.Namespace, world: Path, starts: Sequence[Array])
     out: Path = arguments.out
     processes = Processes(out / 'log')
     common = _parameters(world=world, robot=arguments.robot)
-    lockstep = _parameters(lockstep='local_topology', wait_for_subscribers=_SCAN_LISTENERS)
+    listeners = _SCAN_LISTENERS + arguments.view + arguments.web
+    lockstep = _parameters(lockstep='local_topology', wait_for_subscribers=listeners)
     clock = _parameters(real_time_factor=arguments.rate, seed=arguments.seed)
-    limit = _parameters(time_limit_s=arguments.time_limit, result=out / 'result.json')
+    limit = _parameters(time_limit_s=arguments.time_limit_s, result=out / 'result.json')
     is_team = len(starts) > 1
     where = _parameters(start=_text(starts))
     maps = []
@@ -115,14 +118,18 @@ def explore(arguments: argparse.Namespace, world: Path, starts: Sequence[Array])
         maps = _parameters(map_poses=_text(map_poses(starts)))
     try:
         if is_team:
-            _start_robots(processes, starts, arguments.speed)
+            _start_robots(processes, starts, arguments.speed_m_s)
         else:
-            _start_nodes(processes, starts[0], arguments.speed)
+            _start_nodes(processes, starts[0], arguments.speed_m_s)
         processes.start('recorder', [*_SIM_TIME, *_parameters(bag=out / 'bag')])
-        processes.start('sim', [*common, *lockstep, *clock, *where])
         if arguments.view:
             processes.start('rerun_viewer', _SIM_TIME)
+        if arguments.web:
+            processes.start('web', _SIM_TIME)
+            print(f'page at {_PAGE}', file=sys.stderr)
         processes.start('demo_monitor', [*_SIM_TIME, *common, *limit, *maps], quiet=False)
+        # The last one: what comes after the first scan is seen sooner.
+        processes.start('sim', [*common, *lockstep, *clock, *where])
         _wait(processes)
     finally:
         processes.stop()
@@ -210,8 +217,8 @@ def _starts(arguments: argparse.Namespace, file: Path) -> list[Array]:
     count = arguments.robots
     if not 1 <= count <= MAX_ROBOTS:
         raise InputError(f'--robots={count}: expected 1 to {MAX_ROBOTS}')
-    if count > 1 and arguments.view:
-        raise InputError('--view: expected --robots=1')
+    if count > 1 and (arguments.view or arguments.web):
+        raise InputError(f'--{"view" if arguments.view else "web"}: expected --robots=1')
     world = World.from_patch(*read_world(file))
     radius_m = PRESETS[arguments.robot].radius_m
     return starts_in(world, world.start, read_starts(file), count, radius_m)
@@ -219,9 +226,12 @@ def _starts(arguments: argparse.Namespace, file: Path) -> list[Array]:
 
 def _work(arguments: argparse.Namespace) -> None:
     require_ros()
-    if arguments.view and importlib.util.find_spec('rerun') is None:
-        raise InputError('--view: rerun is not installed: pip install "thinmap_ros[viewer]"')
+    if arguments.view and not rerun_sinks.is_installed():
+        raise InputError(f'--view: {rerun_sinks.ADVICE}')
+    if arguments.web and find_spec('tornado') is None:
+        raise InputError('--web: tornado is not installed: pip install tornado')
     world = package_data.world_path(arguments.world)
+    arguments.out = out_folder(arguments.out, 'demo')
     starts = _starts(arguments, world)
     signal.signal(signal.SIGTERM, _raise_interrupt)
     _prepare(arguments.out)
@@ -266,7 +276,7 @@ def _next_steps(out: Path, count: int) -> str:
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='demo', description=__doc__)
+    parser = Parser('demo', __doc__)
     parser.add_argument(
         '--world', default='room_10x10', help='world or map YAML file, or a world of the package'
     )
@@ -279,18 +289,17 @@ def main() -> None:
         default=1,
         help='number of robots, each with its own map, in one world (default 1)',
     )
-    parser.add_argument('--speed', type=float, default=0.2, help='top speed, m/s (default 0.2)')
+    parser.add_argument('--speed-m-s', type=float, default=0.2, help='top speed, m/s (default 0.2)')
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
     parser.add_argument(
         '--rate', type=float, default=5.0, help='simulated seconds a second, at most (default 5)'
     )
     parser.add_argument(
-        '--time-limit', type=float, default=0.0, help='simulated seconds, 0: none (default)'
+        '--time-limit-s', type=float, default=0.0, help='simulated seconds, 0: none (default)'
     )
-    parser.add_argument(
-        '-o', '--out', type=Path, default=Path('out/demo'), help='folder for the results (out/demo)'
-    )
+    add_out(parser, 'out/demo')
     parser.add_argument('--view', action='store_true', help='show it in rerun')
+    parser.add_argument('--web', action='store_true', help=f'show it in a browser, at {_PAGE}')
     cli.run(_work, parser)
 
 

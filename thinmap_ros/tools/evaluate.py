@@ -15,6 +15,7 @@ from thinmap_ros.evaluation.trajectory_comparison import (
 )
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser, check_place
 
 # Of a folder of replay: live poses, and the same after all corrections.
 _TRAJECTORIES = ('trajectory.tum', 'trajectory_final.tum')
@@ -49,6 +50,8 @@ def _work(arguments: argparse.Namespace) -> None:
     if not arguments.t_max_diff >= 0.0 or arguments.delta < 1:
         given = f'--t-max-diff {arguments.t_max_diff:g}, --delta {arguments.delta}'
         raise InputError(f'{given}: expected no negative time, and at least 1 pose')
+    if arguments.json is not None:
+        check_place(arguments.json)
     results = {path: _compared(path, arguments) for path in _trajectories(arguments.run)}
     for path, result in results.items():
         print(f'{path}: {result.poses} compared with {arguments.reference}')
@@ -62,7 +65,7 @@ def _work(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='evaluate', description=__doc__, epilog=_EPILOG)
+    parser = Parser('evaluate', __doc__, epilog=_EPILOG)
     parser.add_argument('run', type=Path, help='folder of a run, or FILE.tum')
     parser.add_argument('--reference', type=Path, required=True, help='FILE.tum or relations')
     parser.add_argument(

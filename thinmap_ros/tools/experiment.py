@@ -31,6 +31,7 @@ from thinmap_ros.experiments.topological_map import (
 )
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 from thinmap_ros.view.plot_writer import write_plot
 
 # In the order of the papers; the longest are started first.
@@ -99,6 +100,7 @@ def _run_all(
 
 
 def _work(arguments: argparse.Namespace) -> None:
+    arguments.out = out_folder(arguments.out, 'experiments')
     if arguments.name not in (LOGS, PAGE):
         _work_experiments(arguments)
     elif arguments.name == LOGS:
@@ -132,11 +134,11 @@ def _work_logs(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='experiment', description=__doc__)
+    parser = Parser('experiment', __doc__)
     parser.add_argument(
         'name', choices=[*EXPERIMENTS, 'all', LOGS, PAGE], help='which one; page: none'
     )
-    parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
+    add_out(parser, 'out/experiments')
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
     parser.add_argument(
         '--from-bag',

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import math
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,16 +24,18 @@ from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.other_robots import starts_side_by_side
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
-from thinmap_ros.strategies import DEFAULT, NAMES
+from thinmap_ros.strategies import DEFAULT, NAMES, check_strategy
 from thinmap_ros.team.loop import TeamLoop
 from thinmap_ros.team.radio import Trouble
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 from thinmap_ros.view import report_page
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import summary_figure
 
 MAX_ROBOTS = 10
 MAX_DELAY_S = 1000.0
+STRATEGY_HELP = f'{", ".join(NAMES)}, or your own as package.module:factory (default {DEFAULT})'
 WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's worlds"
 
 
@@ -94,16 +95,17 @@ def _start(world: World, given: str | None) -> Array:
     if given is None:
         if not np.isfinite(world.start).all():
             raise InputError(
-                f'{world.name}: the world has no start: give one with --start=X,Y,THETA'
+                f'{world.name}: the world has no start: give one with --start X,Y,THETA'
             )
         return world.start
     try:
-        x, y, theta = (float(word) for word in given.split(','))
-    except ValueError:
-        raise InputError(f'--start={given}: expected three numbers X,Y,THETA (m, m, rad)') from None
-    if not all(math.isfinite(number) for number in (x, y, theta)):
+        x, y, *theta = (float(word) for word in given.split(','))
+        start = se2.pose(x, y, *theta or (0.0,))
+    except (TypeError, ValueError):
+        raise InputError(f'--start={given}: expected X,Y or X,Y,THETA (m, m, rad)') from None
+    if not np.isfinite(start).all():
         raise InputError(f'--start={given}: expected finite numbers')
-    return se2.pose(x, y, theta)
+    return start
 
 
 def options_from(arguments: argparse.Namespace, strategy: str) -> Options:
@@ -111,26 +113,28 @@ def options_from(arguments: argparse.Namespace, strategy: str) -> Options:
     return Options(
         strategy=strategy,
         seed=arguments.seed,
-        speed_m_s=arguments.speed,
+        speed_m_s=arguments.speed_m_s,
         localization=arguments.localization,
         robot=arguments.robot,
         laser=cli.config_from(arguments, LaserScannerConfig),
-        time_limit_s=arguments.time_limit,
-        kidnap_at_s=arguments.kidnap_at,
+        time_limit_s=arguments.time_limit_s,
+        kidnap_at_s=arguments.kidnap_at_s,
     )
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the common options of runs in a simulated world."""
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
-    parser.add_argument('--speed', type=float, default=0.2, help='speed limit, m/s (default 0.2)')
+    parser.add_argument(
+        '--speed-m-s', type=float, default=0.2, help='speed limit, m/s (default 0.2)'
+    )
     parser.add_argument('--localization', default='truth', choices=('truth', 'slam'))
     parser.add_argument('--robot', default='2dx', choices=sorted(PRESETS))
     parser.add_argument(
-        '--time-limit', type=float, default=20_000.0, help='limit of simulated time, s'
+        '--time-limit-s', type=float, default=20_000.0, help='limit of simulated time, s'
     )
     parser.add_argument(
-        '--kidnap-at', type=float, help='kidnap the robot at this simulated time, s (with slam)'
+        '--kidnap-at-s', type=float, help='kidnap the robot at this simulated time, s (with slam)'
     )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     cli.add_config(parser, LaserScannerConfig, ['beams', 'field_of_view_deg', 'range_max_m'])
@@ -142,8 +146,8 @@ def _check_team(arguments: argparse.Namespace) -> None:
     if not 1 <= robots <= MAX_ROBOTS:
         raise InputError(f'--robots={robots}: expected 1 to {MAX_ROBOTS}')
     if robots == 1:
-        if arguments.claim_delay:
-            raise InputError('--claim-delay: expected --robots of 2 or more')
+        if arguments.claim_delay_s:
+            raise InputError('--claim-delay-s: expected --robots of 2 or more')
         if arguments.own_maps:
             raise InputError('--own-maps: expected --robots of 2 or more')
         return
@@ -151,21 +155,23 @@ def _check_team(arguments: argparse.Namespace) -> None:
         raise InputError(
             f'--robots={robots}: expected --strategy={DEFAULT}, the only one that shares candidates'
         )
-    if arguments.kidnap_at is not None:
-        raise InputError(f'--robots={robots}: expected no --kidnap-at')
-    if not 0.0 <= arguments.claim_delay <= MAX_DELAY_S:
+    if arguments.kidnap_at_s is not None:
+        raise InputError(f'--robots={robots}: expected no --kidnap-at-s')
+    if not 0.0 <= arguments.claim_delay_s <= MAX_DELAY_S:
         raise InputError(
-            f'--claim-delay={arguments.claim_delay:g}: expected 0 to {MAX_DELAY_S:g} s'
+            f'--claim-delay-s={arguments.claim_delay_s:g}: expected 0 to {MAX_DELAY_S:g} s'
         )
 
 
 def _work(arguments: argparse.Namespace) -> None:
     _check_team(arguments)
+    check_strategy(arguments.strategy)
+    out = out_folder(arguments.out, Path(arguments.world).stem)
     world = World.from_patch(*read_world(package_data.world_path(arguments.world)))
     options = options_from(arguments, arguments.strategy)
     if options.kidnap_at_s is not None and options.localization == 'truth':
         raise InputError(
-            '--kidnap-at: expected --localization=slam, because true poses are never lost'
+            '--kidnap-at-s: expected --localization=slam, because true poses are never lost'
         )
     start = _start(world, arguments.start)
     with ProgressBar('explore_world', arguments.quiet) as bar:
@@ -180,14 +186,14 @@ def _work(arguments: argparse.Namespace) -> None:
         else:
             radius_m = PRESETS[options.robot].radius_m
             starts = starts_side_by_side(world, start, arguments.robots, radius_m)
-            trouble = Trouble(claim_delay_s=arguments.claim_delay)
+            trouble = Trouble(claim_delay_s=arguments.claim_delay_s)
             team = TeamOptions(trouble=trouble, has_own_maps=arguments.own_maps)
             team_loop, report = explore_together(world, starts, options, team, show)
             write = partial(write_team_outputs, team_loop)
-    write(report, arguments.out)
+    write(report, out)
     how = 'finished' if report['finished'] else 'not finished'
     print(
-        f'{arguments.out}: {how} ({report["reason"]}), '
+        f'{out}: {how} ({report["reason"]}), '
         f'coverage {report["coverage"]:.1%}, {report["distance"]:.1f} m, '
         f'{report["time"]:.0f} s simulated in {report["wall_s"]:.1f} s, '
         f'{report["collisions"]} collisions'
@@ -196,11 +202,13 @@ def _work(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='explore_world', description=__doc__)
+    parser = Parser('explore_world', __doc__)
     parser.add_argument('world', help=WORLD_HELP)
-    parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
-    parser.add_argument('--strategy', default=DEFAULT, choices=sorted(NAMES))
-    parser.add_argument('--start', help="X,Y,THETA in m, m, rad; without it the world's own")
+    add_out(parser, 'out/WORLD')
+    parser.add_argument('--strategy', default=DEFAULT, metavar='NAME', help=STRATEGY_HELP)
+    parser.add_argument(
+        '--start', help="X,Y or X,Y,THETA in m, m, rad (default: the world's own start)"
+    )
     parser.add_argument(
         '--robots',
         type=int,
@@ -208,7 +216,7 @@ def main() -> None:
         help='number of robots that explore together, side by side at the start (default 1)',
     )
     parser.add_argument(
-        '--claim-delay',
+        '--claim-delay-s',
         type=float,
         default=0.0,
         help='time that a claim takes from robot to robot, s (default 0)',

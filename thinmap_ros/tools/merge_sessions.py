@@ -19,6 +19,7 @@ from thinmap_ros.files.merging import (
 )
 from thinmap_ros.files.sessions import GRID, maps_in, require_own_files, stem_of
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser, check_place
 from thinmap_ros.view.merged_figure import merged_figure
 from thinmap_ros.view.progress_bar import ProgressBar
 
@@ -64,6 +65,8 @@ def _merge(arguments: argparse.Namespace) -> MergedMap:
 
 
 def _work(arguments: argparse.Namespace) -> None:
+    for path in filter(None, (arguments.out, arguments.picture, arguments.ids)):
+        check_place(Path(path))
     require_own_files(arguments.out, GRID)  # report a wrong name before the work
     arguments.maps = [each for given in arguments.maps for each in _maps_of(given, arguments.out)]
     if arguments.picture is not None and arguments.picture.suffix != '.png':
@@ -84,9 +87,9 @@ def _work(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(
-        prog='merge_sessions',
-        description=__doc__,
+    parser = Parser(
+        'merge_sessions',
+        __doc__,
         epilog='Ends with 1, and writes nothing, if a map does not show the same place.',
     )
     parser.add_argument(

@@ -1,6 +1,5 @@
 """Parameter files of nodes (ros__parameters), for programs that run the same code without ROS."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,14 +9,11 @@ from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.slam.localizers import default_config, parameters_elsewhere
 from thinmap_ros.core.start import StartConfig
 from thinmap_ros.files.package_data import config_file
-from thinmap_ros.files.yaml import read_mapping
-from thinmap_ros.ros.foreign.tables import PACKAGES
+from thinmap_ros.ros.foreign.sections import EXPECTED, WILDCARDS, bare, is_foreign, sections
 from thinmap_ros.ros.foreign.values import is_known, translated
 
 _LOCALIZER = 'localizer'
 _STRICT = 'strict_parameters'
-_WILDCARDS = ('**', '*')
-_EXPECTED = 'a parameter file: NODE: ros__parameters: NAME: VALUE'
 AnyConfig = TypeVar('AnyConfig', bound=Config)
 
 
@@ -52,40 +48,18 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...], slam: str = '') -> N
     empty: that of the file. Raises InputError with the file name if it has
     no parameters for them, and ConfigError, with `strict_parameters`, for those that no node has.
     """
-    content = read_mapping(path, _EXPECTED)
     given: dict[str, dict[str, Any]] = {node: {} for node in nodes}
-    for key in sorted(content, key=lambda key: key.split('/')[-1] not in _WILDCARDS):
-        own = [node for node in nodes if _is_meant(key.split('/')[-1], node)]
-        values = dict(_flat(path, key, content[key])) if own else {}
-        for node in own:
-            given[node].update(values)
+    found = sections(path)
+    for section in sorted(found, key=lambda section: bare(section) not in WILDCARDS):
+        for node in nodes:
+            if bare(section) in (*WILDCARDS, node) or is_foreign(section, node):
+                given[node].update(found[section])
     if not any(given.values()):
-        raise InputError(f'{path}: no parameters of {", ".join(nodes)}: expected {_EXPECTED}')
+        raise InputError(f'{path}: no parameters of {", ".join(nodes)}: expected {EXPECTED}')
     own_values = {node: translated(node, values) for node, values in given.items()}
     if slam and _LOCALIZER in own_values:
         own_values[_LOCALIZER]['slam'] = slam
     return NodeParameters(own_values, _unknown(path, own_values))
-
-
-def _is_meant(key: str, node: str) -> bool:
-    """Whether the parameters below a name are for a node, or for the one that it replaces."""
-    replaced = any(package.name == key and node in package.nodes for package in PACKAGES)
-    return key in (*_WILDCARDS, node) or replaced
-
-
-def _flat(path: Path, key: str, tree: Any) -> Iterator[tuple[str, Any]]:
-    values = tree.get('ros__parameters') if isinstance(tree, dict) else None
-    if not isinstance(values, dict):
-        raise InputError(f'{path}: {quoted(key)}: expected {_EXPECTED}')
-    yield from _leaves(values, '')
-
-
-def _leaves(values: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f'{prefix}{name}.')
-        else:
-            yield f'{prefix}{name}', value
 
 
 def _unknown(path: Path, given: dict[str, dict[str, Any]]) -> list[str]:
@@ -110,8 +84,7 @@ def _unknown(path: Path, given: dict[str, dict[str, Any]]) -> list[str]:
 def _names_of(node: str, slam: str) -> set[str]:
     """Names of all parameters of a node; slam: as it is set."""
     file = config_file(node)
-    values = read_mapping(file, _EXPECTED)['/**']
-    names = {name for name, _ in _flat(file, '/**', values)}
+    names = set(sections(file)['/**'])
     if node != _LOCALIZER:
         return names
     own = {name for name, _, _ in parameters_of(default_config(slam))}

@@ -9,6 +9,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.experiments.drives import RECIPES, TRUTH_TOPIC, Source
@@ -19,6 +20,7 @@ from thinmap_ros.logs.encode import BagObjects
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 
 _MAP_EVERY = 300  # scans: a minute
 _TYPES = {
@@ -105,7 +107,7 @@ def _pipeline(first: DriveSample, localized: bool) -> tuple[Pipeline, list[Array
     """A pipeline for a drive from this sample, and the list for the true pose of each scan."""
     x, y, yaw = (float(number) for number in first.T_world_base)
     localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
-    config = PipelineConfig(localizer=localizer)
+    config = PipelineConfig(localizer=localizer, grid=PAPER_GRID)
     truth: list[Array] = []
 
     def known(scan: object, T_odom_base: Array) -> Estimate:
@@ -131,25 +133,24 @@ def _about(name: str, seed: int, scans: int, seconds: float, localized: bool) ->
 def _work(arguments: argparse.Namespace) -> None:
     if unknown := set(arguments.names) - set(RECIPES):
         raise InputError(f'drive {quoted(min(unknown))}: expected some of {", ".join(RECIPES)}')
+    out = out_folder(arguments.out, 'bags')
     for name in arguments.names or RECIPES:
-        path = arguments.out / f'{name}.mcap'
+        path = out / f'{name}.mcap'
         samples = list(Source(arguments.seed).samples(name))
         localized = RECIPES[name].localized
         scans = record(path, samples, localized)
         seconds = (samples[-1].scan.stamp_ns - samples[0].scan.stamp_ns) / 1e9
-        write_text(
-            arguments.out / f'{name}.txt', _about(name, arguments.seed, scans, seconds, localized)
-        )
+        write_text(out / f'{name}.txt', _about(name, arguments.seed, scans, seconds, localized))
         print(f'{path}: {scans} scans, {path.stat().st_size / 1e6:.2f} MB', flush=True)
 
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='record_bags', description=__doc__)
+    parser = Parser('record_bags', __doc__)
     parser.add_argument(
         'names', nargs='*', help=f'which drives: some of {", ".join(RECIPES)} (default: all)'
     )
-    parser.add_argument('-o', '--out', type=Path, required=True, help='folder of the bags')
+    add_out(parser, 'out/bags')
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
     cli.run(_work, parser)
 

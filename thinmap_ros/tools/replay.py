@@ -26,6 +26,7 @@ from thinmap_ros.logs.log_format import known_formats
 from thinmap_ros.pipeline import Pipeline
 from thinmap_ros.replaying import Replay
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser, add_out, check_place, out_folder
 from thinmap_ros.tools.replay_run import BATCH, options_of, replay_log
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
@@ -86,6 +87,10 @@ class ReplayView:
 
 def _work(arguments: argparse.Namespace) -> None:
     arguments.command = cli.command_line()
+    is_one = len(arguments.logs) == 1
+    arguments.out = out_folder(arguments.out, arguments.logs[0].stem if is_one else 'logs')
+    if arguments.recording:
+        check_place(arguments.recording)
     if len(arguments.logs) > 1:
         _replay_many(arguments)
     else:
@@ -226,7 +231,7 @@ def _print_notes(result: Replay) -> None:
 
 def main() -> None:
     """Run the program."""
-    parser = argparse.ArgumentParser(prog='replay', description=__doc__)
+    parser = Parser('replay', __doc__)
     parser.add_argument(
         'logs',
         type=Path,
@@ -236,7 +241,7 @@ def main() -> None:
         'summary.csv and report.html there are over all; what is done is not done again',
     )
     cli.add_log_options(parser)
-    parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
+    add_out(parser, 'out/LOG; of several logs out/logs')
     add_run_options(parser)
     parser.add_argument(
         '--params-file',

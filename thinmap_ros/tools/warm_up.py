@@ -11,11 +11,18 @@ from thinmap_ros.jit import cache
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser
 
 
 def main() -> None:
     """Run the command line."""
-    cli.run(work, argparse.ArgumentParser(prog='warm_up', description=__doc__))
+    parser = Parser('warm_up', __doc__)
+    parser.add_argument(
+        '--for-all-users',
+        action='store_true',
+        help='also leave them in the package, for other users of this install',
+    )
+    cli.run(work, parser)
 
 
 def work(arguments: argparse.Namespace) -> None:
@@ -27,7 +34,7 @@ def work(arguments: argparse.Namespace) -> None:
     world = World.from_patch(*read_world(package_data.world_path('office')))
     # A complete exploration reaches the kernels that need several targets.
     explore(world, world.start, Options(localization='slam'))
-    kept = cache.folder()
+    kept = cache.leave_beside_package() if arguments.for_all_users else cache.folder()
     print(
         f'all kernels are compiled, and cached in {kept}' if kept else 'there is no folder for them'
     )

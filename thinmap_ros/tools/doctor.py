@@ -1,0 +1,59 @@
+"""Looks at a running robot: topics, types, rates, frames and clocks, and what to do about them.
+
+Ends with 1 if something is wrong.
+"""
+
+import argparse
+import sys
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser
+from thinmap_ros.tools.ros_check import require_ros
+
+
+def _work(arguments: argparse.Namespace) -> None:
+    if not arguments.seconds > 0.0:
+        raise InputError(f'--seconds {arguments.seconds:g}: expected more than 0')
+    require_ros()
+    # Only now: the help needs no ROS.
+    from thinmap_ros.ros.robot_check import RobotNames, check_robot
+
+    names = RobotNames(
+        arguments.scan_topic,
+        arguments.odom_topic,
+        arguments.base_frame,
+        arguments.odom_frame,
+        arguments.map_frame,
+    )
+    findings = check_robot(names, arguments.seconds)
+    width = max(len(finding.what) for finding in findings)
+    for finding in findings:
+        mark = '\N{CHECK MARK}' if finding.is_good else '\N{BALLOT X}'
+        print(f'{mark} {finding.what:{width}}  {finding.seen}')
+        if not finding.is_good:
+            print(f'  {"":{width}}  {finding.advice}')
+    wrong = sum(not finding.is_good for finding in findings)
+    print(f'{wrong} of {len(findings)} are wrong' if wrong else 'all is there')
+    sys.exit(1 if wrong else 0)
+
+
+def main() -> None:
+    """Run the program."""
+    parser = Parser('doctor', __doc__)
+    parser.add_argument(
+        '--seconds', type=float, default=5.0, help='how long it listens (default 5)'
+    )
+    for name, default in (
+        ('scan-topic', 'scan'),
+        ('odom-topic', 'odom'),
+        ('base-frame', 'base_link'),
+        ('odom-frame', 'odom'),
+        ('map-frame', 'map'),
+    ):
+        parser.add_argument(f'--{name}', default=default, help=f'(default {default})')
+    cli.run(_work, parser)
+
+
+if __name__ == '__main__':
+    main()
