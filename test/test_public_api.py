@@ -1,9 +1,11 @@
 """`from thinmap_ros import ...`: the public names, without ROS."""
 
 import ast
+import os
 import subprocess
 import sys
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -86,3 +88,49 @@ def test_a_name_that_does_not_exist_is_an_attribute_error() -> None:
         _ = thinmap_ros.nothing
     with pytest.raises(ImportError):
         from thinmap_ros import nothing  # noqa: F401
+
+
+def test_what_a_notebook_shows_has_numbers_and_a_picture(tmp_path: Path) -> None:
+    slam = thinmap_ros.Pipeline()
+    log = thinmap_ros.open_log(str(ROOT / 'bags' / 'dead_end.mcap'))
+    for scan, T_odom_base in islice(thinmap_ros.paired_scans(log), 20):
+        slam.step(scan, T_odom_base)
+    patch = slam.grid.known_area()
+    graph = slam.topology.map
+    assert repr(graph) == f'TopologicalMap({len(graph.nodes)} nodes, {len(graph.edges)} edges)'
+    assert repr(slam) == f'Pipeline(20 scans, {patch!r}, {graph!r})'
+    assert repr(patch).startswith(f'GridPatch({patch.shape[0]} x ')
+    assert slam._repr_png_().startswith(b'\x89PNG')
+    thinmap_ros.plot(patch, graph, title='by hand').savefig(tmp_path / 'map.png')
+    assert (tmp_path / 'map.png').stat().st_size > 10_000
+    with pytest.raises(thinmap_ros.InputError, match='plot: a int: expected a Pipeline'):
+        thinmap_ros.plot(3)
+
+
+def test_paths_may_be_texts(tmp_path: Path) -> None:
+    stem = str(tmp_path / 'room')
+    world = str(ROOT / 'worlds' / 'room_10x10.yaml')
+    _, patch, _ = thinmap_ros.read_world(world)
+    thinmap_ros.write_map(stem, patch)
+    assert thinmap_ros.read_map(f'{stem}.yaml').shape == patch.shape
+    graph = thinmap_ros.build_topology(patch, None, thinmap_ros.TopologyConfig())
+    thinmap_ros.write_graph(f'{stem}.geojson', graph)
+    assert (tmp_path / 'room.geojson').stat().st_size > 1000
+
+
+def test_the_first_use_says_that_it_compiles(tmp_path: Path) -> None:
+    code = """
+import numpy as np
+from thinmap_ros import thin
+thin(np.ones((5, 5), dtype=np.bool_))
+"""
+    command = [sys.executable, '-c', code]
+    environment = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path / 'empty')}
+    # It says so before it compiles, which takes a while. Others test what follows.
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment
+    ) as process:
+        assert process.stderr is not None
+        first_line = process.stderr.readline()
+        process.kill()
+    assert first_line.startswith('thinmap: compiling kernels, once (1 of ')

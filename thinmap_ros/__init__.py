@@ -5,18 +5,23 @@ Each name is imported when it is first used: `import thinmap_ros` loads no libra
 It changes nothing in the process.
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.closed_loop import Options as ExplorationOptions
+    from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
     from thinmap_ros.core.errors import ConfigError, InputError, ThinmapError
     from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
-    from thinmap_ros.core.grid.occupancy import OccupancyGrid
+    from thinmap_ros.core.grid.frame import GridFrame
+    from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
     from thinmap_ros.core.grid.patch import GridPatch
+    from thinmap_ros.core.places.config import GlobalLocalizationConfig
     from thinmap_ros.core.places.global_localizer import GlobalLocalization as GlobalLocalizer
     from thinmap_ros.core.planning.graph_search import shortest_path
-    from thinmap_ros.core.scan import Scan
+    from thinmap_ros.core.scan import LaserConfig, Scan
+    from thinmap_ros.core.slam.localizer_config import LocalizerConfig
     from thinmap_ros.core.topology.builder import build as build_topology
     from thinmap_ros.core.topology.config import TopologyConfig
     from thinmap_ros.core.topology.flat import topology_from_msg
@@ -28,19 +33,30 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.files.occupancy_maps import read_map, write_map
     from thinmap_ros.files.package_data import world_path
     from thinmap_ros.files.worlds import read_world
+    from thinmap_ros.logs.carmen import LaserOptions
     from thinmap_ros.logs.reading import open_log, paired_scans
     from thinmap_ros.pipeline import Pipeline, PipelineConfig
+    from thinmap_ros.sim.laser import LaserScannerConfig
     from thinmap_ros.sim.world import World
+    from thinmap_ros.view.plotting import plot
 
 __all__ = [
     'ConfigError',
+    'EkfConfig',
     'ExplorationOptions',
     'Explorer',
     'ExplorerConfig',
+    'GlobalLocalizationConfig',
     'GlobalLocalizer',
+    'GridFrame',
     'GridPatch',
     'InputError',
+    'LaserConfig',
+    'LaserOptions',
+    'LaserScannerConfig',
+    'LocalizerConfig',
     'MergedMap',
+    'OccupancyConfig',
     'OccupancyGrid',
     'Pipeline',
     'PipelineConfig',
@@ -54,6 +70,7 @@ __all__ = [
     'merge_maps',
     'open_log',
     'paired_scans',
+    'plot',
     'read_map',
     'read_world',
     'shortest_path',
@@ -65,18 +82,25 @@ __all__ = [
 ]
 
 # The only place of the version: setup.py reads it, and a test compares the two package.xml with it.
-__version__ = '0.2.0'
+__version__ = '0.3.0'
 
 _PLACES = {
     # SLAM
     'Pipeline': 'pipeline.Pipeline',
     'PipelineConfig': 'pipeline.PipelineConfig',
+    'LocalizerConfig': 'core.slam.localizer_config.LocalizerConfig',
+    'EkfConfig': 'core.ekf_slam.ekf_localizer.EkfConfig',
+    'plot': 'view.plotting.plot',
     'Scan': 'core.scan.Scan',
     # logs
     'open_log': 'logs.reading.open_log',
+    'LaserConfig': 'core.scan.LaserConfig',
+    'LaserOptions': 'logs.carmen.LaserOptions',
     'paired_scans': 'logs.reading.paired_scans',
     # maps
     'GridPatch': 'core.grid.patch.GridPatch',
+    'GridFrame': 'core.grid.frame.GridFrame',
+    'OccupancyConfig': 'core.grid.occupancy.OccupancyConfig',
     'OccupancyGrid': 'core.grid.occupancy.OccupancyGrid',
     'read_map': 'files.occupancy_maps.read_map',
     'write_map': 'files.occupancy_maps.write_map',
@@ -92,8 +116,10 @@ _PLACES = {
     'write_graph': 'files.graphs.write_graph',
     # localization in a finished map
     'GlobalLocalizer': 'core.places.global_localizer.GlobalLocalization',
+    'GlobalLocalizationConfig': 'core.places.config.GlobalLocalizationConfig',
     # exploration, also in the simulator
     'ExplorationOptions': 'closed_loop.Options',
+    'LaserScannerConfig': 'sim.laser.LaserScannerConfig',
     'Explorer': 'core.exploration.explorer.Explorer',
     'ExplorerConfig': 'core.exploration.explorer.ExplorerConfig',
     'World': 'sim.world.World',
@@ -114,7 +140,16 @@ def _load(name: str) -> Any:
     module, _, attribute = _PLACES[name].rpartition('.')
     value = getattr(import_module(f'{__name__}.{module}'), attribute)
     globals()[name] = value
+    _report_compilation()
     return value
+
+
+def _report_compilation() -> None:
+    """Report the compilation of kernels, as programs do: with no word it looks like a fault."""
+    if f'{__name__}.jit' in sys.modules:
+        from thinmap_ros.kernels.progress import report_compilation
+
+        report_compilation()
 
 
 if not TYPE_CHECKING:  # else no type checker would find a name that does not exist

@@ -2,19 +2,20 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.config import Config, parameter, part
+from thinmap_ros.core.errors import ConfigError, quoted
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.exploration.live.drive_progress import Arrivals
 from thinmap_ros.core.exploration.live.drives import Drives
 from thinmap_ros.core.exploration.mission import Odometer
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, Strategy
-from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
@@ -78,13 +79,12 @@ class Mishap(Protocol):
 
 @dataclass
 class _Drive:
-    """The goal (3,) that the navigator has, arrivals, and the last command (v, w).
+    """The goal (3,) that the navigator has, and the last command (v, w).
 
     Speeds in m/s and rad/s. drives: what came of all of them; odometer: of the estimated poses.
     """
 
     goal: Array | None = None
-    arrivals: Arrivals = field(default_factory=Arrivals)
     drives: Drives = field(default_factory=Drives)
     odometer: Odometer = field(default_factory=Odometer)
     command: tuple[float, float] = (0.0, 0.0)
@@ -208,24 +208,13 @@ class ClosedLoop:
         if self._watch is not None:
             self._watch(self.decision, observation.T_map_base)
         self._drive.odometer.add_pose(observation.T_map_base)
-        target = self.decision.target
-        self._drive.drives.follow(target)
-        if target is None:
-            self.navigator.cancel()
-            self._drive.goal = None
-        elif self._drive.goal is None or not np.array_equal(target.goal, self._drive.goal):
-            self._drive_to(target.goal)
-
-    def _drive_to(self, goal: Array) -> None:
-        """Set the goal, as a node would: one that was reached, and stays, has failed."""
-        if self._drive.arrivals.are_repeated(goal):
-            self._drive.arrivals.clear()
-            self._drive.goal = None
-            self.navigator.cancel()
-            self._target_failed('reached, but the target stays')
-            return
+        before = self._drive.goal
+        goal = self._drive.drives.follow(self.decision.target, self.strategy)
         self._drive.goal = goal
-        self.navigator.set_goal(*(float(number) for number in goal))
+        if goal is None:
+            self.navigator.cancel()
+        elif before is None or not np.array_equal(goal, before):
+            self.navigator.set_goal(*(float(number) for number in goal))
 
     def _target_failed(self, reason: str) -> None:
         self._drive.drives.add_result(False, reason)
@@ -266,7 +255,6 @@ class ClosedLoop:
             self._target_failed(command.reason)
         if command.state == 'reached' and self._drive.goal is not None:
             self._drive.drives.add_result(True, '')
-            self._drive.arrivals.add(self._drive.goal)
         if command.state in ('failed', 'reached'):
             self._drive.goal = None
 
@@ -289,17 +277,29 @@ def ground_truth_poses(simulation: Simulation) -> Callable[[Scan, Array], Estima
 
 
 @dataclass(frozen=True)
-class Options:
-    """Options of an exploration, beside world and start."""
+class Options(Config):
+    """Options of an exploration, beside world and start. Its map has cells of 10 cm.
 
-    strategy: str = DEFAULT
-    seed: int = 0
-    speed_m_s: float = 0.2
-    localization: str = 'truth'
-    robot: str = '2dx'
-    laser: LaserScannerConfig = field(default_factory=LaserScannerConfig)
-    time_limit_s: float = 20_000.0
+    kidnap_at_s: time at which the robot is carried elsewhere (s); None: never.
+    """
+
+    strategy: str = parameter(DEFAULT, 'Exploration strategy, or package.module:factory.')
+    seed: int = parameter(0, 'Seed of all noise: the same seed gives the same result.', low=0)
+    speed_m_s: float = parameter(0.2, 'Largest speed of the robot (m/s).', low=0.01, high=10.0)
+    localization: str = parameter(
+        'truth', 'Poses by SLAM, or the true ones.', choices=('slam', 'truth')
+    )
+    robot: str = parameter('2dx', 'Simulated robot.', choices=tuple(PRESETS))
+    laser: LaserScannerConfig = part(LaserScannerConfig)
+    time_limit_s: float = parameter(
+        20_000.0, 'Simulated time after which the exploration ends (s).', low=0.0
+    )
     kidnap_at_s: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kidnap_at_s is not None and not isinstance(self.kidnap_at_s, float | int):
+            raise ConfigError(f'kidnap_at_s = {quoted(self.kidnap_at_s)}: expected a float or None')
 
 
 def make_loop(
@@ -315,7 +315,7 @@ def make_loop(
     localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=theta)
     source = ground_truth_poses(simulation) if options.localization == 'truth' else None
     # A beam without return has observed free space up to the laser's range.
-    grid = OccupancyConfig(no_return_clear_range_m=options.laser.range_max_m)
+    grid = replace(PAPER_GRID, no_return_clear_range_m=options.laser.range_max_m)
     pipeline = Pipeline(
         PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source
     )

@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from time import perf_counter
 
+from thinmap_ros.core.config import Config, config_or_default, parameter, part
 from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
+from thinmap_ros.core.errors import require_type
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class
@@ -18,19 +20,23 @@ from thinmap_ros.core.start import StartConfig
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.topology import Topology
+from thinmap_ros.core.validation import pose_of
 
 
 @dataclass(frozen=True)
-class PipelineConfig:
-    """Parameters of all stages.
+class PipelineConfig(Config):
+    """Parameters of all stages."""
 
-    scans_per_graph: number of scans between updates of the graph.
-    """
-
-    localizer: StartConfig = field(default_factory=LocalizerConfig)
-    grid: OccupancyConfig = field(default_factory=OccupancyConfig)
-    topology: TopologyConfig = field(default_factory=TopologyConfig)
-    scans_per_graph: int = 1
+    localizer: StartConfig = part(LocalizerConfig, kind=StartConfig)
+    grid: OccupancyConfig = part(OccupancyConfig)
+    topology: TopologyConfig = part(TopologyConfig)
+    scans_per_graph: int = parameter(
+        1,
+        'Scans from one update of the graph to the next. Higher: less computing time, and a graph '
+        'that follows the map later.',
+        low=1,
+        high=1_000_000,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +50,23 @@ class Pipeline:
     """Localizer, grid and topology, for every scan, as in three live nodes.
 
     `pose_source` replaces the localizer if poses are known (true poses of a simulator).
+    `resolution_m` (m a cell) is short for that of `config.grid`. `max_range_m` is the usable range
+    of the laser (m), instead of that of the scans. Raises ConfigError for a value out of range.
     """
 
     def __init__(
         self,
         config: PipelineConfig | None = None,
         pose_source: Callable[[Scan, Array], Estimate] | None = None,
+        *,
+        resolution_m: float | None = None,
+        max_range_m: float | None = None,
     ) -> None:
-        self.config = config or PipelineConfig()
+        self.config = config_or_default(config, PipelineConfig)
+        if resolution_m is not None:
+            grid = replace(self.config.grid, resolution_m=resolution_m)
+            self.config = replace(self.config, grid=grid)
+        self._laser = None if max_range_m is None else LaserConfig(max_range_m=max_range_m)
         self.localizer = localizer_class(self.config.localizer)(self.config.localizer)
         # Known poses are never corrected.
         self._mapper = Mapper(
@@ -63,6 +78,16 @@ class Pipeline:
         self.stage_seconds: dict[str, list[float]] = {}
         self._locate = pose_source or self.localizer.step
         self._consistency = ConsistencyMonitor()
+
+    def __repr__(self) -> str:
+        scans = len(self.stage_seconds.get('localizer', ()))
+        return f'Pipeline({scans} scans, {self.grid.known_area()!r}, {self.topology.map!r})'
+
+    def _repr_png_(self) -> bytes:
+        """Picture of map and graph, for notebooks."""
+        from thinmap_ros.view.plotting import plot  # matplotlib takes its time
+
+        return plot(self).png()
 
     @property
     def grid(self) -> OccupancyGrid:
@@ -80,7 +105,14 @@ class Pipeline:
         return list(self._consistency.reported.values())
 
     def step(self, scan: Scan, T_odom_base: Array) -> PipelineResult:
-        """Localize and map one scan with the odometry pose (3,) at its stamp."""
+        """Localize and map one scan with the odometry pose (3,) at its stamp.
+
+        Raises InputError where it is no scan, or no pose of finite numbers.
+        """
+        require_type('scan', scan, Scan)
+        T_odom_base = pose_of('T_odom_base', T_odom_base)
+        if self._laser is not None:
+            scan = replace(scan, max_range_m=self._laser.max_range_m)
         with self._timed('localizer'):
             estimate = self._locate(scan, T_odom_base)
             estimate = self._consistency.checked(scan, T_odom_base, estimate)

@@ -152,7 +152,13 @@ def test_what_no_field_may_hold_is_refused_by_its_name(
         what = 'local map' if kind == 'localizer' else kind
         assert str(error.value).startswith(f'{path}: saved {what}: {told}'), name
         bounded += 1
-    least = {'grid': 1, 'localizer': 5, 'topology': 6, 'exploration': 4 + (byte == LARGE)}
+    least = {
+        'grid': 1,
+        'edits': 5,
+        'localizer': 5,
+        'topology': 6,
+        'exploration': 4 + (byte == LARGE),
+    }
     assert bounded >= least.get(kind, 7)
 
 

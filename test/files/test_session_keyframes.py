@@ -11,7 +11,7 @@ from support.slam_room import drive_round_the_block
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfLocalizer
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Localizer
@@ -66,7 +66,7 @@ def half(tmp_path_factory: pytest.TempPathFactory) -> Half:
     steps = list(drive_round_the_block())
     middle = len(steps) // 2
     localizer = Localizer(START)
-    grid = CorrectableGrid(OccupancyGrid())
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
     run(localizer, grid, steps[:middle])
     grid.finish()
     stem = str(tmp_path_factory.mktemp('session') / 'block')
@@ -134,7 +134,7 @@ def test_a_session_that_is_continued_is_saved_with_all_keyframes(
 ) -> None:
     localizer = load_localizer(half.stem, half.config())
     assert isinstance(localizer, Localizer)
-    run(localizer, CorrectableGrid(OccupancyGrid()), half.rest[:60])
+    run(localizer, CorrectableGrid(OccupancyGrid(PAPER_GRID)), half.rest[:60])
     assert save_localizer(str(tmp_path / 'more'), localizer).endswith('.keyframes.npz')
     again = KEYFRAMES.load(str(tmp_path / 'more'))
     assert len(again.frames) == len(localizer.keyframes) > len(half.localizer.keyframes) + 3
@@ -153,7 +153,7 @@ def test_a_robot_that_starts_elsewhere_is_bound_to_the_keyframes_there(half: Hal
     steps = [step for step in half.first if step[0].stamp_ns >= frame.scan.stamp_ns]
     later = steps[-1][0].stamp_ns
     again = [(replace(scan, stamp_ns=later + scan.stamp_ns), *rest) for scan, *rest in steps[:80]]
-    run(localizer, CorrectableGrid(OccupancyGrid()), again)
+    run(localizer, CorrectableGrid(OccupancyGrid(PAPER_GRID)), again)
     loaded = len(half.localizer.keyframes)
     keyframes = localizer.saved_keyframes()
     assert keyframes is not None

@@ -9,8 +9,10 @@ import pytest
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.grid.edits import MapEdits
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, pose
@@ -24,6 +26,7 @@ from thinmap_ros.files.sessions import (
     GRID,
     LOCALIZER,
     TOPOLOGY,
+    load_edits,
     load_grid,
     save_grid,
     stem_of,
@@ -85,7 +88,7 @@ def assert_same(one: TopologicalMap, other: TopologicalMap) -> None:
 
 
 def test_work_continues_as_without_interruption(tmp_path: Path) -> None:
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     builder = TopologyBuilder()
     poses = way()
     drive(grid, builder, poses[:120], 0)
@@ -108,14 +111,14 @@ def test_work_continues_as_without_interruption(tmp_path: Path) -> None:
 
 
 def test_nothing_seen_yet(tmp_path: Path) -> None:
-    GRID.write(tmp_path / 'a.npz', OccupancyGrid())
+    GRID.write(tmp_path / 'a.npz', OccupancyGrid(PAPER_GRID))
     TOPOLOGY.write(tmp_path / 'b.npz', TopologyBuilder())
     assert GRID.read(tmp_path / 'a.npz').known_area().unknown.all()
     assert not TOPOLOGY.read(tmp_path / 'b.npz').map.nodes
 
 
 def test_inconsistent_states_are_reported(tmp_path: Path) -> None:
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     builder = TopologyBuilder()
     drive(grid, builder, way()[:5], 0)
     GRID.write(tmp_path / 'a.npz', grid)
@@ -133,7 +136,7 @@ def test_inconsistent_states_are_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('end', ['', '.grid.npz', '.topology.npz', '.yaml', '.pgm'])
 def test_a_session_is_named_by_its_stem_or_one_of_its_files(tmp_path: Path, end: str) -> None:
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     builder = TopologyBuilder()
     drive(grid, builder, way()[:5], 0)
     path = str(tmp_path / 'v1.2' / 'room.one') + end
@@ -148,6 +151,20 @@ def test_a_session_is_named_by_its_stem_or_one_of_its_files(tmp_path: Path, end:
     assert_same(TOPOLOGY.load(path).map, builder.map)
 
 
+def test_edits_are_saved_beside_the_grid_and_archived_where_there_are_none(tmp_path: Path) -> None:
+    grid = OccupancyGrid(PAPER_GRID)
+    drive(grid, TopologyBuilder(), way()[:5], 0)
+    path = str(tmp_path / 'a')
+    wall = np.array([[1.0, 2.0], [3.0, 4.0]])
+    edits = MapEdits(KeepOut().with_area(wall, is_wall=True))
+    assert '.edits.npz' in save_grid(path, grid, edits=edits)
+    area = load_edits(path).keep_out.areas[0]
+    assert area.is_wall and np.array_equal(area.corners, wall)
+    save_grid(path, grid)
+    assert not load_edits(path) and (tmp_path / 'a.edits.npz.old').exists()
+    assert not load_edits(str(tmp_path / 'none'))
+
+
 @pytest.mark.parametrize('path', ['', '.', '/', '.yaml', 'a\0b'])
 def test_what_names_no_session(path: str) -> None:
     with pytest.raises(InputError, match='expected the path'):
@@ -155,7 +172,7 @@ def test_what_names_no_session(path: str) -> None:
 
 
 def test_a_map_is_read_where_there_is_no_saved_grid_and_only_there(tmp_path: Path) -> None:
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     drive(grid, TopologyBuilder(), way()[:5], 0)
     write_map(tmp_path / 'a', grid.known_area())
     assert (
@@ -179,7 +196,7 @@ def test_a_map_is_read_where_there_is_no_saved_grid_and_only_there(tmp_path: Pat
 )
 def test_a_grid_of_nonsense_is_refused(wrong: dict[str, Array]) -> None:
     with pytest.raises(InputError, match=r'saved grid: (frame|tiles).*: expected'):
-        OccupancyGrid.from_state(OccupancyGrid().state() | wrong)
+        OccupancyGrid.from_state(OccupancyGrid(PAPER_GRID).state() | wrong)
 
 
 def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
@@ -187,8 +204,8 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
     world = building()
     poses = way()
     believed = [pose(T[0] + 0.004 * k, T[1] + 0.002 * k, T[2]) for k, T in enumerate(poses)]
-    drifted = OccupancyGrid()
-    corrected = OccupancyGrid()
+    drifted = OccupancyGrid(PAPER_GRID)
+    corrected = OccupancyGrid(PAPER_GRID)
     builder = TopologyBuilder()
     straight = TopologyBuilder()
     laser = LaserScanner(LaserScannerConfig(), 0)
@@ -216,7 +233,7 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
 
 def test_a_correction_before_the_first_window() -> None:
     nowhere = np.empty((0, 3))
-    rebuilt = TopologyBuilder().rebuilt(OccupancyGrid().known_area(), nowhere, nowhere)
+    rebuilt = TopologyBuilder().rebuilt(OccupancyGrid(PAPER_GRID).known_area(), nowhere, nowhere)
     assert not rebuilt.map.nodes
 
 

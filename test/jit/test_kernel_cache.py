@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -89,16 +90,24 @@ class Install:
 
     def run(self, **variables: str) -> tuple[list[str], str]:
         """Output of the program: value and folder; and its stderr."""
+        done = self._done(PROGRAM, variables)
+        return done.stdout.split(), done.stderr
+
+    def output(self, code: str) -> str:
+        """Output of another program."""
+        return self._done(code, {}).stdout
+
+    def _done(self, code: str, variables: dict[str, str]) -> 'subprocess.CompletedProcess[str]':
         environment = {**os.environ, 'PYTHONPATH': str(self.folder), 'PYTHONDONTWRITEBYTECODE': '1'}
         for name in ('NUMBA_CACHE_DIR', 'XDG_CACHE_HOME', 'HOME'):
             environment.pop(name, None)
         environment |= {'XDG_CACHE_HOME': str(self.folder / 'home'), **variables}
-        command = [sys.executable, '-c', PROGRAM]
+        command = [sys.executable, '-c', code]
         done = subprocess.run(
             command, cwd=self.folder, env=environment, capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, done.stderr
-        return done.stdout.split(), done.stderr
+        return done
 
 
 @pytest.fixture
@@ -109,7 +118,7 @@ def install(tmp_path: Path) -> Install:
 def test_the_first_run_reports_that_it_compiles_and_later_ones_do_not(install: Install) -> None:
     (value, folder), said = install.run()
     assert value == '6.0'
-    assert folder == str(install.package / '__pycache__' / 'kernels')
+    assert Path(folder).parent == install.folder / 'home' / 'thinmap'
     first, last = said.splitlines()
     assert first == 'thinmap: compiling kernels, once (1 of 1)'
     assert last.startswith('thinmap: kernels compiled in ')
@@ -172,15 +181,57 @@ def test_a_named_tuple_with_other_fields_is_another_type(install: Install) -> No
     assert 'compiling' in said
 
 
-def test_a_read_only_install_keeps_them_in_the_cache_of_the_user(install: Install) -> None:
-    install.close_to_writing()
-    (value, folder), _ = install.run()
-    assert value == '6.0'
-    assert Path(folder).parent == install.folder / 'home' / 'thinmap'
-    assert install.run() == (['6.0', folder], '')
+def test_installs_with_equal_code_share_them_and_others_keep_theirs(tmp_path: Path) -> None:
+    """As of clones of one repository, or of a clone and a wheel."""
+    one, equal, other = (Install(tmp_path / name) for name in ('one', 'equal', 'other'))
+    other.set_gain(5.0)
+    home = {'XDG_CACHE_HOME': str(tmp_path / 'home')}
+    assert 'compiling' in one.run(**home)[1]
+    assert equal.run(**home) == one.run(**home)
+    assert equal.run(**home)[1] == ''
+    (value, _), said = other.run(**home)
+    assert (value, 'compiling' in said) == ('15.0', True)
+    for install, value in ((one, '6.0'), (equal, '6.0'), (other, '15.0')):
+        assert (install.run(**home)[0][0], install.run(**home)[1]) == (value, '')
 
 
-def test_without_a_home_they_are_kept_among_the_temporary_files(install: Install) -> None:
+def test_processes_that_compile_at_the_same_time_leave_whole_kernels(tmp_path: Path) -> None:
+    installs = [Install(tmp_path / str(number)) for number in range(4)]
+    for install in installs[2:]:
+        install.set_gain(5.0)
+    home = {'XDG_CACHE_HOME': str(tmp_path / 'home')}
+    with ThreadPoolExecutor(len(installs)) as pool:
+        first = list(pool.map(lambda install: install.run(**home)[0][0], installs))
+    assert first == ['6.0', '6.0', '15.0', '15.0']
+    for install, value in zip(installs, first, strict=True):
+        ((found, _), said) = install.run(**home)
+        assert (found, said) == (value, '')
+
+
+def test_no_more_than_eight_versions_of_a_kernel_are_kept(tmp_path: Path) -> None:
+    for number in range(10):
+        for ending in ('nbi', '0.nbc'):
+            file = tmp_path / f'module.name.{number}.{ending}'
+            file.touch()
+            os.utime(file, (number, number))
+    (tmp_path / 'module.other.0.nbi').touch()
+    cache._forget_old(tmp_path, 'module.name')
+    left = {file.name for file in tmp_path.glob('module.name.*.nbi')}
+    assert left == {f'module.name.{number}.nbi' for number in range(2, 10)}
+    assert len(list(tmp_path.glob('*.nbc'))) == 8
+    assert (tmp_path / 'module.other.0.nbi').exists()
+
+
+def test_without_a_home_they_are_kept_beside_the_package(install: Install) -> None:
+    beside = str(install.package / '__pycache__' / 'kernels')
+    (value, folder), _ = install.run(XDG_CACHE_HOME='/dev/null/home')
+    assert (value, folder) == ('6.0', beside)
+    assert install.run(XDG_CACHE_HOME='/dev/null/home') == (['6.0', folder], '')
+
+
+def test_a_read_only_install_without_a_home_keeps_them_among_temporary_files(
+    install: Install,
+) -> None:
     install.close_to_writing()
     variables = {'XDG_CACHE_HOME': '/dev/null/home', 'TMPDIR': str(install.folder)}
     (value, folder), _ = install.run(**variables)
@@ -215,19 +266,17 @@ def test_the_folder_of_numba_itself_comes_first(install: Install) -> None:
 
 def test_a_folder_of_numba_that_cannot_be_written_to_is_passed_over(install: Install) -> None:
     (value, folder), _ = install.run(NUMBA_CACHE_DIR='/dev/null/chosen')
-    assert (value, folder) == ('6.0', str(install.package / '__pycache__' / 'kernels'))
+    assert (value, Path(folder).parent) == ('6.0', install.folder / 'home' / 'thinmap')
 
 
-def test_what_was_compiled_at_install_time_is_taken_over(
-    install: Install, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An administrator ran warm_up; the users of the read-only install need not compile."""
+def test_what_an_administrator_compiled_is_taken_over(install: Install) -> None:
+    """With `warm_up --for-all-users`; the users of the read-only install need not compile."""
+    code = 'from thinmap_ros.jit import cache\nprint(cache.leave_beside_package())'
     install.run()
     beside = install.package / '__pycache__' / 'kernels'
-    monkeypatch.setattr(cache, 'BESIDE_PACKAGE', beside)
-    folder = cache._seeded(install.folder / 'home')
+    assert install.output(code) == f'{beside}\n'
+    (value, folder), said = install.run(XDG_CACHE_HOME=str(install.folder / 'user'))
+    assert (value, said) == ('6.0', '')
     names = {file.relative_to(beside) for file in beside.rglob('*.nb[ic]')}
     assert names
-    assert {file.relative_to(folder) for file in folder.rglob('*.nb[ic]')} == names
-    assert list(folder.parent.iterdir()) == [folder]
-    assert install.run(NUMBA_CACHE_DIR=str(folder)) == (['6.0', str(folder)], '')
+    assert {file.relative_to(folder) for file in Path(folder).rglob('*') if file.is_file()} == names

@@ -31,6 +31,15 @@ def test_a_terminal_has_one_line_with_share_and_text():
     assert 'replay:  99%' in shown and '99 of 100 scans' in shown
 
 
+@pytest.mark.parametrize('stream', [Terminal(), io.StringIO()])
+def test_lines_that_stay(stream):
+    with ProgressBar('runs', stream=stream) as bar:
+        bar.show(0.5, '1 of 2')
+        bar.write('office: no such world')
+    lines = [line.rsplit('\r')[-1] for line in stream.getvalue().splitlines()]
+    assert 'office: no such world' in lines
+
+
 def test_a_terminal_shows_counts_without_a_total():
     terminal = Terminal()
     with ProgressBar('replay', stream=terminal) as bar:

@@ -195,12 +195,12 @@ def test_viewer_is_sent_what_the_file_holds_and_ends_with_the_view(tmp_path, mon
     view = View(tmp_path / 'a.rrd', spawn=True)
     viewer = view._streams.viewer
     for i in range(10):
-        view.scalar(START + i * S, 'progress', 'coverage, %', 10.0 * i)
+        view.scalar(START + i * S, 'progress', 'seen, m2', 10.0 * i)
     assert viewer.poll() is None
     view.close()
     assert viewer.poll() is not None
     rows, _ = read_back(tmp_path / 'a.rrd')
-    assert sum(seconds is not None for seconds, _ in rows['/plots/progress/coverage_percent']) == 10
+    assert sum(seconds is not None for seconds, _ in rows['/plots/progress/seen_m2']) == 10
     # It is killed without finishing its file: only its connection matters.
     assert received.stat().st_size > 0
 
@@ -262,7 +262,9 @@ except InputError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, cwd=ROOT)
-    assert done.stdout == 'rerun is not installed: pip install "thinmap_ros[viewer]"\n', done.stderr
+    assert done.stdout == "rerun is not installed: pip install 'rerun-sdk>=0.41,<0.42'\n", (
+        done.stderr
+    )
 
 
 def test_null_view_takes_all_that_a_view_takes():
@@ -313,6 +315,32 @@ def test_step_times_are_those_of_the_robot_that_is_shown():
         'diagnostics', stamped(status=[plain(name=name, values=[rate, pair]) for name in names])
     )
     assert diary.numbers == [('step', 'graph update', 12.5)]
+
+
+def test_the_area_seen_never_falls_within_an_exploration():
+    diary = Diary()
+    feed = MessageView(diary, lambda frame: None)
+    for distance_m, known_m2 in ((0.0, 5.0), (1.0, 9.0), (2.0, 8.5), (0.0, 6.0)):
+        target = {'target_position': plain(x=0.0, y=0.0), 'has_target': False}
+        progress = {'distance_m': distance_m, 'known_area_m2': known_m2}
+        feed.show('exploration_status', stamped(end_nodes_remaining=1, **target, **progress))
+    seen = [value for _, curve, value in diary.numbers if curve == 'seen, m2']
+    assert seen == [5.0, 9.0, 9.0, 6.0]
+
+
+@needs_rerun
+def test_curves_that_are_always_zero_are_not_shown(tmp_path):
+    view = View(tmp_path / 'a.rrd')
+    for i, nodes in enumerate([0.0, 0.0, 3.0, 0.0]):
+        view.scalar(START + i * S, 'count', 'features', 0.0)
+        view.scalar(START + i * S, 'count', 'nodes', nodes)
+    view.close()
+    rows, _ = read_back(tmp_path / 'a.rrd')
+    nodes = [(s, v['Scalars:scalars']) for s, v in rows['/plots/count/nodes'] if s is not None]
+    assert nodes == [(0.0, [0.0]), (2.0, [3.0]), (3.0, [0.0])]
+    assert all(seconds is None for seconds, _ in rows['/plots/count/features'])
+    legend = rows['/legends/count'][-1][1]['TextDocument:text']
+    assert legend == ['- **pink** nodes']
 
 
 def test_local_area_is_where_its_features_are_stored():

@@ -67,22 +67,23 @@ def test_maps_of_any_size_make_a_picture_of_ordinary_size(picture, shape):
     assert WALL in found
 
 
-def test_a_map_that_was_not_measured_is_drawn_cell_by_cell(picture):
-    cells = np.full((20, 20), -1, dtype=np.int8)
-    cells[:, :10] = 0
-    cells[:, 10:14] = 100
+def test_cells_are_drawn_as_they_are(picture):
+    """A doubled wall stays doubled: it is what the picture is looked at for."""
+    cells = np.zeros((20, 20), dtype=np.int8)
     dark = []
-    for is_measured in (True, False):
+    for columns in ([10], [10, 12], [10, 11, 12]):
+        cells[:, columns] = 100
         summary_figure(
             picture,
             GridPatch(GridFrame(0.0, 0.0, 0.1), cells),
             TopologicalMap(),
             np.empty((0, 2)),
-            is_measured=is_measured,
         )
         with Image.open(picture) as drawn:
             dark.append(int((np.asarray(drawn.convert('L')) == 0).sum()))
-    assert dark[1] > 2 * dark[0]
+    one_column = dark[1] - dark[0]
+    assert one_column > 10_000
+    assert dark[2] - dark[1] == pytest.approx(one_column, rel=0.1)
 
 
 def test_the_same_picture_has_the_same_bytes(tmp_path):

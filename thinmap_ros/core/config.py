@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, TypeVar
 
-from thinmap_ros.core.errors import ConfigError, quoted
+from thinmap_ros.core.errors import ConfigError, quoted, with_article
 
 SAFE_LOWER = 'lower'
 SAFE_HIGHER = 'higher'
@@ -67,9 +67,12 @@ def laser_range_noise() -> Any:
     )
 
 
-def part(config: type['Config']) -> Any:
-    """Declare a field of a Config that is itself a Config, with its defaults."""
-    return dataclasses.field(default_factory=config)
+def part(config: type['Config'], kind: type['Config'] | None = None) -> Any:
+    """Declare a field of a Config that is itself a Config, with its defaults.
+
+    kind: what the field may hold; None: configurations of the class of the default.
+    """
+    return dataclasses.field(default_factory=config, metadata={'kind': kind or config})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,8 +84,11 @@ class Config:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
             if is_parameter(field):
-                _check(field, getattr(self, field.name))
+                _check(field, value)
+            elif 'kind' in field.metadata:
+                _require_kind(field.name, value, field.metadata['kind'])
 
 
 def is_parameter(field: 'dataclasses.Field[Any]') -> bool:
@@ -91,6 +97,17 @@ def is_parameter(field: 'dataclasses.Field[Any]') -> bool:
 
 
 AnyConfig = TypeVar('AnyConfig', bound=Config)
+
+
+def config_or_default(config: AnyConfig | None, kind: type[AnyConfig]) -> AnyConfig:
+    """The configuration that a caller gives, or that of the defaults for None.
+
+    Raises ConfigError where it is none of this kind.
+    """
+    if config is None:
+        return kind()
+    _require_kind('config', config, kind)
+    return config
 
 
 def parameters_of(config: Config) -> Iterator[tuple[str, 'dataclasses.Field[Any]', Any]]:
@@ -176,11 +193,16 @@ def _is_shared(field: 'dataclasses.Field[Any]') -> bool:
     return bool(field.metadata.get('shared'))
 
 
+def _require_kind(name: str, value: object, kind: type[Config]) -> None:
+    if not isinstance(value, kind):
+        raise ConfigError(f'{name} = {quoted(value)}: expected {with_article(kind.__name__)}')
+
+
 def _check(field: 'dataclasses.Field[Any]', value: Any) -> None:
     low, high, choices = (field.metadata[key] for key in ('low', 'high', 'choices'))
     if not _same_type(value, field.default):
         expected = type(field.default).__name__
-        raise ConfigError(f'{field.name} = {quoted(value)}: expected a {expected}')
+        raise ConfigError(f'{field.name} = {quoted(value)}: expected {with_article(expected)}')
     if choices is not None and value not in choices:
         raise ConfigError(f'{field.name} = {quoted(value)}: expected one of {", ".join(choices)}')
     require_number(field.name, value, low, high)

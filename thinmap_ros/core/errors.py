@@ -21,6 +21,18 @@ class ConfigError(ThinmapError):
     """A parameter outside its range: the message names it, the value, and what was expected."""
 
 
+def require_type(what: str, value: object, *kinds: type) -> None:
+    """Raise InputError unless a value is of one of some types; what: the value's name."""
+    if not isinstance(value, kinds):
+        names = ' or '.join(kind.__name__ for kind in kinds if kind is not type(None))
+        raise InputError(f'{what} = {quoted(value)}: expected {with_article(names)}')
+
+
+def with_article(noun: str) -> str:
+    """A noun with its article: a Scan, an OccupancyGrid."""
+    return f'{"an" if noun[:1] in "AEIOUaeiou" else "a"} {noun}'
+
+
 def counted(count: int, noun: str) -> str:
     """A number and its noun, which gets an s unless there is one: 1 line, 2 lines."""
     return f'{count} {noun}{"" if count == 1 else "s"}'

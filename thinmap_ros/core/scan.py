@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.config import Config, config_or_default, parameter
+from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 
@@ -109,18 +109,21 @@ class Scan:
         Raises InputError if the geometry is invalid: NaN angles, an increment of 0, an empty or
         negative range interval, a laser pose that is not finite or beyond MAX_MOUNT_OFFSET_M.
         """
-        ranges = np.asarray(ranges_m, dtype=np.float32).astype(np.float64)
-        first, step, low, high = (
-            float(np.float32(v))
-            for v in (angle_min_rad, angle_increment_rad, range_min_m, range_max_m)
-        )
-        mount = np.zeros(3) if T_base_laser is None else np.asarray(T_base_laser, dtype=np.float64)
+        try:
+            ranges = np.asarray(ranges_m, dtype=np.float32).astype(np.float64)
+            first, step, low, high = (
+                float(np.float32(v))
+                for v in (angle_min_rad, angle_increment_rad, range_min_m, range_max_m)
+            )
+            mount = np.asarray(np.zeros(3) if T_base_laser is None else T_base_laser, np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f'scan: {one_line_reason(error)}: expected numbers') from error
         try:
             _require_geometry(ranges, first, step, low, high)
             _require_mount(mount)
         except InputError as error:
             raise InputError(f'scan at {stamp_ns} ns: {error}') from error
-        laser = laser or LaserConfig()
+        laser = config_or_default(laser, LaserConfig)
         if not np.isfinite([time_increment_s, scan_time_s]).all():
             time_increment_s = scan_time_s = 0.0
         is_at_end = laser.scan_stamp == AT_END
@@ -239,11 +242,12 @@ def _require_geometry(ranges: Array, first: float, step: float, low: float, high
 
 def _require_mount(T_base_laser: Array) -> None:
     """Raise InputError unless the pose of a laser (3,) is one on a robot."""
-    if se2.is_finite(T_base_laser) and np.abs(T_base_laser[:2]).max() <= MAX_MOUNT_OFFSET_M:
+    is_pose = T_base_laser.shape == (3,) and se2.is_finite(T_base_laser)
+    if is_pose and np.abs(T_base_laser[:2]).max() <= MAX_MOUNT_OFFSET_M:
         return
-    mount = ', '.join(f'{value:g}' for value in T_base_laser.tolist())
+    mount = ', '.join(f'{value:g}' for value in T_base_laser.ravel())
     raise InputError(
-        f'laser mounted at {mount}: expected finite numbers, at most {MAX_MOUNT_OFFSET_M:g} m'
+        f'laser mounted at {mount}: expected three finite numbers, at most {MAX_MOUNT_OFFSET_M:g} m'
     )
 
 

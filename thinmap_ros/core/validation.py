@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import MAX_QUOTE_LENGTH, InputError
+from thinmap_ros.core.errors import MAX_QUOTE_LENGTH, InputError, quoted
 
 MAX_COORDINATE_M = se2.MAX_COORDINATE_M
 MAX_ANGLE_RAD = 4.0 * np.pi
@@ -17,6 +17,17 @@ MAX_BEAMS = 200_000
 # interval as angle_max.
 _ROUNDING = 0.005
 _INTERVALS = 1.0
+
+
+def pose_of(what: str, value: object) -> se2.Array:
+    """A pose (3,) of a caller: x, y (m) and heading (rad). Raises InputError for anything else."""
+    try:
+        pose = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        pose = np.empty(0)
+    if pose.shape != (3,) or not se2.is_finite(pose):
+        raise InputError(f'{what} = {quoted(value)}: expected x, y (m) and heading (rad), finite')
+    return pose
 
 
 def require_bounded(what: str, values: Iterable[float], limit: float = MAX_COORDINATE_M) -> None:

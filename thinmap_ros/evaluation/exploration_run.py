@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
+from thinmap_ros.core.config import config_or_default
+from thinmap_ros.core.errors import require_type
 from thinmap_ros.core.exploration.strategy import Decision
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.validation import pose_of
 from thinmap_ros.evaluation.exploration_metrics import (
     EndNodeCensus,
     TargetLog,
@@ -25,10 +28,16 @@ from thinmap_ros.sim.world import World
 def explore(
     world: World,
     start: Array,
-    options: Options,
+    options: Options | None = None,
     show: Callable[[float, float], None] = no_progress,
 ) -> tuple[ClosedLoop, dict[str, Any]]:
-    """Explore a world from a start (3,); returns the finished loop and the report."""
+    """Explore a world from a start (3,); returns the finished loop and the report.
+
+    Raises InputError where it is no world or the start no pose, ConfigError for other options.
+    """
+    require_type('world', world, World)
+    start = pose_of('start', start)
+    options = config_or_default(options, Options)
     census = EndNodeCensus()
     targets = TargetLog()
 

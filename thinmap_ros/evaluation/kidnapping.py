@@ -115,7 +115,7 @@ class Kidnapping:
         fits = [world.is_clear(x, y, clearance_m) for x, y in at.tolist()]
         if not any(fits):
             raise InputError(
-                f'--kidnap-at={self._at_s:g}: no mapped place is {_CRITERIA.far_m:g} m away: '
+                f'--kidnap-at-s={self._at_s:g}: no mapped place is {_CRITERIA.far_m:g} m away: '
                 'expected a later time'
             )
         rng = np.random.default_rng(self._seed)

@@ -85,7 +85,7 @@ _HEAD = """\
 
 {provenance}
 
-`scripts/experiment all --docs docs` runs all experiments and generates this page. The robots
+{chart}`scripts/experiment all --docs docs` runs all experiments and generates this page. The robots
 are simulated with realistic noise. The last section replays logs of real robots. The same seed
 gives the same numbers, except for times. `scripts/experiment NAME` runs one experiment. With
 `--from-bag bags` it reads the recorded drives instead of the simulator; poses agree within 1 mm.
@@ -94,6 +94,7 @@ Papers: 1 thinning-based topological maps, 2 exploration by position probability
 topological information. The column *confirmed* compares the result with that of the paper; it is
 empty if the paper gives no number.
 """
+_OPENING = ('strategies', 'distance')
 # Experiment and comparison that decide about a claim, the claim, and a note.
 _CLAIMS = (
     (
@@ -153,19 +154,34 @@ def write_markdown(out: Path, names: list[str], docs: Path) -> Path:
 
     Returns its path.
     """
-    parts = [_HEAD.format(provenance=provenance(out)), *_claims(out, names)]
+    parts = [_HEAD.format(provenance=provenance(out), chart=_first_chart(out, names))]
+    parts += _claims(out, names)
     for name in names:
         about = read_about(out, name)
         parts.append(f'## {about["title"]}\n\n*{about["source"]}.* {about["how"]} (`{name}`)\n')
         if about['comparisons']:
             parts.append(_markdown_rows(about['comparisons']))
         for plot in about['plots']:
-            picture = f'images/papers/{name}_{plot["name"]}.png'
-            write_small_png(out / name / f'{plot["name"]}.png', docs / picture)
-            parts.append(f'![{plot["caption"]}](../{picture})\n\n*{plot["caption"]}*\n')
+            write_small_png(out / name / f'{plot["name"]}.png', docs / _picture(name, plot))
+            parts.append(_figure(name, plot))
     page = docs / 'results' / 'papers.md'
     write_text(page, '\n'.join(parts))
     return page
+
+
+def _first_chart(out: Path, names: list[str]) -> str:
+    """Markdown of the chart that the page opens with: strategies beside each other; or nothing."""
+    name, wanted = _OPENING
+    plots = read_about(out, name)['plots'] if name in names else []
+    return ''.join(f'{_figure(name, plot)}\n' for plot in plots if plot['name'] == wanted)
+
+
+def _picture(name: str, plot: dict[str, Any]) -> str:
+    return f'images/papers/{name}_{plot["name"]}.png'
+
+
+def _figure(name: str, plot: dict[str, Any]) -> str:
+    return f'![{plot["caption"]}](../{_picture(name, plot)})\n\n*{plot["caption"]}*\n'
 
 
 def _markdown_rows(comparisons: list[dict[str, Any]]) -> str:

@@ -4,7 +4,6 @@ import argparse
 import json
 import os
 import signal
-import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -16,10 +15,9 @@ from pathlib import Path
 from threading import Thread
 from typing import Any, Protocol, TypeVar
 
-from tqdm import tqdm
-
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
 from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.view.progress_bar import ProgressBar
 
 Report = dict[str, Any]
 
@@ -76,14 +74,15 @@ def run_pending(
     missing = [job for job in jobs if not file_of(job).exists()]
     done = len(jobs) - len(missing)
     failures: dict[str, Failure] = {}
-    with tqdm(total=len(jobs), initial=done, unit='run', disable=quiet) as bar:
+    with ProgressBar('runs', quiet) as bar:
         for job, outcome in _outcomes(work, missing, arguments) if missing else ():
             if isinstance(outcome, Failure):
                 failures[job.name] = outcome
-                bar.write(f'{job.name}: {outcome.reason}\n{outcome.trace}'.rstrip(), sys.stderr)
+                bar.write(f'{job.name}: {outcome.reason}\n{outcome.trace}'.rstrip())
             else:
                 write_text(file_of(job), json.dumps(outcome) + '\n')
-            bar.update()
+            done += 1
+            bar.show(done / len(jobs), f'{done} of {len(jobs)}')
     return failures
 
 

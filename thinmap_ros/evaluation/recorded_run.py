@@ -170,10 +170,7 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     if rerun_sinks.is_installed():
         recording_from_bag(out / 'bag', out / 'recording.rrd')
     else:
-        print(
-            'no recording.rrd: rerun is not installed (pip install "thinmap_ros[viewer]")',
-            file=sys.stderr,
-        )
+        print(f'no recording.rrd: {rerun_sinks.ADVICE}', file=sys.stderr)
     write_text(out / 'report.json', json.dumps(report, indent=2) + '\n')
     return report
 

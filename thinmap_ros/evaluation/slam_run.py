@@ -7,6 +7,7 @@ from time import process_time
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizers import config_class
 from thinmap_ros.pipeline import Pipeline, PipelineConfig, PipelineResult
@@ -67,7 +68,7 @@ def run_drive(
             x, y, yaw = (float(v) for v in sample.T_world_base)
             kind = config_class(slam)
             config = kind(slam=slam, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
-            run = Run(Pipeline(PipelineConfig(localizer=config)))
+            run = Run(Pipeline(PipelineConfig(localizer=config, grid=PAPER_GRID)))
             start = sample
         began = process_time()
         step = run.pipeline.step(sample.scan, sample.T_odom_base)

@@ -4,29 +4,28 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from thinmap_ros.core.se2 import Array
 
 Report = dict[str, Any]
 OURS = 'position_probability'
-_NORMAL_95 = 1.96
+_UPPER_95 = 0.975  # two-sided
 _COMPLETE = 0.95  # coverage below which a path is short because much is missing
 
 
 def markdown(reports: list[Report]) -> str:
     """Tables of means (and spread over runs) by strategy, and of paired relative savings."""
-    by_strategy: dict[str, dict[tuple[str, int], Report]] = defaultdict(dict)
-    for report in reports:
-        by_strategy[report['strategy']][report['world'], report['start_number']] = report
+    runs_of = by_strategy(reports)
     lines = [
         '| strategy | runs | stopped by itself | coverage, least / mean | collisions '
         '| distance (m) | time (s) | turns (rad) | reversals per 100 m | decision (ms) '
         '| times real time |',
         '|---|---|---|---|---|---|---|---|---|---|---|',
     ]
-    lines += [_row(name, list(runs.values())) for name, runs in sorted(by_strategy.items())]
-    others = sorted(set(by_strategy) - {OURS})
-    if OURS in by_strategy and others:
+    lines += [_row(name, list(runs.values())) for name, runs in sorted(runs_of.items())]
+    others = sorted(set(runs_of) - {OURS})
+    if OURS in runs_of and others:
         lines += [
             '',
             f'Difference of {OURS} to each other strategy, paired by world and start, where both '
@@ -36,8 +35,16 @@ def markdown(reports: list[Report]) -> str:
             '| against | pairs | distance | time | turns | shorter distance in |',
             '|---|---|---|---|---|---|',
         ]
-        lines += [_paired(name, by_strategy[OURS], by_strategy[name]) for name in others]
+        lines += [_paired(name, runs_of[OURS], runs_of[name]) for name in others]
     return '\n'.join(lines) + '\n'
+
+
+def by_strategy(reports: list[Report]) -> dict[str, dict[tuple[str, int], Report]]:
+    """Reports by strategy, and by world and number of the start."""
+    found: dict[str, dict[tuple[str, int], Report]] = defaultdict(dict)
+    for report in reports:
+        found[report['strategy']][report['world'], report['start_number']] = report
+    return dict(found)
 
 
 def relative_saving(
@@ -53,8 +60,12 @@ def relative_saving(
 
 
 def half_interval_95(values: Array) -> float:
-    """Half the width of the 95 % confidence interval of the mean of two or more values (N,)."""
-    return float(_NORMAL_95 * values.std(ddof=1) / np.sqrt(len(values)))
+    """Half the width of the 95 % confidence interval of the mean of two or more values (N,).
+
+    By Student's t: few values say little about their own spread.
+    """
+    quantile = stdtrit(len(values) - 1, _UPPER_95)
+    return float(quantile * values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def _row(name: str, runs: list[Report]) -> str:

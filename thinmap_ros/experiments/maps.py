@@ -5,19 +5,19 @@ from collections.abc import Iterable
 import numpy as np
 
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.experiments.drives import world_of
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.sim.surfaces import inside_of
 from thinmap_ros.sim.world import World
 
-CELL_M = OccupancyConfig().resolution_m
+CELL_M = PAPER_GRID.resolution_m
 
 
 def grid_of(samples: Iterable[DriveSample]) -> OccupancyGrid:
     """Grid of scans at their true poses."""
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     for sample in samples:
         grid.add_scan(sample.scan, sample.T_world_base)
     return grid

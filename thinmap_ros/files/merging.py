@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from thinmap_ros.core.errors import InputError, ThinmapError
+from thinmap_ros.core.errors import InputError, ThinmapError, quoted
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.recognition.decision import JOIN_ODDS, recognize
 from thinmap_ros.core.regions.tracker import RegionTracker
@@ -15,6 +15,7 @@ from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, b
 from thinmap_ros.files import sessions
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.occupancy_maps import Report, read_map, warn
+from thinmap_ros.files.paths import path_of
 from thinmap_ros.files.sessions import EXPLORATION, GRID, KEYFRAMES, LOCALIZER, REGIONS, TOPOLOGY
 
 MIN_MAPS = 2
@@ -78,7 +79,7 @@ class MergedMap:
 
 
 def merge_maps(
-    paths: Sequence[str],
+    paths: Sequence[str | Path],
     join_odds: float = JOIN_ODDS,
     report: Report = warn,
     progress: Callable[[float, str], None] = lambda _share, _text: None,
@@ -90,15 +91,18 @@ def merge_maps(
     Raises InputError where a map cannot be read, NotTheSamePlaceError where one has no place in the
     others: each must show some 20 m of path through what another one shows.
     """
-    if len(paths) < MIN_MAPS or len(set(paths)) < len(paths):
-        raise InputError(f'{" ".join(paths)}: expected two different maps or more')
+    if isinstance(paths, str | Path) or not isinstance(paths, Sequence):
+        raise InputError(f'paths = {quoted(paths)}: expected a list of paths')
+    names = [str(path_of(path)) for path in paths]
+    if len(names) < MIN_MAPS or len(set(names)) < len(names):
+        raise InputError(f'{" ".join(names)}: expected two different maps or more')
     if not join_odds > 1.0:
         raise InputError(f'join odds {join_odds:g}: expected more than 1')
-    maps = {path: read_piece(path, report) for path in paths}
+    maps = {name: read_piece(name, report) for name in names}
     merging = _Merging(maps, join_odds, progress)
     while merging.waiting:
         merging.join_next()
-    regions = REGIONS.load_optional(paths[0]) or RegionTracker()
+    regions = REGIONS.load_optional(names[0]) or RegionTracker()
     regions.update(merging.known.patch)
     return MergedMap(merging.grid, merging.topology, regions, maps, merging.joins)
 

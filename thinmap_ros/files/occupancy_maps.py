@@ -17,13 +17,14 @@ import yaml
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError, one_line_reason, quoted
+from thinmap_ros.core.errors import InputError, one_line_reason, quoted, require_type
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.files.images import CellRule, ImageCells, read_cells
 from thinmap_ros.files.limits import FILES
+from thinmap_ros.files.paths import path_of
 from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.files.yaml import boolean_of, number_of, read_texts
 
@@ -44,10 +45,12 @@ class _Grey(IntEnum):
     OCCUPIED = 0
 
 
-def write_map(stem: Path, patch: GridPatch) -> Path:
+def write_map(stem: Path | str, patch: GridPatch) -> Path:
     """Write STEM.pgm and STEM.yaml (trinary mode); returns the path of the YAML file."""
     from PIL import Image  # imported here: most processes never write or read a map
 
+    stem = path_of(stem)
+    require_type('patch', patch, GridPatch)
     grey = np.full(patch.shape, _Grey.UNKNOWN, dtype=np.uint8)
     grey[patch.free] = _Grey.FREE
     grey[patch.occupied] = _Grey.OCCUPIED
@@ -89,7 +92,7 @@ def warn(text: str) -> None:
 
 
 def read_map(
-    path: Path,
+    path: Path | str,
     folder: Path | None = None,
     report: Report = warn,
     *,
@@ -102,6 +105,7 @@ def read_map(
     Raises InputError with file, key, value and expectation. A map with a yaw in its origin is
     resampled.
     """
+    path = path_of(path)
     content = read_texts(path, 'a map_server YAML file')
     image = _image_of(path, content, folder)
     resolution = _resolution(path, content)

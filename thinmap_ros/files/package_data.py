@@ -5,27 +5,32 @@ folders of ROS where colcon installed it; they are looked for in this order.
 """
 
 from collections.abc import Iterator
+from difflib import get_close_matches
 from importlib import resources, util
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, quoted
+from thinmap_ros.files.paths import path_of
 
 _PACKAGE = 'thinmap_ros'
 
 
-def world_path(name: str) -> Path:
+def world_path(name: str | Path) -> Path:
     """Path of a world: an existing file, or the name of an installed world.
 
     Raises InputError, with the names of the installed worlds, if there is neither.
     """
-    path = Path(name)
+    path = path_of(name)
+    name = str(name)
     if path.is_file():
         return path
     worlds = _worlds()
     if name in worlds:
         return worlds[name]
     installed = ', '.join(sorted(worlds)) or 'none installed'
-    raise InputError(f'world {quoted(name)}: expected a file, or one of {installed}')
+    likely = get_close_matches(name, worlds, n=1)
+    meant = f' (did you mean {likely[0]}?)' if likely else ''
+    raise InputError(f'world {quoted(name)}{meant}: expected a file, or one of {installed}')
 
 
 def config_file(node: str) -> Path:

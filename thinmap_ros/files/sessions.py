@@ -1,7 +1,7 @@
 """Saved sessions: the state of grid mapper, topology builder, localizer and explorer.
 
 A session has a path STEM. `PARTS` lists its files, one for each node. Beside STEM.grid.npz lies the
-same grid as a map_server map, STEM.pgm and STEM.yaml.
+same grid as a map_server map, STEM.pgm and STEM.yaml, and STEM.edits.npz of a map that was edited.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.grid.edits import MapEdits
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.tracker import RegionTracker
@@ -122,6 +123,8 @@ def _restore_localizer(state: State, config: StartConfig | None) -> AnyLocalizer
 
 
 GRID = SessionPart('grid', 'grid_mapper', '.grid.npz', OccupancyGrid.from_state)
+# Keep-out areas and erased parts: written and read with the grid.
+EDITS = SessionPart('edits', 'grid_mapper', '.edits.npz', MapEdits.from_state)
 TOPOLOGY = SessionPart('topology', 'topology_builder', '.topology.npz', TopologyBuilder.from_state)
 # Ids of the regions: the node of the topology saves and loads them with it.
 REGIONS = SessionPart('regions', 'topology_builder', '.regions.npz', RegionTracker.from_state)
@@ -130,7 +133,7 @@ LOCALIZER = SessionPart('localizer', 'localizer', '.slam.npz', _restore_localize
 # Of the local map: `save_localizer` and `load_localizer` write and read both files.
 KEYFRAMES = SessionPart('keyframes', 'localizer', '.keyframes.npz', SavedKeyframes.from_state)
 EXPLORATION = SessionPart('exploration', 'explorer', '.exploration.npz', Explorer.from_state)
-_OF_MAP: tuple[SessionPart[Any, Any], ...] = (GRID, TOPOLOGY, REGIONS, LOCALIZER, KEYFRAMES)
+_OF_MAP: tuple[SessionPart[Any, Any], ...] = (GRID, EDITS, TOPOLOGY, REGIONS, LOCALIZER, KEYFRAMES)
 PARTS = (*_OF_MAP, EXPLORATION)
 # Parts that are saved, and archived, with that of the same node.
 _BESIDE: dict[str, SessionPart[Any, Any]] = {TOPOLOGY.name: REGIONS, LOCALIZER.name: KEYFRAMES}
@@ -199,16 +202,26 @@ def _foreign_error(file: Path) -> InputError:
     )
 
 
-def save_grid(path: str, grid: OccupancyGrid, shown: GridPatch | None = None) -> str:
+def save_grid(
+    path: str,
+    grid: OccupancyGrid,
+    shown: GridPatch | None = None,
+    edits: MapEdits | None = None,
+) -> str:
     """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written. Raises OSError.
 
-    shown: the cells of the image, where they differ from those of the grid.
+    shown: the cells of the image, where they differ from those of the grid. edits: of the map, in
+    STEM.edits.npz; where there are none, those of an earlier session are archived.
     """
     stem = stem_of(path)
     # No file takes its name before all are written: a full disk leaves the old session unchanged.
     with atomic_write(GRID.file(path)) as aside:
         GRID.write(aside, grid)
         write_map(stem, grid.known_area() if shown is None else shown)
+        if edits:
+            EDITS.save(path, edits)
+            return f'{stem}.pgm, {_MAP_ENDING}, {EDITS.ending} and {GRID.ending}'
+        EDITS.archive(path)
     return f'{stem}.pgm, {_MAP_ENDING} and {GRID.ending}'
 
 
@@ -230,6 +243,15 @@ def load_grid(
     if not _exists(description):
         raise InputError(f'{stem}: neither {GRID.file(path).name} nor {description.name} exists')
     return OccupancyGrid.from_patch(read_map(description, folder, report), config)
+
+
+def load_edits(path: str) -> MapEdits:
+    """Edits of STEM.grid.npz; none where the session has no such file, or the map is an image.
+
+    Raises InputError as `SessionPart.load`.
+    """
+    edits = EDITS.load_optional(path) if GRID.exists(path) else None
+    return edits or MapEdits()
 
 
 def load_scans(path: str) -> list[tuple[Scan, Array]]:

@@ -14,6 +14,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, pose
 from thinmap_ros.files.limits import FILES
 from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.files.paths import path_of
 from thinmap_ros.files.yaml import read_mapping
 
 _MARGIN_M = 0.2
@@ -22,12 +23,13 @@ _FREE = 0
 _SOLID = 100
 
 
-def read_world(path: Path) -> tuple[str, GridPatch, Array]:
+def read_world(path: Path | str) -> tuple[str, GridPatch, Array]:
     """Name, map and start (3,) (NaN: none) of a YAML file.
 
     The file is a world (walls, solids, tour) or a map_server map (image).
     Raises InputError with file, key, value and expectation.
     """
+    path = path_of(path)
     content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
     return _from_map(path, content) if 'image' in content else _from_drawing(path, content)
 

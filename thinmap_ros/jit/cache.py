@@ -2,23 +2,28 @@
 
 numba caches a kernel beside its module, or in the home folder, and recompiles it when the file of
 that module is written. That is too rarely, as a kernel also contains code and constants of other
-modules, and too often, as the file may differ in a comment alone. Besides, an install may be
-read-only and a service may have no home: numba then refuses to compile at all. This package
-therefore keeps its kernels in one folder (`folder`), each with a fingerprint of what it is compiled
-from.
+modules, and too often, as the file may differ in a comment alone, or lie elsewhere. Besides, an
+install may be read-only and a service may have no home: numba then refuses to compile at all. This
+package therefore keeps its kernels in one folder of the user (`folder`), in files named by a
+fingerprint of what each is compiled from. Installs and clones with equal code share them, and those
+with other code do not touch them, whichever processes run at the same time.
 """
 
+import glob
 import hashlib
 import os
 import shutil
 import tempfile
+import uuid
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 from numba.core import caching
 
 from thinmap_ros.jit.fingerprint import fingerprint, layouts
@@ -26,19 +31,21 @@ from thinmap_ros.jit.private_folder import private_folder, temporary_folder
 
 PACKAGE = Path(__file__).resolve().parents[1]
 BESIDE_PACKAGE = PACKAGE / '__pycache__' / 'kernels'
+_WORD = 16  # characters of a fingerprint in the names of files
+_KEPT = 8  # fingerprints of a function: its code in so many versions or clones
 
 
 @cache
 def folder() -> Path | None:
     """The cache folder; None, with a warning, if no folder is writable.
 
-    The first writable one of: NUMBA_CACHE_DIR, if set; beside the package; the user's cache folder;
-    a private folder among the temporary files. Kernels that an administrator compiled beside a
-    read-only package are copied from there.
+    The first writable one of: NUMBA_CACHE_DIR, if set; the user's cache folder; beside the package;
+    a private folder among the temporary files. Kernels that it lacks and that an administrator left
+    beside the package (`leave_beside_package`) are copied from there.
     """
     refusals = []
     named = [_named] if numba.config.CACHE_DIR else []
-    for make in (*named, _beside_package, _of_user, _temporary):
+    for make in (*named, _of_user, _beside_package, _temporary):
         try:
             return make()
         except (OSError, RuntimeError) as error:
@@ -50,6 +57,18 @@ def folder() -> Path | None:
         stacklevel=2,
     )
     return None
+
+
+def leave_beside_package() -> Path:
+    """Copy all kernels into the package, for users of other accounts; returns the folder there.
+
+    Raises OSError where the package is read-only.
+    """
+    root = folder()
+    if root is not None and root != BESIDE_PACKAGE:
+        for file in sorted(root.rglob('*.nb[ic]'), key=_is_index):
+            _copy(file, BESIDE_PACKAGE / file.relative_to(root))
+    return BESIDE_PACKAGE
 
 
 class KernelLocator:
@@ -88,24 +107,43 @@ class KernelLocator:
 class _KernelIndex(caching.IndexDataCacheFile):
     """Index of a function's kernels by the types of their arguments."""
 
+    def __init__(self, cache_path: str, filename_base: str, source_stamp: Any) -> None:
+        super().__init__(cache_path, filename_base, source_stamp)
+        self._base = filename_base
+
     def load(self, key: tuple[Any, ...]) -> Any:
         """Load the kernel of a key."""
         return super().load(_with_layouts(key))
 
     def save(self, key: tuple[Any, ...], data: Any) -> None:
-        """Save the kernel of a key."""
-        super().save(_with_layouts(key), data)
+        """Save the kernel of a key, in a file of its own whatever other processes save."""
+        full = _with_layouts(key)
+        overloads = self._load_index()
+        number = int(hashlib.sha256(repr(full).encode()).hexdigest()[:12], 16)
+        name = overloads.setdefault(full, self._data_name(number))
+        self._save_data(name, data)
+        self._save_index(overloads)
+        _forget_old(Path(self._cache_path), self._base)
 
     def _load_index(self) -> dict[Any, str]:
         """Read the index; empty if it names types of modules that were moved or renamed."""
         # Now that all kernels are imported that this one calls.
         if isinstance(self._source_stamp, partial):
-            self._source_stamp: Any = self._source_stamp()
+            self._use_files_of(self._source_stamp())
         try:
             index: dict[Any, str] = super()._load_index()
         except (ImportError, AttributeError):
             return {}
         return index
+
+    def _use_files_of(self, word: str) -> None:
+        """Use the files of a fingerprint, which may lie beside the package."""
+        name = f'{self._base}.{word[:_WORD]}'
+        self._source_stamp: Any = word
+        self._index_path: str = str(Path(self._cache_path) / f'{name}.nbi')
+        self._data_name_pattern: str = f'{name}.{{number:x}}.nbc'
+        if not Path(self._index_path).exists():
+            _fetch(Path(self._cache_path), name)
 
 
 def _with_layouts(key: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -128,29 +166,48 @@ def _beside_package() -> Path:
 
 def _of_user() -> Path:
     base = os.environ.get('XDG_CACHE_HOME')
-    return _seeded(Path(base) if base else Path.home() / '.cache')
+    return _shared(Path(base) if base else Path.home() / '.cache')
 
 
 def _temporary() -> Path:
-    return _seeded(private_folder(temporary_folder()))
+    return _shared(private_folder(temporary_folder()))
 
 
-def _seeded(base: Path) -> Path:
-    """Cache folder of this install; it starts with a copy of the kernels beside the package."""
-    given = BESIDE_PACKAGE.stat().st_mtime_ns if BESIDE_PACKAGE.is_dir() else 0
-    word = hashlib.sha256(f'{PACKAGE} {given}'.encode()).hexdigest()[:16]
-    chosen = base / 'thinmap' / f'kernels-{word}'
-    if given and not chosen.exists():
-        aside = Path(tempfile.mkdtemp(dir=_writable(chosen.parent)))
-        for file in BESIDE_PACKAGE.rglob('*.nb[ic]'):
-            copy = aside / file.relative_to(BESIDE_PACKAGE)
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, copy)  # without its mode: it may be read-only
-        try:
-            aside.rename(chosen)
-        except OSError:  # another process was faster
-            shutil.rmtree(aside)
-    return _writable(chosen)
+def _shared(base: Path) -> Path:
+    """Cache folder of all installs with these versions, whose compiled code fits together."""
+    versions = f'numba-{numba.__version__}-numpy-{np.__version__}'
+    return _writable(base / 'thinmap' / f'kernels-{versions}')
+
+
+def _fetch(chosen: Path, name: str) -> None:
+    """Copy the files of a kernel from beside the package, if there are any: the index at last."""
+    root = folder()
+    beside = BESIDE_PACKAGE if root is None else BESIDE_PACKAGE / chosen.relative_to(root)
+    with suppress(OSError):
+        for file in sorted(beside.glob(f'{glob.escape(name)}.*'), key=_is_index):
+            _copy(file, chosen / file.name)
+
+
+def _copy(file: Path, target: Path) -> None:
+    """Copy a file, without its mode, which may be read-only, and at once for other processes."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    aside = target.with_name(f'{target.name}.tmp.{uuid.uuid4().hex}')
+    shutil.copyfile(file, aside)
+    aside.replace(target)
+
+
+def _is_index(file: Path) -> bool:
+    return file.suffix == '.nbi'
+
+
+def _forget_old(chosen: Path, base: str) -> None:
+    """Delete the kernels of all but the newest fingerprints of a function."""
+    with suppress(OSError):
+        indexes = list(chosen.glob(f'{glob.escape(base)}.*.nbi'))
+        indexes.sort(key=lambda path: path.stat().st_mtime_ns)
+        for index in indexes[:-_KEPT]:
+            for file in chosen.glob(f'{glob.escape(index.stem)}.*'):
+                file.unlink()
 
 
 def _writable(chosen: Path) -> Path:

@@ -8,6 +8,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 import numpy as np
+from numba.core import config
 from numba.core.dispatcher import Dispatcher
 from numba.core.types.abstract import Type
 from numba.core.types.containers import BaseNamedTuple, BaseTuple
@@ -27,7 +28,8 @@ def fingerprint(function: Function) -> str:
     them. What Numba accepts as a global value counts: numbers, texts, tuples, arrays, their types,
     enumerations, named tuples, kernels; of a function of another module its name alone.
     """
-    together = hashlib.sha256(repr(OPTIONS).encode())
+    settings = (OPTIONS, config.OPT, config.BOUNDSCHECK)
+    together = hashlib.sha256(repr(settings).encode())
     known = {function}
     waiting = [function]
     while waiting:

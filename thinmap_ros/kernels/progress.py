@@ -2,6 +2,7 @@
 
 import sys
 import time
+from functools import cache as cache_of_results
 from typing import Any
 
 from numba.core import event
@@ -50,8 +51,9 @@ class CompilationReport(event.Listener):
             self._seconds = 0.0
 
 
+@cache_of_results
 def report_compilation() -> CompilationReport:
-    """Report compilation until the process ends."""
+    """Report compilation until the process ends; called again, it is the same report."""
     report = CompilationReport()
     event.register(_COMPILATION, report)
     return report

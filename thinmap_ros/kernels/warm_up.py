@@ -2,13 +2,16 @@
 
 A node warms up before it subscribes: otherwise a robot loses its first seconds, and a simulation
 faster than real time many more. Each warm-up imports its own modules only, so that a node does not
-load the kernels of others.
+load the kernels of others, and is done once in a process.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
@@ -17,18 +20,22 @@ from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
+if TYPE_CHECKING:
+    from thinmap_ros.core.topology.graph import TopologicalMap
+
 
 @dataclass(frozen=True)
 class _Rehearsal:
     """The room and the drive through it.
 
-    room_cells: side of the room. passage: rows of the passage to unknown space. range_m, beams: of
-    the laser, which sees 180 degrees. scans: number, one each period_s. step_m, turn_rad: motion
-    between two scans.
+    room_cells, closet_cells: sides of a room and a closet. passage: rows of the passage to unknown
+    space. range_m, beams: of the laser, which sees 180 degrees. scans: number, one each period_s.
+    step_m, turn_rad: motion between two scans.
     """
 
     cell_m: float
     room_cells: int
+    closet_cells: int
     passage: slice
     range_m: float
     beams: int
@@ -55,6 +62,7 @@ class _Rehearsal:
 _REHEARSAL = _Rehearsal(
     cell_m=0.1,
     room_cells=80,
+    closet_cells=16,
     passage=slice(30, 50),
     range_m=8.0,
     beams=181,
@@ -65,11 +73,14 @@ _REHEARSAL = _Rehearsal(
 )
 
 
+@cache
 def localizer() -> None:
     """Warm up localization."""
-    from thinmap_ros.core.slam.graph.keyframes import covariances_from
-    from thinmap_ros.core.slam.graph.pose_graph import Edge
+    from thinmap_ros.core.slam.graph.edge_table import EdgeTable
+    from thinmap_ros.core.slam.graph.keyframes import Start, covariances_from
+    from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
     from thinmap_ros.core.slam.localizer import Localizer
+    from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
     _sense()
     rehearsed = Localizer()
@@ -81,13 +92,28 @@ def localizer() -> None:
     rehearsed.step(_scan(_REHEARSAL.scans + 1, np.full(_REHEARSAL.beams, np.inf)), T_map_base)
     Localizer.from_state(rehearsed.state())
     Localizer.in_occupancy_map(_room())
-    # A revisit needs covariances along the graph.
+    # A revisit needs covariances along the graph, and a loop its optimization.
     step = Edge(0, 1, np.zeros(3), np.eye(3), False)
-    covariances_from(0, np.zeros((2, 3)), [step], np.ones((2, 6)))
+    covariances_from(Start(0), np.zeros((2, 3)), [EdgeTable([step])], np.ones((2, 6)))
+    optimized(np.zeros((2, 3)), [step])
+    OdometryCalibration().smoothed()
     topology_builder()
     _recognize()
 
 
+@cache
+def ekf_localizer() -> None:
+    """Warm up localization by line features."""
+    from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
+
+    _sense()
+    rehearsed = EkfLocalizer(EkfConfig())
+    for scan, T_map_base in _drive():
+        rehearsed.step(scan, T_map_base)
+    EkfLocalizer.from_state(rehearsed.state(), EkfConfig())
+
+
+@cache
 def map_joiner() -> None:
     """Warm up recognition between maps, and merging."""
     from thinmap_ros.core.slam.joining.rigid import refined
@@ -136,17 +162,21 @@ def _sense() -> None:
         pairing.add_scan(replace(scan, beam_period_s=beam_s))
 
 
+@cache
 def grid_mapper() -> None:
-    """Warm up the map update and its windows."""
+    """Warm up the map update, its windows, and the keyframes of a session that is loaded."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
+    from thinmap_ros.core.slam.matching.surface import surface_points
 
     rehearsed = OccupancyGrid()
     for scan, T_map_base in _drive():
+        surface_points(scan)
         rehearsed.add_scan(scan, T_map_base)
         rehearsed.window(T_map_base[0], T_map_base[1], WindowConfig().local_map_size_m)
     rehearsed.known_area()
 
 
+@cache
 def topology_builder() -> None:
     """Warm up thinning, the merging of local maps, and the regions."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
@@ -154,6 +184,7 @@ def topology_builder() -> None:
     from thinmap_ros.core.topology.builder import TopologyBuilder
 
     find_regions(_room())
+    _graph(_room())
     grid = OccupancyGrid()
     rehearsed = TopologyBuilder()
     for scan, T_map_base in _drive():
@@ -166,70 +197,134 @@ def topology_builder() -> None:
     rehearsed.rebuilt(grid.known_area(), poses, poses)
 
 
+@cache
 def explorer() -> None:
     """Warm up the choice of an end node, in a partly unknown room, and what other maps need."""
     from thinmap_ros.core.exploration.explorer import Explorer
+    from thinmap_ros.core.exploration.viewpoints import search_beside
     from thinmap_ros.core.grid.foreign_maps import scan_in_map
-    from thinmap_ros.core.topology.builder import TopologyConfig, build
+    from thinmap_ros.core.grid.raytrace import line_is_clear
+    from thinmap_ros.core.planning.grid_search import path_lengths_from
 
     patch = _room()
+    # Of other strategies, and of a frontier that no viewpoint sees into.
+    path_lengths_from(patch.free, (20, 20), np.array([[30, 30]]))
+    line_is_clear(patch.free, *np.array([20, 20, 30, 30]))
+    search_beside(patch.free, np.array([[20, 20]]), patch.free, patch.free, 5, (30, 30))
     rehearsed = Explorer()
-    topology = build(patch, (2.0, 2.0), TopologyConfig())
+    topology = _graph(patch)
     for scan, T_map_base in _drive():
         rehearsed.step(topology, patch, scan, T_map_base)
         scan_in_map(patch, T_map_base, scan.range_max_m, scan.stamp_ns)
 
 
+@cache
 def navigator() -> None:
     """Warm up planning and driving."""
     from thinmap_ros.core.planning.long_path import route_band
     from thinmap_ros.core.planning.navigator import Navigator
-    from thinmap_ros.core.planning.wavefront import WavefrontConfig
-    from thinmap_ros.core.topology.builder import TopologyConfig, build
+    from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path
 
     _sense()
+    _be_blind()
     patch = _room()
-    topology = build(patch, (2.0, 2.0), TopologyConfig())
+    topology = _graph(patch)
     route_band(topology, patch, (2.0, 2.0), (4.0, 3.0), WavefrontConfig())
+    obstacles = Obstacles(np.array([[3.0, 2.5]]), 0.2)
+    find_path(patch, (2.0, 2.0), (4.0, 3.0), WavefrontConfig(), obstacles)
     rehearsed = Navigator()
     rehearsed.set_goal(4.0, 3.0, 0.0)
     for scan, T_map_base in _drive():
         rehearsed.step(T_map_base, patch, scan, _REHEARSAL.period_s)
 
 
+def _be_blind() -> None:
+    """Warm up what takes the place of beams that measure nothing."""
+    from thinmap_ros.core.planning.blind_sectors import BlindSectors
+
+    sectors = BlindSectors()
+    for number in range(2):
+        T_map_laser = se2.pose(2.0 + number, 2.0, 0.0)
+        sectors.add_scan(T_map_laser, _scan(number, np.full(_REHEARSAL.beams, np.nan)))
+    sectors.points(1.0, 2.0)
+
+
+@cache
 def global_localizer() -> None:
     """Warm up global localization."""
     from thinmap_ros.core.places.global_localizer import GlobalLocalization
-    from thinmap_ros.core.topology.builder import TopologyConfig, build
 
     _sense()
     patch = _room()
-    rehearsed = GlobalLocalization(patch, build(patch, (2.0, 2.0), TopologyConfig()))
+    rehearsed = GlobalLocalization(patch, _graph(patch))
     for scan, T_map_base in _drive():
         rehearsed.step(scan, T_map_base)
 
 
+@cache
+def active_search() -> None:
+    """Warm up the drive to where pose candidates differ."""
+    from thinmap_ros.core.places.active_search import best_viewpoint
+    from thinmap_ros.core.places.global_localizer import GlobalLocalization
+    from thinmap_ros.core.planning.wavefront import WavefrontConfig
+
+    navigator()
+    patch = _room()
+    places = GlobalLocalization(patch, _graph(patch)).places
+    starts = np.array([[2.0, 2.0, 0.0], [4.0, 2.0, 1.0]])
+    best_viewpoint(places, np.zeros(3), starts, np.full(2, 0.5), 5.0, WavefrontConfig())
+
+
+@cache
+def sim() -> None:
+    """Warm up the simulated laser."""
+    from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
+    from thinmap_ros.sim.world import World
+
+    start = se2.pose(2.0, 2.0, 0.3)
+    world = World.from_patch('room', _room(), start)
+    LaserScanner(LaserScannerConfig(), 0).scan(world, start, 0)
+
+
 ALL = (
     localizer,
+    ekf_localizer,
     grid_mapper,
     topology_builder,
     explorer,
     navigator,
     global_localizer,
+    active_search,
     map_joiner,
+    sim,
 )
 """Warm-ups of all nodes."""
 
 
+def _graph(patch: GridPatch) -> 'TopologicalMap':
+    """The graph of a map, after that of a closet: one node without edges."""
+    from thinmap_ros.core.topology.builder import TopologyConfig, build
+
+    closet = GridPatch(GridFrame(0.0, 0.0, _REHEARSAL.cell_m), _walls(_REHEARSAL.closet_cells))
+    build(closet, None, TopologyConfig())
+    return build(patch, (2.0, 2.0), TopologyConfig())
+
+
 def _room() -> GridPatch:
     """A room with a pillar, and a passage to unknown space."""
-    cells = np.zeros((_REHEARSAL.room_cells, _REHEARSAL.room_cells), dtype=np.int8)
-    cells[[0, -1]] = 100
-    cells[:, [0, -1]] = 100
+    cells = _walls(_REHEARSAL.room_cells)
     cells[40:46, 40:46] = 100
     cells[_REHEARSAL.passage, -1] = 0
     cells[:, -20:-1] = UNKNOWN
     return GridPatch(GridFrame(0.0, 0.0, _REHEARSAL.cell_m), cells)
+
+
+def _walls(side: int) -> NDArray[np.int8]:
+    """A square between walls."""
+    cells = np.zeros((side, side), dtype=np.int8)
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    return cells
 
 
 def _odd_scan() -> Scan:

@@ -82,25 +82,29 @@ class Wing:
 
 
 @dataclass(frozen=True)
+class Link:
+    """A straight passage of a width, m, from a place inside one wing to one inside another.
+
+    a, b: (2,), m, world frame.
+    """
+
+    a: Array
+    b: Array
+    width: float
+
+
+@dataclass(frozen=True)
 class Building:
-    """A generated world and its properties."""
+    """A generated world, and the wings and links that it is made of."""
 
     world: World
     wings: list[Wing]
+    links: list[Link]
 
     @property
     def area_m2(self) -> float:
         """Free area."""
         return float(np.count_nonzero(self.world.occupied == 0)) * self.world.frame.resolution**2
-
-
-@dataclass(frozen=True)
-class _Link:
-    """A straight passage (a, b: (2,), m, world frame) of a width, m, between two wings."""
-
-    a: Array
-    b: Array
-    width: float
 
 
 def generate_building(seed: int, config: BuildingConfig | None = None) -> Building:
@@ -119,7 +123,7 @@ def generate_building(seed: int, config: BuildingConfig | None = None) -> Buildi
     start = _start(wings[0], frame, occupied, chosen.layout, rng)
     solid = (occupied != 0).astype(np.uint8)
     world = World(name, solid, frame, start, glass if glass.any() else None, moving)
-    return Building(world, wings)
+    return Building(world, wings, links)
 
 
 def _random_config(asked: BuildingConfig, rng: np.random.Generator) -> BuildingConfig:
@@ -145,13 +149,13 @@ def _random_config(asked: BuildingConfig, rng: np.random.Generator) -> BuildingC
     return chosen
 
 
-def _wings(config: BuildingConfig, rng: np.random.Generator) -> tuple[list[Wing], list[_Link]]:
+def _wings(config: BuildingConfig, rng: np.random.Generator) -> tuple[list[Wing], list[Link]]:
     """The main wing at the origin, and oblique wings attached to it where they fit."""
     count = config.wings or 1
     share = 1.0 if count == 1 else 0.6
     area = config.area_m2 or 0.0
     wings = [Wing(_plan(share * area, config, rng), se2.pose(0.0, 0.0, 0.0))]
-    links: list[_Link] = []
+    links: list[Link] = []
     for _ in range(count - 1):
         plan = _plan((1.0 - share) * area / (count - 1), config, rng)
         for _ in range(_TRIES):
@@ -171,7 +175,7 @@ def _plan(area_m2: float, config: BuildingConfig, rng: np.random.Generator) -> F
 
 def _joined(
     wing: Wing, plan: FloorPlan, layout: LayoutConfig, rng: np.random.Generator
-) -> tuple[Wing, _Link] | None:
+) -> tuple[Wing, Link] | None:
     """A wing of a plan, at an angle behind an exit of another wing; None if it does not fit."""
     exits = _exits(wing.plan)
     entries = _exits(plan)
@@ -189,7 +193,7 @@ def _joined(
     inside = 0.5 * width + 1.0
     a = se2.compose(T_exit, se2.pose(-inside, 0.0, 0.0))[:2]
     b = se2.compose(T_entry, se2.pose(-inside, 0.0, 0.0))[:2]
-    return Wing(plan, T_world_wing), _Link(a, b, width)
+    return Wing(plan, T_world_wing), Link(a, b, width)
 
 
 def _exits(plan: FloorPlan) -> list[Array]:
@@ -233,7 +237,7 @@ def _overlap(a: Wing, b: Wing) -> bool:
 
 
 def _rasterized(
-    wings: list[Wing], links: list[_Link], config: BuildingConfig, rng: np.random.Generator
+    wings: list[Wing], links: list[Link], config: BuildingConfig, rng: np.random.Generator
 ) -> tuple[GridFrame, NDArray[np.uint8]]:
     """Cells of the world: 0 free, else obstacle or glass."""
     layout = config.layout
@@ -359,7 +363,7 @@ def _paste(
         occupied[at[here, 0], at[here, 1]] = inside[own[here, 0], own[here, 1]]
 
 
-def _carve(occupied: NDArray[np.uint8], frame: GridFrame, link: _Link) -> None:
+def _carve(occupied: NDArray[np.uint8], frame: GridFrame, link: Link) -> None:
     """Clear the cells of a passage."""
     reach = 0.5 * link.width
     ends = np.stack([link.a, link.b])

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.distance import distance_cells
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -32,6 +33,10 @@ class World:
     @staticmethod
     def from_patch(name: str, patch: GridPatch, start: Array) -> 'World':
         """World of a map; cells that are not free are obstacles. start (3,): NaN if unknown."""
+        require_type('name', name, str)
+        require_type('patch', patch, GridPatch)
+        if np.shape(start) != (3,):
+            raise InputError(f'start = {quoted(start)}: expected a pose (3,)')
         return World(name, (~patch.free).astype(np.uint8), patch.frame, start)
 
     @cached_property

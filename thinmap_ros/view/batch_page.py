@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from thinmap_ros.files.atomic import write_text
-from thinmap_ros.view import report_page
+from thinmap_ros.view import html_page, report_page
 
 _PICTURE = 'summary.png'
 _STYLE = """
@@ -19,28 +18,13 @@ _STYLE = """
 figure { display: inline-block; width: 18rem; margin: .5rem; vertical-align: top; }
 figure img { width: 100%; }
 """
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy"
- content="default-src 'none'; img-src 'self' file:; style-src 'unsafe-inline'">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body class="many">
-<h1>{title}</h1>
-<table>
+_CONTENT = """<table>
 <tr>{head}</tr>
 {rows}
 </table>
 {figures}
 <h2>Command</h2>
-<pre>{command}</pre>
-</body>
-</html>
-"""
+<pre>{command}</pre>"""
 
 
 @dataclass(frozen=True)
@@ -55,16 +39,14 @@ def write(
     folder: Path, title: str, columns: Sequence[str], entries: Sequence[Entry], command: str
 ) -> Path:
     """Write report.html over folders of results beside it; returns its path."""
-    page = _PAGE.format(
-        title=html.escape(title),
-        style=report_page.STYLE + _STYLE,
+    content = _CONTENT.format(
         head=''.join(f'<th>{html.escape(column)}</th>' for column in columns),
         rows='\n'.join(_table_row(folder, entry) for entry in entries),
         figures='\n'.join(_figure(folder, e) for e in entries if (e.folder / _PICTURE).exists()),
         command=html.escape(command),
     )
-    write_text(folder / report_page.NAME, page)
-    return folder / report_page.NAME
+    page = html_page.Page(title, content, images="'self' file:", style=_STYLE, kind='many')
+    return html_page.write(folder / report_page.NAME, page)
 
 
 def _table_row(folder: Path, entry: Entry) -> str:

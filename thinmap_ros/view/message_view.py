@@ -19,42 +19,14 @@ from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.frames.laser_mount import StaticTransforms
 from thinmap_ros.view import palette
+from thinmap_ros.view.apart_scans import ApartScans
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 from thinmap_ros.view.stamp_matcher import StampMatcher
 
 _TF_STATIC = '/tf_static'
 _MEDIAN = re.compile(r'median (\d+\.\d+) ms')
-_APART_STEP_M = 0.5
 _STEPS = {'map update', 'graph update', 'explorer', 'global localization'}
-
-
-class _ApartScans:
-    """Points of the scans of a piece of map that is apart, a step between them.
-
-    points (N, 2): where dead reckoning puts them, m; none once the piece is joined.
-    """
-
-    def __init__(self) -> None:
-        self.points = np.empty((0, 2))
-        self._last: Array | None = None
-
-    def update(self, message: Any) -> bool:
-        """Add the scan of a LocalizedScan, or forget all; returns whether the points changed."""
-        if message.status.state != message.status.MAPPING_APART:
-            was_apart = self._last is not None
-            self.points = np.empty((0, 2))
-            self._last = None
-            return was_apart
-        T_map_base = _pose(message.pose.pose)
-        if self._last is not None and np.hypot(*(T_map_base - self._last)[:2]) < _APART_STEP_M:
-            return False
-        self._last = T_map_base
-        ns = decode.stamp_ns(message)
-        scan = decode.scan(message.scan, ns, decode.pose(message.laser_pose))
-        here = se2.transform_points(T_map_base, scan.points_base())
-        self.points = np.vstack([self.points, here])
-        return True
 
 
 class MessageView:
@@ -75,7 +47,9 @@ class MessageView:
         self._places: dict[int, Array] = {}
         self._T_odom_base: Array | None = None
         self._T_map_odom: Array | None = None
-        self._apart = _ApartScans()
+        self._apart = ApartScans()
+        self._distance_m = 0.0
+        self._seen_m2 = 0.0
         self._pairs: StampMatcher[Array, Array] = StampMatcher()
         self._takers: dict[str, Callable[[int, Any], None]] = {
             'map': self._on_map,
@@ -198,8 +172,14 @@ class MessageView:
     def _on_exploration(self, ns: int, message: Any) -> None:
         place = message.target_position
         self._view.target(ns, np.array([place.x, place.y]) if message.has_target else None)
-        self._view.scalar(ns, 'progress', 'coverage, %', 100.0 * float(message.coverage_estimate))
-        self._view.scalar(ns, 'progress', 'distance, m', float(message.distance_m))
+        distance_m = float(message.distance_m)
+        if distance_m < self._distance_m:  # another exploration
+            self._seen_m2 = 0.0
+        self._distance_m = distance_m
+        # What was seen stays so, even where a chair then covers it or the map is corrected.
+        self._seen_m2 = max(self._seen_m2, float(message.known_area_m2))
+        self._view.scalar(ns, 'progress', 'seen, m2', self._seen_m2)
+        self._view.scalar(ns, 'progress', 'distance, m', distance_m)
         self._view.scalar(ns, 'count', 'end nodes left', float(message.end_nodes_remaining))
 
     def _on_slam(self, ns: int, message: Any) -> None:

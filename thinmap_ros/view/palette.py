@@ -11,6 +11,7 @@ TRUTH = '#332288'
 ROBOTS = ('#332288', '#CC79A7', '#56B4E9', '#999933', '#661100', '#555555')
 HIDDEN = '#882255'
 APART = '#DDB5CC'
+KEEP_OUT = '#D41159'
 # Pale, in turn by id.
 REGIONS = {
     RegionKind.ROOM: ('#C9DFF2', '#D6D3EC', '#C5E3EA', '#DCE6F5'),

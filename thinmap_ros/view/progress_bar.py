@@ -57,6 +57,10 @@ class ProgressBar:
             done = '' if share is None else f'{100.0 * min(share, 1.0):.0f} %, '
             print(f'{self._name}: {done}{text}', file=self._stream, flush=True)
 
+    def write(self, text: str) -> None:
+        """Write lines that stay, above the bar."""
+        tqdm.write(text, file=self._stream)
+
     def _rewrite(self, share: float | None, text: str) -> None:
         form = _BAR_WITHOUT_TOTAL if share is None else _BAR
         bar: Any = self._bar

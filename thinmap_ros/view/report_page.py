@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.view import html_page
 
 NAME = 'report.html'
 _PICTURE = 'summary.png'
@@ -79,43 +79,6 @@ _FILES = {
     'log': 'output of each node',
     'result.json': 'result of the action explore',
 }
-STYLE = """
-:root { color-scheme: light; }
-body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff;
-  max-width: 56rem; margin: 0 auto; padding: 1rem; overflow-wrap: anywhere; }
-h1 { font-size: 1.4rem; line-height: 1.25; }
-h2 { font-size: 1.1rem; margin: 1.6rem 0 .4rem; }
-table { border-collapse: collapse; width: 100%; }
-td, th { text-align: left; vertical-align: top; padding: .25rem .6rem .25rem 0;
-  border-bottom: 1px solid #ddd; font-weight: normal; }
-th { color: #555; }
-td:first-child code { white-space: nowrap; }
-code, pre { font: 0.9em/1.5 ui-monospace, monospace; background: #f3f3f3; border-radius: 3px; }
-code { padding: .1em .3em; }
-pre { padding: .6rem; white-space: pre-wrap; margin: 0; }
-.picture { overflow-x: auto; }
-.picture input { position: absolute; opacity: 0; }
-.picture img { max-width: 100%; cursor: zoom-in; }
-.picture input:checked + label img { max-width: none; cursor: zoom-out; }
-.picture input:focus-visible + label img { outline: 2px solid #0072B2; }
-small { color: #555; }
-"""
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy"
- content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<h1>{title}</h1>
-{sections}
-</body>
-</html>
-"""
 
 
 def write(folder: Path, title: str, report: Mapping[str, Any], command: str) -> Path:
@@ -133,9 +96,7 @@ def write(folder: Path, title: str, report: Mapping[str, Any], command: str) -> 
         for heading, content in sections
         if content
     )
-    page = _PAGE.format(title=html.escape(title), style=STYLE, sections=text)
-    write_text(folder / NAME, page)
-    return folder / NAME
+    return html_page.write(folder / NAME, html_page.Page(title, text, images='data:'))
 
 
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -1,6 +1,7 @@
 """Layout of a view in rerun: the map, curves beside it, and a legend below them."""
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,9 @@ from thinmap_ros.view import palette
 from thinmap_ros.view.rerun_sinks import TIMELINE
 
 UNKNOWN_GREY = 205
-_WIDTHS = (5, 2)  # of the map, and of curves and legend
+_WIDTHS = (5, 3)  # of the map, and of curves and legends
+_PLOT_WIDTHS = (3, 1)  # of curves, and of their legend
+_COLOURS = ('blue', 'orange', 'green', 'pink', 'amber', 'light blue', 'grey')  # of the palette
 LEGEND = """
 - **orange** end node with its position probability, **grey** it will stay;
   **dark blue** branch, **amber** corner, **green** skeleton
@@ -17,12 +20,12 @@ LEGEND = """
   **yellow** planned path and target; **purple** samples
 - **red** scan; **pale pink** scans of a piece of map whose place is unknown;
   **blue** features of the local area, its nodes ringed; **pale blue** other features
-- **pale outlines**: rooms (blue), corridors (sand), halls (green)
+- **pale outlines** on the walls: rooms (blue), corridors (sand), halls (green)
 """
 # Each curve: name in the legend and colour, by plot.
 _PLOTS = {
     'error': ('pose: error, 2 sigma', ('position, cm', 'heading, deg', '2 sigma, cm')),
-    'progress': ('progress', ('coverage, %', 'distance, m')),
+    'progress': ('progress', ('seen, m2', 'distance, m')),
     'count': ('counts', ('features', 'local features', 'matched lines', 'nodes', 'end nodes left')),
     'step': (
         'step times, ms',
@@ -63,6 +66,17 @@ def style(rr: Any) -> dict[str, Any]:
     }
 
 
+def curve_legend(plot: str, curves: Collection[str]) -> str:
+    """Legend of the curves that a plot has so far."""
+    known = zip(_PLOTS[plot][1], _COLOURS, strict=False)
+    return '\n'.join(f'- **{colour}** {curve}' for curve, colour in known if curve in curves)
+
+
+def legend_entity(plot: str) -> str:
+    """Entity path of the legend of a plot."""
+    return f'legends/{plot}'
+
+
 def blueprint(rr: Any, patch: GridPatch, trails: list[str]) -> Any:
     """Layout in which the whole map is in view; trajectories (entities) are shown in full."""
     rrb = rr.blueprint
@@ -78,13 +92,18 @@ def blueprint(rr: Any, patch: GridPatch, trails: list[str]) -> Any:
         line_grid=rrb.LineGrid3D(visible=False),
         overrides={name: rrb.VisibleTimeRanges(timeline=TIMELINE, **past) for name in trails},
     )
-    corner = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
+    # rerun's own legend covers the curves.
+    inside = rrb.PlotLegend(visible=False)
     everything = rrb.TimeRange(
         start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
     )
     axis = rrb.TimeAxis(view_range=everything)
     curves = [
-        rrb.TimeSeriesView(origin=f'plots/{plot}', name=name, plot_legend=corner, axis_x=axis)
+        rrb.Horizontal(
+            rrb.TimeSeriesView(origin=f'plots/{plot}', name=name, plot_legend=inside, axis_x=axis),
+            rrb.TextDocumentView(origin=legend_entity(plot), name='curves'),
+            column_shares=_PLOT_WIDTHS,
+        )
         for plot, (name, _) in _PLOTS.items()
     ]
     legend = rrb.TextDocumentView(origin='legend', name='colours')

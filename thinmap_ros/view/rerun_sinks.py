@@ -17,6 +17,8 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError
 
+# Its package is rerun-sdk: that of the name rerun is another one.
+ADVICE = "rerun is not installed: pip install 'rerun-sdk>=0.41,<0.42'"
 APPLICATION = 'thinmap'
 TIMELINE = 'time'
 # Memory limit of a viewer; beyond it, the oldest data are dropped.
@@ -37,7 +39,7 @@ def library() -> Any:
         import rerun
         import rerun.blueprint
     except ImportError as error:
-        raise InputError('rerun is not installed: pip install "thinmap_ros[viewer]"') from error
+        raise InputError(ADVICE) from error
     return rerun
 
 

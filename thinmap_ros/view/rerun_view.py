@@ -105,6 +105,8 @@ class View(NullView):
         self._target = np.zeros((0, 2))
         self._patch: GridPatch | None = None
         self._framed_m = 0.0
+        self._curves: dict[str, dict[str, None]] = {}
+        self._zeros: dict[tuple[str, str], int] = {}
         if spawn:
             self._streams.open_viewer()
         if recording is not None:
@@ -311,7 +313,31 @@ class View(NullView):
         self._log('map/target', points)
 
     def scalar(self, ns: int, plot: str, curve: str, value: float) -> None:
-        """Add a value to a curve of a plot (`error`, `progress`, `count`, `step`)."""
+        """Add a value to a curve of a plot (`error`, `progress`, `count`, `step`).
+
+        A curve that has only been zero is not shown.
+        """
+        is_new = curve not in self._curves.get(plot, {})
+        if is_new and value == 0.0:
+            self._zeros.setdefault((plot, curve), ns)
+            return
+        if is_new:
+            self._begin_curve(plot, curve)
+        self._log_value(ns, plot, curve, value)
+
+    def _begin_curve(self, plot: str, curve: str) -> None:
+        """Name a curve in the legend of its plot, and show its first value if that was zero."""
+        known = self._curves.setdefault(plot, {})
+        known[curve] = None
+        text = self._rr.TextDocument(
+            rerun_blueprint.curve_legend(plot, known), media_type='text/markdown'
+        )
+        self._log(rerun_blueprint.legend_entity(plot), text, static=True)
+        first_ns = self._zeros.pop((plot, curve), None)
+        if first_ns is not None:
+            self._log_value(first_ns, plot, curve, 0.0)
+
+    def _log_value(self, ns: int, plot: str, curve: str, value: float) -> None:
         self._at(ns)
         self._log(rerun_blueprint.entity(plot, curve), self._rr.Scalars([value]))
 

@@ -14,13 +14,15 @@ from thinmap_ros.core.regions.region_map import RegionKind, RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.files.atomic import atomic_write
-from thinmap_ros.view import palette, wall_lines
+from thinmap_ros.view import cell_blocks, palette
+from thinmap_ros.view.cell_blocks import DrawnCells
 from thinmap_ros.view.figures import draw_graph, draw_hidden_areas
-from thinmap_ros.view.wall_lines import DrawnCells
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from thinmap_ros.view.map_figure import MapFigure
 
 _UNKNOWN = '#CCCCCC'
 _FREE = '#FFFFFF'
@@ -81,30 +83,45 @@ def summary_figure(
     title: str = '',
     regions: RegionMap | None = None,
     hidden: Array | None = None,
-    is_measured: bool = True,
     apart: Array = _NO_POINTS,
     robots: Mapping[str, Array] | None = None,
 ) -> None:
-    """Write a PNG: map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven.
+    """Write a PNG of `make_figure`."""
+    figure = make_figure(patch, topology, estimated, true, title, regions, hidden, apart, robots)
+    with atomic_write(path) as aside:
+        figure.save(aside)
+
+
+def make_figure(
+    patch: GridPatch,
+    topology: TopologicalMap,
+    estimated: Array = _NO_POINTS,
+    true: Array | None = None,
+    title: str = '',
+    regions: RegionMap | None = None,
+    hidden: Array | None = None,
+    apart: Array = _NO_POINTS,
+    robots: Mapping[str, Array] | None = None,
+) -> 'MapFigure':
+    """A figure of map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven.
 
     regions: of the grid, in pale colours; hidden (N, 3): positions, m, and hidden area, m2, that is
-    expected there; is_measured: whether walls are drawn as lines (see `wall_lines`), or each cell
-    as it is; apart (N, 2): scan points of pieces of map whose place is unknown; robots: paths (N, 2
-    or more) of several robots by name.
+    expected there; apart (N, 2): scan points of pieces of map whose place is unknown; robots: paths
+    (N, 2 or more) of several robots by name.
     """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+
+    from thinmap_ros.view.map_figure import MapFigure
 
     area = shown_area(patch, apart)
     width, height = _map_inches(area)
     with matplotlib.rc_context({'font.size': _LAYOUT.font_pt}):
-        figure = Figure(dpi=_LAYOUT.dpi, layout='constrained')
+        figure = MapFigure(dpi=_LAYOUT.dpi, layout='constrained')
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
         axes.set_facecolor(_UNKNOWN)
-        cells = wall_lines.drawn_cells(patch) if is_measured else raw_cells(patch)
-        surfaces = _draw_cells(axes, patch, cells, regions)
+        surfaces = _draw_cells(axes, patch, regions)
         _draw_apart(axes, apart)
         _draw_paths(axes, estimated, true)
         _draw_robots(axes, robots or {})
@@ -119,8 +136,7 @@ def summary_figure(
         _draw_scale_bar(axes, right - left)
         figure.suptitle(shortened(title), parse_math=False)
         _draw_legend(figure, axes, surfaces, (width, height))
-        with atomic_write(path) as aside:
-            figure.savefig(aside, format='png', bbox_inches='tight', metadata={'Software': None})
+    return figure
 
 
 def shown_area(patch: GridPatch, points: Array = _NO_POINTS) -> tuple[float, float, float, float]:
@@ -157,24 +173,17 @@ def shortened(title: str) -> str:
     return line if len(line) <= most else line[: most - 1] + _ELLIPSIS
 
 
-def raw_cells(patch: GridPatch) -> DrawnCells:
-    """Free and occupied cells of a map as they are."""
-    return DrawnCells(patch.free, patch.occupied)
-
-
 def _map_inches(area: tuple[float, float, float, float]) -> tuple[float, float]:
     left, right, bottom, top = area
     scale = _LAYOUT.long_in / max(right - left, top - bottom)
     return (right - left) * scale, (top - bottom) * scale
 
 
-def _draw_cells(
-    axes: 'Axes', patch: GridPatch, cells: DrawnCells, regions: RegionMap | None
-) -> dict[str, str]:
+def _draw_cells(axes: 'Axes', patch: GridPatch, regions: RegionMap | None) -> dict[str, str]:
     """Draw the cells; returns the colour of each kind of surface by its name in the legend."""
-    factor = wall_lines.reduction(patch.shape)
+    factor = cell_blocks.reduction(patch.shape)
     cell_m = factor * patch.frame.resolution
-    cells = wall_lines.reduced(cells, factor)
+    cells = cell_blocks.reduced(DrawnCells(patch.free, patch.occupied), factor)
     shade = np.empty((*cells.free.shape, 3), dtype=np.uint8)
     shade[:] = palette.rgb(_UNKNOWN)
     shade[cells.free] = palette.rgb(_FREE)
@@ -182,7 +191,7 @@ def _draw_cells(
     surfaces['unknown'] = _UNKNOWN
     labels = None
     if regions is not None and regions.regions:
-        labels = wall_lines.block_maximum(regions.labels, factor)
+        labels = cell_blocks.block_maximum(regions.labels, factor)
         labels = _spread_labels(labels, cells.free, round(_REGION_MARGIN_M / cell_m))
         for kind, name in _KINDS.items():
             ids = [region.id for region in regions.regions.values() if region.kind == kind]

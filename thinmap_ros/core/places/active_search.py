@@ -278,7 +278,8 @@ def _gains(
     resolution = places.frame.resolution
     origin = (places.frame.origin_x, places.frame.origin_y)
     views = np.stack([(se2.transform_points(T, at) - origin) / resolution for T in starts])
-    ranges = _ranges(places.states, views, starts[:, 2], range_m / resolution) * resolution
+    headings = starts[:, 2].copy()  # contiguous, whatever their number: one kernel
+    ranges = _ranges(places.states, views, headings, range_m / resolution) * resolution
     gains = np.zeros(len(at))
     total = 0.0
     towards = np.zeros(len(at), dtype=np.complex128)

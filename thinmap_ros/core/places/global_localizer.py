@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.config import config_or_default
+from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.fit import usual_share
@@ -137,7 +139,9 @@ class GlobalLocalization:
 
         Raises InputError where it has no wall, no free place, or the topology no node.
         """
-        self.config = config or GlobalLocalizationConfig()
+        require_type('patch', patch, GridPatch)
+        require_type('topology', topology, TopologicalMap)
+        self.config = config_or_default(config, GlobalLocalizationConfig)
         self.places = Places.of(patch, topology, self.config)
         self._rng = np.random.default_rng(seed)
         self._model: NodeModel | None = None
@@ -168,6 +172,9 @@ class GlobalLocalization:
 
     def step(self, scan: Scan, T_odom_base: Array) -> Result:
         """Process a scan with the odometry pose (3,) at its stamp."""
+        require_type('scan', scan, Scan)
+        if np.shape(T_odom_base) != (3,):
+            raise InputError(f'T_odom_base = {quoted(T_odom_base)}: expected a pose (3,)')
         if not se2.is_finite(T_odom_base):
             return self._waiting(f'odometry {T_odom_base.tolist()}: expected finite numbers')
         if self._jumped(T_odom_base):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
@@ -110,7 +110,7 @@ Moment = tuple[float, Array, GridPatch, TopologicalMap, Array]
 def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]:
     """State once a second (time, pose, map, graph, node A); A by scan: time, x, y, path."""
     builder = TopologyBuilder(TopologyConfig())
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     moments: list[Moment] = []
     track: list[list[float]] = []
     at = np.array(_SETUP.bend)

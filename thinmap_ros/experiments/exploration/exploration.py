@@ -8,6 +8,7 @@ from thinmap_ros.closed_loop import SCANS_PER_GRAPH
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision
+from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -138,7 +139,7 @@ def _replay_exploration(samples: list[DriveSample]) -> tuple[list[_Moment], EndN
     def here(scan: object, T_odom_base: Array) -> Estimate:
         return Estimate(truth, np.zeros((3, 3)), np.zeros(3))
 
-    pipeline = Pipeline(PipelineConfig(scans_per_graph=SCANS_PER_GRAPH), here)
+    pipeline = Pipeline(PipelineConfig(grid=PAPER_GRID, scans_per_graph=SCANS_PER_GRAPH), here)
     explorer = PaperExplorer()
     census = EndNodeCensus()
     moments = []

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.core.errors import ConfigError, InputError, one_line_reason
+from thinmap_ros.core.grid.occupancy import PAPER_GRID
+from thinmap_ros.evaluation import peers
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.evaluation.trajectory_errors import RelationErrors, read_columns, relation_errors
 from thinmap_ros.files.yaml import read_mapping
@@ -28,21 +30,6 @@ _LASERS = {
         'range_max_m': 25.0,
     },
 }
-# Published results on the Intel log: errors of translation in m, live and after all corrections;
-# CPU ms per scan; MB. Single runs of the programs with their defaults, Cartographer
-# tuned; the last three as published in 2009.
-_OTHERS: list[tuple[str, float | None, float, float | None, float | None]] = [
-    ('IRIS LaMa slam2d', 0.036, 0.033, 0.17, 13.0),
-    ('Karto', 0.073, 0.038, 12.3, 73.0),
-    ('GMapping, 30 particles', 0.104, 0.046, 8.7, 110.0),
-    ('slam_toolbox', 0.113, 0.056, 1.17, 45.0),
-    ('Cartographer 2D', 1.55, 0.081, 34.0, 257.0),
-    ('a public line-feature EKF-SLAM', 1.87, 1.87, 30.0, 79.0),
-    ('scan matching, 2009', None, 0.220, None, None),
-    ('RBPF, 2009', None, 0.070, None, None),
-    ('graph mapping, 2009', None, 0.031, None, None),
-]
-_OTHERS_LOG = 'intel'
 _COLUMNS = [
     'log',
     'scans',
@@ -87,10 +74,10 @@ def run(folder: Path, out: Path) -> Outcome:
         'Localizer, grid and topological map process each log in file order. '
         'Live: the estimate at the time of a scan; final: after all corrections. '
         'Errors are means over the reference relations between poses, of translation and rotation. '
-        'The column *paper* has the published results of other programs.',
+        'The column *paper* has errors of other programs: [Peers](peers.md).',
         [
             Table('logs', _COLUMNS, rows),
-            Table('others', ['system', 'live_m', 'final_m', 'cpu_ms_per_scan', 'peak_mb'], _OTHERS),
+            Table('others', _OTHER_COLUMNS, [_other(run) for run in peers.runs(peers.INTEL)]),
             Table('times', _TIMED, [result.timed for result in results], timed=True),
         ],
         [result.plot for result in results],
@@ -98,13 +85,17 @@ def run(folder: Path, out: Path) -> Outcome:
     )
 
 
+_OTHER_COLUMNS = ['system', 'log', 'live_m', 'final_m', 'cpu_ms_per_scan', 'peak_mb', 'origin']
 _TIMED = ['log', 'cpu_ms_per_scan', 'wall_ms_median', 'wall_ms_p95', 'wall_ms_max', 'peak_mb']
 
 
 def _one(folder: Path, out: Path) -> _Result:
     wall = time.perf_counter()
     cpu = time.process_time()
-    result = replay(CarmenLog(folder / 'log.clf', laser_of(folder, folder.name)), PipelineConfig())
+    result = replay(
+        CarmenLog(folder / 'log.clf', laser_of(folder, folder.name)),
+        PipelineConfig(grid=PAPER_GRID),
+    )
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     report = write_outputs(result, out, folder.name, seconds)
     ms = report['ms_per_scan']['all']
@@ -192,18 +183,22 @@ def _comparisons(row: list[Any]) -> list[Comparison]:
         f'odometry {values["odometry_m"]:.2f} m'
     )
     rows = [Comparison(f'{name}: mean error', '', ours, remark=degrees)]
-    if name == _OTHERS_LOG:
-        rows += [
-            _against(system, live_m, final_m, values) for system, live_m, final_m, *_ in _OTHERS
-        ]
+    if name == peers.INTEL:
+        rows += [_against(run, values) for run in peers.runs(name)]
     return rows
 
 
-def _against(
-    system: str, live_m: float | None, final_m: float, values: dict[str, Any]
-) -> Comparison:
-    theirs = f'{final_m:.3f} m' + ('' if live_m is None else f', {live_m:.3f} m live')
-    live = '' if live_m is None else f', {values["live_m"]:.3f} m live'
-    ours = f'{values["final_m"]:.3f} m' + live
-    better = values['final_m'] <= final_m and (live_m is None or values['live_m'] <= live_m)
-    return Comparison(f'{values["log"]}, against {system}', theirs, ours, bool(better))
+def _other(run: peers.PeerRun) -> list[Any]:
+    errors = [peers.shown(run.live_m), peers.shown(run.final_m)]
+    return [run.system, run.log, *errors, run.cpu_ms, run.peak_mb, run.origin.value]
+
+
+def _against(run: peers.PeerRun, values: dict[str, Any]) -> Comparison:
+    """Errors beside those of another program: ours are as good if each is at most its lowest."""
+    pairs = [('final', run.final_m), ('live', run.live_m)]
+    known = [(name, metres) for name, metres in pairs if metres is not None]
+    theirs = ', '.join(f'{peers.shown(metres)} m {name}' for name, metres in known)
+    ours = ', '.join(f'{values[f"{name}_m"]:.3f} m {name}' for name, _ in known)
+    better = all(values[f'{name}_m'] <= metres[0] for name, metres in known)
+    what = f'intel, against {run.system}' + (f' ({run.note})' if run.note else '')
+    return Comparison(what, theirs, ours, better, remark=run.origin.value)

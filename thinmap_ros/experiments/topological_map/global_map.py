@@ -5,7 +5,7 @@ from itertools import groupby
 import numpy as np
 from scipy.spatial import cKDTree
 
-from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid, WindowConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
@@ -26,7 +26,7 @@ def run(source: Source) -> Outcome:
     stops = [list(samples) for _, samples in by_place]
     order = [*_FIRST_STOPS, *(k for k in range(len(stops)) if k not in _FIRST_STOPS)]
     builder = TopologyBuilder(TopologyConfig())
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     growth = []
     panels = []
     states = []
