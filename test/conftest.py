@@ -58,7 +58,7 @@ def without_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def started_programs(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests that start a process are marked: unit tests start none."""
-    if any(request.node.get_closest_marker(name) for name in ('programs', 'live')):
+    if any(request.node.get_closest_marker(name) for name in ('programs', 'live', 'browser')):
         return
 
     start = subprocess.Popen.__init__

@@ -7,6 +7,8 @@ import numpy as np
 
 from thinmap_ros.closed_loop import Options, make_loop
 from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
+from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.polygon import inside
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.coverage import observable_cells
@@ -104,3 +106,30 @@ def test_a_robot_stands_still_once_its_laser_has_slipped():
     assert path_m[-1] < 8.0
     assert path_m[-1] == path_m[-100], 'it stands in the last seconds'
     assert any('laser turned by' in warning for warning in loop.pipeline.warnings)
+
+
+def test_an_exploration_does_not_enter_a_keep_out_area():
+    """The area is in the middle of the path of an exploration without it."""
+    world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
+    start = np.asarray(world.start)
+    goal = observable_cells(world, start, 0.25, 8.0)
+
+    def path(keep_out):
+        loop = make_loop(world, start, Options(speed_m_s=0.5))
+        decide_on = loop.decide_on
+
+        def decide(observation, T_map_odom):
+            patch = keep_out.laid_on(observation.patch, observation.T_map_base)
+            decide_on(observation._replace(patch=patch), T_map_odom)
+
+        loop.decide_on = decide
+        outcome = loop.run(goal, 600.0, lambda seconds, coverage: None)
+        assert outcome.finished, outcome.reason
+        return np.array(loop.log.true_poses)[:, :2]
+
+    free = path(KeepOut())
+    middle = free[np.hypot(*(free - start[:2]).T).argmax() // 2]
+    square = middle + 0.5 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    assert inside(free, square).any() and not inside(start[None, :2], square).any()
+    around = path(KeepOut().with_area(square, is_wall=False))
+    assert not inside(around, square).any()

@@ -14,7 +14,6 @@ from support.hidden_library import hide_ros
 
 from thinmap_ros import __main__ as command
 from thinmap_ros import __version__
-from thinmap_ros.jit.cache import BESIDE_PACKAGE
 
 pytestmark = pytest.mark.programs
 
@@ -68,6 +67,32 @@ def test_a_subcommand_has_its_own_arguments_and_errors() -> None:
     assert done.stderr.startswith('thinmap carmen_to_bag: error: /no/such.clf: ')
 
 
+@pytest.mark.parametrize(
+    ('typed', 'offered'),
+    [
+        ('thinmap rep', ['replay ']),
+        ('thinmap replay --las', ['--laser-pose ']),
+        ('thinmap map-to-graph --pru', ['--prune-m ']),
+        ('thinmap nodes lo', []),
+    ],
+)
+def test_tab_completes_subcommands_and_options(
+    typed: str, offered: list[str], tmp_path: Path
+) -> None:
+    said = tmp_path / 'offered.txt'
+    variables = {
+        **os.environ,
+        '_ARGCOMPLETE': '1',
+        '_ARGCOMPLETE_STDOUT_FILENAME': str(said),
+        'COMP_LINE': typed,
+        'COMP_POINT': str(len(typed)),
+    }
+    done = subprocess.run([sys.executable, '-m', 'thinmap_ros'], env=variables, text=True)
+    assert done.returncode == 0
+    words = said.read_text().split('\013') if said.exists() else []
+    assert [word for word in words if word] == offered
+
+
 @pytest.mark.parametrize('name', ['demo', 'nodes'])
 def test_what_needs_ros_says_what_is_missing(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -111,7 +136,6 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def thinmap(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Runs the installed command, without ROS and without the source tree."""
     monkeypatch.setenv('PYTHONPATH', str(installed))
-    monkeypatch.setenv('NUMBA_CACHE_DIR', str(BESIDE_PACKAGE))
     hide_ros(tmp_path, monkeypatch)
 
     def run_installed(*words: str) -> str:

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -48,6 +49,15 @@ def test_an_example_is_short_and_uses_public_names(path: Path) -> None:
         if isinstance(node, ast.ImportFrom) and node.module.startswith('thinmap_ros'):
             assert node.module == 'thinmap_ros'
             assert {name.name for name in node.names} <= set(thinmap_ros.__all__)
+
+
+@pytest.mark.parametrize('path', EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_has_help(path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, 'argv', [str(path), '--help'])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(path), run_name='__main__')
+    assert end.value.code == 0
+    assert f'Usage: python examples/{path.name}' in capsys.readouterr().out
 
 
 def test_every_example_is_run_here() -> None:

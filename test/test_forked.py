@@ -15,8 +15,11 @@ from support.timeouts import PATIENCE_S
 
 pytestmark = pytest.mark.programs
 PROGRAM = """
-import json, os, signal, sys, threading, thinmap_ros
+import atexit, json, os, signal, sys, threading, thinmap_ros
 
+last_words = []
+threading.Timer(0.3, last_words.append, ['of a thread']).start()
+atexit.register(lambda: print('an error', last_words, file=sys.stderr, end=''))
 print(json.dumps({
     'name': __name__,
     'spec': __spec__.name,
@@ -33,8 +36,6 @@ print(json.dumps({
     'SIGINT': repr(signal.getsignal(signal.SIGINT).__name__),
     'threads': threading.active_count(),
 }))
-print('an error', file=sys.stderr)
-sys.stdout.flush()
 match sys.argv[1]:
     case 'exit':
         sys.exit(int(sys.argv[2]))
@@ -43,6 +44,7 @@ match sys.argv[1]:
     case 'interrupt':
         signal.raise_signal(signal.SIGINT)
     case 'kill':
+        sys.stdout.flush()
         os.kill(os.getpid(), signal.SIGKILL)
 """
 WAITS = """
@@ -88,7 +90,7 @@ def test_a_fork_is_to_a_program_what_a_start_is(
         assert isinstance(process, forked.Process) != fresh
         assert process.wait(PATIENCE_S) == code
         told.append(json.loads(out.read_text()))
-        errors.append(err.read_text().splitlines()[-1])
+        errors.append(err.read_text().splitlines()[-1:])
     assert told[0] == told[1]
     assert errors[0] == errors[1]
 

@@ -2,7 +2,6 @@
 
 import ast
 import re
-import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -11,6 +10,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 from ament_index_python import get_package_prefix, get_package_share_directory
+from support.forks import forked
 
 from thinmap_ros import __version__
 
@@ -19,7 +19,7 @@ PACKAGE = ROOT / 'thinmap_ros'
 MODULES = [path for room in ('nodes', 'tools') for path in (PACKAGE / room).glob('*.py')]
 PROGRAMS = sorted(path.stem for path in MODULES if 'def main(' in path.read_text())
 TOOLS = sorted(
-    path.stem for path in (PACKAGE / 'tools').glob('*.py') if 'ArgumentParser(' in path.read_text()
+    path.stem for path in (PACKAGE / 'tools').glob('*.py') if '\ndef main(' in path.read_text()
 )
 # rosdep keys of packages that are imported or installed under another name.
 KEYS = {
@@ -31,14 +31,21 @@ KEYS = {
     'mcap': 'python3-mcap-pip',
     'lz4': 'python3-mcap-pip',  # a dependency of mcap, as zstandard
     'zstandard': 'python3-mcap-pip',
+    'segno': 'python3-segno-pip',
     'cv2': 'python3-opencv',
     'opencv-contrib-python-headless': 'python3-opencv',
     'scikit-image': 'python3-skimage',
     'pytest-xdist': None,  # no key; it only runs tests in parallel
+    # No keys: the notebook of the tutorials is run with the wheels.
+    'ipykernel': None,
+    'jupytext': None,
+    'nbclient': None,
 }
 # Keys of rosdistro's rosdep/python.yaml, read in its commit 662921b on 2026-11-22; of two that were
-# added or widened to Ubuntu 24.04 later: its pull requests 37795 (rosbags) and 36477 (numba).
+# added or widened to Ubuntu 24.04 later: its pull requests 37795 (rosbags) and 36477 (numba); of
+# argcomplete: package.xml of ros2cli.
 KNOWN_KEYS = {
+    'python3-argcomplete',
     'python3-hypothesis',
     'python3-matplotlib',
     'python3-networkx',
@@ -52,6 +59,7 @@ KNOWN_KEYS = {
     'python3-rosbags-pip',
     'python3-scipy',
     'python3-skimage',
+    'python3-tornado',
     'python3-tqdm',
     'python3-yaml',
 }
@@ -167,14 +175,17 @@ def test_setup_py_and_the_requirements_ask_for_the_same():
         names_in(ROOT / 'requirements' / f'{part}.in') for part in ('python', 'test', 'viewer')
     )
     assert bare(needed) == bare(python) - BUILDERS
-    assert bare(extras['test'] + extras['cluster']) == bare(test) - CHECKERS
+    tested = [name for extra in ('test', 'cluster', 'completion', 'web') for name in extras[extra]]
+    assert bare(tested) == bare(test) - CHECKERS
     assert set(extras['viewer']) == viewer.keys(), 'with the same bounds'
 
 
 def test_setup_py_and_package_xml_ask_for_the_same():
     tree = ElementTree.parse(ROOT / 'package.xml')
     needed, extras = asked_in_setup_py()
-    for names, tag in ((needed, 'exec_depend'), (extras['test'], 'test_depend')):
+    run_with = needed + extras['completion'] + extras['web']
+    wanted = ((bare(run_with), 'exec_depend'), (extras['test'], 'test_depend'))
+    for names, tag in wanted:
         keys = {KEYS.get(name, f'python3-{name}') for name in names} - {None}
         assert keys == {e.text for e in tree.iter(tag) if e.text.startswith('python3-')}
 
@@ -214,8 +225,7 @@ def test_files_for_users_are_installed(folder):
 @pytest.mark.programs
 @pytest.mark.parametrize('name', TOOLS)
 def test_every_tool_has_help(name):
-    command = [sys.executable, '-m', f'thinmap_ros.tools.{name}', '--help']
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = forked.run(f'thinmap_ros.tools.{name}', '--help')
     assert done.returncode == 0, done.stderr
     assert 'usage' in done.stdout
 

@@ -1,4 +1,4 @@
-"""scripts/env on machines for which there are no ROS wheels."""
+"""scripts/env on machines for which there are no ROS wheels, and beside another distribution."""
 
 import shutil
 import subprocess
@@ -62,3 +62,22 @@ def test_other_machines_are_set_up(set_up, tmp_path, machine, variables):
     assert 'ROS wheels' not in done.stderr
     assert 'cmake not found: install the package cmake' in done.stderr
     assert (tmp_path / '.setup').exists()
+
+
+@pytest.mark.parametrize(
+    ('variables', 'named'),
+    [
+        ({'ROS_DISTRO': 'humble', 'AMENT_PREFIX_PATH': '/opt/ros/humble'}, 'humble'),
+        ({'ROS_DISTRO': 'noetic'}, 'noetic'),
+        ({'AMENT_PREFIX_PATH': '/home/me/ws/install:/opt/ros/iron'}, 'iron'),
+        ({**SOURCED, 'AMENT_PREFIX_PATH': '/opt/ros/jazzy:/opt/ros/humble'}, 'humble'),
+        ({**SOURCED, 'THINMAP_ENV': '/somewhere', 'ROS_DISTRO': 'humble'}, 'humble'),
+    ],
+    ids=['humble', 'ROS 1', 'by its path', 'mixed', 'sourced later'],
+)
+def test_another_distribution_is_named(set_up, tmp_path, variables, named):
+    done = set_up('x86_64', **variables)
+    assert done.returncode == 1 and done.stdout == ''
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f'thinmap: ROS {named} is sourced in this shell: expected ROS 2 Jazzy')
+    assert not (tmp_path / '.setup').exists()

@@ -20,14 +20,14 @@ def test_a_wrong_stage_is_one_line_and_exit_code_2() -> None:
     assert done.returncode == 2
     assert done.stdout == ''
     assert done.stderr.startswith('scripts/test: units: expected')
-    assert done.stderr.endswith('a stage: lint unit without-ros live bounds\n')
+    assert done.stderr.endswith('a stage: lint unit without-ros live browser bounds\n')
     assert done.stderr.count('\n') == 1
 
 
 def test_every_test_is_in_one_stage(request: pytest.FixtureRequest) -> None:
     for item in request.session.items:
         marks = {mark.name for mark in item.iter_markers()}
-        assert not {'programs', 'live'} <= marks, item.nodeid
+        assert len(marks & {'programs', 'live', 'browser'}) <= 1, item.nodeid
 
 
 def test_what_test_modules_share_is_in_support() -> None:

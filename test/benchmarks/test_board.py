@@ -196,7 +196,8 @@ def called(*words):
 @pytest.fixture
 def small_board(monkeypatch, tmp_path):
     """A board of one small world; the folder for its results."""
-    cases = [LoopCase('lab', 1, 'turtlebot3'), DriveCase('lab', 1), DriveCase('lab', 2)]
+    drives = [DriveCase('room_10x10', run) for run in (1, 2)]
+    cases = [LoopCase('room_10x10', 1, 'turtlebot3'), *drives]
     monkeypatch.setattr(board_run, 'board_cases', lambda logs: cases)
     return tmp_path / 'out'
 
@@ -205,29 +206,29 @@ def small_board(monkeypatch, tmp_path):
 def test_a_small_board_is_resumed(small_board, capsys):
     words = ['-o', small_board, '--jobs', 1, '--quiet']
     assert called(*words, '--only', 'drive_*_1') == 0
-    assert '[1 of 2 cases]' in (small_board / 'slam.md').read_text()
-    assert (small_board / 'drives' / 'lab.npz').exists()
+    assert '[1 of 2 cases]' in (small_board / 'targets.md').read_text()
+    assert (small_board / 'drives' / 'room_10x10.npz').exists()
     results = small_board / 'board'
-    kept = results / 'drive_lab.odometry_1.json'
+    kept = results / 'drive_room_10x10.odometry_1.json'
     first = json.loads(kept.read_text())
     assert first['scans'] > 100
     assert first['live_m'] < 0.2
     kept.write_text(json.dumps(first | {'step_ms': 98765.0}))
     capsys.readouterr()
     assert called(*words) == 0
-    text = (small_board / 'slam.md').read_text()
-    assert '| 98765 (drive_lab.odometry_1) | **missed** |' in text
+    text = (small_board / 'targets.md').read_text()
+    assert '| 98765 (drive_room_10x10.odometry_1) | **missed** |' in text
     assert capsys.readouterr().out.splitlines()[2] in text
     assert '| closed loop, other lasers' in text
-    second = json.loads((results / 'drive_lab.odometry_2.json').read_text())
+    second = json.loads((results / 'drive_room_10x10.odometry_2.json').read_text())
     assert second['scans'] == first['scans']
     assert second['live_m'] != first['live_m']
-    loop = json.loads((results / 'loop_lab.turtlebot3_1.json').read_text())
+    loop = json.loads((results / 'loop_room_10x10.turtlebot3_1.json').read_text())
     assert loop['coverage'] > 0.9
     assert loop['live_m'] < 0.2
-    cases = (small_board / 'slam.md').read_text()
-    assert '| drive_lab.odometry_1 |' in cases
-    assert '| loop_lab.turtlebot3_1 |' in cases
+    cases = (small_board / 'cases.md').read_text()
+    assert '| drive_room_10x10.odometry_1 |' in cases
+    assert '| loop_room_10x10.turtlebot3_1 |' in cases
     # Other options need another folder with the same recordings; two folders are compared.
     assert called(*words, '--set', 'slam=ekf_ti') == 2
     assert 'other options' in capsys.readouterr().err
@@ -235,11 +236,11 @@ def test_a_small_board_is_resumed(small_board, capsys):
     other += ['--against', small_board, '--only', '*_1', '--set', 'slam=ekf_ti']
     assert called(*other, '--jobs', 1, '--quiet') == 0
     assert not (small_board / 'other' / 'drives').exists()
-    text = (small_board / 'other' / 'slam.md').read_text()
-    assert '| 98765 (drive_lab.odometry_1) |' in text
+    text = (small_board / 'other' / 'targets.md').read_text()
+    assert '| 98765 (drive_room_10x10.odometry_1) |' in text
     assert (
         '## Comparison with another run (2 of 2 cases)'
-        in (small_board / 'other/slam.md').read_text()
+        in (small_board / 'other/cases.md').read_text()
     )
 
 

@@ -1,20 +1,24 @@
 """The fit of the belief: coefficients, reliability, and what is hidden behind a frontier."""
 
 import json
+import sys
 from dataclasses import fields
 
 import numpy as np
 import pytest
 
+from benchmarks.exploration.cases import generated
 from benchmarks.exploration.fit_belief import (
+    UNSEEN,
     fit,
     logistic_fit,
+    main,
     observed,
     predicted,
     reliability_table,
     source,
 )
-from benchmarks.exploration.observed_candidates import COLUMNS, hidden_areas
+from benchmarks.exploration.observed_candidates import COLUMNS, Case, hidden_areas
 from thinmap_ros.core.exploration.belief.fitted import FITTED
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -61,6 +65,19 @@ def test_a_fitted_model_predicts_what_the_explorer_believes(tmp_path):
     assert len(model.mean_area_m2) == len(model.area_limits_m2) + 1
     table = reliability_table(predicted(model, data.columns), data)
     assert float(table[-1].split('mean error ')[1].split(';')[0]) < 0.03
+
+
+def test_the_published_table_is_that_of_the_present_constants(tmp_path, monkeypatch):
+    data, _ = candidates(tmp_path)
+    kept = (tmp_path / 'one.json').read_text()
+    for name in (*generated(5000, 20), *UNSEEN):
+        (tmp_path / f'{Case(name).name.replace("/", "_")}.json').write_text(kept)
+    monkeypatch.setattr(sys, 'argv', ['fit_belief', '-o', str(tmp_path)])
+    main()
+    written = (tmp_path / 'reliability.md').read_text().splitlines()
+    # Scores alone: there are 25 times as many candidates.
+    expected = reliability_table(predicted(FITTED, data.columns), data)
+    assert written[-1].split(';')[:2] == expected[-1].split(';')[:2]
 
 
 def test_candidates_seen_often_count_once(tmp_path):

@@ -43,7 +43,8 @@ def test_a_row_is_resumed_and_shown_on_the_page(tmp_path: Path) -> None:
     made = 'Commit 1234567, a processor, 2 cores, Python 3.12.3'
     (tmp_path / 'provenance.txt').write_text(f'{made}\n')
     text = page(tmp_path)
-    assert text.startswith(f'# Global localization\n\n{made}\n')
+    assert text.startswith('# Global localization: correct, false, not localized\n\n')
+    assert f'\n\n{made}\n\n![' in text
     assert '| kth/a | 2 | 1 | 0 | 1 | 2.5 | 2.5 |' in text
     assert '| kth/b | 1 | 0 | 1 | 0 | 2.5 | 2.5 |' in text
     assert '## Dungeons' not in text

@@ -48,7 +48,7 @@ NOT_RUN = {
     'rosdep install --from-paths src/thinmap src/thinmap/thinmap_msgs --ignore-src -y': 'as above',
     'colcon build --base-paths src/thinmap src/thinmap/thinmap_msgs': 'as above; CI does it',
     'source install/setup.bash': 'as above',
-    'ros2 run thinmap_ros warm_up': 'as above',
+    'thinmap warm_up': 'as above',
     'ros2 run thinmap_ros thinmap': 'as above; other pages have it, too',
     'ros2 run thinmap_ros rerun_viewer': 'needs rerun, opens a window',
     'rviz2 -d $(ros2 pkg prefix --share thinmap_ros)/config/thinmap.rviz': 'opens a window',
@@ -62,6 +62,8 @@ NOT_RUN = {
     'export ROS_SECURITY_KEYSTORE=$PWD/keys ROS_SECURITY_ENABLE=true '
     'ROS_SECURITY_STRATEGY=Enforce': 'as above',
     'ros2 run thinmap_ros thinmap --ros-args --enclave /robot': 'as above',
+    'ros2 run thinmap_ros web --ros-args -p host:=0.0.0.0 '
+    '-p web_token_file:=$HOME/thinmap_tokens': 'writes into the home of the user',
     'scripts/fuzz': 'hours; test/fuzz runs a part of it',
     'scripts/endurance --faults': 'hours',
 }
@@ -74,8 +76,13 @@ HELP_ONLY = {
     'scripts/endurance': 'hours; scripts/endurance --minutes 10 is for releases',
     'scripts/experiment all': 'test/experiments/test_experiments.py runs each experiment',
 }
+_COMPARE = (
+    'thinmap compare_exploration floor_40x10 -o out/compare --speed-m-s 0.5 \\\n'
+    '  --strategies position_probability nearest_frontier'
+)
 # Shortened by options that the same lines of the documents name.
 SHORTER = {
+    _COMPARE: f'{_COMPARE} --starts 1',
     'scripts/test': 'scripts/test test/core/topology/test_thinning.py',
     'scripts/experiment exploration': 'scripts/experiment exploration --from-bag bags',
 }
@@ -106,6 +113,7 @@ PAGES: dict[str, Nodes] = {
     'tune_a_laser.md': {},
     'two_robots.md': {},
     'use_nav2.md': SIM,
+    'web_page.md': {},
     'what_a_driver_must_publish.md': SIM,
 }
 
@@ -180,8 +188,10 @@ class Line:
         """Wait for the end, and check the exit code."""
         self.process.wait(timeout=PATIENCE_S)
         assert self.process.returncode == code, f'{self.text}\n{self.said()}'
+        said = self.said()
         for bad in FAILED:
-            assert bad not in self.said(), f'{self.text}\n{self.said()}'
+            # First what is wrong: reports are cut in the middle.
+            assert bad not in said, f'{said[said.index(bad) :]}\n{self.text}\n{said}'
 
     def kill(self) -> None:
         for child in self._children():

@@ -13,7 +13,7 @@ from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
@@ -93,7 +93,7 @@ class Drive:
 
 def map_and_graph(shared: None, rng: np.random.Generator, folder: Path) -> None:
     drive = Drive(rng, folder)
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     builder = TopologyBuilder()
     explorer = Explorer()
     for _ in range(int(rng.integers(1, 15))):
@@ -162,7 +162,7 @@ def check_consistency(shared: None, rng: np.random.Generator, folder: Path) -> N
 
 
 def known_room(folder: Path) -> tuple[GridPatch, Any]:
-    grid = OccupancyGrid()
+    grid = OccupancyGrid(PAPER_GRID)
     builder = TopologyBuilder()
     for k in range(40):
         T = se2.pose(1.5 + 0.18 * k, 1.5, 0.4 * k)

@@ -12,7 +12,9 @@ from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.correctable import CorrectableGrid
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.edits import Erasures, MapEdits
+from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.topology.builder import TopologyBuilder
@@ -25,7 +27,7 @@ State = dict[str, np.ndarray]
 Work = Callable[[Any, Any], object]
 LONGEST = 500
 STEPS = 4
-KINDS = ('topology', 'exploration', 'localizer', 'keyframes', 'grid')
+KINDS = ('topology', 'exploration', 'localizer', 'keyframes', 'grid', 'edits')
 
 
 class Explored:
@@ -53,6 +55,7 @@ class Explored:
             'localizer': pipeline.localizer.state(),
             'keyframes': keyframes.state(),
             'grid': pipeline.grid.state(),
+            'edits': dict(edited(start[:2]).state()),
         }
 
     def use(self, kind: str, state: State) -> None:
@@ -86,7 +89,7 @@ class Explored:
         config = self.loop.pipeline.localizer.config
         localizer = Localizer.from_state(self.states['localizer'], config, keyframes)
         localizer.set_pose(self.scans[-STEPS][1], 1e-4 * np.eye(3))
-        grid = CorrectableGrid(OccupancyGrid(), scans=keyframes.scans)
+        grid = CorrectableGrid(OccupancyGrid(PAPER_GRID), scans=keyframes.scans)
         work = localizer.step
 
         def step(scan: Any, T: Any) -> None:
@@ -106,6 +109,29 @@ class Explored:
             grid.known_area()
 
         return work
+
+    def _use_edits(self, state: State) -> Work:
+        edits = MapEdits.from_state(state)
+        grid = CorrectableGrid(
+            OccupancyGrid(PAPER_GRID), scans=self.scans[:STEPS], erasures=edits.erasures
+        )
+        grid.apply_correction(np.empty(0, dtype=np.int64), np.empty((0, 3)), 0)
+        grid.finish()
+
+        def work(scan: Any, T: Any) -> None:
+            grid.update(scan, T)
+            edits.keep_out.laid_on(grid.shown.known_area(), T)
+
+        return work
+
+
+def edited(xy: np.ndarray) -> MapEdits:
+    """Edits around a place: an area, a wall, and two parts that are erased."""
+    square = xy + np.array([[0.5, 0.5], [1.5, 0.5], [1.5, 1.5], [0.5, 1.5]])
+    erasures = Erasures()
+    erasures.add(square, 2_000_000_000)
+    erasures.add(square + 0.5, 4_000_000_000)
+    return MapEdits(KeepOut().with_area(square, False).with_area(square[:2], True), erasures)
 
 
 def replaced(array: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:

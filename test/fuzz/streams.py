@@ -18,7 +18,7 @@ from support.slam_room import ROOM, scan_in
 from fuzz.cases import chosen
 from thinmap_msgs.msg import LocalGrid, LocalizedScan, ProbabilityGrid, SlamStatus
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.occupancy import ROBOT_GRID, OccupancyGrid
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.ros import messages
@@ -66,7 +66,7 @@ class Stream:
         self._topics = topics
         self._steps = int(rng.integers(40, 160))
         self._disturbances = [self._disturbance() for _ in range(int(rng.integers(1, 5)))]
-        self._grid = OccupancyGrid(ROBOT_GRID)
+        self._grid = OccupancyGrid()
         self._time_ns = START_NS
 
     @property

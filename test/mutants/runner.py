@@ -17,6 +17,7 @@ from pathlib import Path
 
 from mutants.mutations import Mutation
 from mutants.selection import Selection
+from thinmap_ros.jit import cache
 
 _MAX_MEMORY = 8 * 2**30  # bytes: a mutant may allocate any amount
 # CPU time of the tests with a mutant over that without it. A busy machine hardly matters:
@@ -90,9 +91,8 @@ class Workshop:
         self._kernels = folder / 'kernels'
         self._kernels_used = folder / 'kernels_used'
         _copy_project(root, self._copy)
-        beside_package = root / package / '__pycache__' / 'kernels'
-        if beside_package.is_dir():
-            shutil.copytree(beside_package, self._kernels)
+        if (cached := cache.folder()) is not None:
+            shutil.copytree(cached, self._kernels)
         self._kernels.mkdir(exist_ok=True)
         # By content: a mutant of the same size and time must not be taken for the original.
         command = ['-m', 'compileall', '-q', '--invalidation-mode', 'checked-hash', package]

@@ -1,13 +1,13 @@
 """Pieces of the map of a generated building, each driven by a robot from an origin of its own."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.places.recognition.piece import MapPiece
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
@@ -47,7 +47,7 @@ def driven_piece(building, drive, path_m=60.0, drift=0.0):
     """A random drive through a building; drift: m of sideways error per metre of path."""
     world = world_of(building)
     start = random_start(world, np.random.default_rng([building, drive]))
-    grid = OccupancyGrid(OccupancyConfig(no_return_clear_range_m=8.0))
+    grid = OccupancyGrid(replace(PAPER_GRID, no_return_clear_range_m=8.0))
     frames = []
     driven_m = 0.0
     last = start

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from support.forks import forked
+from support.forks.warmed_kernels import LATE
 from support.timeouts import PATIENCE_S
 
 from thinmap_msgs.msg import TopologicalMap
@@ -200,9 +201,16 @@ class Graph:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
 
+    def late_kernels(self) -> list[str]:
+        """Kernels that nodes compiled or loaded after their start: their warm-ups lack them."""
+        logs = [file.read_text(errors='replace') for file in self.folder.glob('*.log')]
+        return sorted({line for log in logs for line in log.splitlines() if LATE in line})
+
 
 @pytest.fixture
 def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
     live = Graph(ros_domain, tmp_path)
     yield live
     live.close()
+    late = live.late_kernels()
+    assert not late, '\n'.join(['extend the warm-ups of the nodes by:', *late])

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.sensing.robots_in_scan import without_robots
 
@@ -44,7 +44,7 @@ def test_a_robot_leaves_no_wall_in_the_map():
     scan = Scan.create(0, ranges, -0.5 * math.pi, math.pi / 180, 0.05, 8.0)
     walls = []
     for seen in (scan, without_robots(scan, POSE, np.array([[2.0, 5.0]]), 0.35)):
-        grid = OccupancyGrid()
+        grid = OccupancyGrid(PAPER_GRID)
         for _ in range(3):
             grid.add_scan(seen, POSE)
         patch = grid.known_area()

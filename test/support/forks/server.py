@@ -5,6 +5,9 @@ has started the server, which waits for them as for its own: each loses its pare
 there, and then falls to the nearest ancestor that asks for orphans (`support.forks.forked`).
 """
 
+from support.forks import quick_end  # before what registers functions for the end
+
+# isort: split
 import gc
 import importlib
 import importlib.util
@@ -17,10 +20,13 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
+from support.forks.warmed_kernels import WarmedKernels
+
 import thinmap_ros.startup
-from thinmap_ros.kernels import warm_up
 
 REQUEST_BYTES = 1 << 20
+# What programs import where they first use it, which takes a second each time.
+_LATE_IMPORTS = ('matplotlib.backends.backend_agg', 'scipy.ndimage', 'thinmap_ros.view.map_figure')
 
 
 class Program(NamedTuple):
@@ -37,15 +43,15 @@ def main() -> None:
     """Import, then fork for each request until the other end of the socket is closed."""
     control = socket.socket(fileno=int(sys.argv[1]))
     _import_programs()
-    for rehearse in warm_up.ALL:
-        rehearse()
+    kernels = WarmedKernels()
     gc.collect()
     gc.freeze()
     program = _serve(control)
     control.close()
-    # Run from here: a fork ends as any program does.
-    if program is not None:
-        _run(program)
+    with quick_end.of_this_process():
+        if program is not None:
+            kernels.forget(program.module)
+            _run(program)
 
 
 def _import_programs() -> None:
@@ -63,6 +69,8 @@ def _import_programs() -> None:
         for path in importlib.import_module(package).__path__:
             for module in pkgutil.iter_modules([path], f'{package}.'):
                 importlib.import_module(module.name)
+    for name in _LATE_IMPORTS:
+        importlib.import_module(name)
     assert _threads() == of_tracing
 
 
