@@ -34,9 +34,11 @@ ROS_DATA = [
     (f'share/{NAME}/config/robots', glob('config/robots/*.yaml')),
     (f'share/{NAME}/config/sensors', glob('config/sensors/*.yaml')),
     (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
+    # colcon puts it on PATH.
+    ('bin', ['scripts/thinmap']),
 ]
 # A program is a module with a `main`. `scripts/env` installs a new one when this file changes, or
-# without .setup/package.stamp. The newest one is evaluate.
+# without .setup/package.stamp. The newest one is fetch_logs.
 ROS_PROGRAMS = [
     f'{path.stem} = {NAME}.{folder}.{path.stem}:main'
     for folder in ('nodes', 'tools')
@@ -60,7 +62,11 @@ setup(
     ],
     options={'build': {'build_base': BUILD.name}} if IS_WHEEL else {},
     package_dir=WHEEL_DATA if IS_WHEEL else {},
-    package_data={NAME: ['py.typed'], '': ['*.yaml', '*.msg', '*.rviz', '*.json']},
+    package_data={
+        NAME: ['py.typed'],
+        f'{NAME}.web': ['page/*'],
+        '': ['*.yaml', '*.msg', '*.rviz', '*.json'],
+    },
     data_files=[] if IS_WHEEL else ROS_DATA,
     install_requires=[
         'lz4',
@@ -77,9 +83,14 @@ setup(
     ],
     extras_require={
         'cluster': ['distributed'],
+        'completion': ['argcomplete>=3'],
         'viewer': ['rerun-sdk>=0.41,<0.42'],  # its interface changes with each minor version
+        'web': ['segno>=1.5', 'tornado>=6.2'],
         'test': [
             'hypothesis',
+            'ipykernel',
+            'jupytext',
+            'nbclient',
             'networkx',
             'opencv-contrib-python-headless',
             'psutil',
@@ -92,7 +103,18 @@ setup(
     python_requires='>=3.11',
     zip_safe=False,
     maintainer='thinmap maintainers',
-    maintainer_email='maintainers@thinmap.invalid',
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Intended Audience :: Science/Research',
+        'License :: OSI Approved :: Apache Software License',
+        'Operating System :: OS Independent',
+        'Programming Language :: Python :: 3 :: Only',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Programming Language :: Python :: 3.13',
+        'Topic :: Scientific/Engineering',
+        'Typing :: Typed',
+    ],
     description='Thinning-based topological mapping, exploration and SLAM for robots '
     'with one 2D laser scanner.',
     license='Apache-2.0',

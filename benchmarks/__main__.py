@@ -1,10 +1,15 @@
-"""All benchmarks: python -m benchmarks [NAME ...] [--quick] [--worlds DIR] [--csv DIR]."""
+"""All benchmarks: python -m benchmarks [NAME ...] [--quick] [--worlds DIR] [--csv DIR].
+
+`python -m benchmarks release` makes all pages of results.
+"""
 
 import argparse
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks.graphs import compactness, map_to_graph, voronoi
+from benchmarks.graphs import compactness, doors, map_to_graph, real_maps, voronoi
+from benchmarks.release import command as release
 from benchmarks.speed import (
     ekf_step,
     exploration,
@@ -15,6 +20,7 @@ from benchmarks.speed import (
     map_update,
     node_load,
     planning,
+    pose_graph,
     scan_matching,
     thinning,
     topology_update,
@@ -27,6 +33,8 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'thinning': thinning.run,
     'mapping': map_update.run,
     'graphs': map_to_graph.run,
+    'doors': doors.run,
+    'real_maps': real_maps.run,
     'compactness': compactness.run,
     'voronoi': voronoi.run,
     'online': topology_update.run,
@@ -38,13 +46,20 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'long_paths': long_paths.run,
     'exploration': exploration.run,
     'slam': ekf_step.run,
+    'pose_graph': pose_graph.run,
     'growth': growth.run,
 }
 
 
 def main() -> None:
-    """Run the benchmarks that are named, or all."""
-    parser = argparse.ArgumentParser(prog='benchmarks', description='Benchmarks of the core')
+    """Run the benchmarks that are named, or all; `release` has its own command line."""
+    if sys.argv[1:2] == ['release']:
+        release.main(sys.argv[2:])
+        return
+    parser = argparse.ArgumentParser(
+        prog='benchmarks',
+        description='Benchmarks of the core. `benchmarks release --help`: all pages of results',
+    )
     parser.add_argument('names', nargs='*', help=f'some of {", ".join(_ALL)} (default: all)')
     parser.add_argument(
         '--quick', action='store_true', help='fewer worlds, pairs and scans: a minute or two'

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
+from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, pose, wrap
@@ -37,7 +37,7 @@ class Drive:
 
     def __init__(self, world: World, topology: TopologyConfig | None = None, seed: int = 0) -> None:
         self.world = world
-        self.grid = OccupancyGrid(OccupancyConfig())
+        self.grid = OccupancyGrid(PAPER_GRID)
         self.builder = TopologyBuilder(topology)
         self.ledger = Ledger()
         self._laser = LaserScanner(LaserScannerConfig(), seed)

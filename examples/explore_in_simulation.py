@@ -4,7 +4,7 @@ Usage: python examples/explore_in_simulation.py [WORLD]
 WORLD: a world or map_server YAML, or the name of a world of the package (default: room_10x10).
 """
 
-import sys
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 
 from thinmap_ros import ExplorationOptions, World, explore, read_world, world_path
 
@@ -20,4 +20,6 @@ def main(name: str) -> None:
 
 
 if __name__ == '__main__':
-    main(sys.argv[1] if len(sys.argv) > 1 else 'room_10x10')
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    parser.add_argument('world', nargs='?', default='room_10x10')
+    main(parser.parse_args().world)

@@ -5,7 +5,7 @@ As in: python examples/find_the_robot.py office bags/office.mcap
 WORLD: a world or map_server YAML, or the name of a world of the package.
 """
 
-import sys
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 
 from thinmap_ros import (
     GlobalLocalizer,
@@ -18,13 +18,11 @@ from thinmap_ros import (
 )
 
 
-def main(name: str, bag: str) -> None:
+def main(world: str, bag: str) -> None:
     """Print the pose of the robot as soon as it is the only one that explains the scans."""
-    _, patch, _ = read_world(world_path(name))
+    _, patch, _ = read_world(world_path(world))
     localizer = GlobalLocalizer(patch, build_topology(patch, None, TopologyConfig()))
-    scans = 0
-    for scan, T_odom_base in paired_scans(open_log(bag)):
-        scans += 1
+    for scans, (scan, T_odom_base) in enumerate(paired_scans(open_log(bag)), start=1):
         found = localizer.step(scan, T_odom_base).pose
         if found is not None:
             x, y, yaw = found.T_map_base
@@ -34,4 +32,7 @@ def main(name: str, bag: str) -> None:
 
 
 if __name__ == '__main__':
-    main(*sys.argv[1:3])
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    parser.add_argument('world')
+    parser.add_argument('bag')
+    main(**vars(parser.parse_args()))

@@ -4,17 +4,17 @@ Usage: python examples/route_graph.py MAP.yaml START_X,START_Y GOAL_X,GOAL_Y
 MAP.yaml: any map of map_server; places in m in the map frame.
 """
 
-import sys
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from pathlib import Path
 
 from thinmap_ros import TopologyConfig, build_topology, read_map, shortest_path
 
 
-def main(map_file: Path, start_xy: list[float], goal_xy: list[float]) -> None:
+def main(map_file: Path, start_xy: str, goal_xy: str) -> None:
     """Build the graph of a map and print the path between the nodes nearest to two places."""
     graph = build_topology(read_map(map_file), None, TopologyConfig(robot_radius_m=0.2))
-    start = graph.nearest_node(*start_xy)
-    goal = graph.nearest_node(*goal_xy)
+    start = graph.nearest_node(*map(float, start_xy.split(',')))
+    goal = graph.nearest_node(*map(float, goal_xy.split(',')))
     if start is None or goal is None:
         print('no free place for this robot')
         return
@@ -27,5 +27,8 @@ def main(map_file: Path, start_xy: list[float], goal_xy: list[float]) -> None:
 
 
 if __name__ == '__main__':
-    start, goal = ([float(word) for word in given.split(',')] for given in sys.argv[2:4])
-    main(Path(sys.argv[1]), start, goal)
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    for name in ('map', 'start', 'goal'):
+        parser.add_argument(name)
+    given = parser.parse_args()
+    main(Path(given.map), given.start, given.goal)

@@ -4,7 +4,7 @@ Usage: python examples/slam_on_a_log.py bags/dead_end.mcap out/slam
 Writes out/slam/map.pgm, map.yaml (for map_server) and route.geojson (for Nav2's route server).
 """
 
-import sys
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from pathlib import Path
 
 import numpy as np
@@ -28,4 +28,8 @@ def main(log: str, folder: Path) -> None:
 
 
 if __name__ == '__main__':
-    main(sys.argv[1], Path(sys.argv[2]))
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    parser.add_argument('log')
+    parser.add_argument('folder', type=Path)
+    given = parser.parse_args()
+    main(given.log, given.folder)

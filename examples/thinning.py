@@ -4,6 +4,8 @@ Usage: python examples/thinning.py
 Prints occupied cells as #, the skeleton as o, other free cells as dots.
 """
 
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
+
 import numpy as np
 
 from thinmap_ros import thin
@@ -31,4 +33,6 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    parser.parse_args()
     main()

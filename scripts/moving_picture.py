@@ -5,14 +5,15 @@
     python scripts/moving_picture.py map MAP.yaml [-o docs/images/intel.png]
 
 `exploration` explores a simulated world with SLAM, as explore_world does, and draws a frame every
-few seconds of simulated time: occupancy map, topological graph, path, robot and laser.
+few seconds of simulated time: occupancy map, topological graph, path, robot and laser. The first
+frame is the finished one, which is all that is seen where pictures do not move.
 `team` does so with two robots that explore together, as explore_world --robots 2.
-`map` draws a map_server map, as `replay --resolution-m 0.05` writes it.
+`map` draws a map_server map, as `replay` writes it.
 """
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -43,13 +44,14 @@ from thinmap_ros.team.loop import TeamLoop
 from thinmap_ros.view import palette
 
 IMAGES = Path(__file__).resolve().parents[1] / 'docs' / 'images'
-CELL_M = 0.05
 WIDTH_PX = 800
 MARGIN_M = 0.3
-CAPTION_PX = 24
+CAPTION_PX = 24  # of the caption, and of the key below it
+KEY_GAP_PX = 14
 SMOOTHING = 2  # frames are drawn this many times as large
 SCANS_PER_FRAME = 12
 FRAME_MS = 100
+FIRST_FRAME_MS = 1500
 LAST_FRAME_MS = 3000
 TEAM = 2
 MAP_MARGIN_M = 1.0
@@ -64,6 +66,14 @@ OBSERVED = '#DAEEF9'  # the laser's colour on white
 PATH = palette.ESTIMATE
 WHITE = '#FFFFFF'
 BLACK = '#000000'
+KEY = {
+    'wall': BLACK,
+    'free': WHITE,
+    'unknown': GREY,
+    'laser': OBSERVED,
+    'graph': palette.EDGE,
+    **{f'{kind.name.lower()} node': colour for kind, colour in palette.NODES.items()},
+}
 
 
 class Canvas:
@@ -73,7 +83,7 @@ class Canvas:
         self.low = low
         self.high = high
         self.scale = SMOOTHING * WIDTH_PX / (high[0] - low[0])
-        height_px = round((high[1] - low[1]) * self.scale) + SMOOTHING * CAPTION_PX
+        height_px = round((high[1] - low[1]) * self.scale) + 2 * SMOOTHING * CAPTION_PX
         self.image = Image.new('RGB', (SMOOTHING * WIDTH_PX, height_px), WHITE)
         self.draw = ImageDraw.Draw(self.image, 'RGBA')
 
@@ -96,10 +106,28 @@ class Canvas:
         box = (x - radius, y - radius, x + radius, y + radius)
         self.draw.ellipse(box, fill=colour, outline=BLACK, width=SMOOTHING // 2)
 
+    @property
+    def bottom_px(self) -> int:
+        """Lower edge of the map."""
+        return self.image.height - 2 * CAPTION_PX * SMOOTHING
+
     def caption(self, text: str) -> None:
         """Write a line below the map."""
-        place = (6 * SMOOTHING, self.image.height - CAPTION_PX * SMOOTHING)
+        place = (6 * SMOOTHING, self.bottom_px)
         self.draw.text(place, text, fill=BLACK, font=font(16 * SMOOTHING))
+
+    def key(self, colours: Mapping[str, str]) -> None:
+        """Write what each colour means below the caption."""
+        letters = font(13 * SMOOTHING)
+        left = 6.0 * SMOOTHING
+        top = self.bottom_px + CAPTION_PX * SMOOTHING
+        edge = 10 * SMOOTHING
+        for name, colour in colours.items():
+            box = (left, top + 3 * SMOOTHING, left + edge, top + 3 * SMOOTHING + edge)
+            self.draw.rectangle(box, fill=colour, outline=BLACK, width=SMOOTHING // 2)
+            left += edge + 4 * SMOOTHING
+            self.draw.text((left, top), name, fill=BLACK, font=letters)
+            left += letters.getlength(name) + KEY_GAP_PX * SMOOTHING
 
     def smoothed(self) -> Image.Image:
         """The picture in its final size."""
@@ -129,7 +157,7 @@ def paste_map(canvas: Canvas, patch: GridPatch) -> None:
     ((left_px, top_px),) = canvas.pixels(top)
     size = [round(count * frame.resolution * canvas.scale) for count in (cols, rows)]
     cells = map_image(patch).resize((size[0], size[1]), Image.Resampling.NEAREST)
-    bottom_px = canvas.image.height - SMOOTHING * CAPTION_PX
+    bottom_px = canvas.bottom_px
     canvas.draw.rectangle((0, 0, canvas.image.width, bottom_px), fill=GREY)
     canvas.image.paste(cells, (round(left_px), round(top_px)))
     canvas.draw.rectangle((0, bottom_px, canvas.image.width, canvas.image.height), fill=WHITE)
@@ -216,6 +244,7 @@ class Film(Strategy):
         text = f'{scan.stamp_ns / 1e9:.0f} s   {driven_m:.0f} m driven   '
         text += f'{decision.known_area_m2:.0f} m² known'
         canvas.caption(f'{text}   exploration finished' if decision.finished else text)
+        canvas.key(KEY | {'path': PATH, 'plan': PLAN, 'robot': ROBOT})
         return canvas.smoothed()
 
 
@@ -266,14 +295,16 @@ def team_image(loop: TeamLoop, canvas: Canvas, seconds: float) -> Image.Image:
     known_m2 = float(patch.free.sum()) * patch.frame.resolution**2
     text = f'{seconds:.0f} s   {driven_m:.0f} m driven   {known_m2:.0f} m² known'
     canvas.caption(f'{text}   exploration finished' if loop.is_finished else text)
+    robots = zip(loop.members, palette.ROBOTS, strict=False)
+    canvas.key(KEY | {f'robot {i}': colour for i, (_, colour) in enumerate(robots, 1)})
     return canvas.smoothed()
 
 
 def fine_pipeline(start: Array, options: Options) -> Pipeline:
-    """The pipeline of an exploration in the simulator, with cells of CELL_M."""
+    """The pipeline of an exploration in the simulator, with cells of 5 cm."""
     x, y, yaw = (float(number) for number in start)
     localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
-    grid = OccupancyConfig(resolution_m=CELL_M, no_return_clear_range_m=options.laser.range_max_m)
+    grid = OccupancyConfig(no_return_clear_range_m=options.laser.range_max_m)
     return Pipeline(PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH))
 
 
@@ -294,10 +325,11 @@ def gif_palette(drawn: Sequence[str]) -> Image.Image:
 
 
 def write_gif(path: Path, images: list[Image.Image], drawn: Sequence[str]) -> None:
-    """Write an endless loop, with one palette for all frames; drawn: colours beside the graph's."""
+    """Write an endless loop that begins with its end; drawn: colours beside the graph's."""
     colours = gif_palette(drawn)
     frames = [image.quantize(palette=colours, dither=Image.Dither.NONE) for image in images]
-    durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
+    frames.insert(0, frames[-1])
+    durations = [FIRST_FRAME_MS] + [FRAME_MS] * (len(frames) - 2) + [LAST_FRAME_MS]
     with atomic_write(path) as aside:
         frames[0].save(
             aside,

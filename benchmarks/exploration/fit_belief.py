@@ -1,7 +1,8 @@
-"""Fit the belief of the explorer, and compare it with what is hidden in worlds not fitted on.
+"""Compare the belief of the explorer with what is hidden in worlds that it was not fitted on.
 
-Usage: python -m benchmarks.exploration.fit_belief -o DIR [--buildings N] [--write]. Explorations
-are kept in DIR; with --write the constants go to core/exploration/belief/fitted.py.
+Usage: python -m benchmarks.exploration.fit_belief -o DIR [--write [--buildings N]]. Explorations
+are kept in DIR. With --write the belief is fitted first, and its constants go to
+core/exploration/belief/fitted.py.
 """
 
 import argparse
@@ -177,18 +178,19 @@ def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for explorations')
-    parser.add_argument('--buildings', type=int, default=100, help='buildings to fit on')
-    parser.add_argument('--write', action='store_true', help='write the constants')
+    parser.add_argument('--buildings', type=int, default=100, help='with --write: to fit on')
+    parser.add_argument('--write', action='store_true', help='fit, and write the constants')
     add_run_options(parser)
     arguments = parser.parse_args()
-    fitted_on = [*generated(_FIRST_FITTED_SEED, arguments.buildings), *FITTED_ON]
-    unseen = [*generated(_FIRST_UNSEEN_SEED, _UNSEEN_BUILDINGS), *UNSEEN]
-    model = fit(_explored(fitted_on, arguments))
-    test = _explored(unseen, arguments)
-    for name, chosen in (('present', FITTED), ('fitted', model)):
-        print(f'\n{name}: {chosen}\n')
-        print('\n'.join(reliability_table(predicted(chosen, test.columns), test)))
-    table = reliability_table(predicted(model, test.columns), test)
+    models = {'present': FITTED}
+    if arguments.write:
+        fitted_on = [*generated(_FIRST_FITTED_SEED, arguments.buildings), *FITTED_ON]
+        models['fitted'] = fit(_explored(fitted_on, arguments))
+    test = _explored([*generated(_FIRST_UNSEEN_SEED, _UNSEEN_BUILDINGS), *UNSEEN], arguments)
+    for name, model in models.items():
+        table = reliability_table(predicted(model, test.columns), test)
+        print(f'\n{name}: {model}\n', *table, sep='\n')
+    # Of the constants that hold from now on: the last ones.
     write_text(arguments.out / 'reliability.md', '\n'.join(table) + '\n')
     if arguments.write:
         write_text(Path(fitted.__file__), source(model))

@@ -1,33 +1,57 @@
 """Make docs/results/exploration.md from the results of compare_exploration.
 
-Usage: python -m benchmarks.exploration.page DIR [DIR ...]. A file reliability.md of a folder is the
-table of fit_belief.
+Usage: python -m benchmarks.exploration.page DIR [DIR ...] [--docs DOCS]. A file reliability.md of a
+folder is the table of fit_belief.
 """
 
+import argparse
 import json
-import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from benchmarks.charts import DOCS, OTHERS, Mark, Panel, chart_path, draw, picture
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.machine import provenance
-from thinmap_ros.evaluation.strategy_comparison import OURS, markdown, relative_saving
+from thinmap_ros.evaluation.peers import Origin
+from thinmap_ros.evaluation.strategy_comparison import (
+    OURS,
+    by_strategy,
+    half_interval_95,
+    markdown,
+    relative_saving,
+)
+from thinmap_ros.files.atomic import read_text, write_text
 
 Report = dict[str, Any]
-_PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'results' / 'exploration.md'
+_CHART = 'exploration'
 _FULL_COVERAGE = 0.99
-_KINDS = {'dungeon': 'Dungeons', 'kth': 'KTH floors'}
+_KINDS = {'dungeon': 'Random worlds of 50 x 50 m', 'kth': 'Real floors of a university'}
 _NEARLY_ALL = 0.995
+_PEERS = ('nearest_frontier', 'explore_lite')  # what others drive by; the rest is thinmap's
 _HEAD = """\
-# Exploration
+# Exploration: distance, time and coverage
 
-{provenance}
+{chart}
+Simulated robots explore worlds that they do not know. Each section states the laser, the speed,
+the source of the poses, and the commit and machine of its runs. `python -m benchmarks release`
+generates this page.
 
-`python -m benchmarks.exploration.page DIR ...` generates this page from folders of
-`compare_exploration WORLD... -o DIR`. Each section states the laser, the speed and the source of
-the poses.
+| strategy | what it is |
+|---|---|
+| `position_probability` | thinmap's default: position probability with the calibrated belief |
+| `nearest_frontier` | the frontier with the shortest path (Yamauchi, 1997), in thinmap's code |
+| `explore_lite` | the cost function of the ROS package explore_lite, in thinmap's code |
+| `paper` | position probability as the paper prints it |
+| `bounded_tour` | a short tour through the next targets |
+
+All strategies have the same map, navigator and simulator; none is another program.
+[Peers](peers.md) tells what that means for the comparison.
 
 - *Distance*, *time* and *turns*: means, ± the mean standard deviation over the starts of a world.
+- *Differences*: paired by world and start; an interval that includes zero shows no difference. The
+  starts of one world are not independent: the intervals are rather too narrow.
 - *Coverage*: share of the area that is observable from where the robot can be.
 - *Reversals*: returns to the target before the last.
 - *Decision*: median CPU time. *Times real time*: on one core, next to other load.
@@ -37,10 +61,11 @@ The strategies are described in [Exploration: theory](../theory/exploration.md).
 _BELIEF = """\
 ## Calibration of the belief
 
-The belief is the probability that nothing is hidden behind a frontier candidate. It is fitted on
-100 generated buildings, four dungeons and a floor, and evaluated on 20 other buildings, four other
-dungeons and another floor (`python -m benchmarks.exploration.fit_belief -o DIR`). Nothing is
-hidden if less than 0.5 m2 of observable area lies behind the frontier. Each candidate counts once.
+The belief is the probability that nothing is hidden behind a frontier candidate. It is evaluated on
+20 generated buildings, four dungeons and a floor on which it was not fitted
+(`python -m benchmarks.exploration.fit_belief -o DIR`); `core/exploration/belief/fitted.py` tells on
+which it was. Nothing is hidden if less than 0.5 m2 of observable area lies behind the frontier.
+Each candidate counts once.
 
 """
 _NOTES = """\
@@ -68,25 +93,79 @@ that is probably missing instead.
 """
 
 
-def page(reports: list[Report], reliability: str = '', made: str = '') -> str:
+def write(folders: list[Path], docs: Path) -> Path:
+    """Write the page of folders of compare_exploration and fit_belief, and its chart.
+
+    Returns its path. Raises InputError where no folder has reports.
+    """
+    tables = [folder / 'reliability.md' for folder in folders]
+    reliability = '\n'.join(read_text(table) for table in tables if table.exists())
+    reports = [
+        {'made': provenance(folder), **report}
+        for folder in folders
+        if (folder / 'reports.json').exists()
+        for report in json.loads(read_text(folder / 'reports.json'))
+    ]
+    if not reports:
+        raise InputError(f'{folders[0]}: no reports.json: expected folders of compare_exploration')
+    draw(chart_path(docs, _CHART), [panel(reports)], _KEYS)
+    path = docs / 'results' / 'exploration.md'
+    write_text(path, page(reports, reliability))
+    return path
+
+
+def page(reports: list[Report], reliability: str = '') -> str:
     """Text of the page: a section for each kind of world and options of the exploration.
 
-    reliability: table of `fit_belief`; made: line of commit and machine.
+    reports: each with a line `made` of commit and machine; reliability: table of `fit_belief`.
     """
-    sections: dict[tuple[str, str], list[Report]] = defaultdict(list)
-    for report in reports:
-        sections[report['world'].split('-')[0], _conditions(report['options'])].append(report)
-    parts = [_HEAD.format(provenance=made)]
-    for (kind, conditions), chosen in sections.items():
-        worlds = {report['world'] for report in chosen}
+    caption = 'Distance of thinmap relative to other strategies; left of the line: thinmap drives '
+    caption += 'less. Bars: 95 % confidence intervals of paired runs.'
+    parts = [_HEAD.format(chart=picture(_CHART, caption))]
+    for title, chosen in _sections(reports).items():
+        worlds = sorted({report['world'] for report in chosen})
         parts += [
-            f'## {_KINDS.get(kind, kind)} ({len(worlds)}): {conditions}\n',
-            f'Worlds: {", ".join(sorted(worlds))}.\n',
+            f'## {title}\n',
+            f'Worlds: {", ".join(worlds)}.\n',
+            *(f'{made}.\n' for made in dict.fromkeys(report['made'] for report in chosen)),
             markdown(chosen),
             *_verdicts(chosen),
         ]
     belief = [_BELIEF + reliability] if reliability else []
     return '\n'.join([*parts, *belief, _NOTES])
+
+
+def _sections(reports: list[Report]) -> dict[str, list[Report]]:
+    """Reports by kind of world and conditions, by the titles of their sections."""
+    found: dict[tuple[str, str], list[Report]] = defaultdict(list)
+    for report in reports:
+        found[report['world'].split('-')[0], _conditions(report['options'])].append(report)
+    return {
+        f'{_KINDS.get(kind, kind)} ({len({r["world"] for r in some})}): {conditions}': some
+        for (kind, conditions), some in found.items()
+    }
+
+
+_KEYS = (('nearest frontier, explore_lite', OTHERS[Origin.TEAM], True),)
+
+
+def panel(reports: list[Report]) -> Panel:
+    """Differences of distance to what others drive by, a row for each section and strategy."""
+    marks = []
+    for title, chosen in _sections(reports).items():
+        runs = by_strategy(chosen)
+        for name in _PEERS:
+            shares = relative_saving(runs.get(OURS, {}), runs.get(name, {}), 'distance')
+            if len(shares) > 1:
+                marks.append(difference(f'{title.split(":")[0]}: {name}', shares))
+    return Panel('', 'difference of the distance (%)', marks, limit=0.0)
+
+
+def difference(row: str, shares: Array) -> Mark:
+    """Mark of relative differences (N,), in percent, with their confidence interval."""
+    mean = 100.0 * float(shares.mean())
+    half = 100.0 * half_interval_95(shares)
+    return Mark(row, mean, OTHERS[Origin.TEAM], mean - half, mean + half)
 
 
 def _conditions(options: dict[str, Any]) -> str:
@@ -101,10 +180,8 @@ def _conditions(options: dict[str, Any]) -> str:
 
 def _verdicts(reports: list[Report]) -> list[str]:
     """Faults of position_probability, and pairs in which another strategy is shorter."""
-    by_strategy: dict[str, dict[tuple[str, int], Report]] = defaultdict(dict)
-    for report in reports:
-        by_strategy[report['strategy']][report['world'], report['start_number']] = report
-    ours = by_strategy.pop(OURS, {})
+    runs = by_strategy(reports)
+    ours = runs.pop(OURS, {})
     lines = [_fault(report) for report in ours.values() if not _is_good(report)]
     if ours and not lines:
         count = f'{len(ours)} of {len(ours)}'
@@ -123,7 +200,7 @@ def _verdicts(reports: list[Report]) -> list[str]:
         lines.append(
             f'After a coverage of {_NEARLY_ALL:.1%}, {OURS} drove {rest:.1%} of its path (mean).'
         )
-    for name, theirs in sorted(by_strategy.items()):
+    for name, theirs in sorted(runs.items()):
         longer = relative_saving(ours, theirs, 'distance')
         if (longer > 0.0).any():
             lines.append(
@@ -162,19 +239,11 @@ def _pose_error(report: Report) -> str:
 
 def main() -> None:
     """Write the page."""
-    folders = [Path(word) for word in sys.argv[1:]]
-    tables = [folder / 'reliability.md' for folder in folders]
-    reliability = '\n'.join(table.read_text('utf-8') for table in tables if table.exists())
-    reports = [
-        report
-        for folder in folders
-        if (folder / 'reports.json').exists()
-        for report in json.loads((folder / 'reports.json').read_text('utf-8'))
-    ]
-    # Folders that were made later may be of another commit; the table of fit_belief has none.
-    made = dict.fromkeys(provenance(folder) for folder in folders if (folder / 'runs').exists())
-    text = page(reports, reliability, '\n'.join(made))
-    _PAGE.write_text(text, encoding='utf-8')
+    parser = argparse.ArgumentParser(prog='benchmarks.exploration.page', description=__doc__)
+    parser.add_argument('folders', nargs='+', type=Path, help='of compare_exploration, fit_belief')
+    parser.add_argument('--docs', type=Path, default=DOCS, help='folder of the pages')
+    arguments = parser.parse_args()
+    print(write(arguments.folders, arguments.docs))
 
 
 if __name__ == '__main__':

@@ -10,7 +10,7 @@ from benchmarks.worlds import Floor
 from thinmap_ros.closed_loop import ClosedLoop
 from thinmap_ros.core import se2
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.grid.occupancy import ROBOT_GRID, OccupancyGrid
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -106,7 +106,7 @@ def explorations(floor: Floor, start: int, limit_s: float) -> list[SentMap]:
 def random_drives(floor: Floor, start: int, seconds: float, each_m: float) -> Iterator[SentMap]:
     """What a robot with true poses has sent each so many m of a drive to random places."""
     T_start = floor.starts[start]
-    grid = OccupancyGrid(ROBOT_GRID)
+    grid = OccupancyGrid()
     frames: list[Keyframe] = []
     path_m = 0.0
     next_m = each_m

@@ -3,18 +3,27 @@
 Usage: python -m benchmarks.kidnapped.page DIR [DOCS_DIR].
 """
 
+import re
 import sys
 from pathlib import Path
 
+from benchmarks.charts import BAD, DOCS, OURS, Mark, Panel, chart_path, draw, picture
 from benchmarks.kidnapped.__main__ import read
 from benchmarks.kidnapped.summary import Written, by_group, summary
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.machine import provenance
-from thinmap_ros.evaluation.outcome import VERDICTS
+from thinmap_ros.evaluation.outcome import Row
+from thinmap_ros.files.atomic import write_text
 
+_CHART = 'localization'
 _HEAD = """\
-# Global localization
+# Global localization: correct, false, not localized
 
 {provenance}
+
+{chart}
+No other program has been run on these drives, so the chart compares the sections of this page.
+[Targets](../development/targets.md) compares them with the targets of the project.
 
 `python -m benchmarks.kidnapped -o DIR` runs the drives (`--count N`: the first N of each section),
 `python -m benchmarks.kidnapped.page DIR` generates this page.
@@ -23,6 +32,7 @@ _HEAD = """\
   for the kidnapped robot), and *false* with a larger one.
 - Unless a section states otherwise, the laser has 181 beams over 180 degrees and a range of 8 m.
   The robot drives to random positions at 0.5 m/s, at most 40 m.
+- Worlds: `kth`, floors of a university; `dungeon`, random worlds of 50 x 50 m.
 - Times are CPU times, measured next to other load.
 
 [Speed](speed.md) has the times of the parts of a step and the memory of a map.
@@ -33,8 +43,8 @@ _ABOUT = {
     'start at (2 m, 2 m, 270 deg), 20 seeds, 11 steps of up to 0.3 m',
     'lab': 'Laboratory, random starts, 15 steps of up to 0.3 m',
     'voronoi': 'Laboratory, with the nodes of a Voronoi diagram in the map',
-    'kth': 'Real floors, random starts',
-    'dungeon': 'Dungeons, random starts',
+    'kth': 'Real floors of a university, random starts',
+    'dungeon': 'Random worlds of 50 x 50 m, random starts',
     'twins': 'Equal rooms, and a floor with a symmetry of 180 degrees; at most 30 m',
     'foreign': 'Robot in another building than that of the map; at most 20 m',
     'foreign_log': 'Real robot (Intel log) with maps of other buildings, and robots in these with '
@@ -50,24 +60,62 @@ _ABOUT = {
 _DIVIDED = ('kth', 'dungeon', 'lasers', 'fine', 'driven')
 
 
+def write(folder: Path, docs: Path) -> Path:
+    """Write the page of a folder of localizations, and its chart. Returns its path."""
+    draw(chart_path(docs, _CHART), [panel(sections(folder))], _KEYS)
+    path = docs / 'results' / 'localization.md'
+    write_text(path, page(folder))
+    return path
+
+
 def page(folder: Path) -> str:
     """Text of the page: a section for each file."""
-    parts = [_HEAD.format(provenance=provenance(folder))]
-    for row, about in _ABOUT.items():
-        records = read(folder / f'{row}.csv')
+    caption = 'Correct and false localizations in the sections of this page.'
+    parts = [_HEAD.format(provenance=provenance(folder), chart=picture(_CHART, caption))]
+    for name, about in _ABOUT.items():
+        records = read(folder / f'{name}.csv')
         if records:
-            lines = [
-                f'| {r.what} | {r.value} | {r.target} | {VERDICTS[r.good]} |'
-                for r in summary(row, records)
-            ]
-            parts += [
-                f'## {about}\n',
-                '| quantity | value | target | |\n|---|---|---|---|',
-                *lines,
-                '',
-            ]
-            parts += _groups(records) if row in _DIVIDED else []
+            parts += section(about, list(summary(name, records)))
+            parts += _groups(records) if name in _DIVIDED else []
     return '\n'.join(parts)
+
+
+def section(title: str, rows: list[Row]) -> list[str]:
+    """Title and table of a section."""
+    lines = [f'| {row.what} | {row.value} |' for row in rows]
+    return [f'## {title}\n', '| quantity | value |\n|---|---|', *lines, '']
+
+
+def sections(folder: Path) -> dict[str, list[Row]]:
+    """Summary of each file of a folder, by the title of its section.
+
+    Raises InputError where there is none.
+    """
+    found = {}
+    for name, about in _ABOUT.items():
+        records = read(folder / f'{name}.csv')
+        if records:
+            found[about] = list(summary(name, records))
+    if not found:
+        raise InputError(
+            f'{folder}: no results of python -m benchmarks.kidnapped: expected ROW.csv'
+        )
+    return found
+
+
+_KEYS = (('correct', OURS, True), ('false', BAD, True))
+_SHARES = {'correct': OURS, 'false': BAD}
+
+
+def panel(rows: dict[str, list[Row]]) -> Panel:
+    """Shares of correct and false localizations, a row for each section that has them."""
+    marks = []
+    for title, some in rows.items():
+        for row in some:
+            colour = _SHARES.get(row.what.split()[0])
+            if colour and row.what.endswith('localizations (%)'):
+                marks.append(Mark(re.split('[,:;]', title)[0], float(row.value), colour))
+    return Panel('', 'share of the drives (%)', marks)
 
 
 def _groups(records: list[Written]) -> list[str]:
@@ -95,5 +143,4 @@ def _groups(records: list[Written]) -> list[str]:
 
 
 if __name__ == '__main__':
-    docs = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parents[2] / 'docs'
-    (docs / 'results' / 'localization.md').write_text(page(Path(sys.argv[1])), encoding='utf-8')
+    print(write(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else DOCS))

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from benchmarks.places.recorded import RecordedPiece
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, Mishap, no_progress
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
@@ -68,7 +69,7 @@ def explored(
     """
     laser = LaserScannerConfig()
     simulation = Simulation(world, start, PRESETS['2dx'], laser, seed)
-    grid = OccupancyConfig(no_return_clear_range_m=laser.range_max_m)
+    grid = replace(PAPER_GRID, no_return_clear_range_m=laser.range_max_m)
     pipeline = Pipeline(PipelineConfig(grid=grid, scans_per_graph=SCANS_PER_GRAPH))
     controller = PathFollowerConfig(max_speed_m_s=_SPEED_M_S)
     navigator = Navigator(NavigatorConfig(controller=controller))
@@ -81,7 +82,7 @@ def explored(
 
 def _mapped(pairs: Iterable[tuple[Scan, Array]]) -> tuple[Pipeline, dict[int, Array]]:
     """Map scans with their odometry; returns the corrected poses (3,) by stamp, too."""
-    pipeline = Pipeline(PipelineConfig(scans_per_graph=_SCANS_PER_GRAPH))
+    pipeline = Pipeline(PipelineConfig(grid=PAPER_GRID, scans_per_graph=_SCANS_PER_GRAPH))
     stamps = []
     for scan, T_odom_base in pairs:
         estimate = pipeline.step(scan, T_odom_base).estimate

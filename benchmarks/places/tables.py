@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from benchmarks.places import cases
 from benchmarks.places.recorded import RecordedPiece
 from benchmarks.places.truth import relative_errors, rigid_errors
-from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.places.recognition.decision import Decision, decide, recognize
 from thinmap_ros.core.places.recognition.drawn_scans import drawn_piece
 from thinmap_ros.core.places.recognition.piece import MapPiece
@@ -161,7 +162,7 @@ def _joined_row(known: RecordedPiece, query: RecordedPiece) -> list[Any]:
     if decision.placement is None or not decision.is_joined:
         return [f'{known.name} + {query.name}', *[None] * 11]
     is_simulated = not known.name.startswith(cases.LOGS)
-    grid = OccupancyConfig(no_return_clear_range_m=LaserScannerConfig().range_max_m)
+    grid = replace(PAPER_GRID, no_return_clear_range_m=LaserScannerConfig().range_max_m)
     merged = join(first, second, decision.placement, JoinConfig(grid if is_simulated else None))
     ended = time.process_time()
     count = len(known.frames)

@@ -56,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
         '--board',
         action='store_true',
         help='targets of the localizer, a row each: some logs and buildings, recorded '
-        'drives, the closed loop, other lasers. Page: DIR/slam.md',
+        'drives, the closed loop, other lasers. DIR/targets.md, DIR/cases.md',
     )
     parser.add_argument(
         '--recordings',

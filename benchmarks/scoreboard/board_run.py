@@ -27,15 +27,9 @@ FOLDER = 'board'  # of the results; a case of the complete scoreboard may have t
 _SCANS_PER_GRAPH = 10
 _SPARSE_LOGS = ('aces', 'csail', 'fhw', 'intel_sparse')
 _HEAD = """\
-# SLAM
+# Targets of SLAM
 
 {provenance}
-
-`python -m benchmarks.scoreboard -o DIR --board` generates this page. Targets are those of the
-project. A *recorded drive* is the first 20 minutes of an exploration (6,000 scans), replayed with
-another odometry noise. *Closed loop*: exploration with the estimated pose. Errors of logs are means
-over the reference relations. Errors of drives and explorations are rms errors of the position, not
-aligned unless stated.
 
 """
 
@@ -73,7 +67,7 @@ class RecordTask:
 
 
 def run_board(arguments: argparse.Namespace, options: Numbers) -> None:
-    """Run the cases without a result, and write slam.md, the page of docs/results.
+    """Run the cases without a result; write targets.md, met or missed, and cases.md.
 
     Raises InputError where a case fails, after all others.
     """
@@ -93,11 +87,12 @@ def run_board(arguments: argparse.Namespace, options: Numbers) -> None:
     write_provenance(arguments.out)
     head = _HEAD.format(provenance=provenance(arguments.out))
     board = f'{head}{table}\nCPU time of all cases: {taken:.0f} s.\n'
-    tables = f'{COLUMN_NOTES}\n{case_tables(cases, reports)}'
+    write_text(arguments.out / 'targets.md', board)
+    tables = f'{COLUMN_NOTES}\n{case_tables(reports)}'
     if others is not None:
         tables += '\n' + against(cases, reports, others)
-    write_text(arguments.out / 'slam.md', f'{board}\n{tables}')
-    print(f'{table}\n{arguments.out}/slam.md')
+    write_text(arguments.out / 'cases.md', tables)
+    print(f'{table}\n{arguments.out}/targets.md, cases.md')
     if failures:
         raise failure_summary(failures)
 
@@ -116,7 +111,7 @@ def measure_on_board(task: BoardTask) -> Numbers:
         numbers = measure_drive(case, task.recordings, options, _SCANS_PER_GRAPH)
     else:
         numbers = measure_loop(case, task.worlds, options)
-    taken = {'cpu_s': time.process_time() - began}
+    taken = {'cpu_s': time.process_time() - began, 'made': provenance()}
     return {'name': task.name, 'options': options, **taken, **numbers}
 
 

@@ -1,5 +1,6 @@
 """Explorations of the scoreboard: by the true pose, recorded, and by the estimated one."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from thinmap_ros.closed_loop import (
 )
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.se2 import Array
@@ -130,7 +131,7 @@ def _pipeline_config(
     """As `explore_world` has it: a beam that met nothing has seen as far as this laser can."""
     return PipelineConfig(
         localizer=config_of(options or {}, start),
-        grid=OccupancyConfig(no_return_clear_range_m=laser.range_max_m),
+        grid=replace(PAPER_GRID, no_return_clear_range_m=laser.range_max_m),
         scans_per_graph=SCANS_PER_GRAPH,
     )
 

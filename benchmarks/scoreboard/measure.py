@@ -20,6 +20,7 @@ from benchmarks.scoreboard.played import (
 )
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizers import config_with
@@ -196,7 +197,9 @@ def play(
     Raises InputError where there is no scan.
     """
     rehearse()
-    pipeline = PlayedPipeline(PipelineConfig(localizer=config, scans_per_graph=scans_per_graph))
+    pipeline = PlayedPipeline(
+        PipelineConfig(localizer=config, grid=PAPER_GRID, scans_per_graph=scans_per_graph)
+    )
     forget_peak()
     for scan, T_odom_base in scans:
         pipeline.step(scan, T_odom_base)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.scoreboard.cases import BuildingCase, Case, DriveCase, LogCase, LoopCase
+from benchmarks.scoreboard.cases import Case, LogCase
 from benchmarks.scoreboard.measure import DISTURBED
 from benchmarks.scoreboard.played import Numbers
 from thinmap_ros.core import se2
@@ -13,11 +13,6 @@ from thinmap_ros.core import se2
 MAX_ERROR_M = 10.0  # larger errors count as this
 _SHORT_S = 240.0  # of the processor for the short form
 _START_S = 3.0  # of the processor for a process that runs a case, before it begins
-_PEERS = """\
-Results of other programs on the same logs, m: IRIS LaMa (final or live = final) intel 0.047, aces
-0.046, csail 1.09, fhw 0.75; Cartographer (published) intel_raw 0.023, aces_raw 0.038, csail_raw
-0.032.
-"""
 COLUMN_NOTES = """\
 - *live*, *final*: error of the estimate at the time of a scan, and after all corrections. Logs:
   mean error of the reference relations; *degraded*: rms of the positions against the original log.
@@ -45,12 +40,8 @@ _HEAD = """\
 `python -m benchmarks.scoreboard -o DIR` generates this page.
 
 """
-_KINDS = (
-    ('Logs', LogCase),
-    ('Buildings', BuildingCase),
-    ('Recorded drives', DriveCase),
-    ('Closed loop', LoopCase),
-)
+_LOGS = 'Logs'
+_KINDS = {'building_': 'Buildings', 'drive_': 'Recorded drives', 'loop_': 'Closed loop'}
 _COLUMNS = (
     ('live (m)', 'live_m', '.3f'),
     ('final (m)', 'final_m', '.3f'),
@@ -86,23 +77,32 @@ def page(cases: Sequence[Case], reports: Sequence[Numbers], made: str = '') -> s
         _HEAD.format(provenance=made) + COLUMN_NOTES,
         f'**Worst tenth, live: {worst_tenth(cases, reports):.3f} m** (mean; an error '
         f'counts as at most {MAX_ERROR_M:g} m). Its cases: {", ".join(worst)}.\n',
-        _PEERS,
+        'Other programs: docs/results/peers.md.\n',
         *([f'**Failed**: {", ".join(failed)}.\n'] if failed else []),
     ]
-    parts.append(case_tables(cases, reports))
+    parts.append('## Cases\n')
+    parts.append(case_tables(reports, live))
     if any(case.run for case in cases):
         parts.append(_repeated(cases, reports, live))
     return '\n'.join(parts)
 
 
-def case_tables(cases: Sequence[Case], reports: Sequence[Numbers]) -> str:
-    """Markdown: a table of the cases of each kind."""
-    live = errors(cases, reports)
+def kind_of(name: str) -> str:
+    """Kind of the case with a name, as the pages call it."""
+    return next((kind for prefix, kind in _KINDS.items() if name.startswith(prefix)), _LOGS)
+
+
+def case_tables(reports: Sequence[Numbers], live: np.ndarray | None = None) -> str:
+    """Markdown: a table of the cases of each kind.
+
+    live: errors (N,), m, of logs that are judged by another one.
+    """
+    errors_m = [report.get('live_m', math.nan) for report in reports] if live is None else live
     parts = []
-    for title, kind in _KINDS:
-        rows = [k for k, case in enumerate(cases) if isinstance(case, kind)]
+    for title in (_LOGS, *_KINDS.values()):
+        rows = [k for k, report in enumerate(reports) if kind_of(report['name']) == title]
         if rows:
-            parts.append(f'## {title}\n\n' + _table(rows, cases, reports, live))
+            parts.append(f'### {title}\n\n' + _table(rows, reports, errors_m))
     return '\n'.join(parts)
 
 
@@ -163,9 +163,7 @@ def _against(own: list[list[float]] | None, path: list[list[float]]) -> float:
     return float(np.sqrt((np.array(off) ** 2).sum(axis=1).mean()))
 
 
-def _table(
-    rows: list[int], cases: Sequence[Case], reports: Sequence[Numbers], live: np.ndarray
-) -> str:
+def _table(rows: list[int], reports: Sequence[Numbers], live: Sequence[float] | np.ndarray) -> str:
     columns = [
         each for each in _COLUMNS if each[1] == 'live_m' or any(each[1] in reports[k] for k in rows)
     ]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.evaluation.machine import CpuTimedPipeline, resident_mb
@@ -28,6 +29,8 @@ _ROBOT = '2dx'
 _MARKS_M = (100.0, 500.0, 1000.0, 2000.0, 3000.0, 5000.0, 7500.0, 10_000.0)
 _MARKS_QUICK_M = (100.0, 500.0, 1000.0)
 _SPAN_M = 100.0  # before a mark, over which its time is measured
+_KILOMETRE_M = 1000.0
+_MAX_GROWTH = 1.3  # of a kilometre over the first one
 _WARM_UP = 300  # scans of a drive that is thrown away
 _RANGE_M = 32.0  # another mode of the LMS200: with 8 m, aisles show too little
 _PARTS = ('localizer', 'grid', 'topology')
@@ -35,10 +38,14 @@ _PARTS = ('localizer', 'grid', 'topology')
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """Measurements at a distance, m: CPU by part, ms; area, m2; memory, MB; pose error, m."""
+    """Measurements at a distance, m: CPU by part, ms; area, m2; memory, MB; pose error, m.
+
+    kilometre_ms: CPU time of a scan on the last kilometre, mean.
+    """
 
     travelled_m: float
     taken_ms: dict[str, Array]
+    kilometre_ms: float
     area_m2: float
     resident_mb: float
     off_m: float
@@ -52,6 +59,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
     again = [lap * lap_m + _MARKS_M[0] for lap in range(1, 4)]
     first: _Mark | None = None
     new: _Mark | None = None  # the last one of the first lap
+    kilometre: _Mark | None = None  # the first one
     for mark in _drive(samples, sorted(_MARKS_QUICK_M if quick else {*_MARKS_M, *again})):
         yield from _rows(mark)
         first = first or mark
@@ -60,6 +68,10 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         lap = again.index(mark.travelled_m) + 2 if mark.travelled_m in again else None
         where = f'lap {lap}, first {_SPAN_M:.0f} m' if lap else f'after {mark.travelled_m:.0f} m'
         yield from _ratios(where, mark, first)
+        if kilometre is not None:
+            yield from _against_kilometre(mark, kilometre)
+        elif mark.travelled_m >= _KILOMETRE_M:
+            kilometre = mark
         if mark.travelled_m <= lap_m:
             new = mark
             grown_kb = 1e3 * (mark.resident_mb - first.resident_mb)
@@ -99,6 +111,19 @@ def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
     yield at_most('  the same, mean', float(now.mean() / then.mean()), 1.2)
 
 
+def _against_kilometre(mark: _Mark, first: _Mark) -> Iterator[Row]:
+    yield at_most(
+        '  last kilometre: CPU time / that of the first one, mean',
+        mark.kilometre_ms / first.kilometre_ms,
+        _MAX_GROWTH,
+    )
+    yield at_most(
+        '  memory / that after the first kilometre',
+        mark.resident_mb / first.resident_mb,
+        _MAX_GROWTH,
+    )
+
+
 def _drive(samples: Iterator[DriveSample], marks_m: list[float]) -> Iterator[_Mark]:
     """Marks after these lengths of the drive."""
     pipeline: CpuTimedPipeline | None = None
@@ -111,7 +136,8 @@ def _drive(samples: Iterator[DriveSample], marks_m: list[float]) -> Iterator[_Ma
             x, y, yaw = sample.T_world_base.tolist()
             pipeline = CpuTimedPipeline(
                 PipelineConfig(
-                    localizer=LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
+                    localizer=LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw),
+                    grid=PAPER_GRID,
                 )
             )
         travelled_m += 0.0 if last is None else float(np.hypot(*(sample.T_world_base - last)[:2]))
@@ -124,10 +150,12 @@ def _drive(samples: Iterator[DriveSample], marks_m: list[float]) -> Iterator[_Ma
         ways.append(travelled_m)
         if travelled_m >= marks_m[0]:
             on_span = np.array(ways) > travelled_m - _SPAN_M
+            on_kilometre = np.array(ways) > travelled_m - _KILOMETRE_M
             patch = pipeline.grid.known_area()
             yield _Mark(
                 marks_m[0],
                 {part: 1e3 * np.array(each)[on_span] for part, each in taken.items()},
+                1e3 * float(np.array(taken['all'])[on_kilometre].mean()),
                 float(patch.free.sum()) * patch.frame.resolution**2,
                 resident_mb(),
                 float(np.hypot(*(T_map_base - sample.T_world_base)[:2])),

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.speed.node_process import TrafficListener, processor_s, start, stop, use_own_domain
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import ROBOT_GRID, OccupancyGrid
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.topology.builder import TopologyBuilder
@@ -73,7 +73,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
 
 def floor(side_m: int) -> GridPatch:
     """Rooms with a pillar each, and a door in the middle of each wall between two of them."""
-    cell_m = ROBOT_GRID.resolution_m
+    cell_m = OccupancyConfig().resolution_m
     cells = np.zeros((round(side_m / cell_m),) * 2, dtype=np.int8)
     room = round(_ROOM_M / cell_m)
     gap = round(_DOOR_M / cell_m)
@@ -99,7 +99,7 @@ def floor(side_m: int) -> GridPatch:
 def write_floor(path: Path, side_m: int) -> Path:
     """Write a floor as session and as world; returns the path stem."""
     patch = floor(side_m)
-    grid = OccupancyGrid.from_patch(patch, ROBOT_GRID)
+    grid = OccupancyGrid.from_patch(patch)
     sessions.save_grid(str(path), grid)
     topology = TopologyBuilder()
     topology.update(patch, np.array([*_START, 0.0]))

@@ -1,31 +1,35 @@
 """Make docs/results/speed.md from the results of benchmarks.
 
-Usage: python -m benchmarks.speed.page CSV_DIR [DOCS_DIR].
+Usage: python -m benchmarks.speed.page DIR [DOCS]. The chart has the SLAM programs, too, if there is
+a folder of the board beside DIR, slam.
 """
 
 import csv
+import re
 import sys
 from pathlib import Path
 
+from benchmarks.charts import DOCS, OTHERS, Mark, Panel, chart_path, draw, picture
+from benchmarks.scoreboard.results_page import read_reports
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.machine import provenance
+from thinmap_ros.evaluation.peers import INTEL, Origin, runs
+from thinmap_ros.files.atomic import write_text
 
+_CHART = 'speed'
 _HEAD = """\
-# Speed
+# Speed: computing time and memory
 
 {provenance}
 
+{chart}
 {machine}
 
-`python -m benchmarks --csv out/benchmarks` runs the benchmarks (`--quick`: short ones), and
-`python -m benchmarks.speed.page out/benchmarks` generates this page. Times are of one core. With a
-load average far above the number of cores, times are too long.
-
-`python -m benchmarks.scoreboard -o DIR` measures the localizer on logs, degraded logs and generated
-buildings, and writes `DIR/scoreboard.md`. `--short` runs its worst cases in two minutes. `--runs 8`
-runs each case eight times with different odometry noise, and lists means and worst errors. With
-`--board` it compares the localizer with its targets and writes `DIR/slam.md`, the page
-[SLAM](slam.md). The board includes recorded drives, kept in `DIR/drives` or in the folder of
-`--recordings`. Delete them when the simulator or the explorer changes.
+`python -m benchmarks --csv DIR` runs the benchmarks (`--quick`: short ones), and `python -m
+benchmarks.speed.page DIR` generates this page; `python -m benchmarks release` does both. Times are
+of one core. With a load average far above the number of cores, times are too long. The page
+[SLAM](slam.md) has the time of SLAM per scan beside other programs, and
+[Targets](../development/targets.md) the targets of the project.
 """
 # In this order: title, and what is measured.
 _ABOUT = {
@@ -38,6 +42,17 @@ _ABOUT = {
     'graphs': (
         'Topological maps of whole floors',
         'Time against a Voronoi diagram by SciPy; drivable edges and connectivity.',
+    ),
+    'doors': (
+        'Narrow doors',
+        'Doors of 0.7 m in walls at several angles, on cells of 5 and 10 cm, for robots of 0.25 to '
+        '0.35 m radius, with and without noise at the walls: the planner passes those that the '
+        'graph passes.',
+    ),
+    'real_maps': (
+        'Route graphs of real maps',
+        'Saved maps of buildings and of replayed logs: edges that are safe, long enough and few, '
+        'and a node in sight. Places behind glass are among those that see no node.',
     ),
     'compactness': (
         'Memory of graph and grid',
@@ -86,6 +101,10 @@ _ABOUT = {
         'A filter step against the number of features in the map: with the features of the local '
         'area in the state (ti), and with all features (full).',
     ),
+    'pose_graph': (
+        'Pose graph',
+        'What an optimization takes of a scan of a drive back and forth, with matches between.',
+    ),
     'growth': (
         'Growth with the distance driven',
         'Localizer, grid and graph on a long drive through a warehouse of 200 x 200 m.',
@@ -94,25 +113,111 @@ _ABOUT = {
 _IN_PROVENANCE = ('processor', 'cores', 'Python')
 
 
+def write(folder: Path, docs: Path) -> Path:
+    """Write the page of a folder of benchmarks, and its chart. Returns its path."""
+    draw(chart_path(docs, _CHART), [panel(folder)], _KEYS)
+    path = docs / 'results' / 'speed.md'
+    write_text(path, page(folder))
+    return path
+
+
 def page(folder: Path) -> str:
-    """Text of the page."""
+    """Text of the page. Raises InputError where the folder has no results."""
+    if not (folder / 'machine.csv').exists():
+        raise InputError(f'{folder}: no machine.csv: expected results of python -m benchmarks')
     machine = ', '.join(
         f'{what} {value}'
-        for what, value, _, _ in _rows(folder / 'machine.csv')
+        for what, value, _, _ in read_rows(folder / 'machine.csv')
         if what not in _IN_PROVENANCE
     )
-    parts = [_HEAD.format(provenance=provenance(folder), machine=f'Packages and load: {machine}.')]
+    caption = (
+        'Time of other programs for the same work, relative to thinmap; left of the line: faster '
+        'than thinmap. SLAM by others was run by the team, on another machine.'
+    )
+    parts = [
+        _HEAD.format(
+            provenance=provenance(folder),
+            chart=picture(_CHART, caption),
+            machine=f'Packages and load: {machine}.',
+        )
+    ]
     for name, (title, about) in _ABOUT.items():
         path = folder / f'{name}.csv'
         if path.exists():
             parts.append(f'## {title}\n\n{about} Benchmark: `{name}`.\n')
-            parts.append('| quantity | value | target | |\n|---|---|---|---|')
-            parts += [f'| {" | ".join(_indented(row))} |' for row in _rows(path)]
+            parts.append('| quantity | value |\n|---|---|')
+            parts += [f'| {" | ".join(_indented(row)[:2])} |' for row in read_rows(path)]
             parts.append('')
     return '\n'.join(parts)
 
 
-def _rows(path: Path) -> list[list[str]]:
+def sections(folder: Path) -> dict[str, list[list[str]]]:
+    """Rows of each benchmark of a folder (what, value, target, verdict), by the section's title."""
+    return {
+        title: read_rows(folder / f'{name}.csv')
+        for name, (title, _) in _ABOUT.items()
+        if (folder / f'{name}.csv').exists()
+    }
+
+
+_KEYS = (('other programs', OTHERS[Origin.TEAM], True),)
+# Name in the chart; file, a row above the value, and the row of a ratio.
+_RATIOS = (
+    ('thinning by scikit-image', 'thinning', '1000 x 1000 cells', 'times faster than skimage'),
+    ('thinning by OpenCV', 'thinning', '1000 x 1000 cells', 'times faster than opencv'),
+    (
+        'Voronoi graph by SciPy',
+        'graphs',
+        'kth/50052751',
+        'times faster than a Voronoi graph (SciPy)',
+    ),
+)
+_MATCH = 'CPU time of a match, median'
+
+
+def panel(folder: Path) -> Panel:
+    """Times of other programs for the same work, relative to thinmap, as far as measured."""
+    marks = []
+    for label, name, above, what in _RATIOS:
+        value = _value(folder / f'{name}.csv', what, above)
+        if value is not None:
+            marks.append(Mark(label, value, OTHERS[Origin.TEAM]))
+    times = [
+        _value(folder / 'matching.csv', f'{program}: {_MATCH}')
+        for program in ('thinmap', 'karto-scanmatcher')
+    ]
+    if times[0] and times[1]:
+        marks.append(Mark('scan matching by OpenKarto', times[1] / times[0], OTHERS[Origin.TEAM]))
+    marks += _slam(folder.parent / 'slam')
+    return Panel('', 'time / time of thinmap', marks, is_log=True, limit=1.0)
+
+
+def _slam(folder: Path) -> list[Mark]:
+    """CPU times of SLAM programs per scan of the Intel log, relative to that of the board's run."""
+    if not folder.exists():
+        return []
+    own = [report for report in read_reports(folder) if report['name'] == INTEL]
+    return [
+        Mark(f'SLAM by {run.system}', run.cpu_ms / report['ms_mean'], OTHERS[run.origin])
+        for report in own
+        for run in runs(INTEL)
+        if run.cpu_ms is not None
+    ]
+
+
+def _value(path: Path, what: str, above: str = '') -> float | None:
+    """First number of a row, of the first that comes after another row; None if there is none."""
+    is_after = not above
+    for title, value, *_ in read_rows(path) if path.exists() else []:
+        is_after = is_after or title == above
+        number = re.match(r'[\d.e+-]+', value)
+        if is_after and title.strip() == what and number:
+            return float(number[0])
+    return None
+
+
+def read_rows(path: Path) -> list[list[str]]:
+    """Rows of a file of results: what, value, target, verdict."""
     with path.open(encoding='utf-8', newline='') as file:
         return list(csv.reader(file))[1:]
 
@@ -123,5 +228,4 @@ def _indented(row: list[str]) -> list[str]:
 
 
 if __name__ == '__main__':
-    docs = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parents[2] / 'docs'
-    (docs / 'results' / 'speed.md').write_text(page(Path(sys.argv[1])), encoding='utf-8')
+    print(write(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else DOCS))

@@ -78,7 +78,7 @@ def _try(floor: Floor, patch: GridPatch, rng: np.random.Generator, tally: _Tally
     cell = np.array([rng.integers(size) for size in patch.shape])
     goal = patch.frame.centres_of(cell[None])[0]
     clearance_m = ndimage.distance_transform_edt(np.pad(patch.free, 1))[1:-1, 1:-1] * resolution
-    parts, _ = ndimage.label(clearance_m >= config.robot_radius_m - _HAIR)
+    parts, _ = ndimage.label(clearance_m >= config.robot_radius_m - _HAIR, np.ones((3, 3)))
     at = tuple(patch.frame.cells_of(start[None, :2])[0])
     expected = parts[at] > 0 and parts[tuple(cell)] == parts[at]
     # Beside what can be reached, a goal moves a little: neither answer is wrong there.

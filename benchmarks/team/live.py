@@ -280,11 +280,11 @@ def main() -> None:
     parser.add_argument('-o', '--output', type=Path, required=True, help='CSV file')
     parser.add_argument('--robots', type=int, default=2, help='number of robots (default 2)')
     parser.add_argument('--unknown-starts', action='store_true', help='map_joiner has to find them')
-    parser.add_argument('--speed', type=float, default=0.5, help='top speed, m/s (default 0.5)')
+    parser.add_argument('--speed-m-s', type=float, default=0.5, help='top speed, m/s (default 0.5)')
     parser.add_argument('--rate', type=float, default=10.0, help='simulated s a second, at most')
     parser.add_argument('--seed', type=int, default=0, help='decides noise and starts (default 0)')
     parser.add_argument('--runs', type=int, default=1, help='of each world, with other seeds')
-    parser.add_argument('--time-limit', type=float, default=3000.0, help='simulated s')
+    parser.add_argument('--time-limit-s', type=float, default=3000.0, help='simulated s')
     parser.add_argument('--folder', type=Path, default=WORLDS, help='folder with worlds.json')
     arguments = parser.parse_args()
     os.environ.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randrange(1, 102)))
@@ -301,11 +301,11 @@ def main() -> None:
                 starts,
                 map_poses(starts),
                 not arguments.unknown_starts,
-                arguments.speed,
+                arguments.speed_m_s,
                 arguments.rate,
                 seed,
             )
-            record = run(setting, arguments.time_limit)
+            record = run(setting, arguments.time_limit_s)
             _append(arguments.output, record)
             print(record, flush=True)
     rclpy.shutdown()

@@ -1,0 +1,118 @@
+"""Make docs/results/peers.md: every other program, how it was run, and its figures beside ours.
+
+Usage: python -m benchmarks.peers_page DIR [DOCS]. DIR has the folder slam of `python -m benchmarks
+release`. The text is that of peers_page.md.
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.charts import DOCS, OTHERS, OURS, Mark, Panel, chart_path, draw, picture
+from benchmarks.scoreboard.played import Numbers
+from benchmarks.scoreboard.results_page import made_lines, read_reports
+from thinmap_ros.evaluation.machine import provenance
+from thinmap_ros.evaluation.peers import INTEL, PEERS, Origin, PeerRun, runs, shown
+from thinmap_ros.files.atomic import read_text, write_text
+
+_CHART = 'peers'
+_TEMPLATE = Path(__file__).with_suffix('.md')
+
+
+def write(folder: Path, docs: Path) -> Path:
+    """Write the page of a folder of all results, and its chart. Returns its path."""
+    reports = read_reports(folder / 'slam')
+    for report in reports:
+        report.setdefault('made', provenance(folder / 'slam'))
+    logs = {run.log for run in PEERS}
+    ours = {r['name']: r for r in reports if r['name'] in logs and 'live_m' in r}
+    draw(chart_path(docs, _CHART), panels(ours), _KEYS)
+    path = docs / 'results' / 'peers.md'
+    write_text(path, page(ours))
+    return path
+
+
+def page(ours: dict[str, Numbers]) -> str:
+    """Text of the page; ours: reports of thinmap by log."""
+    caption = 'Intel Research Lab, 5,438 scans: error, time and memory of all programs.'
+    lines = [
+        '| program | log | live | final | CPU ms per scan | memory (MB) | thinmap, live / final '
+        '| source |',
+        '|---|---|---|---|---|---|---|---|',
+        *(_line(run, ours.get(run.log)) for run in PEERS),
+    ]
+    return read_text(_TEMPLATE).format(
+        chart=picture(_CHART, caption),
+        made=made_lines(list(ours.values())),
+        figures='\n'.join(lines),
+        losses='\n'.join(_losses(ours)),
+    )
+
+
+def _losses(ours: dict[str, Numbers]) -> list[str]:
+    """A line for each run that has a smaller error than thinmap."""
+    lines = []
+    for run in PEERS:
+        own = ours.get(run.log, {})
+        smaller = [
+            f'{name} {metres[1]:.3f} against {own[key]:.3f}'
+            for name, key, metres in (
+                ('live', 'live_m', run.live_m),
+                ('final', 'final_m', run.final_m),
+            )
+            if metres is not None and key in own and metres[1] < own[key]
+        ]
+        if smaller:
+            lines.append(f'- {_title(run)}, `{run.log}`: {", ".join(smaller)}')
+    return lines
+
+
+def _title(run: PeerRun) -> str:
+    note = f' ({run.note})' if run.note and run.origin is Origin.TEAM else ''
+    return run.system + note
+
+
+def _line(run: PeerRun, own: Numbers | None) -> str:
+    source = run.note if run.origin is Origin.PUBLISHED else run.origin.value
+    cells = [
+        _title(run),
+        f'`{run.log}`',
+        shown(run.live_m),
+        shown(run.final_m),
+        f'{run.cpu_ms:g}' if run.cpu_ms is not None else '',
+        f'{run.peak_mb:g}' if run.peak_mb is not None else '',
+        f'{own["live_m"]:.3f} / {own["final_m"]:.3f}' if own else '',
+        source,
+    ]
+    return f'| {" | ".join(cells)} |'
+
+
+_KEYS = (('thinmap', OURS, True), ('run by the team', OTHERS[Origin.TEAM], True))
+
+
+def panels(ours: dict[str, Numbers]) -> Sequence[Panel]:
+    """Live error, CPU time and memory of the programs that were run on the Intel log."""
+    own = ours.get(INTEL)
+    if own is None:
+        return [Panel('Intel, 5,438 scans', 'mean live error (m)', _errors(), is_log=True)]
+    costs = [run for run in runs(INTEL) if run.cpu_ms is not None and run.peak_mb is not None]
+    colour = OTHERS[Origin.TEAM]
+    times = [Mark(run.system, run.cpu_ms or 0.0, colour) for run in costs]
+    memory = [Mark(run.system, run.peak_mb or 0.0, colour) for run in costs]
+    return [
+        Panel('live error', 'm', [Mark('thinmap', own['live_m']), *_errors()], is_log=True),
+        Panel('CPU time per scan', 'ms', [Mark('thinmap', own['ms_mean']), *times], is_log=True),
+        Panel('memory, peak', 'MB', [Mark('thinmap', own['mb']), *memory], is_log=True),
+    ]
+
+
+def _errors() -> list[Mark]:
+    return [
+        Mark(run.system, run.live_m[0], OTHERS[run.origin])
+        for run in runs(INTEL)
+        if run.live_m is not None
+    ]
+
+
+if __name__ == '__main__':
+    print(write(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else DOCS))

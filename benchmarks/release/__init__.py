@@ -1,0 +1,1 @@
+"""All results of a release in one run that can be interrupted."""
