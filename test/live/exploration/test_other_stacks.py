@@ -169,19 +169,18 @@ def test_a_foreign_slam_and_nav2_are_enough(graph, office):
 
 
 def test_nav2_drives_through_an_office_that_our_nodes_map(graph, office):
-    office.tell('refuse')
     office.start_our_slam()
     # The simulation waits for the test as well: it must act before everything is explored.
     graph.paced()
-    office.start_nav2(paced_by='heard_too')
+    office.start_nav2(paced_by='heard_too', mode='refuse')
+    # From now on the server answers this client. Its first answer can be lost, and it is asked
+    # again after a while: an explorer would have given up all targets that are refused meanwhile.
+    assert not office.drive_home().accepted
     office.start_explorer()
     handle = graph.send_goal(office.client, Explore.Goal())
     office.until_logged('goal rejected')
-    # From now on the server answers this client.
-    assert not office.drive_home().accepted
-    office.tell('abort')
+    office.tell('abort_once')
     office.until_logged('target not reached: failed to create a plan')
-    office.tell('drive')
     office.drive_to_somewhere_else()
     ended = graph.result(handle, 'the exploration')
     assert ended.status == GoalStatus.STATUS_SUCCEEDED

@@ -2,8 +2,8 @@
 
 A lifecycle node with the action navigate_to_pose. Unconfigured there is no server; an inactive one
 rejects goals. A newer goal preempts the running one, which is aborted with an empty result. On
-nav2_mode (std_msgs/String) it is told how to behave from the next goal on: drive, refuse, abort, or
-stall: accept, and neither drive nor report.
+nav2_mode (std_msgs/String) it is told how to behave from the next goal on: drive, refuse, abort,
+abort_once: abort one goal, then drive; or stall: accept, and neither drive nor report.
 """
 
 import math
@@ -35,7 +35,7 @@ _POLL_S = 0.002
 
 
 class BtNavigator(LifecycleNode):
-    """Parameters: autostart; paced_by: see `spin_once`."""
+    """Parameters: autostart; mode: at the start; paced_by: see `spin_once`."""
 
     def __init__(self):
         super().__init__('bt_navigator')
@@ -44,7 +44,7 @@ class BtNavigator(LifecycleNode):
         self._transforms = TransformListener(self)
         self._laser = LaserTransform(self)
         self._navigator = Navigator()
-        self._mode = 'drive'
+        self._mode = self.declare_parameter('mode', 'drive').value
         self._patch = None
         self._is_active = False
         self._server = None
@@ -103,7 +103,8 @@ class BtNavigator(LifecycleNode):
         self._began_ns = self.get_clock().now().nanoseconds
         self._goal = messages.pose_from_msg(handle.request.pose.pose)
         self._navigator.set_goal(*self._goal.tolist())
-        if self._mode == 'abort':
+        if self._mode in ('abort', 'abort_once'):
+            self._mode = self._mode.replace('abort_once', 'drive')
             self._end(GoalStatus.STATUS_ABORTED, FAILED, 'failed to create a plan')
 
     def _end(self, status, code, text):
