@@ -8,6 +8,8 @@ from support.driven_pieces import driven_piece, true_transform
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.edits import Erasures, MapEdits
+from thinmap_ros.core.grid.keep_out import KeepOut, KeepOutArea
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
@@ -104,6 +106,80 @@ def test_sessions_with_keyframes_are_bent_until_they_agree(tmp_path):
     require_right(merged.joins[0], SECOND)
     merged.save(str(tmp_path / 'both'))
     assert not sessions.KEYFRAMES.exists(str(tmp_path / 'both'))
+
+
+CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+
+
+def driven_place(drive, step):
+    """A place (2,) on the way of a drive, in the frame of its map."""
+    return driven_piece(*drive).piece.keyframes[step].T_map_base[:2]
+
+
+def draw(path, place, name, stamp_ns=-1):
+    """A keep-out area at a place (2,), the name of the region there, and an erased part."""
+    corners = place + CORNERS
+    erasures = Erasures()
+    if stamp_ns >= 0:
+        erasures.add(corners - 0.5, stamp_ns)
+    edits = MapEdits(KeepOut().with_area(corners, is_wall=False), erasures)
+    sessions.save_grid(path, GRID.load(path), edits=edits)
+    tracker = REGIONS.load(path)
+    regions = tracker.update(GRID.load(path).known_area())
+    number = int(regions.ids_at(place[None])[0])
+    assert number
+    tracker.names.put(regions, number, place, name)
+    REGIONS.save(path, tracker)
+
+
+@pytest.mark.parametrize('has_keyframes', [False, True])
+def test_what_people_have_drawn_on_the_maps_stays_at_its_place(tmp_path, has_keyframes):
+    paths = []
+    for drive, step in ((FIRST, 0), (SECOND, 20)):
+        path = save_session(tmp_path / f'{drive}', drive)
+        draw(path, driven_place(drive, step), f'room of {drive}')
+        if has_keyframes:
+            save_keyframes(path, drive)
+        paths.append(path)
+    out = str(tmp_path / 'both')
+    merge_maps(paths).save(out)
+    areas = sessions.load_edits(out).keep_out.areas
+    assert [area.id for area in areas] == [1, 2]
+    T = true_transform(driven_piece(*FIRST), driven_piece(*SECOND))
+    there = se2.transform_points(T, driven_place(SECOND, 20) + CORNERS)
+    np.testing.assert_allclose(areas[0].corners, driven_place(FIRST, 0) + CORNERS, atol=0.1)
+    np.testing.assert_allclose(areas[1].corners, there, atol=0.15)
+    tracker = REGIONS.load(out)
+    regions = tracker.names.named(tracker.update(GRID.load(out).known_area()))
+    ids = regions.ids_at(np.array([driven_place(FIRST, 0), there[0]])).tolist()
+    names = [regions.regions[number].name for number in ids]
+    assert names == [f'room of {FIRST}', f'room of {SECOND}']
+
+
+def test_what_was_erased_is_not_drawn_again_from_earlier_scans(tmp_path):
+    paths = [save_session(tmp_path / f'{drive}', drive) for drive in (FIRST, SECOND)]
+    place = driven_place(FIRST, 0)
+    known = {}
+    for stamp_ns in (0, 2**60):
+        draw(paths[0], place, 'hall', stamp_ns)
+        for path, drive in zip(paths, (FIRST, SECOND), strict=True):
+            save_keyframes(path, drive)
+        patch = merge_maps(paths).grid.known_area()
+        rows, cols = patch.frame.cells_of(place + np.array([[-0.3, -0.3], [0.3, 0.3]])).T
+        known[stamp_ns] = (~patch.unknown)[rows[0] : rows[1], cols[0] : cols[1]].mean()
+    assert known[0] > 0.9  # erased before any scan
+    assert known[2**60] == 0.0
+
+
+def test_too_many_keep_out_areas_of_all_maps_are_refused_before_the_work(tmp_path):
+    paths = [save_session(tmp_path / f'{drive}', drive) for drive in (FIRST, SECOND)]
+    for path in paths:
+        areas = [KeepOutArea(number, CORNERS) for number in range(1, 60)]
+        sessions.save_grid(path, GRID.load(path), edits=MapEdits(KeepOut(areas)))
+    began = []
+    with pytest.raises(InputError, match='118 keep-out areas: expected at most 100'):
+        merge_maps(paths, progress=lambda share, text: began.append(text))
+    assert not began
 
 
 def test_a_foreign_map_is_refused(folder):

@@ -7,6 +7,7 @@ import re
 import signal
 import time
 
+import numpy as np
 import pytest
 from fuzz.strange_requests import mutated
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
@@ -20,9 +21,11 @@ from support.hidden_library import hide
 from support.team_talk import ME, TeamTalk
 from support.web_client import WebClient
 
+from thinmap_ros.core.grid.edits import MapEdits
+from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.topology.builder import TopologyBuilder
-from thinmap_ros.files.sessions import TOPOLOGY, load_grid, load_topology, save_grid
+from thinmap_ros.files.sessions import TOPOLOGY, load_edits, load_grid, load_topology, save_grid
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -229,6 +232,8 @@ def test_two_sessions_are_shown_together_before_they_are_saved(graph):
     maps = graph.folder / 'maps'
     for name, drive in (('east', (1, 1)), ('west', (1, 2)), ('foreign', (11, 1))):
         save_piece(maps / name, driven_piece(*drive).piece)
+    wall = KeepOut().with_area(np.array([[0.0, 0.0], [1.0, 0.0]]), is_wall=True)
+    save_grid(str(maps / 'west'), load_grid(str(maps / 'west')), edits=MapEdits(wall))
     site = Site(graph, save_directory='maps')
     page = site.open()
     page.ask('sessions')
@@ -254,6 +259,7 @@ def test_two_sessions_are_shown_together_before_they_are_saved(graph):
     page.until(lambda: 'both' in page.items['sessions'], 'its name')
     free = {name: load_grid(str(maps / name)).known_area().free.sum() for name in ('east', 'both')}
     assert free['both'] > free['east'] and load_topology(str(maps / 'both')).map.nodes
+    assert len(load_edits(str(maps / 'both')).keep_out.areas) == 1
     page.ask('merge', first='east', second='west')
     page.until(lambda: page.items['merge']['state'] == 'working', 'work that is dropped')
     page.ask('merge_drop')

@@ -12,9 +12,12 @@ import pytest
 import yaml
 from PIL import Image
 
+from thinmap_ros.core.grid.edits import MapEdits
+from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.files.occupancy_maps import read_map
-from thinmap_ros.files.sessions import REGIONS
+from thinmap_ros.files.sessions import EDITS, GRID, REGIONS
 from thinmap_ros.tools import map_to_graph
 
 YAML = {
@@ -245,3 +248,25 @@ def test_regions_of_a_saved_session_keep_their_names(
     features = json.loads((tmp_path / 'g.geojson').read_text())['features']
     names = [f['properties']['name'] for f in features if f['geometry']['type'] == 'Polygon']
     assert names == ['Südflur']
+
+
+def test_no_edge_leads_through_a_keep_out_area_of_the_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, corridors())
+    stem = str(path.with_suffix(''))
+    # Across the right part of the long corridor.
+    corners = np.array([[5.0, 5.9], [5.5, 5.9], [5.5, 7.1], [5.0, 7.1]])
+    keep_out = KeepOut().with_area(corners, is_wall=False)
+    GRID.save(stem, OccupancyGrid.from_patch(read_map(path)))
+    EDITS.save(stem, MapEdits(keep_out))
+    out = tmp_path / 'g.geojson'
+    assert run(monkeypatch, path, '-o', out) == 0
+    printed = capsys.readouterr().out
+    assert 'connected parts: 2, ' in printed
+    assert 'keep-out areas: 1' in printed
+    EDITS.file(stem).unlink()
+    assert run(monkeypatch, path, '-o', out) == 0
+    printed = capsys.readouterr().out
+    assert 'connected parts: 1' in printed
+    assert 'keep-out' not in printed

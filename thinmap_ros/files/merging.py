@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, ThinmapError, quoted
+from thinmap_ros.core.grid.edits import MapEdits
+from thinmap_ros.core.grid.keep_out import KeepOut, require_count
+from thinmap_ros.core.grid.motion import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.recognition.decision import JOIN_ODDS, recognize
 from thinmap_ros.core.regions.tracker import RegionTracker
@@ -50,12 +53,14 @@ class MapJoin:
 class MergedMap:
     """The map of several, in the frame of the first of them.
 
-    maps: these, by path; joins: of all but the first, in the order in which they were joined.
+    keep_out: areas of all of them; maps: these, by path; joins: of all but the first, in the order
+    in which they were joined.
     """
 
     grid: OccupancyGrid
     topology: TopologyBuilder
     regions: RegionTracker
+    keep_out: KeepOut
     maps: dict[str, SlamPiece]
     joins: list[MapJoin]
 
@@ -72,7 +77,7 @@ class MergedMap:
         ):
             TOPOLOGY.write(topology, self.topology)
             REGIONS.write(regions, self.regions)
-            grid = sessions.save_grid(path, self.grid)
+            grid = sessions.save_grid(path, self.grid, edits=MapEdits(self.keep_out))
         lines = [f'{grid}, {TOPOLOGY.ending} and {REGIONS.ending}']
         lines += [part.archive(path) for part in (LOCALIZER, EXPLORATION)]
         return [line for line in lines if line]
@@ -102,9 +107,35 @@ def merge_maps(
     merging = _Merging(maps, join_odds, progress)
     while merging.waiting:
         merging.join_next()
-    regions = REGIONS.load_optional(names[0]) or RegionTracker()
+    regions = merging.drawn.regions
     regions.update(merging.known.patch)
-    return MergedMap(merging.grid, merging.topology, regions, maps, merging.joins)
+    return MergedMap(
+        merging.grid, merging.topology, regions, merging.drawn.keep_out, maps, merging.joins
+    )
+
+
+@dataclass(eq=False)
+class _Drawn:
+    """What people have drawn on a map: keep-out areas, and names of its regions."""
+
+    keep_out: KeepOut
+    regions: RegionTracker
+
+    @staticmethod
+    def of(path: str) -> '_Drawn':
+        """That of a session; nothing of another map. Raises InputError where it is broken."""
+        regions = REGIONS.load_optional(path) or RegionTracker()
+        return _Drawn(sessions.load_edits(path).keep_out, regions)
+
+    def move(self, motion: MapMotion) -> None:
+        """Move it as the map."""
+        self.keep_out = self.keep_out.moved(motion.before, motion.after)
+        self.regions.names.move(motion)
+
+    def add(self, other: '_Drawn') -> None:
+        """Add that of another map. Raises InputError where it is too much."""
+        self.keep_out = self.keep_out.joined(other.keep_out)
+        self.regions.names.add(other.regions.names)
 
 
 class _Merging:
@@ -120,6 +151,9 @@ class _Merging:
         self._maps = maps
         self._join_odds = join_odds
         self._progress = progress
+        self._drawn = {path: _Drawn.of(path) for path in maps}
+        require_count(sum(len(drawn.keep_out.areas) for drawn in self._drawn.values()))
+        self.drawn = self._drawn[first]
         self.known = maps[first]
         self.grid = OccupancyGrid()
         self.topology = TopologyBuilder()
@@ -155,6 +189,9 @@ class _Merging:
             )
         )
         self.waiting.remove(path)
+        for drawn, motion in zip((self.drawn, self._drawn[path]), joined.motions, strict=True):
+            drawn.move(motion)
+        self.drawn.add(self._drawn[path])
         self.known = joined.piece
         self.grid = joined.grid
         self.topology = joined.topology
@@ -179,7 +216,8 @@ def read_piece(path: str, report: Report = warn) -> SlamPiece:
         saved = KEYFRAMES.load_optional(path) if GRID.exists(path) else None
         if saved is not None:
             edges = [*saved.steps, *saved.edges]
-            return SlamPiece(saved.frames, edges, patch, builder.map, builder.next_id)
+            erased = sessions.load_edits(path).erasures.items
+            return SlamPiece(saved.frames, edges, patch, builder.map, builder.next_id, erased)
         return SlamPiece.of_bare_map(patch, builder.map, builder.next_id)
     return SlamPiece.of_bare_map(patch, build(patch, None, TopologyConfig()))
 

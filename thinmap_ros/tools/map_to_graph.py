@@ -28,7 +28,7 @@ from thinmap_ros.evaluation.batch import (
 )
 from thinmap_ros.evaluation.parallel_jobs import Report, add_run_options
 from thinmap_ros.files import graphs, occupancy_maps
-from thinmap_ros.files.sessions import REGIONS
+from thinmap_ros.files.sessions import REGIONS, load_edits
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser, check_place
 from thinmap_ros.view.summary import summary_figure
@@ -88,12 +88,16 @@ def _config(arguments: argparse.Namespace) -> TopologyConfig:
 
 @dataclass(frozen=True)
 class _Graph:
-    """What was found in a map: counts, and why there is nothing, if so."""
+    """What was found in a map: counts, and why there is nothing, if so.
+
+    keep_out: number of the keep-out areas of its session, which are walls for the graph.
+    """
 
     nodes: int
     edges: int
     parts: int
     regions: int
+    keep_out: int
     empty: str
 
 
@@ -111,7 +115,9 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
     start = _start(arguments.start)
     config = _config(arguments)
     patch = occupancy_maps.read_map(path, keeps_unknown=True)
-    topology = _graph_of(patch, start, config, arguments.detail_m)
+    keep_out = load_edits(str(path)).keep_out
+    drivable = keep_out.as_walls(patch)
+    topology = _graph_of(drivable, start, config, arguments.detail_m)
     found = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius_m))
     session = REGIONS.load_optional(str(path))
     regions = found if session is None else session.names.named(found)
@@ -120,7 +126,7 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
     if picture is not None:
         summary_figure(
             picture,
-            patch,
+            drivable,
             topology,
             np.empty((0, 2)),
             title=path.stem,
@@ -133,6 +139,7 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
         len(topology.edges),
         len(topology.components()),
         len(regions.regions),
+        len(keep_out.areas),
         '' if topology.nodes else empty,
     )
 
@@ -201,9 +208,10 @@ def _convert_one(path: Path, arguments: argparse.Namespace) -> None:
     found = _convert(path, arguments.out, arguments.picture, arguments)
     if found.empty:
         print(f'map_to_graph: warning: {path}: {found.empty}', file=sys.stderr)
+    kept_out = f', keep-out areas: {found.keep_out}' if found.keep_out else ''
     print(
         f'{arguments.out}: {found.nodes} nodes, {found.edges} edges, '
-        f'connected parts: {found.parts}, regions: {found.regions}'
+        f'connected parts: {found.parts}, regions: {found.regions}{kept_out}'
     )
 
 

@@ -38,6 +38,10 @@ class Erasure(NamedTuple):
     corners: Array
     stamp_ns: int
 
+    def moved(self, before: Array, after: Array) -> 'Erasure':
+        """The same, moved along with the pose (3,) nearest to it; poses (N >= 1, 3)."""
+        return Erasure(moved_corners(self.corners, before, after), self.stamp_ns)
+
 
 @dataclass(eq=False)
 class Erasures:
@@ -64,10 +68,7 @@ class Erasures:
     def move(self, before: Array, after: Array) -> None:
         """Move each along with the pose (3,) nearest to it; poses (N, 3) around a correction."""
         if len(before):
-            self.items = [
-                Erasure(moved_corners(item.corners, before, after), item.stamp_ns)
-                for item in self.items
-            ]
+            self.items = [item.moved(before, after) for item in self.items]
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,8 +62,7 @@ class KeepOut:
 
     def __init__(self, areas: Sequence[KeepOutArea] = (), next_id: int = 1) -> None:
         """Raises InputError where there are too many, or an id occurs twice."""
-        if len(areas) > MAX_AREAS:
-            raise InputError(f'{len(areas)} keep-out areas: expected at most {MAX_AREAS}')
+        require_count(len(areas))
         validation.require_unique('keep-out areas', [area.id for area in areas])
         self.areas = tuple(areas)
         self.next_id = max([next_id, *(area.id + 1 for area in areas)])
@@ -71,10 +70,15 @@ class KeepOut:
 
     def with_area(self, corners: Array, is_wall: bool) -> 'KeepOut':
         """These and one more, with corners (M, 2), m. Raises InputError where it is none."""
-        if self.next_id > MAX_ID:
-            raise InputError(f'keep-out area {self.next_id}: expected ids up to {MAX_ID}')
         area = KeepOutArea(self.next_id, corners, is_wall).checked(MAX_OUTLINE_M)
-        return KeepOut((*self.areas, area))
+        return self._with([area])
+
+    def joined(self, other: 'KeepOut') -> 'KeepOut':
+        """These and those of another map, which get new ids.
+
+        Raises InputError where there are too many.
+        """
+        return self._with(other.areas)
 
     def without(self, number: int) -> 'KeepOut':
         """These but one; 0: none of them. Raises InputError where there is no such id."""
@@ -83,6 +87,14 @@ class KeepOut:
             known = ', '.join(str(area.id) for area in self.areas) or 'none'
             raise InputError(f'keep-out area {number}: expected the id of one ({known})')
         return KeepOut(kept, self.next_id)
+
+    def _with(self, areas: Sequence[KeepOutArea]) -> 'KeepOut':
+        """These and others, with the next ids."""
+        end_id = self.next_id + len(areas)
+        if end_id - 1 > MAX_ID:
+            raise InputError(f'keep-out area {end_id - 1}: expected ids up to {MAX_ID}')
+        added = [replace(area, id=self.next_id + i) for i, area in enumerate(areas)]
+        return KeepOut((*self.areas, *added), end_id)
 
     def moved(self, before: Array, after: Array) -> 'KeepOut':
         """These, each moved along with the pose (3,) of the robot that is nearest to it.
@@ -125,6 +137,12 @@ class KeepOut:
                 f'{MAX_MASK_CELLS} cells'
             )
         return row, col, end_row, end_col
+
+    def as_walls(self, patch: GridPatch) -> GridPatch:
+        """Map with all areas as walls."""
+        if not self.areas:
+            return patch
+        return with_walls(patch, self.cells(patch.frame, patch.shape))
 
     def laid_on(self, patch: GridPatch, T_map_base: Array) -> GridPatch:
         """Map with all areas as walls, but those in which the robot is, at (3,): it may leave.
@@ -171,6 +189,12 @@ def _cells_of(areas: Sequence[KeepOutArea], frame: GridFrame, shape: tuple[int, 
     for area in areas:
         cells |= touched_cells(area.corners, frame, shape, not area.is_wall)
     return cells
+
+
+def require_count(count: int) -> None:
+    """Raise InputError where there are more areas than a map may have."""
+    if count > MAX_AREAS:
+        raise InputError(f'{count} keep-out areas: expected at most {MAX_AREAS}')
 
 
 def require_corners(

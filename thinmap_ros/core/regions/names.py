@@ -66,6 +66,16 @@ class RegionNames:
         if self._names:
             self._anchors = motion.moved(self._anchors)
 
+    def add(self, others: 'RegionNames') -> None:
+        """Add names of another map; in a region with a name of both, the own one stays.
+
+        Raises InputError where there are too many names.
+        """
+        names = [*others._names, *self._names]
+        _check_count(len(names))
+        self._anchors = np.vstack([others._anchors, self._anchors])
+        self._names = names
+
     def named(self, regions: RegionMap) -> RegionMap:
         """Regions with their names; of several in one region the newest."""
         ids = regions.ids_at(self._anchors).tolist()
@@ -90,9 +100,13 @@ class RegionNames:
         names = RegionNames()
         names._anchors = checked['name_anchors']
         names._names = [_text(row) for row in checked['name_letters'].tolist()]
-        if len(names._names) > MAX_NAMES:
-            raise InputError(f'{len(names._names)} names of regions: expected at most {MAX_NAMES}')
+        _check_count(len(names._names))
         return names
+
+
+def _check_count(count: int) -> None:
+    if count > MAX_NAMES:
+        raise InputError(f'{count} names of regions: expected at most {MAX_NAMES}')
 
 
 def _text(letters: list[int]) -> str:

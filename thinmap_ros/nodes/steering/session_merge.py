@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line, one_line_reason
 from thinmap_ros.files.merging import MergedMap
-from thinmap_ros.files.sessions import GRID, PARTS, REGIONS, load_grid, load_topology
+from thinmap_ros.files.sessions import GRID, PARTS, REGIONS, load_edits, load_grid, load_topology
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.web.board import Board
@@ -171,5 +171,6 @@ class SessionMerge:
 
 def _save(stem: str, path: str) -> str:
     """Save a merged session under another name, all files or none; returns what was written."""
-    merged = MergedMap(load_grid(stem), load_topology(stem), REGIONS.load(stem), {}, [])
+    keep_out = load_edits(stem).keep_out
+    merged = MergedMap(load_grid(stem), load_topology(stem), REGIONS.load(stem), keep_out, {}, [])
     return '; '.join(merged.save(path))

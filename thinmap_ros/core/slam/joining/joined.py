@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.grid.edits import Erasure
+from thinmap_ros.core.grid.erasing import add_scan_outside
+from thinmap_ros.core.grid.motion import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.rotated import overlaid
 from thinmap_ros.core.places.recognition.recognition import Placement
@@ -35,7 +38,8 @@ class JoinedMap:
     """The map of two pieces, in the frame of the first.
 
     T_first_second (3,): frame of the second piece; ids: of the nodes of the second piece in the
-    map, by their own; links: number of edges between keyframes of both.
+    map, by their own; links: number of edges between keyframes of both; motions: how the places of
+    the first and of the second piece have moved.
     """
 
     piece: SlamPiece
@@ -44,6 +48,7 @@ class JoinedMap:
     T_first_second: Array
     ids: Ids
     links: int
+    motions: tuple[MapMotion, MapMotion]
 
 
 def join(
@@ -75,9 +80,9 @@ def _optimized_together(
     links = found(match_keyframes(frames[:count], frames[count:], nearby))
     poses = _bent(poses, first, second, links)
     frames = _at(frames, poses)
-    grid = OccupancyGrid(config.grid, first.patch.frame)
-    for frame in frames:
-        grid.add_scan(frame.scan, frame.T_map_base)
+    motions = (MapMotion(first.poses, poses[:count]), MapMotion(second.poses, poses[count:]))
+    erased = _erased(first, second, motions)
+    grid = _rendered(frames, erased, OccupancyGrid(config.grid, first.patch.frame))
     patch = grid.known_area()
     topology, ids = join_topologies(
         patch,
@@ -87,10 +92,31 @@ def _optimized_together(
         config.topology,
     )
     edges = _all_edges(first, second, links)
-    piece = SlamPiece(frames, edges, patch, topology.map, topology.next_id)
+    piece = SlamPiece(frames, edges, patch, topology.map, topology.next_id, erased)
     nearest = links[0].b if links else 0
     T_joined = se2.compose(poses[count + nearest], se2.invert(second.poses[nearest]))
-    return JoinedMap(piece, grid, topology, T_joined, ids, len(links))
+    return JoinedMap(piece, grid, topology, T_joined, ids, len(links), motions)
+
+
+def _erased(
+    first: SlamPiece, second: SlamPiece, motions: tuple[MapMotion, MapMotion]
+) -> list[Erasure]:
+    """Erased parts of both pieces, where they are now."""
+    return [
+        erasure.moved(motion.before, motion.after)
+        for piece, motion in zip((first, second), motions, strict=True)
+        for erasure in piece.erased
+    ]
+
+
+def _rendered(
+    frames: Sequence[Keyframe], erased: Sequence[Erasure], grid: OccupancyGrid
+) -> OccupancyGrid:
+    """The grid with all scans, but for what was erased after they were made."""
+    for frame in frames:
+        later = [each.corners for each in erased if each.stamp_ns >= frame.scan.stamp_ns]
+        add_scan_outside(grid, frame.scan, frame.T_map_base, later)
+    return grid
 
 
 def _all_edges(first: SlamPiece, second: SlamPiece, links: Sequence[Edge]) -> list[Edge]:
@@ -123,4 +149,5 @@ def _joined_rigidly(
     )
     piece = SlamPiece.of_bare_map(patch, topology.map, topology.next_id)
     grid = OccupancyGrid.from_patch(patch, config.grid)
-    return JoinedMap(piece, grid, topology, T, ids, len(links))
+    motions = (MapMotion.rigid(np.zeros(3)), MapMotion.rigid(T))
+    return JoinedMap(piece, grid, topology, T, ids, len(links), motions)

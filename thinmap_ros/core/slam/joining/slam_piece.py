@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from thinmap_ros.core.grid.edits import Erasure
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.recognition.drawn_scans import drawn_scans
 from thinmap_ros.core.places.recognition.piece import MapPiece
@@ -21,7 +22,8 @@ class SlamPiece:
     """A piece of map.
 
     edges: between keyframes, by their numbers; without any the piece is rigid. next_id: smallest
-    number that no node or edge of the graph has had.
+    number that no node or edge of the graph has had. erased: parts of which no earlier scan shows
+    anything.
     """
 
     frames: Sequence[Keyframe]
@@ -29,6 +31,7 @@ class SlamPiece:
     patch: GridPatch
     graph: TopologicalMap
     next_id: int
+    erased: Sequence[Erasure] = ()
 
     @staticmethod
     def of_bare_map(patch: GridPatch, graph: TopologicalMap, next_id: int = 1) -> 'SlamPiece':
