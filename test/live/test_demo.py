@@ -1,5 +1,6 @@
 """The demo as documented: the whole live graph, faster than real time."""
 
+import contextlib
 import json
 import shlex
 import signal
@@ -7,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import psutil
@@ -97,11 +99,13 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     assert not nodes_of(out)
 
 
-@pytest.mark.parametrize(('robots', 'nodes'), [('1', 8), ('2', 6)])
+@pytest.mark.parametrize(('robots', 'nodes'), [(1, 9), (2, 8)])
 def test_ctrl_c_ends_everything(ros_domain, tmp_path, robots, nodes):
     out = tmp_path / 'demo'
-    process = demo(out, '--rate', '5', '--robots', robots)
+    process = demo(out, '--rate', '5', '--robots', str(robots), '--web')
     tree = until_started(process, out, nodes)
+    for port in range(8480, 8480 + robots):
+        until_there_is_a_page(process, port)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
@@ -166,6 +170,16 @@ def until_started(process, out, count):
         assert time.monotonic() < until and process.poll() is None, process.communicate()
         time.sleep(0.1)
     return process_tree(process)
+
+
+def until_there_is_a_page(process, port):
+    until = time.monotonic() + PATIENCE_S
+    while True:
+        assert time.monotonic() < until and process.poll() is None, process.communicate()
+        with contextlib.suppress(OSError), urlopen(f'http://127.0.0.1:{port}/') as page:
+            assert b'thinmap' in page.read()
+            return
+        time.sleep(0.1)
 
 
 def process_tree(process):

@@ -42,7 +42,8 @@ _SIM_TIME = ['-p', 'use_sim_time:=true']
 # Subscribers of the scans of a robot: simulated time waits for all of them.
 _SCAN_LISTENERS = 4
 _SLEEP_S = 0.05
-_PAGE = 'http://127.0.0.1:8480/'
+_PORT = 8480  # of the page; of several robots, each has the next one
+_PAGE = f'http://127.0.0.1:{_PORT}/'
 
 
 @dataclass(eq=False)
@@ -125,8 +126,7 @@ def explore(arguments: argparse.Namespace, world: Path, starts: Sequence[Array])
         if arguments.view:
             processes.start('rerun_viewer', _SIM_TIME)
         if arguments.web:
-            processes.start('web', _SIM_TIME)
-            print(f'page at {_PAGE}', file=sys.stderr)
+            _start_pages(processes, len(starts))
         processes.start('demo_monitor', [*_SIM_TIME, *common, *limit, *maps], quiet=False)
         # The last one: what comes after the first scan is seen sooner.
         processes.start('sim', [*common, *lockstep, *clock, *where])
@@ -148,13 +148,29 @@ def _start_nodes(processes: Processes, start: Array, speed: float) -> None:
 def _start_robots(processes: Processes, starts: Sequence[Array], speed: float) -> None:
     """Start a process for each robot, with all of its nodes, and one that joins the maps."""
     for number, (start, T_world_map) in enumerate(zip(starts, map_poses(starts), strict=True), 1):
-        namespace = f'__ns:=/robot{number}'
-        remap = ['-r', namespace, '-r', '/tf:=tf', '-r', '/tf_static:=tf_static']
         limit = _parameters({'controller.max_speed_m_s': speed})
         pose = _initial_pose(se2.between(T_world_map, start))
-        arguments = [*remap, *_SIM_TIME, *limit, *pose, *_parameters(team='true')]
-        processes.start('thinmap', arguments, label=f'robot{number}')
+        processes.start('thinmap', [*_in_team(number), *limit, *pose], label=f'robot{number}')
     processes.start('map_joiner', _SIM_TIME)
+
+
+def _in_team(number: int) -> list[str]:
+    """Arguments of a node of one of several robots."""
+    remap = ['-r', f'__ns:=/robot{number}', '-r', '/tf:=tf', '-r', '/tf_static:=tf_static']
+    return [*remap, *_SIM_TIME, *_parameters(team='true')]
+
+
+def _start_pages(processes: Processes, count: int) -> None:
+    """Start a page for each robot."""
+    if count == 1:
+        processes.start('web', _SIM_TIME)
+        print(f'page at {_PAGE}', file=sys.stderr)
+        return
+    for number in range(1, count + 1):
+        port = _PORT + number - 1
+        arguments = [*_in_team(number), *_parameters(port=port)]
+        processes.start('web', arguments, label=f'web{number}')
+        print(f'page of robot {number} at http://127.0.0.1:{port}/', file=sys.stderr)
 
 
 def map_poses(starts: Sequence[Array]) -> list[Array]:
@@ -217,8 +233,8 @@ def _starts(arguments: argparse.Namespace, file: Path) -> list[Array]:
     count = arguments.robots
     if not 1 <= count <= MAX_ROBOTS:
         raise InputError(f'--robots={count}: expected 1 to {MAX_ROBOTS}')
-    if count > 1 and (arguments.view or arguments.web):
-        raise InputError(f'--{"view" if arguments.view else "web"}: expected --robots=1')
+    if count > 1 and arguments.view:
+        raise InputError('--view: expected --robots=1')
     world = World.from_patch(*read_world(file))
     radius_m = PRESETS[arguments.robot].radius_m
     return starts_in(world, world.start, read_starts(file), count, radius_m)
@@ -299,7 +315,8 @@ def main() -> None:
     )
     add_out(parser, 'out/demo')
     parser.add_argument('--view', action='store_true', help='show it in rerun')
-    parser.add_argument('--web', action='store_true', help=f'show it in a browser, at {_PAGE}')
+    web_help = f'show it in a browser, at {_PAGE}; each further robot at the next port'
+    parser.add_argument('--web', action='store_true', help=web_help)
     cli.run(_work, parser)
 
 
