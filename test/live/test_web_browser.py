@@ -3,10 +3,12 @@
 import re
 import shutil
 
+import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped, Twist
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 
-from thinmap_ros.ros import messages
+from thinmap_msgs.msg import KeepOut
+from thinmap_ros.ros import messages, qos
 
 playwright = pytest.importorskip(
     'playwright.sync_api', reason='needs Playwright, which is not installed'
@@ -28,6 +30,20 @@ def browser():
         opened = library.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox'])
         yield opened
         opened.close()
+
+
+# Two fingers on the map, one of which moves.
+PINCH = """() => {
+  const map = document.getElementById('map');
+  map.setPointerCapture = () => {};
+  const send = (name, id, x, y) => map.dispatchEvent(
+    new PointerEvent(name, { pointerId: id, pointerType: 'touch', clientX: x, clientY: y }));
+  send('pointerdown', 11, 300, 300);
+  send('pointerdown', 12, 400, 300);
+  send('pointermove', 12, 440, 300);
+  send('pointerup', 12, 440, 300);
+  send('pointerup', 11, 300, 300);
+}"""
 
 
 class Tab:
@@ -121,6 +137,47 @@ def test_a_person_sees_the_robot_sends_it_and_stops_it(graph, browser):
     assert not tab.errors and not narrow.errors
     tab.page.close()
     graph.until(lambda: commands[-1].linear.x == 0.0, 'it stops when the page is gone')
+
+
+def test_what_is_drawn_by_mistake_is_forgotten(graph, browser):
+    areas = graph.heard('keep_out', KeepOut, qos.LATCHED)
+    poses = graph.heard('initialpose', PoseWithCovarianceStamped)
+    graph.start('web', port=0)
+    graph.start('grid_mapper')
+    tab = Tab(graph, browser, address_of(graph))
+    tab.until(lambda: tab.text('link') == 'connected', 'the page')
+    corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0)]
+
+    def draw(points):
+        tab.page.locator('[data-mode=keep_out]').click()
+        for point in points:
+            tab.page.mouse.click(*tab.place_on_screen(*point))
+
+    draw([(-2.0, -2.0), *corners])
+    tab.page.keyboard.press('Escape')
+    assert not tab.page.locator('#done').is_visible()
+    tab.page.locator('[data-mode=initial_pose]').click()
+    tab.page.mouse.move(*tab.place_on_screen(0.5, 0.5))
+    tab.page.mouse.down()
+    tab.page.keyboard.press('Escape')
+    tab.page.mouse.up()
+    # Two fingers zoom, and draw no corner.
+    draw(corners[:1])
+    tab.page.evaluate(PINCH)
+    for point in corners[1:]:
+        tab.page.mouse.click(*tab.place_on_screen(*point))
+    tab.page.locator('#done').click()
+    tab.until(lambda: areas and areas[-1].areas, 'the area')
+    (area,) = areas[-1].areas
+    assert np.array(drawn_corners(area)) == pytest.approx(np.array(corners), abs=CELL_M)
+    tab.page.get_by_role('button', name='Remove').click()
+    tab.until(lambda: not areas[-1].areas, 'no area')
+    assert not poses
+    assert not tab.errors
+
+
+def drawn_corners(area):
+    return [(point.x, point.y) for point in area.corners.points]
 
 
 def test_a_wrong_token_sees_nothing(graph, browser):

@@ -170,6 +170,13 @@ addEventListener('keydown', (event) => {
   event.preventDefault();
   if (!event.repeat) stop();
 }, true);
+addEventListener('keydown', (event) => {
+  if (event.code !== 'Escape') return;
+  view.sketch = null;
+  limit = [];
+  drawn = [];
+  setMode('pan');
+});
 addEventListener('keyup', (event) => {
   if (event.code === 'Space' && event.target.id !== 'region-name') event.preventDefault();
 }, true);
@@ -256,13 +263,15 @@ function setMode(chosen) {
 // The map under one pointer or two.
 
 const pointers = new Map();
+let hasPinched = false; // since there was no pointer
 const canvas = find('map');
 const placeOf = (event) => [event.offsetX, event.offsetY];
 
 canvas.onpointerdown = (event) => {
   canvas.setPointerCapture(event.pointerId);
   pointers.set(event.pointerId, placeOf(event));
-  if (pointers.size > 1) view.sketch = null;
+  hasPinched = pointers.size > 1;
+  if (hasPinched) view.sketch = null;
   else if (mode === 'goal' || mode === 'initial_pose') {
     view.sketch = { from: view.toMap(...placeOf(event)), to: null };
   }
@@ -282,7 +291,7 @@ canvas.onpointermove = (event) => {
   view.redraw();
 };
 canvas.onpointerup = (event) => {
-  const isSingle = pointers.size === 1;
+  const isSingle = pointers.size === 1 && !hasPinched;
   pointers.delete(event.pointerId);
   const place = view.toMap(...placeOf(event));
   if (isSingle && view.sketch?.from) finish();
