@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ SHARED = next(
     ROOT.parent / 'shared',
 )
 
+_SHOWN_LINES = 15  # of a log
+
 # No deadline: the time of an example depends on the machine. The same examples in every run.
 settings.register_profile('thinmap', deadline=None, derandomize=True)
 settings.load_profile('thinmap')
@@ -43,6 +45,21 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     is_worker = hasattr(session.config, 'workerinput')
     if not is_worker and not session.config.option.collectonly and 'THINMAP_ENV' not in os.environ:
         subprocess.run([sys.executable, '-m', 'thinmap_ros.tools.warm_up'], cwd=ROOT, check=True)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Show what the nodes and programs of a test that failed said last."""
+    report = yield
+    folder = getattr(item, 'funcargs', {}).get('tmp_path')
+    if report.when == 'call' and report.failed and folder is not None:
+        for log in sorted(folder.rglob('*.log')):
+            lines = log.read_text(errors='replace').splitlines()[-_SHOWN_LINES:]
+            if lines:
+                report.sections.append((str(log.relative_to(folder)), '\n'.join(lines)))
+    return report
 
 
 @pytest.fixture(scope='session', autouse=True)
