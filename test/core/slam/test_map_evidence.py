@@ -5,6 +5,11 @@ import pytest
 
 from thinmap_ros.core.slam.map_evidence import MapEvidence
 from thinmap_ros.core.slam.matching.scan_matcher import Match
+from thinmap_ros.core.slam.matching.visibility import SeenThrough
+
+ANGLES = np.linspace(-np.pi, np.pi, 90)
+ALL_AROUND = 4.0 * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
+DOOR = np.column_stack([np.full(90, 2.0), np.linspace(-1.0, 1.0, 90)])
 
 
 def match(inlier_ratio: float, contradiction_ratio: float) -> Match:
@@ -89,7 +94,7 @@ def test_walls_that_are_seen_through_are_evidence_that_no_inlier_reduces():
     evidence = MapEvidence(4.0, 0.6)
     scans = 0
     while not evidence.needs_submap:
-        evidence.update(match(1.0, 0.0), seen_through=0.5)
+        evidence.update(match(1.0, 0.0), through(ALL_AROUND, 0.5))
         scans += 1
         assert not evidence.agrees
     assert scans == 16
@@ -100,5 +105,34 @@ def test_walls_that_are_seen_through_are_evidence_that_no_inlier_reduces():
 def test_glass_is_seen_through_and_no_evidence():
     evidence = MapEvidence(4.0, 0.6)
     for _ in range(1000):
-        evidence.update(match(0.9, 0.05), seen_through=0.2)
+        evidence.update(match(0.9, 0.05), through(ALL_AROUND, 0.2))
     assert evidence.agrees
+
+
+def test_a_door_that_opens_before_the_robot_is_no_evidence_of_another_place():
+    evidence = MapEvidence(4.0, 0.6)
+    for _ in range(30):
+        evidence.update(match(0.95, 0.0), through(DOOR, 0.7))
+        assert not evidence.needs_submap
+    # Beside it the walls are those of another place.
+    scans = 0
+    while not evidence.needs_submap:
+        evidence.update(match(0.95, 0.0), through(ALL_AROUND, 0.7))
+        scans += 1
+    assert 20 < scans < 60
+
+
+def test_after_a_door_another_place_is_noticed_as_soon():
+    evidence = MapEvidence(4.0, 0.6)
+    for _ in range(10):
+        evidence.update(match(0.95, 0.0), through(DOOR, 0.7))
+    for _ in range(50):
+        evidence.update(match(1.0, 0.0))
+    assert evidence.agrees
+    for _ in range(16):
+        evidence.update(match(1.0, 0.0), through(ALL_AROUND, 0.5))
+    assert evidence.needs_submap
+
+
+def through(walls, ratio):
+    return SeenThrough(walls, ratio)

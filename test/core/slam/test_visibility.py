@@ -9,7 +9,7 @@ from support.slam_room import map_of, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.local_map import LocalMap
-from thinmap_ros.core.slam.matching.visibility import seen_through_ratio
+from thinmap_ros.core.slam.matching.visibility import seen_through
 
 PERIOD_NS = 200_000_000
 # A hall of 30 x 30 m: in its middle no wall is in range.
@@ -82,20 +82,24 @@ def test_the_wall_is_matched_when_it_returns(hall):
     assert np.hypot(off[0], off[1]) < 0.1
 
 
+def seen_ratio(*arguments):
+    return seen_through(*arguments).ratio
+
+
 def test_returns_behind_walls_are_counted_and_those_on_them_and_beside_them_not():
     wall = np.array([[3.0, -4.0, 3.0, 4.0]])
     behind = np.array([[6.0, -8.0, 6.0, 8.0]])
     side = np.array([[-1.0, 1.0, 6.0, 1.0]])
     here = np.zeros(3)
     seen = map_of(np.vstack([wall, side]), [here] * 3)
-    assert seen_through_ratio(scan_in(np.vstack([wall, side]), here), seen, here, SURE) == 0.0
+    assert seen_ratio(scan_in(np.vstack([wall, side]), here), seen, here, SURE) == 0.0
     through = scan_in(np.vstack([behind, side]), here)
     x = through.ranges_m * np.cos(through.angles_rad)
     expected = np.mean(np.isclose(x[through.returned], 6.0))
-    assert seen_through_ratio(through, seen, here, SURE) == pytest.approx(expected, abs=0.05)
+    assert seen_ratio(through, seen, here, SURE) == pytest.approx(expected, abs=0.05)
     assert expected > 0.2
     unsure = np.diag([1.5, 0.1, 0.01])
-    assert seen_through_ratio(through, seen, here, unsure) < 0.02, 'drift of 3 m explains them'
+    assert seen_ratio(through, seen, here, unsure) < 0.02, 'drift of 3 m explains them'
     closer = scan_in(np.array([[2.0, -4.0, 2.0, 0.9]]), here)
-    assert seen_through_ratio(closer, seen, here, SURE) == 0.0
-    assert seen_through_ratio(through, LocalMap(), here, SURE) == 0.0
+    assert seen_ratio(closer, seen, here, SURE) == 0.0
+    assert seen_ratio(through, LocalMap(), here, SURE) == 0.0

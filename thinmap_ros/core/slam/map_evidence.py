@@ -1,13 +1,18 @@
 """Evidence against the map: scans agree with it, the robot is lost, or it is delocalized."""
 
+import numpy as np
+
 from thinmap_ros.core.places.recognition.views import WINDOW_M
+from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.scan_matcher import Match
+from thinmap_ros.core.slam.matching.visibility import NOTHING, SeenThrough
 
 # Inliers for each contradicting point with which a match overrides the odometry.
 INLIERS_PER_CONTRADICTION = 3.0
 # Ratio of returns behind walls, between that of the worst real log (mean 0.11, of an office with
 # much glass) and that of robots that were kidnapped (mean 0.4 in the first seconds).
 _SEEN_THROUGH = 0.25
+_OPENING_RADIUS_M = 1.5  # a gate for hospital beds, or two leaves of an automatic door
 # Of a pose that no scan has confirmed: less than a scan with 30 % inliers removes.
 _UNCONFIRMED_EVIDENCE = 0.3 / INLIERS_PER_CONTRADICTION
 
@@ -40,6 +45,39 @@ class _Trial:
         return not self.is_passed and self._path_m > 2.0 * WINDOW_M
 
 
+class _Opening:
+    """Whether one opening explains all walls that were seen through: a door, or a cupboard gone.
+
+    Who was carried off sees through walls all around. A robot that waits before an automatic door
+    and then drives through it sees through that alone, with most of its beams for some metres.
+    """
+
+    def __init__(self) -> None:
+        self._centre: Array | None = None
+        self._within = 0.0  # sums of ratios of returns, since there is evidence
+        self._beside = 0.0
+
+    @property
+    def explains_all(self) -> bool:
+        """Whether most of what was seen through since there is evidence is within one opening."""
+        return self._within > self._beside
+
+    def add(self, seen: SeenThrough, is_begun: bool) -> None:
+        """Add what a scan sees through; is_begun: whether there is evidence."""
+        if not is_begun:
+            self._centre = None
+            self._within = self._beside = 0.0
+            return
+        if not len(seen.walls):
+            return
+        if self._centre is None:
+            self._centre = np.median(seen.walls, axis=0)
+        is_beside = np.hypot(*(seen.walls - self._centre).T) > _OPENING_RADIUS_M
+        beside = seen.ratio * float(np.mean(is_beside))
+        self._beside += beside
+        self._within += seen.ratio - beside
+
+
 class MapEvidence:
     """Detects by CUSUM tests that scans contradict the map.
 
@@ -60,6 +98,7 @@ class MapEvidence:
         self.level = 0.0
         self._seen_through = 0.0
         self._before_look = 0.0  # the same before the present look
+        self._opening = _Opening()
         self._is_foreign = False  # whether the last scan may be one of another place
         self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
         self._trial: _Trial | None = None
@@ -105,19 +144,21 @@ class MapEvidence:
         """Whether the evidence against the map, or against a given pose, reaches the threshold."""
         if self._trial is not None and self._trial.is_failed:
             return True
-        return max(self.level, self._seen_through) >= self._lost_evidence
+        if self.level >= self._lost_evidence:
+            return True
+        return self._seen_through >= self._lost_evidence and not self._opening.explains_all
 
     def update(
         self,
         match: Match | None,
-        seen_through: float = 0.0,
+        seen_through: SeenThrough = NOTHING,
         is_stationary: bool = False,
         moved_m: float = 0.0,
     ) -> None:
         """Update the evidence by a match; None (no match was possible) leaves it unchanged.
 
-        seen_through: ratio of returns behind walls of the map; is_stationary: whether the scan is
-        of the same look as the last one, and no evidence of its own; moved_m: path since that one.
+        seen_through: walls of the map that it sees through; is_stationary: whether the scan is of
+        the same look as the last one, and no evidence of its own; moved_m: path since that one.
         """
         if match is None:
             self.is_unconfirmed = True
@@ -132,7 +173,8 @@ class MapEvidence:
         self.level = max(self.level + more, 0.0)
         if not is_stationary:
             self._end_look(self._seen_through)
-        self._seen_through = max(self._before_look + seen_through - _SEEN_THROUGH, 0.0)
+        self._seen_through = max(self._before_look + seen_through.ratio - _SEEN_THROUGH, 0.0)
+        self._opening.add(seen_through, is_begun=self._seen_through > 0.0)
         if self.is_delocalized:
             self.level = min(self.level, self._lost_evidence)
             agrees = self.agrees and fits

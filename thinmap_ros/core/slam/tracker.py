@@ -14,7 +14,12 @@ from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.map_evidence import INLIERS_PER_CONTRADICTION, MapEvidence
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS, Match, Matcher
-from thinmap_ros.core.slam.matching.visibility import misses_walls, seen_through_ratio
+from thinmap_ros.core.slam.matching.visibility import (
+    NOTHING,
+    SeenThrough,
+    misses_walls,
+    seen_through,
+)
 from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction, Prediction
 from thinmap_ros.core.slam.track import Track
 
@@ -81,8 +86,8 @@ class Tracker:
         match = self._match(scan, points, prediction.prior, there)
         track.reckoned = track.reckoned.moved(prediction)
         moved_m = 0.0 if is_stationary else float(np.hypot(*(prediction.prior - before)[:2]))
-        seen_through = self._seen_through_ratio(scan, match, there)
-        track.evidence.update(match, seen_through, is_stationary, moved_m)
+        through = self._seen_through(scan, match, there)
+        track.evidence.update(match, through, is_stationary, moved_m)
         own = None if match is None else match.seen_from(there.anchor.T_map)
         fits = self._update(own, prediction, is_stationary)
         if fits and match is not None:
@@ -146,18 +151,18 @@ class Tracker:
         prior = there.anchor.pose(prior)
         return self._matcher.match(points, scan.T_base_laser, there.local_map, prior, covariance)
 
-    def _seen_through_ratio(self, scan: Scan, match: Match | None, there: Surroundings) -> float:
-        """Ratio of returns behind walls of the map that this localizer makes.
+    def _seen_through(self, scan: Scan, match: Match | None, there: Surroundings) -> SeenThrough:
+        """Walls of the map that this localizer makes, and that a scan sees through.
 
         In a map that does not change, the inliers alone tell where the robot is; and its furniture
         may have changed.
         """
         if match is None or not self._config.is_mapping:
-            return 0.0
+            return NOTHING
         # At a given pose no drift explains them: it is right or wrong.
         is_given = self.track.evidence.is_delocalized
         covariance = np.zeros((3, 3)) if is_given else self.covariance(there.anchor)
-        return seen_through_ratio(scan, there.local_map, match.pose, covariance)
+        return seen_through(scan, there.local_map, match.pose, covariance)
 
     def _update(self, match: Match | None, prediction: Prediction, is_stationary: bool) -> bool:
         """Set the pose to that of an accepted match, or else to the predicted one.

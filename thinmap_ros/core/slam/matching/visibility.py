@@ -1,6 +1,7 @@
 """Walls of the local map that beams would hit, or have passed through."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,10 +45,20 @@ def misses_walls(scan: Scan, local_map: LocalMap, T_map_base: Array, covariance:
     return is_most_missed(scan, missed)
 
 
-def seen_through_ratio(
+class SeenThrough(NamedTuple):
+    """Walls of the map (M, 2), m, map frame, behind which a scan has returns; ratio: of all."""
+
+    walls: Array
+    ratio: float
+
+
+NOTHING = SeenThrough(np.empty((0, 2)), 0.0)
+
+
+def seen_through(
     scan: Scan, local_map: LocalMap, T_map_base: Array, covariance: Array
-) -> float:
-    """Ratio of the returns of a scan that lie behind a wall of the map.
+) -> SeenThrough:
+    """What a scan sees through, one wall for each return that lies behind one.
 
     T_map_base (3,) with covariance (3, 3), map frame: a return behind a wall by no more than the
     pose is uncertain may lie in front of it. So drift up to a loop is told from a robot that was
@@ -56,12 +67,13 @@ def seen_through_ratio(
     returned = scan.returned
     total = int(np.count_nonzero(returned))
     if local_map.is_empty or total == 0:
-        return 0.0
+        return NOTHING
     T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
     angles = T_map_laser[2] + scan.angles_rad[returned]
     reaches_m = scan.ranges_m[returned] - _BEHIND_M - _uncertainty_m(covariance)
     hit_ratio = local_map.config.occupied_min_hit_ratio
-    return _count_through(angles, reaches_m, T_map_laser, local_map.lattice, hit_ratio) / total
+    walls = _walls_through(angles, reaches_m, T_map_laser, local_map.lattice, hit_ratio)
+    return SeenThrough(walls, len(walls) / total)
 
 
 def _uncertainty_m(covariance: Array) -> float:
@@ -70,13 +82,14 @@ def _uncertainty_m(covariance: Array) -> float:
 
 
 @kernel
-def _count_through(
+def _walls_through(
     angles: Array, reaches_m: Array, laser: Array, lattice: LocalMapView, hit_ratio: float
-) -> int:
-    """Number of beams at angles (N,), map frame, with a wall within their reaches (N,), m.
+) -> Array:
+    """Nearest wall within the reach of each beam that has one, (M, 2), m, map frame.
 
-    laser (3,): its pose.
+    Of beams at angles (N,), map frame, with reaches (N,), m. laser (3,): its pose.
     """
+    walls = np.empty((len(angles), 2))
     count = 0
     x0 = laser[0] / lattice.cell_m - lattice.first_col
     y0 = laser[1] / lattice.cell_m - lattice.first_row
@@ -104,9 +117,11 @@ def _count_through(
                 continue
             normal = 0.5 * math.atan2(wall['sin2'], wall['cos2'])
             if abs(math.cos(normal) * cos + math.sin(normal) * sin) > _MAX_COSINE:
+                walls[count, 0] = laser[0] + step * _STEP_CELLS * lattice.cell_m * cos
+                walls[count, 1] = laser[1] + step * _STEP_CELLS * lattice.cell_m * sin
                 count += 1
                 break
-    return count
+    return walls[:count]
 
 
 @kernel
