@@ -1,6 +1,7 @@
 """What a robot sees of a map that somebody else makes, and from where: by TF and scans."""
 
 from collections import deque
+from functools import cached_property
 
 from sensor_msgs.msg import LaserScan
 
@@ -37,7 +38,7 @@ class RobotView:
         self._settings = settings
         self._map_frame = map_frame
         self._laser_transform = laser_transform
-        self._transforms = TransformListener(node)
+        self._node = node
         self._scans: deque[LaserScan] = deque(maxlen=_MAX_SCANS)
 
     def reset(self) -> None:
@@ -56,6 +57,11 @@ class RobotView:
                 return found
         T_map_base = self.newest_pose(now_ns)
         return scan_in_map(patch, T_map_base, self._settings.view_range_m, now_ns), T_map_base
+
+    @cached_property
+    def _transforms(self) -> TransformListener:
+        """From the first look on: each transform costs time, and most explorations need none."""
+        return TransformListener(self._node)
 
     def _scan_at(self, message: LaserScan, now_ns: int) -> tuple[Scan, Array] | None:
         try:

@@ -22,7 +22,7 @@ class BroadcastConfig(Config):
         'Publish the transform from map_frame to odom_frame on /tf. false: another node does.',
     )
     transform_publish_period: float = parameter(
-        0.02,
+        0.05,
         'Time between two transforms (s). 0: one with each scan. Lower it where lookups find a '
         'transform that is too old, raise it to save CPU.',
         low=0.0,
