@@ -46,7 +46,7 @@ class _Trial:
 
 
 class _Opening:
-    """Whether one opening explains all walls that were seen through: a door, or a cupboard gone.
+    """Whether one opening explains what is seen through: a door, or a cupboard that is gone.
 
     Who was carried off sees through walls all around. A robot that waits before an automatic door
     and then drives through it sees through that alone, with most of its beams for some metres.
@@ -58,16 +58,12 @@ class _Opening:
         self._beside = 0.0
 
     @property
-    def explains_all(self) -> bool:
+    def explains_most(self) -> bool:
         """Whether most of what was seen through since there is evidence is within one opening."""
         return self._within > self._beside
 
-    def add(self, seen: SeenThrough, is_begun: bool) -> None:
-        """Add what a scan sees through; is_begun: whether there is evidence."""
-        if not is_begun:
-            self._centre = None
-            self._within = self._beside = 0.0
-            return
+    def add(self, seen: SeenThrough) -> None:
+        """Add what a scan sees through."""
         if not len(seen.walls):
             return
         if self._centre is None:
@@ -146,7 +142,7 @@ class MapEvidence:
             return True
         if self.level >= self._lost_evidence:
             return True
-        return self._seen_through >= self._lost_evidence and not self._opening.explains_all
+        return self._seen_through >= self._lost_evidence and not self._opening.explains_most
 
     def update(
         self,
@@ -174,7 +170,8 @@ class MapEvidence:
         if not is_stationary:
             self._end_look(self._seen_through)
         self._seen_through = max(self._before_look + seen_through.ratio - _SEEN_THROUGH, 0.0)
-        self._opening.add(seen_through, is_begun=self._seen_through > 0.0)
+        if self._seen_through > 0.0:
+            self._opening.add(seen_through)
         if self.is_delocalized:
             self.level = min(self.level, self._lost_evidence)
             agrees = self.agrees and fits
@@ -194,6 +191,8 @@ class MapEvidence:
         """Set the evidence of walls that were seen through before the present look."""
         self._before_look = seen_through
         self._seen_through = seen_through
+        if seen_through == 0.0:
+            self._opening = _Opening()
 
     def place(self, is_map_given: bool = False) -> None:
         """The pose was given: the robot is delocalized until scans fit.
