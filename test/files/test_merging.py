@@ -112,7 +112,7 @@ CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
 def driven_place(drive, step):
-    """A place (2,) on the way of a drive, in the frame of its map."""
+    """A place (2,) on the path of a drive, in the frame of its map."""
     return driven_piece(*drive).piece.keyframes[step].T_map_base[:2]
 
 

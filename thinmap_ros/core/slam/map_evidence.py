@@ -48,7 +48,7 @@ class _Trial:
 class _Opening:
     """Whether one opening explains what is seen through: a door, or a cupboard that is gone.
 
-    Who was carried off sees through walls all around. A robot that waits before an automatic door
+    A kidnapped robot sees through walls all around. One that waits before an automatic door
     and then drives through it sees through that alone, with most of its beams for some metres.
     """
 
