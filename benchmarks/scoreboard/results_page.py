@@ -48,10 +48,10 @@ IRIS LaMa closes no loops: one error is recorded for each log, and it loses all 
 
 """
 _INTEL_NOTES = """\
-IRIS LaMa takes about a tenth of thinmap's time and memory on this log and is about as exact: better
-in its first build, worse in its third. slam_toolbox takes half the time, and Karto and IRIS LaMa
-have the smaller final errors. Cartographer was tuned by hand for this log; its published 0.023 m
-are final poses of the complete log, so that 0.081 m is what to compare.
+IRIS LaMa takes about a tenth of thinmap's time and a twentieth of its memory on this log and is
+about as exact: better in its first build, worse in its third. slam_toolbox takes some half of the
+time, and Karto and IRIS LaMa have the smaller final errors. Cartographer was tuned by hand for this
+log; its published 0.023 m are final poses of the complete log, so that 0.081 m is what to compare.
 
 """
 _WHY = """\
