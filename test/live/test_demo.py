@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import random
 import shlex
 import signal
 import subprocess
@@ -102,10 +103,13 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
 @pytest.mark.parametrize(('robots', 'nodes'), [(1, 9), (2, 8)])
 def test_ctrl_c_ends_everything(ros_domain, tmp_path, robots, nodes):
     out = tmp_path / 'demo'
-    process = demo(out, '--rate', '5', '--robots', str(robots), '--web')
+    # Ports below those that the system gives to others.
+    port = random.SystemRandom().randrange(20_000, 30_000)
+    pages = ('--web', '--web-port', str(port))
+    process = demo(out, '--rate', '5', '--robots', str(robots), *pages)
     tree = until_started(process, out, nodes)
-    for port in range(8480, 8480 + robots):
-        until_there_is_a_page(process, port)
+    for number in range(robots):
+        until_there_is_a_page(process, port + number)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
@@ -194,6 +198,7 @@ def process_tree(process):
         (['--rate', 'fast'], 'fast'),
         (['--robots', '0'], '--robots=0: expected 1 to 9'),
         (['--robots', '2', '--view'], '--view: '),
+        (['--web', '--web-port', '65536'], '--web-port=65536: expected 1 to 65535'),
         (['--robots', 'two'], 'two'),
     ],
 )

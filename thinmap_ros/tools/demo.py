@@ -42,8 +42,8 @@ _SIM_TIME = ['-p', 'use_sim_time:=true']
 # Subscribers of the scans of a robot: simulated time waits for all of them.
 _SCAN_LISTENERS = 4
 _SLEEP_S = 0.05
-_PORT = 8480  # of the page; of several robots, each has the next one
-_PAGE = f'http://127.0.0.1:{_PORT}/'
+_PORT = 8480
+_MAX_PORT = 65535
 
 
 @dataclass(eq=False)
@@ -126,7 +126,7 @@ def explore(arguments: argparse.Namespace, world: Path, starts: Sequence[Array])
         if arguments.view:
             processes.start('rerun_viewer', _SIM_TIME)
         if arguments.web:
-            _start_pages(processes, len(starts))
+            _start_pages(processes, len(starts), arguments.web_port)
         processes.start('demo_monitor', [*_SIM_TIME, *common, *limit, *maps], quiet=False)
         # The last one: what comes after the first scan is seen sooner.
         processes.start('sim', [*common, *lockstep, *clock, *where])
@@ -160,14 +160,14 @@ def _in_team(number: int) -> list[str]:
     return [*remap, *_SIM_TIME, *_parameters(team='true')]
 
 
-def _start_pages(processes: Processes, count: int) -> None:
-    """Start a page for each robot."""
+def _start_pages(processes: Processes, count: int, first_port: int) -> None:
+    """Start a page for each robot, each at the next port."""
     if count == 1:
-        processes.start('web', _SIM_TIME)
-        print(f'page at {_PAGE}', file=sys.stderr)
+        processes.start('web', [*_SIM_TIME, *_parameters(port=first_port)])
+        print(f'page at http://127.0.0.1:{first_port}/', file=sys.stderr)
         return
     for number in range(1, count + 1):
-        port = _PORT + number - 1
+        port = first_port + number - 1
         arguments = [*_in_team(number), *_parameters(port=port)]
         processes.start('web', arguments, label=f'web{number}')
         print(f'page of robot {number} at http://127.0.0.1:{port}/', file=sys.stderr)
@@ -233,6 +233,9 @@ def _starts(arguments: argparse.Namespace, file: Path) -> list[Array]:
     count = arguments.robots
     if not 1 <= count <= MAX_ROBOTS:
         raise InputError(f'--robots={count}: expected 1 to {MAX_ROBOTS}')
+    last_port = _MAX_PORT + 1 - count
+    if not 1 <= arguments.web_port <= last_port:
+        raise InputError(f'--web-port={arguments.web_port}: expected 1 to {last_port}')
     if count > 1 and arguments.view:
         raise InputError('--view: expected --robots=1')
     world = World.from_patch(*read_world(file))
@@ -315,8 +318,10 @@ def main() -> None:
     )
     add_out(parser, 'out/demo')
     parser.add_argument('--view', action='store_true', help='show it in rerun')
-    web_help = f'show it in a browser, at {_PAGE}; each further robot at the next port'
+    web_help = f'show it in a browser, at http://127.0.0.1:{_PORT}/'
     parser.add_argument('--web', action='store_true', help=web_help)
+    port_help = f'of the page; each further robot has the next one (default {_PORT})'
+    parser.add_argument('--web-port', type=int, default=_PORT, help=port_help)
     cli.run(_work, parser)
 
 
