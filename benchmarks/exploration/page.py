@@ -34,9 +34,9 @@ _HEAD = """\
 # Exploration: distance, time and coverage
 
 {chart}
-Simulated robots explore worlds that they do not know. Each section states the laser, the speed,
-the source of the poses, and the commit and machine of its runs. `python -m benchmarks release`
-generates this page.
+Simulated robots explore worlds that they do not know. Each section of runs states the laser, the
+speed, the source of the poses, and the commit and machine. The calibration of the belief is of an
+earlier commit, with the same constants. `python -m benchmarks release` generates this page.
 
 | strategy | what it is |
 |---|---|
