@@ -318,6 +318,7 @@ def test_a_loop_that_closes_in_a_loaded_session_corrects_it(graph, tmp_path):
     assert walls[0] < 1.25 * walls[1], 'each wall once'
 
 
+@pytest.mark.slow
 def test_real_log_bag_and_live_graph_agree(graph, shared_data, tmp_path):
     log = CarmenLog(shared_data / 'logs' / 'sena' / 'log.clf', LaserOptions(offset_m=0.78))
     from_log = replay(log, COARSE)
