@@ -14,13 +14,18 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.ros import parameters
-from thinmap_ros.ros.command_line import check_arguments, show_help, warn_of_files
+from thinmap_ros.ros.command_line import (
+    init_ros,
+    refusal,
+    show_help,
+    warn_of_unused,
+)
+from thinmap_ros.ros.foreign.sections import split_arguments
 
 _SECURITY = 'ROS_SECURITY_ENABLE'
 _KEYSTORE = 'ROS_SECURITY_KEYSTORE'
@@ -62,8 +67,11 @@ def run(make_node: Callable[[], Node]) -> None:
     A node may have a method `start()`, called after its creation, and methods `end()` and
     `close()`, called once, last, whatever ended the node.
     """
-    if not show_help(make_node):
-        run_all([make_node])
+    if show_help(make_node):
+        return
+    for word in split_arguments(sys.argv)[0]:
+        _fail(refusal(word))
+    run_all([make_node])
 
 
 def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
@@ -79,7 +87,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
     try:
         with parameters.shared_process(len(make_nodes)):
             nodes.extend(_made(make) for make in make_nodes)
-        warn_of_files(nodes, sys.argv)
+        warn_of_unused(nodes, sys.argv)
         for node in nodes:
             parameters.freeze_clock(node)
             getattr(node, 'start', lambda: None)()
@@ -104,12 +112,9 @@ def _init() -> None:
     """Parse the arguments after --ros-args; ends with 2 and an error line where they are wrong."""
     try:
         enforce_security(os.environ)
-        check_arguments(sys.argv)
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        init_ros(sys.argv)
     except InputError as error:
         _fail(str(error))
-    except rclpy_implementation.RCLError as error:
-        _fail(f'arguments after --ros-args: {one_line_reason(error)}')
 
 
 def enforce_security(environment: MutableMapping[str, str]) -> None:

@@ -1,23 +1,34 @@
 """Sections of parameter files: which nodes they are for, also those of other packages' files."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.files.yaml import read_mapping
+from thinmap_ros.files.yaml import parse_yaml, read_mapping
 from thinmap_ros.ros.foreign.tables import PACKAGES
 
 EXPECTED = 'a parameter file: NODE: ros__parameters: NAME: VALUE'
 WILDCARDS = ('**', '*')
 _VALUES = 'ros__parameters'
+_FILE = '--params-file'
+_RULES = ('-p', '--param')
+_ANY = '/**'
+
+
+class Given(NamedTuple):
+    """Value of a parameter on a command line, and the section of a file, or of a rule, it is in."""
+
+    section: str
+    name: str
+    value: Any
 
 
 def given_files(words: Sequence[str]) -> list[Path]:
     """The parameter files that a command line names after --ros-args."""
-    flags = ('--params-file',)
-    return [Path(word) for flag, word in ros_arguments(words) if flag in flags]
+    return [Path(word) for flag, word in ros_arguments(words) if flag == _FILE]
 
 
 def ros_arguments(words: Sequence[str]) -> Iterator[tuple[str, str]]:
@@ -27,6 +38,62 @@ def ros_arguments(words: Sequence[str]) -> Iterator[tuple[str, str]]:
         is_ros = before == '--ros-args' or (is_ros and before != '--')
         if is_ros:
             yield before, word
+
+
+def split_arguments(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Words of a command line, without its program, that are not for ROS, and those that are."""
+    own: list[str] = []
+    for_ros: list[str] = []
+    is_ros = False
+    for word in words[1:]:
+        is_ros = is_ros or word == '--ros-args'
+        (for_ros if is_ros else own).append(word)
+        is_ros = is_ros and word != '--'
+    return own, for_ros
+
+
+def given_values(words: Sequence[str]) -> Iterator[Given]:
+    """What a command line gives after --ros-args, by files and rules, in its order.
+
+    Raises InputError where a parameter file is none.
+    """
+    for flag, word in ros_arguments(words):
+        if flag == _FILE:
+            for section, values in sections(Path(word)).items():
+                yield from (Given(section, name, value) for name, value in values.items())
+        elif flag in _RULES:
+            yield _given_by_rule(flag, word)
+
+
+def _given_by_rule(flag: str, word: str) -> Given:
+    names, _, text = word.partition(':=')
+    node, _, name = names.rpartition(':')
+    try:
+        return Given(node or _ANY, name, parse_yaml(text))
+    except InputError as error:
+        raise InputError(f'{flag} {quoted(word)}: {error}') from error
+
+
+def is_for(section: str, node: str) -> bool:
+    """Whether a section is for a node by its full name, as ROS matches them."""
+    pattern = re.escape('/' + section.lstrip('/'))
+    pattern = pattern.replace(r'/\*\*', '(/[^/]+)*').replace(r'/\*', '/[^/]+')
+    return re.fullmatch(pattern, node) is not None
+
+
+def overruled_values(words: Sequence[str], node: str) -> dict[str, Any]:
+    """Values that are given last for a node, by its full name, and that ROS does not take.
+
+    ROS puts sections in the order in which they are first named: the value of a rule, which is in
+    that for all nodes, stands below that of the node's own section of an earlier file.
+
+    Raises InputError where a parameter file is none.
+    """
+    given = [each for each in given_values(words) if is_for(each.section, node)]
+    order = list(dict.fromkeys(each.section for each in given))
+    taken = {each.name: each for each in sorted(given, key=lambda each: order.index(each.section))}
+    last = {each.name: each for each in given}
+    return {name: each.value for name, each in last.items() if each is not taken[name]}
 
 
 def sections(path: Path) -> dict[str, dict[str, Any]]:

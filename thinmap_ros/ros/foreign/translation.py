@@ -1,24 +1,26 @@
-"""Translation of the parameters of other packages before a node declares its own."""
+"""What a node was given, before it declares its parameters: in order, and by their own names."""
 
 import sys
 
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from thinmap_ros.ros.foreign.sections import foreign_values, given_files
+from thinmap_ros.ros.foreign.sections import foreign_values, given_files, overruled_values
 from thinmap_ros.ros.foreign.values import translated
 
 _CLOCK = 'use_sim_time'
 
 
 def translate(node: Node, program: str) -> None:
-    """Give a node its own parameters for those of other packages that it was started with.
+    """Give a node what was given last, and its own parameters for those of other packages.
 
     program: name of the node before remapping. Sections of parameter files for the nodes that it
     replaces are read, too. Raises InputError where a parameter file is none.
     """
     # rclpy has no public way to change what was given.
     given = node._parameter_overrides
+    for name, value in overruled_values(sys.argv, node.get_fully_qualified_name()).items():
+        given[name] = Parameter(name, value=value)
     for file in given_files(sys.argv):
         for name, value in foreign_values(file, program, node.get_namespace()).items():
             if value is not None:
