@@ -26,6 +26,7 @@ from docs import commands
 from thinmap_ros.files import occupancy_maps, package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+from thinmap_ros.nodes.thinmap import chosen_nodes
 from thinmap_ros.tools.carmen_to_bag import convert
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(400)]
@@ -117,7 +118,6 @@ PAGES: dict[str, Nodes] = {
     'what_a_driver_must_publish.md': SIM,
 }
 
-FIVE = ['localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer']
 ENDS_BY_ITSELF = ('bag_player',)
 _START = 'ros2 run thinmap_ros '
 
@@ -132,7 +132,7 @@ def told_by(text: str) -> list[str]:
     words = text.split('--ros-args')[0].split('#')[0].removesuffix('&').split()
     program = words[3]
     renamed = re.search(r'__node:=(\w+)', text)
-    names = words[4:] or FIVE if program == 'thinmap' else [renamed[1] if renamed else program]
+    names = chosen_nodes(words[4:]) if program == 'thinmap' else [renamed[1] if renamed else program]
     space = re.search(r'__ns:=/(\S+)', text)
     prefix = f'{space[1]}/' if space else ''
     return [f'{prefix}{name}: thinmap' for name in names]

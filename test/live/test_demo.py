@@ -100,9 +100,7 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     assert not nodes_of(out)
 
 
-@pytest.mark.parametrize(
-    ('robots', 'nodes'), [pytest.param(1, 9, marks=pytest.mark.slow), (2, 8)]
-)
+@pytest.mark.parametrize(('robots', 'nodes'), [pytest.param(1, 9, marks=pytest.mark.slow), (2, 8)])
 def test_ctrl_c_ends_everything(ros_domain, tmp_path, robots, nodes):
     out = tmp_path / 'demo'
     # Ports below those that the system gives to others.

@@ -9,3 +9,4 @@ def test_the_page_comes_beside_the_others():
     assert chosen_nodes(['web:=true']) == [*usual, 'web']
     assert chosen_nodes(['localizer', 'web:=true']) == ['localizer', 'web']
     assert chosen_nodes(['web']) == ['web']
+    assert chosen_nodes(['web:=false']) == usual

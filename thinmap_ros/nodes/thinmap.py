@@ -20,10 +20,11 @@ _OTHERS = [
     if not module.ispkg and module.name not in (*_NODES, *_NO_CHOICE)
 ]
 _WITH_PAGE = 'web:=true'
+_WITHOUT_PAGE = 'web:=false'
 _USAGE = f"""usage: {{program}} [NODE ...] [{_WITH_PAGE}] [--ros-args ...]
 
 Runs nodes in one process. Without names: {', '.join(_NODES)}.
-{_WITH_PAGE}: with web, the page in the browser, beside them.
+{_WITH_PAGE}: with web, the page in the browser, beside them; {_WITHOUT_PAGE}: without.
 There are also: {', '.join(_OTHERS)}.
 A parameter goes to every node that has it; -p localizer:slam:=ekf_ti sets that of one."""
 
@@ -42,7 +43,7 @@ def node_factories(names: list[str]) -> list['Callable[[], Node]']:
 
 def chosen_nodes(words: list[str]) -> list[str]:
     """Names of the nodes that the words of a command line choose."""
-    names = [word for word in words if word != _WITH_PAGE] or list(_NODES)
+    names = [word for word in words if word not in (_WITH_PAGE, _WITHOUT_PAGE)] or list(_NODES)
     return [*names, 'web'] if _WITH_PAGE in words else names
 
 
@@ -54,12 +55,17 @@ def main() -> None:
         print(usage)
         return
     # Only now: the help needs no ROS.
-    from rclpy.utilities import remove_ros_args
-
     from thinmap_ros.ros import node_main
+    from thinmap_ros.ros.command_line import refusal
+    from thinmap_ros.ros.foreign.sections import split_arguments
 
-    names = chosen_nodes(remove_ros_args(sys.argv)[1:])
+    names = chosen_nodes(split_arguments(sys.argv)[0])
     unknown = [name for name in names if name not in (*_NODES, *_OTHERS)]
+    if unknown and ':=' in unknown[0]:
+        expected = f"'{unknown[0]}': expected {_WITH_PAGE} or {_WITHOUT_PAGE}"
+        is_page = unknown[0].startswith('web:=')
+        print(f'error: {expected if is_page else refusal(unknown[0])}', file=sys.stderr)
+        sys.exit(2)
     if unknown or len(set(names)) < len(names):
         print(
             f'error: {unknown[0] if unknown else "a name twice"}: no such choice\n{usage}',
