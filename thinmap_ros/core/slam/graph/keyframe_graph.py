@@ -87,6 +87,7 @@ class KeyframeGraph:
     def _followed(self, parameters: Array) -> Iterator[Correction | None]:
         """Slices of a move by parameters (N, 4); none after the first iteration if it is small."""
         poses = self._keyframes.poses()
+        anchor = self._keyframes.anchor  # others may be added between the slices
         now = self._all_edges()
         settled = now.settled(poses)
         change = self._all_edges(parameters).T_a_b - now.T_a_b
@@ -97,7 +98,6 @@ class KeyframeGraph:
                 break  # the first iteration is complete
             yield None
         self._calibration.applied = parameters[-1]
-        anchor = self._keyframes.anchor
         if math.dist(moved[anchor, :2], poses[anchor, :2]) > _MIN_MOVE_M:
             self._calibrate(self._calibration.smoothed())
             yield None
