@@ -12,7 +12,8 @@ from support.slam_room import ROOM, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph import keyframes as keyframes_module
 from thinmap_ros.core.slam.graph import pose_graph
-from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Step
+from thinmap_ros.core.slam.graph.keyframe_graph import KeyframeGraph
+from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Keyframes, Step
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
@@ -181,3 +182,34 @@ def test_keyframes_edges_joins_and_places_may_come_between_any_two_slices(moment
     for number, frame in enumerate(keyframes.frames):
         np.testing.assert_array_equal(frame.T_map_base, keyframes.poses()[number])
         assert number in keyframes.near(frame.T_map_base, 0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('size', [1_600, 15_000])
+def test_a_large_graph_follows_the_calibration_while_a_keyframe_is_added(size):
+    calibration = OdometryCalibration()
+    keyframes = Keyframes(KeyframeConfig())
+    graph = KeyframeGraph(keyframes, calibration)
+
+    def add(number):
+        pose = np.array([float(number), 0.0, 0.0])
+        scan = replace(SCAN, stamp_ns=number)
+        frame = Keyframe(
+            scan, POINTS, pose, float(number), STEP, 0, systematic=along(float(number))
+        )
+        share = Systematic(along(1.0), calibration.parameters, calibration.spans)
+        keyframes.add(frame, Step(STEP, share))
+
+    for number in range(size):
+        add(number)
+    learn(calibration)
+    graph.follow_calibration()
+    assert graph.is_moving
+    add(size)
+    while graph.is_moving:
+        correction = graph.step()
+    assert correction is not None
+    last = keyframes.frames[-1]
+    expected = se2.compose(keyframes.frames[-2].T_map_base, keyframes.steps[-1].T_a_b)
+    np.testing.assert_allclose(last.T_map_base, expected)
+    assert last.T_map_base[0] > 1.1 * size
