@@ -107,12 +107,20 @@ class Pipeline:
     def step(self, scan: Scan, T_odom_base: Array) -> PipelineResult:
         """Localize and map one scan with the odometry pose (3,) at its stamp.
 
-        Raises InputError where it is no scan, or no pose of finite numbers.
+        Raises InputError where it is no scan, or no pose of finite numbers. Any other error has the
+        stamp of the scan as a note; that scan is left out, and others may follow.
         """
         require_type('scan', scan, Scan)
         T_odom_base = pose_of('T_odom_base', T_odom_base)
         if self._laser is not None:
             scan = replace(scan, max_range_m=self._laser.max_range_m)
+        try:
+            return self._step(scan, T_odom_base)
+        except Exception as error:
+            error.add_note(f'scan at {scan.stamp_ns} ns')
+            raise
+
+    def _step(self, scan: Scan, T_odom_base: Array) -> PipelineResult:
         with self._timed('localizer'):
             estimate = self._locate(scan, T_odom_base)
             estimate = self._consistency.checked(scan, T_odom_base, estimate)

@@ -44,10 +44,14 @@ def quoted(value: object) -> str:
 
 
 def one_line_reason(error: BaseException) -> str:
-    """Message of another library's error, one line of at most 200 characters; else its type."""
+    """Message of another library's error, one line of at most 200 characters; else its type.
+
+    After its notes: what was processed when it came.
+    """
     # A KeyError holds the missing key. An integer of a million digits cannot even be converted.
     text = quoted(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
-    return one_line(text) or type(error).__name__
+    notes = getattr(error, '__notes__', [])
+    return one_line(': '.join([*notes, text or type(error).__name__]))
 
 
 def one_line(text: str) -> str:

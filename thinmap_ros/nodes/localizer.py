@@ -21,6 +21,7 @@ from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
@@ -295,22 +296,12 @@ class LocalizerNode(ThinmapNode):
 
     def _process(self, ready: list[tuple[Scan, Array]]) -> None:
         for scan, T_odom_base in ready:
-            self._resume(scan, T_odom_base)
-            started = perf_counter()
-            estimate = self._localizer.step(scan, T_odom_base)
-            estimate = self._input.consistency.checked(scan, T_odom_base, estimate)
-            step_ms = 1000.0 * (perf_counter() - started)
-            self._publish(scan, estimate, step_ms)
-            if estimate.odometry_discontinuity:
-                self.get_logger().warning(
-                    f'{estimate.odometry_discontinuity}: the motion of the robot is unknown, and '
-                    'its pose follows from the scan alone'
-                )
-            if not estimate.is_lost:
-                last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
-                self._recovery.last = last
-            if estimate.correction is not None:
-                self.checkpoint_now()
+            try:
+                self._step(scan, T_odom_base)
+            except InputError:
+                raise
+            except Exception as error:
+                self.step_failed(f'scan at {scan.stamp_ns} ns', error)
         self._report_warnings()
         diagnostics = self.diagnostics
         diagnostics.set_drop_total(
@@ -319,6 +310,25 @@ class LocalizerNode(ThinmapNode):
         discarded = self._input.pairing.discarded_odometry
         diagnostics.set_drop_total('odometry with stamps ahead of those after it', discarded)
         diagnostics.set_drop_total('invalid scans or odometry', self._localizer.rejected)
+
+    def _step(self, scan: Scan, T_odom_base: Array) -> None:
+        """Localize a scan, and publish its pose."""
+        self._resume(scan, T_odom_base)
+        started = perf_counter()
+        estimate = self._localizer.step(scan, T_odom_base)
+        estimate = self._input.consistency.checked(scan, T_odom_base, estimate)
+        step_ms = 1000.0 * (perf_counter() - started)
+        self._publish(scan, estimate, step_ms)
+        if estimate.odometry_discontinuity:
+            self.get_logger().warning(
+                f'{estimate.odometry_discontinuity}: the motion of the robot is unknown, and '
+                'its pose follows from the scan alone'
+            )
+        if not estimate.is_lost:
+            last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
+            self._recovery.last = last
+        if estimate.correction is not None:
+            self.checkpoint_now()
 
     def _report_warnings(self) -> None:
         """Log each kind of warning once."""

@@ -146,9 +146,16 @@ class SingleGoalServer:
         except InvalidGoalError as invalid:
             self._run(goal, Outcome.ABORTED, invalid.result)
             return
+        except Exception:
+            self._run(goal, Outcome.ABORTED, goal.server.action_type.Result())
+            raise
         self.finish(Outcome.ABORTED, self._preempted())
         self._goal = goal
-        self._on_goal(request)
+        try:
+            self._on_goal(request)
+        except Exception:
+            self.finish(Outcome.ABORTED, goal.server.action_type.Result())
+            raise
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         is_current = self._goal is not None and handle.goal_id == self._goal.handle.goal_id

@@ -2,6 +2,7 @@
 
 import math
 import re
+import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,10 +18,13 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from thinmap_ros.core.errors import counted
+from thinmap_ros.core.errors import counted, one_line_reason
 from thinmap_ros.ros import qos
 
 _PERIOD_S = 1.0
+# For which a failed step is reported, unless another fails: five times what is published.
+_FAILED_S = 5.0
+_MAX_TRACEBACKS = 20  # in the log of a node, each of another place in the code
 _TOPICS_OF_EVERY_NODE = ('/parameter_events', '/rosout', '/diagnostics', '/clock')
 _NUMBER = re.compile(r'-?\b(\d+\.?\d*(e[+-]?\d+)?|inf|nan)\b')
 OK = DiagnosticStatus.OK
@@ -168,6 +172,31 @@ class StepTimes:
         return values
 
 
+class _StepFailures:
+    """Steps that ended in an error that nobody expects, and the last of these errors."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.last = ''
+        self._last_s = -math.inf
+        self._places: set[str] = set()
+
+    def add(self, step: str, error: Exception) -> str:
+        """Count a step; returns the traceback where the error comes from another place."""
+        self.count += 1
+        self._last_s = monotonic()
+        self.last = f'{step} failed: {type(error).__name__}: {one_line_reason(error)}'
+        place = str(traceback.extract_tb(error.__traceback__)[-1:])
+        if place in self._places or len(self._places) >= _MAX_TRACEBACKS:
+            return ''
+        self._places.add(place)
+        return ''.join(traceback.format_exception(error))
+
+    def fault(self) -> str:
+        """What failed within the last seconds; '' if nothing did."""
+        return self.last if monotonic() - self._last_s < _FAILED_S else ''
+
+
 @dataclass
 class _Check:
     """A condition that returns what is wrong, '' for nothing; logged now and then."""
@@ -192,7 +221,7 @@ class NodeDiagnostics:
     """Publishes the state of a node once a second of the machine, whatever the node's clock does.
 
     A level above OK lasts as long as its cause: rejections and drops until a second without any, a
-    check until its condition returns ''.
+    check until its condition returns '', a failed step for 5 s.
     """
 
     def __init__(self, node: Node) -> None:
@@ -202,7 +231,8 @@ class NodeDiagnostics:
         self._state = (OK, 'running')
         self._is_paused = False
         self._values: dict[str, str] = {}
-        self._checks: list[_Check] = []
+        self._failures = _StepFailures()
+        self._checks = [_Check(ERROR, self._failures.fault)]
         self._update_callbacks: list[Callable[[], None]] = []
         self._topic = node.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
         # Not in the node's time: a clock that stands still is reported, too.
@@ -231,6 +261,13 @@ class NodeDiagnostics:
     def record_step_time(self, step: str, milliseconds: float) -> None:
         """Record the duration of a step, ms."""
         self._step_times.add(step, milliseconds)
+
+    def step_failed(self, step: str, error: Exception) -> None:
+        """Report an error that nobody expects: ERROR, its traceback in the log, a count."""
+        trace = self._failures.add(step, error)
+        self.set_value('failed steps', self._failures.count)
+        if trace:
+            self._node.get_logger().error(f'{self._failures.last}\n{trace}')
 
     @contextmanager
     def time_step(self, step: str) -> Iterator[None]:

@@ -56,6 +56,7 @@ class ThinmapNode(LifecycleNode):
         self._checkpoints: list[PeriodicCheckpoint] = []
         self._activation_callbacks: list[Callable[[], None]] = []
         self._end_callbacks: list[Callable[[], None]] = []
+        self._failure_callbacks: list[Callable[[], None]] = []
         self.diagnostics.add_update_callback(self.handle_time_jump)
         self.create_service(Trigger, '~/reset', self._on_reset)
         self._reject_invalid_transitions()
@@ -153,6 +154,19 @@ class ThinmapNode(LifecycleNode):
     def add_end_callback(self, work: Callable[[], None]) -> None:
         """Call `work` when the process ends in order, before `close`."""
         self._end_callbacks.append(work)
+
+    def add_failure_callback(self, work: Callable[[], None]) -> None:
+        """Call `work` each time that a step of the node has failed."""
+        self._failure_callbacks.append(work)
+
+    def step_failed(self, step: str, error: Exception) -> None:
+        """Report a step that an error has ended, which nobody expects; the node goes on.
+
+        step: what was processed, with its stamp if it has one.
+        """
+        for work in self._failure_callbacks:
+            work()
+        self.diagnostics.step_failed(step, error)
 
     def end(self) -> None:
         """The process ends in order."""

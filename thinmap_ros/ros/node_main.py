@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
@@ -184,8 +184,7 @@ def _spin_one(
     stop_event = running.stop_event
     try:
         while rclpy.ok() and not stop_event.is_set() and not getattr(node, 'finished', False):
-            # A bounded wait: Python handles signals only between calls.
-            executor.spin_once(timeout_sec=0.25)
+            _spin_once(executor, node)
             after_each_call()
     except Exception as error:  # raised by the main thread
         running.failures.append(error)
@@ -194,6 +193,24 @@ def _spin_one(
         running.close(node)  # now: a robot that drives does not wait for the other nodes
         # The garbage collector may end its parts first; then it ends with a traceback.
         executor.shutdown()
+
+
+def _spin_once(executor: SingleThreadedExecutor, node: Node) -> None:
+    """Run a callback. What it raises ends the node, unless it has a `step_failed` to report it."""
+    try:
+        # A bounded wait: Python handles signals only between calls.
+        task, entity, _ = executor.wait_for_ready_callbacks(timeout_sec=0.25)
+    except TimeoutException:
+        return
+    task()
+    error = task.exception()
+    if error is None:
+        return
+    report = getattr(node, 'step_failed', None)
+    if report is None or not rclpy.ok():
+        raise error
+    names = (getattr(entity, name, '') for name in ('topic_name', 'srv_name'))
+    report(next(filter(None, names), 'a callback'), error)
 
 
 def _on_signals(handler: Any) -> None:

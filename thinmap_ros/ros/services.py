@@ -1,25 +1,34 @@
 """Services with the response `success` and `message`: filled in by a node, called by another."""
 
+import traceback
 from collections.abc import Callable
 from typing import Any
 
 from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
+from rclpy.logging import get_logger
 from rclpy.node import Node
 
-from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.core.errors import ThinmapError, one_line_reason
 
 _TIMEOUT_S = 10.0
 
 
 def fill_response(response: Any, work: Callable[[], str]) -> Any:
-    """Fill in a response: the message that `work` returns, or the error that it raises."""
+    """Fill in a response: the message that `work` returns, or the error that it raises.
+
+    The traceback of an error that nobody expects is in the log.
+    """
     try:
         response.message = work()
         response.success = True
     except (ThinmapError, OSError) as error:
         response.message = str(error)
         response.success = False
+    except Exception as error:
+        response.message = f'failed: {type(error).__name__}: {one_line_reason(error)}'
+        response.success = False
+        get_logger('thinmap').error(traceback.format_exc())
     return response
 
 

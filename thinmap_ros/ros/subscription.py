@@ -1,6 +1,7 @@
 """Guarded subscriptions: messages are processed while the node is active.
 
-Invalid messages are counted, logged and dropped; messages lost on the way are counted.
+Invalid messages, and those whose processing fails, are counted, logged and dropped; messages lost
+on the way are counted.
 """
 
 from collections import deque
@@ -48,8 +49,9 @@ def subscribe_guarded(
 ) -> None:
     """Subscribe to a topic.
 
-    A message for which `process` raises InputError is dropped with a throttled warning. Where a
-    publisher offers less than the profile requests (best effort, volatile), less is requested.
+    A message for which `process` raises InputError is dropped with a throttled warning; with any
+    other error it is dropped, too, and a step of the node has failed. Where a publisher offers less
+    than the profile requests (best effort, volatile), less is requested.
     """
     _GuardedSubscription(node, kind, topic, process, profile)
 
@@ -129,6 +131,9 @@ class _GuardedSubscription:
             if monotonic() - self._logged_s >= WARN_PERIOD_S:
                 self._logged_s = monotonic()
                 self._node.get_logger().warning(f'{self._topic}: {error}')
+        except Exception as error:
+            self._node.diagnostics.count_drops(f'{self._topic}: step failed', 1)
+            self._node.step_failed(f'{self._topic} at {_stamp_ns(message)} ns', error)
 
     def _process_latched(self) -> None:
         message = self._latched_message

@@ -13,7 +13,8 @@ from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.stage import LocalizedScan
-from thinmap_ros.core.topology.topology import Topology
+from thinmap_ros.core.topology.layers.stack import Layers
+from thinmap_ros.core.topology.topology import Finished, Topology
 
 POSES = np.array([[4.0 + 0.5 * k, 5.0, 0.0] for k in range(5)])
 STILL = CorrectedPoses(POSES, POSES)
@@ -187,3 +188,29 @@ def test_a_graph_is_saved_as_not_corrected_while_it_is_rebuilt():
     assert topology.state()['corrected_ns'] == 0
     topology.finish()
     assert topology.state()['corrected_ns'] == 9
+
+
+@pytest.mark.parametrize('begin', [Finished, Later])
+@pytest.mark.parametrize('failing', [(Layers, 'update_skeleton'), (Layers, 'fill')])
+def test_a_graph_that_an_error_has_left_half_changed_is_rebuilt(begin, failing, monkeypatch):
+    topology = built(begin=begin)
+
+    def fail(*_):
+        raise ZeroDivisionError('planted')
+
+    def correct():
+        topology.add_map(whole(halved(), 9))
+        topology.finish()
+
+    part, name = failing
+    with monkeypatch.context() as broken, pytest.raises(ZeroDivisionError):
+        broken.setattr(part, name, fail)
+        correct() if name == 'fill' else topology.step(update(halved(), 0))
+    assert topology.step(update(halved(), 0)) is None, 'before it is rebuilt'
+    assert int(topology.state()['corrected_ns']) == 0
+    topology.add_map(whole(halved(), 0))
+    topology.finish()
+    expected = built()
+    expected.step(update(halved(), 0))
+    assert places(topology) == places(expected)
+    assert topology.step(update(hall(), 0)) is not None

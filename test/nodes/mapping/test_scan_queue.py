@@ -52,6 +52,15 @@ def test_a_trajectory_that_a_newer_one_has_replaced_is_not_waited_for():
     assert taken(queue) == [(1, None), (2, None), (3, None), (4, 4)]
 
 
+def test_a_trajectory_that_could_not_be_followed_comes_again_with_the_next_scan():
+    queue = ScanQueue()
+    queue.add_trajectory(trajectory(2))
+    queue.add_scan(scan(2, 2))
+    queue.add_scan(scan(3, 2))
+    assert next(queue.ready()).trajectory.since_ns == 2  # an error ends the loop over them
+    assert taken(queue) == [(3, 2)]
+
+
 def test_a_localizer_that_begins_anew_is_followed():
     queue = ScanQueue()
     queue.add_trajectory(trajectory(1))

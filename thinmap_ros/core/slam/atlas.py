@@ -64,7 +64,10 @@ class Atlas:
         if self._search is None or self._search.is_outdated(self._loops):
             published = (k for k, frame in enumerate(frames) if pieces.is_published(frame.submap))
             self._search = _Search(pieces.piece, published)
-        self._join = self._search.step(self._loops, join_odds) or self._join
+        search = self._search
+        self._search = None  # begun again if this step of it fails
+        self._join = search.step(self._loops, join_odds) or self._join
+        self._search = search
 
     def take_join(self) -> Join | None:
         """The join that a correction has completed; None where it was a loop of its own."""

@@ -81,8 +81,18 @@ class LocalizerMap:
     def add(self, scan: Scan, points: Array) -> None:
         """Add a scan with surface points (N, 5) if the robot has moved far enough since the last.
 
-        In a submap of its own if scans contradict the map.
+        In a submap of its own if scans contradict the map. The pose stays, whatever of it an error
+        ends.
         """
+        T_map_base = self.pose
+        try:
+            self._add(scan, points)
+        except Exception:
+            # What it is relative to may be another keyframe.
+            self._tracker.track.T_anchor_base = self.loops.anchor.relative(T_map_base)
+            raise
+
+    def _add(self, scan: Scan, points: Array) -> None:
         config = self._config.local_map
         track = self._tracker.track
         moved = track.since_update

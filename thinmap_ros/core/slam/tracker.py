@@ -74,7 +74,10 @@ class Tracker:
         self.track.evidence.adjust(config.lost_threshold, config.matching.min_inlier_ratio)
 
     def step(self, scan: Scan, points: Array, T_odom_base: Array, there: Surroundings) -> Tracked:
-        """Track a scan with surface points (N, 5), given the odometry pose (3,) at its stamp."""
+        """Track a scan with surface points (N, 5), given the odometry pose (3,) at its stamp.
+
+        Where an error ends it, the scan is left out, and the motion up to it is not.
+        """
         track = self.track
         before = track.T_anchor_base
         prediction = self.prediction.predict(scan, T_odom_base, before, there.revision)
@@ -83,8 +86,26 @@ class Tracker:
         track.uncertainty.predict(
             before, prediction.prior, prediction.covariance, is_stationary, by_calibration
         )
-        match = self._match(scan, points, prediction.prior, there)
         track.reckoned = track.reckoned.moved(prediction)
+        try:
+            return self._measure(scan, points, prediction, is_stationary, there)
+        except Exception:
+            track.T_anchor_base = prediction.prior
+            track.uncertainty.coast(prediction.prior, prediction.covariance, is_stationary)
+            raise
+
+    def _measure(
+        self,
+        scan: Scan,
+        points: Array,
+        prediction: Prediction,
+        is_stationary: bool,
+        there: Surroundings,
+    ) -> Tracked:
+        """Match a scan at its predicted pose, and update the pose by it."""
+        track = self.track
+        before = prediction.before
+        match = self._match(scan, points, prediction.prior, there)
         moved_m = 0.0 if is_stationary else float(np.hypot(*(prediction.prior - before)[:2]))
         through = self._seen_through(scan, match, there)
         track.evidence.update(match, through, is_stationary, moved_m)

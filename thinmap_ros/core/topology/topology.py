@@ -1,6 +1,7 @@
 """From the map to its graph."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Protocol
@@ -8,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from thinmap_ros.core import snapshot
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.mapper import MapUpdate, WholeMap
 from thinmap_ros.core.grid.patch import GridPatch
@@ -17,6 +19,9 @@ from thinmap_ros.core.stage import Stage
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
+
+# Before every correction: the graph is rebuilt from the next whole map.
+_STALE_NS = -1
 
 
 class Job(Protocol):
@@ -49,7 +54,8 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
 
     While the map is rendered again the graph takes no cells, nor later those of a map that follows
     another correction than the graph. It is rebuilt when the whole map of a newer one comes;
-    changes that come meanwhile are added to the new graph. Nodes keep their ids.
+    changes that come meanwhile are added to the new graph. Nodes keep their ids. A graph that an
+    error has left half changed is rebuilt from the next whole map.
     """
 
     def __init__(
@@ -82,7 +88,7 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
     def state(self) -> State:
         """The graph, and the correction that it follows."""
         # A graph that is being rebuilt does not follow the correction yet.
-        corrected_ns = 0 if self._job is not None else self._corrected_ns or 0
+        corrected_ns = 0 if self._job is not None else max(self._corrected_ns or 0, 0)
         return {**self.builder.state(), 'corrected_ns': np.array(corrected_ns)}
 
     def restore(self, state: State) -> None:
@@ -120,11 +126,14 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
         """Wait for the graph that is being rebuilt."""
         if self._job is None:
             return
-        self.builder = self._job.result()
+        job = self._job
+        pending = self._pending
         self._job = None
-        for update in self._pending:
-            self._add(update.changes, update)
         self._pending = []
+        with self._rebuilt_after_errors():
+            self.builder = job.result()
+        for update in pending:
+            self._add(update.changes, update)
 
     def _adopt(self, update: MapUpdate) -> None:
         """Learn which correction the graph follows, from changes of its map."""
@@ -161,7 +170,19 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
         return self._take_rebuilt()
 
     def _add(self, cells: GridPatch | None, update: MapUpdate) -> bool:
-        return cells is not None and self.builder.update(cells, update.localized.T_map_base)
+        with self._rebuilt_after_errors():
+            return cells is not None and self.builder.update(cells, update.localized.T_map_base)
+
+    @contextmanager
+    def _rebuilt_after_errors(self) -> Iterator[None]:
+        """Rebuild the graph from the next whole map if a change of it ends half done."""
+        try:
+            yield
+        except InputError:
+            raise  # changes that do not fit are refused before anything is done
+        except Exception:
+            self._corrected_ns = _STALE_NS
+            raise
 
     def _take_rebuilt(self) -> bool:
         if self._job is None or not self._job.done():
@@ -190,4 +211,5 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
         moved = whole.moved if is_next else CorrectedPoses(whole.moved.after, whole.moved.after)
         self._corrected_ns = whole.corrected_ns
         self._whole = None
-        self._job = self._begin(partial(self.builder.rebuilt, whole.patch, *moved))
+        with self._rebuilt_after_errors():
+            self._job = self._begin(partial(self.builder.rebuilt, whole.patch, *moved))

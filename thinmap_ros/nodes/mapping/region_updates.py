@@ -159,8 +159,9 @@ class RegionUpdates:
         self._poll.cancel()
         if self._pending is None:
             return
-        regions = self._pending.result()
+        pending = self._pending
         self._pending = None
+        regions = pending.result()
         if regions is not self._published or self._is_graph_newer:
             self._publish(regions)
 

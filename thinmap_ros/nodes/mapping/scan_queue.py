@@ -49,5 +49,6 @@ class ScanQueue:
             localized = self._scans.popleft()
             is_new = localized.corrected_ns > self._corrected_ns
             is_here = localized.corrected_ns == self._trajectory_ns
-            self._corrected_ns = localized.corrected_ns
             yield replace(localized, trajectory=self._trajectory if is_new and is_here else None)
+            # Not before: if following it fails, the next scan has the trajectory, too.
+            self._corrected_ns = localized.corrected_ns

@@ -38,7 +38,8 @@ def declare_stamped(node: Node) -> bool:
 class VelocityPublisher:
     """Publishes velocity commands on cmd_vel, and reports other publishers of it.
 
-    A motion that no other command follows in time is ended with a stop: see `CommandWatchdog`.
+    A motion that no other command follows in time is ended with a stop: see `CommandWatchdog`. So
+    is one that was commanded before a step of the node failed, at once.
     """
 
     def __init__(self, node: ThinmapNode, base_frame: str, is_stamped: bool) -> None:
@@ -49,12 +50,14 @@ class VelocityPublisher:
         kind = TwistStamped if is_stamped else Twist
         self._publisher = node.create_publisher(kind, TOPIC, qos.STREAM)
         self._interruption = ''
+        self._is_moving = False  # as commanded last
         self._watchdog = CommandWatchdog(
             self._send, self._on_interruption, CommandTimeout(node.elapsed_time.is_simulated)
         )
         # A joystick or Nav2's behaviors may share the topic on purpose.
         node.diagnostics.check_sole_publisher(TOPIC, WARN)
         node.diagnostics.add_check(WARN, lambda: self._interruption)
+        node.add_failure_callback(self._on_failure)
 
     @property
     def is_interrupted(self) -> bool:
@@ -73,6 +76,7 @@ class VelocityPublisher:
     def publish(self, v: float, w: float) -> None:
         """Publish a command: v m/s ahead, w rad/s to the left."""
         self._interruption = ''
+        self._is_moving = v != 0.0 or w != 0.0
         self._watchdog.send(v, w)
 
     def _send(self, v: float, w: float) -> None:
@@ -82,6 +86,12 @@ class VelocityPublisher:
             return
         header = messages.header(self._frame, self._node.get_clock().now().nanoseconds)
         self._publisher.publish(TwistStamped(header=header, twist=twist))
+
+    def _on_failure(self) -> None:
+        """Stand until the next command, which begins at rest."""
+        if self._is_moving:
+            self.publish(0.0, 0.0)
+            self._interruption = 'a step failed: stopped'
 
     def _on_interruption(self, seconds: float) -> None:
         paused = 'the simulation is paused, or ' if self._node.elapsed_time.is_simulated else ''
