@@ -86,7 +86,8 @@ class Drive:
     def edge(self):
         """A match that agrees, or nearly, with an earlier keyframe."""
         frames = self.loops.keyframes.frames
-        a, b = 0, len(frames) - 1
+        a = 0
+        b = len(frames) - 1
         T_a_b = se2.compose(se2.between(frames[a].T_map_base, frames[b].T_map_base), OFF)
         self.loops.graph.edges.append(Edge(a, b, T_a_b, 100.0 * np.eye(3), robust=True))
 
