@@ -345,10 +345,11 @@ class LocalizerNode(ThinmapNode):
         if not isinstance(self._config, LocalizerConfig):
             return  # a map of line features cannot be made of a grid
         self.get_logger().warning(
-            'grid is of a map that another localizer has begun: lost in that map until scans '
-            'match at the start pose, or a pose is given'
+            'grid is of a map that another localizer has begun: lost in that map until '
+            'scans on the way confirm the start pose, or a pose is given'
         )
-        self._localizer = Localizer.in_occupancy_map(patch, self._config)
+        # The robot has driven since it was at the start pose: a room may fit there by chance.
+        self._localizer = Localizer.in_occupancy_map(patch, self._config, is_guess=True)
         self._recovery.awaited = None
         ids.id = map_id
 

@@ -27,10 +27,10 @@ def test_two_scans_that_fit_well_or_three_that_fit_place_a_robot(inlier_ratio, s
     assert evidence.agrees
 
 
-def tried(*rows):
+def tried(*rows, is_guess=False):
     """Evidence at a start pose that nobody gave, after scans: path, m, and inlier ratio of each."""
     evidence = MapEvidence(4.0, 0.6)
-    evidence.start_delocalized(is_pose_given=False)
+    evidence.start_delocalized(is_pose_given=is_guess, is_guess=is_guess)
     for moved_m, inlier_ratio in rows:
         evidence.update(match(inlier_ratio, 0.0), moved_m=moved_m)
     return evidence
@@ -42,6 +42,19 @@ def test_a_start_that_nobody_gave_is_confirmed_along_the_path_of_a_view(path_m):
     is_confirmed = path_m > 6.0
     assert evidence.permits_mapping == is_confirmed != evidence.is_delocalized
     assert evidence.agrees and not evidence.is_lost and not evidence.needs_submap
+
+
+@pytest.mark.parametrize('path_m', [0.0, 5.9, 6.1])
+def test_a_robot_at_a_guessed_pose_is_lost_until_its_way_confirms_it(path_m):
+    evidence = tried(*[(0.0, 1.0)] * 2, *[(path_m / 20.0, 1.0)] * 20, is_guess=True)
+    assert evidence.permits_mapping == (not evidence.is_lost) == (path_m > 6.0)
+
+
+def test_a_given_pose_ends_a_guess():
+    evidence = tried((0.0, 1.0), is_guess=True)
+    evidence.place()
+    evidence.update(match(1.0, 0.0))
+    assert not evidence.is_lost and evidence.permits_mapping
 
 
 def test_a_scan_that_does_not_fit_begins_the_path_anew_and_without_a_view_the_robot_is_elsewhere():

@@ -151,17 +151,20 @@ class Localizer:
         return localizer
 
     @staticmethod
-    def in_occupancy_map(patch: GridPatch, config: LocalizerConfig | None = None) -> 'Localizer':
+    def in_occupancy_map(
+        patch: GridPatch, config: LocalizerConfig | None = None, is_guess: bool = False
+    ) -> 'Localizer':
         """Localizer in an occupancy map, at the configured initial pose.
 
-        It is delocalized until scans fit.
+        It is delocalized until scans fit. is_guess: the robot may be anywhere else, and is lost
+        until scans on its way confirm the pose.
         """
         localizer = Localizer(config)
         local = localizer._map.local.map
         local.add_free_cells(*free_cells(patch, local.config.resolution_m))
         for faces in occupied_surface_points(patch):
             local.add_walls(faces.points, faces.normal)
-        localizer._start_delocalized(local.state())
+        localizer._start_delocalized(local.state(), is_guess=is_guess)
         return localizer
 
     @staticmethod
@@ -233,14 +236,17 @@ class Localizer:
         return self._map.apart_points()
 
     def _start_delocalized(
-        self, given: State | None, keyframes: SavedKeyframes | None = None
+        self,
+        given: State | None,
+        keyframes: SavedKeyframes | None = None,
+        is_guess: bool = False,
     ) -> None:
         """Start in a loaded map: delocalized until scans fit."""
         start = self.pose
         self._map.load(given, keyframes)
         self._map.place(start, self._tracker.slip_covariance())
         is_believed = self.config.is_start_given or not self.config.is_mapping
-        self._tracker.track.evidence.start_delocalized(is_believed)
+        self._tracker.track.evidence.start_delocalized(is_believed, is_guess=is_guess)
 
     def _detect_loss(self) -> None:
         """In a map that does not change, the robot is delocalized if scans contradict it.

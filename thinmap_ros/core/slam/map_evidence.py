@@ -25,7 +25,9 @@ class _Trial:
     one of 1.5 m or of 3 m, and none with this.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, is_guess: bool) -> None:
+        """is_guess: whether the robot is lost until the pose is confirmed."""
+        self.is_guess = is_guess
         self._path_m = 0.0
         self._fitting_m = 0.0  # path since a scan did not fit
 
@@ -133,7 +135,8 @@ class MapEvidence:
     @property
     def is_lost(self) -> bool:
         """Whether scans have not confirmed the pose at which the robot was placed in the map."""
-        return self.is_delocalized and not self.agrees
+        is_guess = self._trial is not None and self._trial.is_guess
+        return self.is_delocalized and (is_guess or not self.agrees)
 
     @property
     def needs_submap(self) -> bool:
@@ -206,10 +209,13 @@ class MapEvidence:
         self.level = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
         self._end_look(0.0)
 
-    def start_delocalized(self, is_pose_given: bool = True) -> None:
-        """Start in a loaded map; is_pose_given: one scan that fits confirms the pose."""
+    def start_delocalized(self, is_pose_given: bool = True, is_guess: bool = False) -> None:
+        """Start in a loaded map; is_pose_given: one scan that fits confirms the pose.
+
+        is_guess: the robot may be anywhere; scans that fit on the way confirm it.
+        """
         self.is_delocalized = True
-        self._trial = None if is_pose_given else _Trial()
+        self._trial = None if is_pose_given and not is_guess else _Trial(is_guess)
         self.level = self._loaded_evidence
 
     def lose(self) -> None:
