@@ -18,6 +18,8 @@ from support.forks import forked
 from support.hidden_library import hide
 from support.timeouts import PATIENCE_S
 
+from thinmap_ros.core.errors import one_line_reason
+from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.files import occupancy_maps
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
@@ -526,6 +528,22 @@ class FullDisk(Diary):
     def grid(self, ns, patch):
         if self.told['pose'] == 20:
             raise OSError('disk full again')
+
+
+def test_an_error_that_nobody_expects_ends_a_replay_with_the_stamp_of_its_scan(log, monkeypatch):
+    work = Mapper.step
+
+    def step(mapper, localized):
+        if localized.scan.stamp_ns == 2_000_000_000:
+            raise ZeroDivisionError('planted')
+        return work(mapper, localized)
+
+    monkeypatch.setattr(Mapper, 'step', step)
+    carmen = CarmenLog(log, LaserOptions())
+    result = replay(carmen, PipelineConfig(), keep_partial=True)
+    assert one_line_reason(result.ended_by) == 'scan at 2000000000 ns: planted'
+    assert isinstance(result.ended_by, ZeroDivisionError)
+    assert result.stamps_ns[-1] < 2_000_000_000
 
 
 def test_an_error_of_the_view_keeps_what_was_mapped_if_asked(log):
