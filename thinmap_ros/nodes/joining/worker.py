@@ -5,13 +5,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 
-from thinmap_ros.core.errors import InputError
-
 Result = Callable[[], None]
 """Takes what work has found, in the thread of the node."""
 
 
-def _fail(error: InputError) -> None:
+def _fail(error: Exception) -> None:
     raise error
 
 
@@ -50,7 +48,7 @@ class Worker:
             began_s = time.thread_time()
             try:
                 result = work()
-            except InputError as error:
+            except Exception as error:  # raised once, when the result is taken
                 result = partial(_fail, error)
             return result, time.thread_time() - began_s
 
