@@ -65,7 +65,7 @@ from thinmap_ros.ros.tf.odometry_source import OdometrySource
 
 _HEALTH = {
     SlamStatus.TRACKING: (OK, 'tracking'),
-    SlamStatus.LOST: (ERROR, 'lost: scans contradict the map'),
+    SlamStatus.LOST: (ERROR, 'lost: scans contradict the map, or have not confirmed the pose'),
     SlamStatus.NO_MAP: (ERROR, 'no map: waits for topic map; dead reckoning'),
 }
 

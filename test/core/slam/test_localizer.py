@@ -784,6 +784,26 @@ def test_a_killed_localizer_resumes_in_the_occupancy_map(slip):
     assert worst(rows[10:]) < 0.1
 
 
+@pytest.mark.parametrize(('guess', 'is_right'), [((2.0, 2.0, 0.0), True), ((4.1, 6.0, 1.6), False)])
+def test_a_guessed_start_pose_is_confirmed_by_the_way_alone(guess, is_right):
+    """A localizer begins in a map in which the robot may be anywhere."""
+    rng = np.random.default_rng(0)
+    grid = OccupancyGrid(OccupancyConfig(resolution_m=0.05))
+    poses = list(drive(260, rng, START))
+    scans = [scan_in(ROOM, T, rng, k * PERIOD_NS) for k, (T, _) in enumerate(poses)]
+    for scan, (truth, _) in zip(scans, poses, strict=True):
+        grid.add_scan(scan, truth)
+    x, y, yaw = guess
+    config = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
+    localizer = Localizer.in_occupancy_map(grid.known_area(), config, is_guess=True)
+    for k, (scan, (truth, odom)) in enumerate(zip(scans, poses, strict=True)):
+        estimate = localizer.step(scan, odom)
+        off_m = np.hypot(*(estimate.T_map_base - truth)[:2])
+        assert estimate.is_lost or (off_m < 0.1 and k > 100)
+        assert estimate.placement is not Placement.MAP or off_m < 0.1
+    assert estimate.is_lost != is_right
+
+
 @pytest.mark.parametrize(
     ('name', 'value'),
     [
