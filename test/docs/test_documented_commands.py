@@ -132,7 +132,9 @@ def told_by(text: str) -> list[str]:
     words = text.split('--ros-args')[0].split('#')[0].removesuffix('&').split()
     program = words[3]
     renamed = re.search(r'__node:=(\w+)', text)
-    names = chosen_nodes(words[4:]) if program == 'thinmap' else [renamed[1] if renamed else program]
+    names = (
+        chosen_nodes(words[4:]) if program == 'thinmap' else [renamed[1] if renamed else program]
+    )
     space = re.search(r'__ns:=/(\S+)', text)
     prefix = f'{space[1]}/' if space else ''
     return [f'{prefix}{name}: thinmap' for name in names]

@@ -8,11 +8,10 @@ from typing import Any
 from action_msgs.msg import GoalInfo
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.private_rclpy import adopt_goal, begin_goal
 
 
 class Outcome(Enum):
@@ -113,12 +112,9 @@ class SingleGoalServer:
         server = self._servers[0]
         stamp = self._node.get_clock().now().to_msg()
         info = GoalInfo(goal_id=UUID(uuid=list(goal_id)), stamp=stamp)
-        # What the server does with a request for a goal, without the answer to it.
         handle = ServerGoalHandle(server, info, server.action_type.Goal())
-        server._goal_handles[goal_id] = handle
-        server._result_futures[goal_id] = Future()
-        server.add_future(server._result_futures[goal_id])
-        handle._update_state(rclpy_implementation.GoalEvent.EXECUTE)
+        adopt_goal(server, handle, goal_id)
+        begin_goal(handle)
         self._goal = _Goal(server, handle)
 
     def feedback(self, message: Any) -> None:
@@ -139,8 +135,7 @@ class SingleGoalServer:
         goal.server.notify_execute(goal.handle, None)
 
     def _accept(self, goal: _Goal, read: Callable[[Any], Any]) -> None:
-        # What the handle's `execute` does, without the coroutine.
-        goal.handle._update_state(rclpy_implementation.GoalEvent.EXECUTE)
+        begin_goal(goal.handle)
         try:
             request = read(goal.handle.request)
         except InvalidGoalError as invalid:

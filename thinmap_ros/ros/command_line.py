@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -23,6 +22,7 @@ from thinmap_ros.ros.foreign.sections import (
     ros_arguments,
     split_arguments,
 )
+from thinmap_ros.ros.private_rclpy import RCLError, UnknownROSArgsError
 
 _RULES = {
     '-p': 'NAME:=VALUE',
@@ -45,8 +45,8 @@ def init_ros(words: Sequence[str]) -> None:
     set_logger_level('rcl', LoggingSeverity.FATAL)
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    except (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError) as error:
-        is_unknown = isinstance(error, rclpy_implementation.UnknownROSArgsError)
+    except (RCLError, UnknownROSArgsError) as error:
+        is_unknown = isinstance(error, UnknownROSArgsError)
         reason = re.sub(r'^failed to initialize rcl: |, at /\S+:\d+', '', str(error))
         text = f'{"unknown: " if is_unknown else ""}{one_line(reason)}'
         raise InputError(f'arguments after --ros-args: {text}') from error

@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
@@ -17,11 +16,11 @@ from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint
 from thinmap_ros.ros.clocks.time_jumps import ElapsedTime, TimeJumps
 from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
 from thinmap_ros.ros.foreign.translation import translate
+from thinmap_ros.ros.private_rclpy import RCLError
 from thinmap_ros.ros.services import fill_response
 
 _CHECKPOINT_PERIOD_S = 0.5
 _DEAR_INTERVAL = 200.0  # half a percent of the time
-RCLError = rclpy_implementation.RCLError
 
 
 class ThinmapNode(LifecycleNode):

@@ -12,7 +12,6 @@ from typing import Any, NoReturn
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
@@ -26,6 +25,7 @@ from thinmap_ros.ros.command_line import (
     warn_of_unused,
 )
 from thinmap_ros.ros.foreign.sections import split_arguments
+from thinmap_ros.ros.private_rclpy import RCLError
 
 _SECURITY = 'ROS_SECURITY_ENABLE'
 _KEYSTORE = 'ROS_SECURITY_KEYSTORE'
@@ -154,7 +154,7 @@ def _made(make_node: Callable[[], Node]) -> Node:
             # Of a node that was not created: it says no more than the error.
             warnings.filterwarnings('ignore', message='Failed to fini', category=RuntimeWarning)
             return make_node()
-    except rclpy_implementation.RCLError as error:
+    except RCLError as error:
         reason = one_line_reason(error)
         raise InputError(f'{reason}{_security_advice(reason)}') from error
 

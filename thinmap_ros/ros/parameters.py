@@ -27,6 +27,7 @@ from thinmap_ros.core.config import (
 )
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.ros.foreign.values import is_known
+from thinmap_ros.ros.private_rclpy import declared_names, given_parameters
 
 STRICT = 'strict_parameters'
 # What describes the robot: one file may give it to all nodes, also to those that do not need it.
@@ -149,10 +150,11 @@ def declare_parameter(
 
 def _accept_integer(node: Node, name: str, default: Any) -> None:
     """Take an integer that was given for a float as that float, as in many parameter files."""
-    given = node._parameter_overrides.get(name)
+    overrides = given_parameters(node)
+    given = overrides.get(name)
     is_integer = given is not None and given.type_ == Parameter.Type.INTEGER
     if isinstance(default, float) and is_integer:
-        node._parameter_overrides[name] = Parameter(name, value=float(given.value))
+        overrides[name] = Parameter(name, value=float(given.value))
 
 
 def given_text(node: Node, name: str, default: str) -> str:
@@ -160,7 +162,7 @@ def given_text(node: Node, name: str, default: str) -> str:
 
     A value of another type is left to the declaration, which rejects it.
     """
-    given = node._parameter_overrides.get(name)
+    given = given_parameters(node).get(name)
     is_text = given is not None and given.type_ == Parameter.Type.STRING
     return str(given.value) if is_text else default
 
@@ -240,13 +242,12 @@ def reject_unknown(node: Node, elsewhere: Mapping[str, str] | None = None) -> No
     several nodes share a process, a parameter may be meant for another one: the last of them
     decides. Raises ConfigError.
     """
-    # rclpy has no public way to see what was given but never declared.
     given = {
         name
-        for name in set(node._parameter_overrides).difference(ROBOT)
+        for name in set(given_parameters(node)).difference(ROBOT)
         if not name.startswith('qos_overrides.') and not is_known(name)
     }
-    known = {name for name in node._parameters if not name.startswith('qos_overrides')}
+    known = {name for name in declared_names(node) if not name.startswith('qos_overrides')}
     meant = dict(elsewhere or {})
     shared = _SHARED.get()
     if shared is not None:

@@ -11,6 +11,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.places.recognition.decision import JOIN_ODDS
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import parameters
+from thinmap_ros.ros.private_rclpy import given_parameters
 
 # As map_merge names them: /robot1/map_merge/init_pose_x.
 _INITIAL_POSE = re.compile(r'(/\S*)/map_merge/init_pose_(x|y|z|yaw)')
@@ -66,7 +67,7 @@ class MapJoinerConfig(Config):
 
 def declare_initial_poses(node: Node) -> dict[str, Array]:
     """Declare the initial poses that the node was given, by the namespace of the robot, (3,)."""
-    found = [_INITIAL_POSE.fullmatch(name) for name in node._parameter_overrides]
+    found = [_INITIAL_POSE.fullmatch(name) for name in given_parameters(node)]
     poses: dict[str, dict[str, float]] = {}
     for match in found:
         if match is not None:
@@ -82,7 +83,7 @@ def declare_initial_poses(node: Node) -> dict[str, Array]:
 
 def warn_of_confidence(node: Node) -> None:
     """Name the parameter that takes the place of map_merge's confidence."""
-    if node._parameter_overrides.pop(_CONFIDENCE, None) is not None:
+    if given_parameters(node).pop(_CONFIDENCE, None) is not None:
         node.get_logger().warning(
             f'{_CONFIDENCE} is not used: join_odds decides which maps are joined (default '
             f'{JOIN_ODDS:g}, at most one wrong join in so many)'

@@ -7,6 +7,7 @@ from rclpy.parameter import Parameter
 
 from thinmap_ros.ros.foreign.sections import foreign_values, given_files, overruled_values
 from thinmap_ros.ros.foreign.values import translated
+from thinmap_ros.ros.private_rclpy import given_parameters
 
 _CLOCK = 'use_sim_time'
 
@@ -17,8 +18,7 @@ def translate(node: Node, program: str) -> None:
     program: name of the node before remapping. Sections of parameter files for the nodes that it
     replaces are read, too. Raises InputError where a parameter file is none.
     """
-    # rclpy has no public way to change what was given.
-    given = node._parameter_overrides
+    given = given_parameters(node)
     for name, value in overruled_values(sys.argv, node.get_fully_qualified_name()).items():
         given[name] = Parameter(name, value=value)
     for file in given_files(sys.argv):
