@@ -4,7 +4,6 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
 from nav_msgs.msg import Path
 from rclpy.action import ActionClient
-from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import KeepOut, SlamStatus, TopologicalMap
@@ -21,7 +20,8 @@ from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.frames.bag_odometry import NONE
-from thinmap_ros.nodes.navigation.map_input import MapInput
+from thinmap_ros.nodes.navigation.base_watch import BaseWatch
+from thinmap_ros.nodes.navigation.map_input import MapInput, MapTimeoutConfig
 from thinmap_ros.nodes.navigation.robot_state import RobotState
 from thinmap_ros.nodes.navigation.tasks import (
     STOPPED,
@@ -32,7 +32,7 @@ from thinmap_ros.nodes.navigation.tasks import (
 from thinmap_ros.nodes.navigation.team_driving import TeamDriving
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
-from thinmap_ros.ros.diagnostics import OK, WARN
+from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.stop_topic import subscribe_to_stop
@@ -50,14 +50,24 @@ _POSE_FAULTS = {
     SlamStatus.LOST: 'lost (the place of the robot in the map is unknown)',
     SlamStatus.BLIND: 'laser blind (it does not confirm the pose)',
     SlamStatus.MISALIGNED: 'laser misaligned (turned on the robot)',
+    SlamStatus.NO_MAP: 'the localizer has no map',
 }
+# A base that was told to drive by a node that is gone drives on: stops of a second after each new
+# subscription of cmd_vel, which may discover this node later than it is discovered.
+_STOPS = round(1.0 / CONTROL_PERIOD_S)
 
 
 class _NavigatorPublishers:
-    """Publishes velocity commands and the planned path."""
+    """Publishes velocity commands and the planned path.
 
-    def __init__(self, node: Node, map_frame: str, base_frame: str) -> None:
+    base: whether the robot moves as commanded.
+    """
+
+    def __init__(self, node: ThinmapNode, map_frame: str, base_frame: str, base: BaseWatch) -> None:
         self.map_frame = map_frame
+        self.base = base
+        self._subscribers = 0
+        self._stops = 0
         self._clock = node.get_clock()
         self._velocity = VelocityPublisher(node, base_frame, declare_stamped(node))
         self._plan = node.create_publisher(Path, 'plan', qos.LATCHED)
@@ -69,6 +79,17 @@ class _NavigatorPublishers:
 
     def command(self, v: float, w: float) -> None:
         self._velocity.publish(v, w)
+        self.base.add_sent(v, w)
+
+    def stand(self) -> None:
+        """Without a goal, tell to stand who has just subscribed, and a base that moves."""
+        count = self._velocity.subscribers
+        if count > self._subscribers and (self._subscribers == 0 or self.base.is_obeyed):
+            self._stops = _STOPS
+        self._subscribers = count
+        if self._stops > 0 or self.base.is_creeping:
+            self._stops -= self._stops > 0
+            self.command(0.0, 0.0)
 
     def stop(self) -> None:
         self._velocity.stop()
@@ -100,12 +121,12 @@ class NavigatorNode(ThinmapNode):
         map_frame = parameters.declare_map_frame(self)
         self._laser_transform = LaserTransform(self)
         base_frame = self._laser_transform.base_frame
-        self._output = _NavigatorPublishers(self, map_frame, base_frame)
-        self._map = MapInput()
+        base = BaseWatch(self, self._config)
+        self._output = _NavigatorPublishers(self, map_frame, base_frame, base)
+        timeout_s = parameters.declare_config(self, MapTimeoutConfig).map_timeout_s
+        self._map = MapInput(self.elapsed_time, timeout_s)
         self._tasks = TaskReader(self, map_frame, self._map)
-        self._odometry = OdometrySource(
-            self, base_frame, lambda ns, T_odom_base: self._robot.add_odometry(ns, T_odom_base)
-        )
+        self._odometry = OdometrySource(self, base_frame, self._on_odometry)
         self._team = TeamDriving(self)
         parameters.reject_unknown(self)
         warm_up.navigator()
@@ -133,7 +154,19 @@ class NavigatorNode(ThinmapNode):
         )
         # As in Nav2, a goal from RViz is one of the action: its status is public.
         self._own_client = ActionClient(self, NavigateToPose, 'navigate_to_pose')
+        self._check_inputs()
         self.create_active_timer(CONTROL_PERIOD_S, self._control)
+
+    def _check_inputs(self) -> None:
+        """Report a mapper that is silent; drive neither by two poses nor by two maps."""
+        self.diagnostics.add_check(
+            WARN, lambda: '' if self._robot.stop_reason() else self._map.warning
+        )
+        for topic, is_heard in (
+            ('pose', lambda: self._robot.has_two_localizers()),
+            ('local_grid', self._map.has_two_mappers),
+        ):
+            self.diagnostics.check_sole_publisher(topic, ERROR, is_heard)
 
     def reset_state(self) -> None:
         """Discard the map, the graph and the pose of the robot."""
@@ -141,6 +174,7 @@ class NavigatorNode(ThinmapNode):
         self._tasks.reset()
         self._navigator = Navigator(self._config)
         self._map.reset()
+        self._output.base.release()
         self._robot = RobotState(self.elapsed_time, self._odometry.source != NONE)
         self._task = NavigationTask(NavigateToPose, (), 0)
 
@@ -151,6 +185,7 @@ class NavigatorNode(ThinmapNode):
         topology = self._navigator.topology
         self._navigator = Navigator(config)
         self._navigator.topology = topology
+        self._output.base.set_config(config)
         if self._goals.active:
             self._drive_to(self._task.poses[-remaining:])
 
@@ -162,6 +197,10 @@ class NavigatorNode(ThinmapNode):
         """Stop the robot: the last thing the node does."""
         self._output.stop()
         super().close()
+
+    def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
+        self._robot.add_odometry(stamp_ns, T_odom_base)
+        self._output.base.add_odometry(stamp_ns, T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from_msg(message.pose.pose)
@@ -196,6 +235,8 @@ class NavigatorNode(ThinmapNode):
             self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, str(error))
 
     def _on_stop(self, is_stopped: bool) -> None:
+        if self._tasks.is_stopped and not is_stopped:
+            self._output.base.release()
         self._tasks.is_stopped = is_stopped
         if is_stopped:
             self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, STOPPED)
@@ -224,9 +265,13 @@ class NavigatorNode(ThinmapNode):
 
     def _control(self) -> None:
         if not self._goals.active:
+            self._output.stand()
             return
         if self._goals.is_cancel_requested:
             self._end(Outcome.CANCELED, ErrorCode.NONE, 'cancelled')
+            return
+        if fault := self._output.base.fault:
+            self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, fault)
             return
         if self._output.is_interrupted:
             self._navigator.reset_velocity()
@@ -249,7 +294,7 @@ class NavigatorNode(ThinmapNode):
 
         None before all inputs are received.
         """
-        if fault := self._robot.stop_reason() or self._map.fault:
+        if fault := self._robot.stop_reason() or self._map.fault or self.diagnostics.error:
             reason = f'{fault}: standing still'
             self.get_logger().warning(reason, throttle_duration_sec=WARN_PERIOD_S)
             self.diagnostics.set_state(WARN, reason)

@@ -313,12 +313,22 @@ class NodeDiagnostics:
         """Call `work` once a second, before the diagnostics are published."""
         self._update_callbacks.append(work)
 
-    def check_sole_publisher(self, topic: str, level: bytes = ERROR) -> None:
-        """Report at a level that several nodes publish a topic, an output or an input."""
+    @property
+    def error(self) -> str:
+        """The first failed check of level ERROR, by the last diagnostics; '' for none."""
+        return next((each.fault for each in self._checks if each.level == ERROR and each.fault), '')
+
+    def check_sole_publisher(
+        self, topic: str, level: bytes = ERROR, is_heard: Callable[[], bool] = lambda: True
+    ) -> None:
+        """Report at a level that several nodes publish a topic, an output or an input.
+
+        is_heard: whether several do so now; a node that was killed is still known for a while.
+        """
         name = self._node.resolve_topic_name(topic)
 
         def rivals() -> str:
-            if self._node.count_publishers(name) < 2:
+            if self._node.count_publishers(name) < 2 or not is_heard():
                 return ''
             nodes = publisher_names(self._node, name)
             return f'{len(nodes)} nodes publish {name}: {", ".join(nodes)}: stop all but one'

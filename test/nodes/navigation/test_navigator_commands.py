@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from rclpy.time import Time
 from support.halls import empty_hall
 
@@ -12,6 +13,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import pose
 from thinmap_ros.nodes.navigator import NavigatorNode
 from thinmap_ros.ros import messages
+from thinmap_ros.ros.diagnostics import ERROR
 from thinmap_ros.sim.robot import after_arc
 
 pytestmark = pytest.mark.live
@@ -25,6 +27,8 @@ class Driven:
         self.node = node
         self.now_ns = 10**9
         self.silent = set()
+        self.poses = 1
+        self.fast = 1.0
         self.T = np.zeros(3)
         node._map._on_map(messages.grid_from_msg(empty_hall()))
         node._drive_to((pose(4.0, 0.0, 0.0),))
@@ -38,7 +42,8 @@ class Driven:
             self._publish()
             command = self.node._command()
             if command is not None:
-                moved = (command.v * CONTROL_PERIOD_S, command.w * CONTROL_PERIOD_S)
+                self.node._output.command(command.v, command.w)
+                moved = (self.fast * command.v * CONTROL_PERIOD_S, command.w * CONTROL_PERIOD_S)
                 self.T = after_arc(self.T, *moved)
         return command
 
@@ -54,7 +59,8 @@ class Driven:
             self.node._on_scan(messages.scan_msg(scan, 'laser', CONTROL_PERIOD_S))
         if 'localizer' not in self.silent:
             message = messages.pose_with_covariance_msg(T, np.eye(3), 'map', self.now_ns)
-            self.node._on_pose(message)
+            for _ in range(self.poses):
+                self.node._on_pose(message)
 
 
 @pytest.fixture
@@ -99,6 +105,7 @@ def test_the_state_of_the_localizer_stops_it(driven):
         (SlamStatus.LOST, 'lost (the place of the robot in the map is unknown)'),
         (SlamStatus.BLIND, 'laser blind (it does not confirm the pose)'),
         (SlamStatus.MISALIGNED, 'laser misaligned (turned on the robot)'),
+        (SlamStatus.NO_MAP, 'the localizer has no map'),
     ):
         driven.node._on_slam_status(SlamStatus(state=state))
         command = driven.step()
@@ -118,3 +125,59 @@ def test_a_pose_in_another_map_than_the_grid_stops_it(driven):
     assert driven.step().reason.startswith('the pose is in another map than the one on grid')
     driven.node._on_slam_status(SlamStatus(state=SlamStatus.TRACKING, map_id=7))
     assert driven.step().state == 'driving'
+
+
+@pytest.fixture
+def other(driven):
+    """Another node of the graph."""
+    node = rclpy.create_node('other')
+    yield node
+    node.destroy_node()
+
+
+def diagnose(driven):
+    """Level and message of /diagnostics."""
+    status = driven.node.diagnostics._status(0.0)
+    return status.level, status.message
+
+
+def test_two_localizers_stop_it_and_a_dead_one_does_not(driven, other):
+    """A localizer that was killed is known for a while beside the one that replaces it."""
+    assert all(other.create_publisher(PoseWithCovarianceStamped, 'pose', 1) for _ in range(2))
+    driven.step(20)
+    diagnose(driven)
+    assert driven.step().state == 'driving'
+    driven.poses = 2
+    driven.step(5)
+    level, message = diagnose(driven)
+    assert level == ERROR and message.startswith('2 nodes publish /pose: ')
+    command = driven.step()
+    assert (command.v, command.w, command.state) == (0.0, 0.0, 'blocked')
+    assert command.reason.startswith('2 nodes publish /pose: ')
+    driven.poses = 1
+    driven.step(30)
+    diagnose(driven)
+    assert driven.step().state == 'driving'
+
+
+def test_a_base_that_is_too_fast_is_an_error_until_a_stop_is_released(driven, other):
+    assert other.create_subscription(Twist, 'cmd_vel', print, 1)
+    driven.fast = 4.0
+    driven.step(30)
+    level, message = diagnose(driven)
+    assert level == ERROR and message.startswith('the base moves at 0.')
+    assert 'm/s: no goal is driven before ' in message
+    driven.fast = 1.0
+    driven.step(30)
+    assert diagnose(driven)[0] == ERROR
+    for is_stopped in (True, False):
+        driven.node._on_stop(is_stopped)
+    driven.step(30)
+    assert diagnose(driven)[0] != ERROR
+
+
+def test_the_motion_of_a_base_that_others_drive_too_is_nobodys_fault(driven, other):
+    assert other.create_publisher(Twist, 'cmd_vel', 1)
+    driven.fast = 4.0
+    driven.step(30)
+    assert diagnose(driven)[0] != ERROR

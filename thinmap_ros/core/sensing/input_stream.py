@@ -11,6 +11,9 @@ _GAP_INTERVALS = 3.0  # a longer silence is no low rate
 _DRIFT = 2e-4
 # A message may overtake another one. Several before the newest stamp: the clock was set back.
 _SET_BACK = 2
+# Stamps of one source grow. Two that do not, within so long: the diagnostics look once a second.
+_MIXED = 2
+_MIXED_NS = 2 * SECOND_NS
 
 
 class Lateness:
@@ -57,6 +60,8 @@ class InputStream:
         self._late_limit_ns = late_limit_ns
         self._lateness = Lateness(late_limit_ns)
         self._received_ns: int | None = None
+        self._stamp_ns: int | None = None
+        self._repeated_ns: deque[int] = deque(maxlen=_MIXED)
         self._intervals_ns: deque[int] = deque(maxlen=_USUAL_INTERVALS)
 
     def add(self, stamp_ns: int, received_ns: int, age_ns: int) -> None:
@@ -67,7 +72,15 @@ class InputStream:
         if self._received_ns is not None:
             self._intervals_ns.append(received_ns - self._received_ns)
         self._received_ns = received_ns
+        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
+            self._repeated_ns.append(received_ns)
+        self._stamp_ns = stamp_ns
         self._lateness.add(stamp_ns, received_ns, age_ns)
+
+    def is_mixed(self, now_ns: int) -> bool:
+        """Whether stamps did not grow lately: two sources measure at once."""
+        times_ns = self._repeated_ns
+        return len(times_ns) == _MIXED and now_ns - times_ns[0] <= _MIXED_NS
 
     def fault(self, now_ns: int) -> str:
         """Why the robot cannot rely on the measurements; '' for no reason, and before the first."""

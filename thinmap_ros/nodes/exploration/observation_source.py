@@ -13,6 +13,8 @@ from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.sensing.input_stream import InputStream
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
@@ -24,6 +26,7 @@ from thinmap_ros.nodes.exploration.robot_view import RobotView
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN, FollowedMap, Origin
+from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_from_msg
@@ -32,6 +35,9 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 _LOOK_PERIOD_S = 0.5
 # A publisher that is silent because its map does not change: the old one holds.
 _UNCHANGED_S = 10.0
+_AWAITED = 'scan that shows anything on local_grid of grid_mapper'
+# As of the map of navigator: a mapper answers each scan.
+_SILENT_NS = 2 * SECOND_NS
 # A robot that was not localized for so long is somewhere else, perhaps.
 _POSE_TIMEOUT_S = 3.0
 
@@ -51,17 +57,32 @@ class _GridPublisher:
         self.followed = FollowedMap()
         self._node = node
         self._check = PublisherCheck(node, 'grid', 'local_grid')
+        self.forget()
+        node.diagnostics.add_check(WARN, self._silence)
+
+    def forget(self) -> None:
+        """A mapper that is silent is gone, and not dead."""
+        self._stream = InputStream('local_grid of grid_mapper', _SILENT_NS, _SILENT_NS)
+        self._is_heard = False
 
     def is_found(self) -> bool:
-        """Whether somebody publishes grids."""
-        return self._check.is_found()
+        """Whether somebody publishes grids, or has done so: a mapper that was killed returns."""
+        return self._is_heard or self._check.is_found()
 
     def received(self, message: ProbabilityGrid) -> None:
         """Reset the node where a grid is of another map than those before."""
         self._check.message_received()
+        self._is_heard = True
+        time = self._node.elapsed_time
+        stamp_ns = messages.stamp_ns(message.header.stamp)
+        self._stream.add(stamp_ns, time.now_ns(), time.age_ns(stamp_ns))
         if self.followed.origin(message.map_id) is Origin.OTHER:
             self._node.reset('grid is of another map')
             self.followed.origin(message.map_id)
+
+    def _silence(self) -> str:
+        fault = self._stream.fault(self._node.elapsed_time.now_ns())
+        return f'{fault}: nothing to explore with' if fault else ''
 
 
 class _TopologyPublisher:
@@ -131,6 +152,7 @@ class ObservationSource:
         Not the published graph: that of the next map may have come before its grid.
         """
         self._grids.followed = FollowedMap()
+        self._grids.forget()
         self.watchdog = InputWatchdog()
         self._mapped = MapReceiver()
         self._graph = MapGraph(self._graph_config)
@@ -190,7 +212,7 @@ class ObservationSource:
             return  # ignored: a blind scan observes nothing
         if self._is_graph_awaited():
             return
-        self.watchdog.awaited = InputWatchdog.awaited
+        self.watchdog.awaited = _AWAITED
         self.watchdog.add_scan(now_s)
         patch = self._mapped.patch
         if patch is not None:

@@ -69,6 +69,10 @@ class RobotState:
             self._scan_offset_ns = self._offset_ns(scan.stamp_ns)
             self._record('laser', scan.stamp_ns)
 
+    def has_two_localizers(self) -> bool:
+        """Whether poses come from two sources."""
+        return self._streams['localizer'].is_mixed(self._time.now_ns())
+
     def pose(self) -> Array | None:
         """T_map_base (3,) now; None before a pose and odometry are received."""
         if self._T_map_odom is None or self._T_odom_base is None:

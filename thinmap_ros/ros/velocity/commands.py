@@ -64,6 +64,11 @@ class VelocityPublisher:
         """Whether the watchdog has stopped the robot since the last command."""
         return bool(self._interruption)
 
+    @property
+    def subscribers(self) -> int:
+        """Number of subscriptions that receive the commands."""
+        return int(self._publisher.get_subscription_count())
+
     def stop(self) -> None:
         """Publish a stop, the last command, and wait until it is received.
 

@@ -1,0 +1,78 @@
+"""Whether the base does what it is told."""
+
+from thinmap_ros.core.planning.navigator import NavigatorConfig
+from thinmap_ros.core.planning.supervision import BaseSupervisor
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.ros import parameters
+from thinmap_ros.ros.diagnostics import ERROR
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.velocity import commands
+
+_RELEASE = 'no goal is driven before ~/reset, or a stop that is released'
+
+
+class BaseWatch:
+    """Compares commands and odometry; reports at level ERROR what is wrong.
+
+    Where others publish cmd_vel too, or nobody hears it, any motion is allowed.
+    """
+
+    def __init__(self, node: ThinmapNode, config: NavigatorConfig) -> None:
+        """Declare the parameter `base_velocity_topic`."""
+        self._node = node
+        self._supervisor = BaseSupervisor(config)
+        topic = parameters.declare_parameter(
+            node,
+            'base_velocity_topic',
+            '',
+            'Topic of the commands that the base obeys, where a multiplexer (twist_mux) is between '
+            'navigator and base: its output. The motion of the robot is compared with them. Empty: '
+            'the base obeys this node.',
+        )
+        self._own_topic = node.resolve_topic_name(commands.TOPIC)
+        self._is_behind = bool(topic)
+        if topic:
+            commands.VelocitySubscription(node, node.diagnostics, self._add_command, str(topic))
+        node.diagnostics.add_check(ERROR, lambda: self.fault)
+
+    @property
+    def fault(self) -> str:
+        """Why no goal may be driven; '' for no reason."""
+        fault = self._supervisor.fault
+        return f'{fault}: {_RELEASE}' if self._supervisor.is_fast else fault
+
+    @property
+    def is_creeping(self) -> bool:
+        """Whether the robot moves though it is to stand."""
+        return self._supervisor.is_creeping
+
+    def set_config(self, config: NavigatorConfig) -> None:
+        """Continue with other limits."""
+        self._supervisor.set_config(config)
+
+    def release(self) -> None:
+        """Drive goals again."""
+        self._supervisor.release()
+
+    def add_sent(self, v: float, w: float) -> None:
+        """Add a command of this node, m/s and rad/s."""
+        if not self._is_behind:
+            self._add_command(v, w)
+
+    def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
+        """Add a sample of the odometry, T_odom_base (3,)."""
+        if not self._is_behind and not self.is_obeyed:
+            self._supervisor.add_unheard_command(self._now_s())
+        self._supervisor.add_odometry(self._now_s(), stamp_ns, T_odom_base)
+
+    @property
+    def is_obeyed(self) -> bool:
+        """Whether somebody hears cmd_vel, and nobody else publishes it."""
+        publishers = int(self._node.count_publishers(self._own_topic))
+        return publishers == 1 and int(self._node.count_subscribers(self._own_topic)) > 0
+
+    def _add_command(self, v: float, w: float) -> None:
+        self._supervisor.add_command(self._now_s(), v, w)
+
+    def _now_s(self) -> float:
+        return self._node.elapsed_time.now_s()
