@@ -1,13 +1,20 @@
 """`thinmap doctor` on a robot that has all, on one under other names, and on none."""
 
+import threading
+
 import pytest
+from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from support.forks import forked
 
-from thinmap_ros.ros import qos
+from thinmap_ros.core.se2 import pose
+from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
+TICK_S = 0.05
 
 
 def lines(*arguments):
@@ -47,3 +54,74 @@ def test_a_driver_that_publishes_nothing_is_named(graph):
     assert publisher
     _, said = lines('--seconds', '2', '--odom-topic', 'wheels')
     assert 'a publisher, and no message' in '\n'.join(said)
+
+
+class Base:
+    """A base that turns as told, with or without a time-out of its commands, in its own time."""
+
+    def __init__(self, graph, timeout_s):
+        self._timeout_s = timeout_s
+        self._w = self._told_s = self._yaw = self._now_s = 0.0
+        node = Node('base', context=graph.context)
+        node.create_subscription(Twist, 'cmd_vel', self._on_command, 10)
+        self._odometry = node.create_publisher(Odometry, 'odom', 10)
+        node.create_timer(TICK_S, self._step)
+        self._executor = SingleThreadedExecutor(context=graph.context)
+        self._executor.add_node(node)
+        self._node = node
+        self._thread = threading.Thread(target=self._executor.spin)
+        self._thread.start()
+
+    def close(self):
+        self._executor.shutdown()
+        self._thread.join()
+        self._node.destroy_node()
+
+    def _on_command(self, message):
+        self._w = message.angular.z
+        self._told_s = self._now_s
+
+    def _step(self):
+        self._now_s += TICK_S
+        if self._now_s - self._told_s > self._timeout_s:
+            self._w = 0.0
+        self._yaw += TICK_S * self._w
+        here = pose(0.0, 0.0, self._yaw)
+        frames = ('odom', 'base_link')
+        stamp_ns = round(1e9 * self._now_s)
+        self._odometry.publish(messages.odometry_msg(here, (0.0, self._w), frames, stamp_ns))
+
+
+@pytest.mark.parametrize(
+    ('timeout_s', 'words'),
+    [
+        (1.0, '✓ watchdog of the base  stands within 2 s after the last command'),
+        (1e9, '✗ watchdog of the base  turns on at 0.'),
+    ],
+)
+def test_the_time_out_of_a_base_is_tried_and_the_base_stands_in_the_end(graph, timeout_s, words):
+    base = Base(graph, timeout_s)
+    try:
+        commands = graph.heard('cmd_vel', Twist)
+        code, said = lines('--try-watchdog', '--yes')
+        assert said[0].startswith(words)
+        assert code == (0 if words.startswith('✓') else 1)
+        graph.until(lambda: commands and commands[-1].angular.z == 0.0, 'a stop')
+        assert 0.0 < max(command.angular.z for command in commands) <= 0.3
+    finally:
+        base.close()
+
+
+def test_a_base_is_not_moved_without_consent_and_not_beside_another_driver(graph):
+    commands = graph.heard('cmd_vel', Twist)
+    done = forked.run('thinmap_ros.tools.doctor', '--try-watchdog')
+    assert done.returncode == 2 and 'expected --yes, or a terminal' in done.stderr
+    driver = graph.node.create_publisher(Twist, 'cmd_vel', 10)
+    base = Base(graph, 1.0)
+    try:
+        done = forked.run('thinmap_ros.tools.doctor', '--try-watchdog', '--yes')
+    finally:
+        base.close()
+    assert driver and done.returncode == 2
+    assert 'published by /test_client: end it first' in done.stderr
+    assert not commands

@@ -83,7 +83,7 @@ class _NavigatorPublishers:
 
     def stand(self) -> None:
         """Without a goal, tell to stand who has just subscribed, and a base that moves."""
-        count = self._velocity.subscribers
+        count = self.base.subscribers
         if count > self._subscribers and (self._subscribers == 0 or self.base.is_obeyed):
             self._stops = _STOPS
         self._subscribers = count

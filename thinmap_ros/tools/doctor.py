@@ -6,18 +6,26 @@ Ends with 1 if something is wrong.
 import argparse
 import sys
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser
 from thinmap_ros.tools.ros_check import require_ros
+
+_QUESTION = (
+    'The robot turns on the spot, by up to 2 rad, also without a stop by this program. '
+    'Is there room all around it, and a hand at its emergency stop? yes: '
+)
 
 
 def _work(arguments: argparse.Namespace) -> None:
     if not arguments.seconds > 0.0:
         raise InputError(f'--seconds {arguments.seconds:g}: expected more than 0')
+    if arguments.try_watchdog:
+        _confirm(arguments.yes)
     require_ros()
     # Only now: the help needs no ROS.
     from thinmap_ros.ros.robot_check import RobotNames, check_robot
+    from thinmap_ros.ros.velocity.base_trial import try_watchdog
 
     names = RobotNames(
         arguments.scan_topic,
@@ -26,7 +34,10 @@ def _work(arguments: argparse.Namespace) -> None:
         arguments.odom_frame,
         arguments.map_frame,
     )
-    findings = check_robot(names, arguments.seconds)
+    if arguments.try_watchdog:
+        findings = [try_watchdog(names.odom_topic, names.base_frame)]
+    else:
+        findings = check_robot(names, arguments.seconds)
     width = max(len(finding.what) for finding in findings)
     for finding in findings:
         mark = '\N{CHECK MARK}' if finding.is_good else '\N{BALLOT X}'
@@ -38,12 +49,31 @@ def _work(arguments: argparse.Namespace) -> None:
     sys.exit(1 if wrong else 0)
 
 
+def _confirm(is_confirmed: bool) -> None:
+    """Ask whether the robot may move. Raises InputError unless the answer is yes."""
+    if is_confirmed:
+        return
+    if not sys.stdin.isatty():
+        raise InputError('--try-watchdog moves the robot: expected --yes, or a terminal to ask at')
+    print(_QUESTION, end='', flush=True)
+    answer = sys.stdin.readline().strip()
+    if answer != 'yes':
+        raise InputError(f'answer {quoted(answer)}: expected yes: the robot is not moved')
+
+
 def main() -> None:
     """Run the program."""
     parser = Parser('doctor', __doc__)
     parser.add_argument(
         '--seconds', type=float, default=5.0, help='how long it listens (default 5)'
     )
+    parser.add_argument(
+        '--try-watchdog',
+        action='store_true',
+        help='instead, turn the robot slowly, end the commands without a stop, and look whether it '
+        'stands within 2 s; asks first',
+    )
+    parser.add_argument('--yes', action='store_true', help='do not ask')
     for name, default in (
         ('scan-topic', 'scan'),
         ('odom-topic', 'odom'),

@@ -66,10 +66,14 @@ class BaseWatch:
         self._supervisor.add_odometry(self._now_s(), stamp_ns, T_odom_base)
 
     @property
+    def subscribers(self) -> int:
+        """Number of subscriptions of cmd_vel."""
+        return int(self._node.count_subscribers(self._own_topic))
+
+    @property
     def is_obeyed(self) -> bool:
         """Whether somebody hears cmd_vel, and nobody else publishes it."""
-        publishers = int(self._node.count_publishers(self._own_topic))
-        return publishers == 1 and int(self._node.count_subscribers(self._own_topic)) > 0
+        return self.subscribers > 0 and int(self._node.count_publishers(self._own_topic)) == 1
 
     def _add_command(self, v: float, w: float) -> None:
         self._supervisor.add_command(self._now_s(), v, w)

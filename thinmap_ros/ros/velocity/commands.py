@@ -13,7 +13,7 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.velocity.watchdog import CommandTimeout, CommandWatchdog
 
 TOPIC = 'cmd_vel'
-_KINDS: dict[str, type] = {
+KINDS: dict[str, type] = {
     'geometry_msgs/msg/Twist': Twist,
     'geometry_msgs/msg/TwistStamped': TwistStamped,
 }
@@ -63,11 +63,6 @@ class VelocityPublisher:
     def is_interrupted(self) -> bool:
         """Whether the watchdog has stopped the robot since the last command."""
         return bool(self._interruption)
-
-    @property
-    def subscribers(self) -> int:
-        """Number of subscriptions that receive the commands."""
-        return int(self._publisher.get_subscription_count())
 
     def stop(self) -> None:
         """Publish a stop, the last command, and wait until it is received.
@@ -134,7 +129,7 @@ class VelocitySubscription:
 
     def _subscribe(self) -> object:
         return self._node.create_subscription(
-            _KINDS[self._kind], self._topic, self._on_message, qos.STREAM
+            KINDS[self._kind], self._topic, self._on_message, qos.STREAM
         )
 
     def _on_message(self, message: Twist | TwistStamped) -> None:
@@ -147,7 +142,7 @@ class VelocitySubscription:
         return {info.topic_type for info in self._node.get_publishers_info_by_topic(name)}
 
     def _follow_publishers(self) -> None:
-        published = self._published_types().intersection(_KINDS)
+        published = self._published_types().intersection(KINDS)
         if not published or self._kind in published:
             return
         self._node.destroy_subscription(self._subscription)
