@@ -202,13 +202,24 @@ def test_what_somebody_else_commands_is_no_creeping():
     base = Base()
     base.drive(3.0)
     base.executed = lambda v, w: (0.8, 0.5)
-    for _ in range(100):
-        base.supervisor.add_unheard_command(base.now_s)
-        assert base.drive(0.1) == ('', None)
+    base.supervisor.set_unheard(base.now_s, True)
+    assert base.drive(10.0) == ('', None)
+    base.supervisor.set_unheard(base.now_s, False)
     base.executed = lambda v, w: (v, w)
     assert base.drive(10.0) == ('', None)
     base.executed = lambda v, w: (0.15, 0.0)
     assert base.drive(5.0)[0]
+
+
+def test_a_command_that_somebody_left_standing_is_creeping():
+    base = Base()
+    base.drive(3.0)
+    base.supervisor.set_unheard(base.now_s, True)
+    base.executed = lambda v, w: (0.1, 0.0)
+    assert base.drive(2.0) == ('', None)
+    base.supervisor.set_unheard(base.now_s, False)
+    fault, after_s = base.drive(8.0)
+    assert fault.endswith('and is told to stand') and after_s < 5.0
 
 
 def test_before_the_first_command_nothing_is_known():

@@ -36,9 +36,7 @@ class Driven:
     def step(self, count=1):
         """Commands of the next control periods, of which the robot obeys each."""
         for _ in range(count):
-            self.now_ns += STEP_NS
-            clock = self.node.get_clock()
-            clock.set_ros_time_override(Time(nanoseconds=self.now_ns, clock_type=clock.clock_type))
+            self._pass_time()
             self._publish()
             command = self.node._command()
             if command is not None:
@@ -46,6 +44,18 @@ class Driven:
                 moved = (self.fast * command.v * CONTROL_PERIOD_S, command.w * CONTROL_PERIOD_S)
                 self.T = after_arc(self.T, *moved)
         return command
+
+    def creep(self, seconds, v):
+        """Let the base move at v m/s, whatever it was told."""
+        for _ in range(round(seconds / CONTROL_PERIOD_S)):
+            self._pass_time()
+            self.T = after_arc(self.T, v * CONTROL_PERIOD_S, 0.0)
+            self._publish()
+
+    def _pass_time(self):
+        self.now_ns += STEP_NS
+        clock = self.node.get_clock()
+        clock.set_ros_time_override(Time(nanoseconds=self.now_ns, clock_type=clock.clock_type))
 
     def _publish(self):
         T = self.T
@@ -181,3 +191,41 @@ def test_the_motion_of_a_base_that_others_drive_too_is_nobodys_fault(driven, oth
     driven.fast = 4.0
     driven.step(30)
     assert diagnose(driven)[0] != ERROR
+
+
+def commands_of_idle(driven, other, heard):
+    """Commands of the next two seconds without a goal."""
+    known = -1
+    while len(heard) > known:
+        known = len(heard)
+        rclpy.spin_once(other, timeout_sec=0.1)
+    heard.clear()
+    for _ in range(20):
+        driven.node._control()
+        rclpy.spin_once(other, timeout_sec=0.05)
+    return [(command.linear.x, command.angular.z) for command in heard]
+
+
+def test_a_base_that_is_discovered_is_told_to_stand_and_one_that_creeps_as_long_as_it_does(
+    driven, other
+):
+    heard = []
+    assert other.create_subscription(Twist, 'cmd_vel', heard.append, 10)
+    told = commands_of_idle(driven, other, heard)
+    assert 0 < len(told) <= 10 and set(told) == {(0.0, 0.0)}
+    assert not commands_of_idle(driven, other, heard)
+    driven.step(50)
+    driven.node._output.command(0.0, 0.0)
+    driven.creep(4.0, 0.0)
+    assert diagnose(driven)[0] != ERROR
+    driven.creep(3.0, 0.15)
+    level, message = diagnose(driven)
+    assert level == ERROR
+    assert message.startswith('the base moves at 0.1') and message.endswith(
+        ', and is told to stand'
+    )
+    told = commands_of_idle(driven, other, heard)
+    assert len(told) > 10 and set(told) == {(0.0, 0.0)}
+    driven.creep(3.0, 0.0)
+    assert diagnose(driven)[0] != ERROR
+    assert not commands_of_idle(driven, other, heard)

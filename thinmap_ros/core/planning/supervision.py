@@ -66,7 +66,7 @@ class _Motion(NamedTuple):
     def exceeds(self, lever_m: float) -> bool:
         """Whether it is more than was commanded, with turns at a lever."""
         way_m = max(self.way_m, lever_m * self.turn)
-        return way_m > _TOLERANCE * self.allowed_m + _SLACK_M
+        return way_m > max(_TOLERANCE * self.allowed_m, self.allowed_m + _SLACK_M)
 
     def words(self, lever_m: float, is_to_stand: bool) -> str:
         """What is wrong with it."""
@@ -111,6 +111,7 @@ class BaseSupervisor:
         self.is_fast = False
         self._limits = _Limits.of(config)
         self._speed_m_s: float | None = None  # commanded last; None: nothing yet
+        self._is_unheard = False
         self._earlier: deque[_Command] = deque()
         self._last: tuple[float, Array] | None = None
         self._steps: deque[_Step] = deque()
@@ -128,11 +129,24 @@ class BaseSupervisor:
 
     def add_command(self, now_s: float, v: float, w: float) -> None:
         """Add a command, v m/s, w rad/s, at a time that does not jump."""
-        self._set_speed(now_s, abs(v) + self._limits.lever_m * abs(w))
+        speed_m_s = abs(v) + self._limits.lever_m * abs(w)
+        if self._speed_m_s == speed_m_s:
+            return
+        if self._speed_m_s:
+            self._earlier.append(_Command(self._speed_m_s, now_s))
+        self._speed_m_s = speed_m_s
 
-    def add_unheard_command(self, now_s: float) -> None:
-        """Somebody else commands the base: any speed may have been commanded."""
-        self._set_speed(now_s, _ANY_SPEED_M_S)
+    def set_unheard(self, now_s: float, is_unheard: bool) -> None:
+        """Whether somebody else may command the base now: any speed is allowed.
+
+        At the end of that, the speed that it has then.
+        """
+        if self._is_unheard and not is_unheard and self._steps:
+            since_s = self._steps[-1].at_s - _WINDOWS_S[0]
+            recent = [step for step in self._steps if step.at_s > since_s]
+            fastest = max(self._step_m(step) / step.dt_s for step in recent)
+            self._earlier.append(_Command(min(fastest, _ANY_SPEED_M_S), now_s))
+        self._is_unheard = is_unheard
 
     def add_odometry(self, now_s: float, stamp_ns: int, T_odom_base: Array) -> None:
         """Add a sample, T_odom_base (3,), that is received now; compare."""
@@ -155,16 +169,11 @@ class BaseSupervisor:
             # What was commanded so long ago does not act any more.
             self._forget(now_s - self._limits.latency_s)
 
-    def _set_speed(self, now_s: float, speed_m_s: float) -> None:
-        if self._speed_m_s == speed_m_s:
-            return
-        if self._speed_m_s:
-            self._earlier.append(_Command(self._speed_m_s, now_s))
-        self._speed_m_s = speed_m_s
-
     def _commanded(self, now_s: float) -> float:
         """Highest speed that may still be due to a command, m/s."""
         assert self._speed_m_s is not None
+        if self._is_unheard:
+            return _ANY_SPEED_M_S
         braking = self._limits.braking_m_s2
         acts_s = now_s - self._limits.latency_s
         fastest = max((each.speed_m_s for each in self._earlier), default=0.0)

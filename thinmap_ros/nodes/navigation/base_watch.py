@@ -61,9 +61,9 @@ class BaseWatch:
 
     def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         """Add a sample of the odometry, T_odom_base (3,)."""
-        if not self._is_behind and not self.is_obeyed:
-            self._supervisor.add_unheard_command(self._now_s())
-        self._supervisor.add_odometry(self._now_s(), stamp_ns, T_odom_base)
+        now_s = self._node.elapsed_time.now_s()
+        self._supervisor.set_unheard(now_s, not (self._is_behind or self.is_obeyed))
+        self._supervisor.add_odometry(now_s, stamp_ns, T_odom_base)
 
     @property
     def subscribers(self) -> int:
@@ -76,7 +76,4 @@ class BaseWatch:
         return self.subscribers > 0 and int(self._node.count_publishers(self._own_topic)) == 1
 
     def _add_command(self, v: float, w: float) -> None:
-        self._supervisor.add_command(self._now_s(), v, w)
-
-    def _now_s(self) -> float:
-        return self._node.elapsed_time.now_s()
+        self._supervisor.add_command(self._node.elapsed_time.now_s(), v, w)
