@@ -200,7 +200,8 @@ class NavigatorNode(ThinmapNode):
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         self._robot.add_odometry(stamp_ns, T_odom_base)
-        self._output.base.add_odometry(stamp_ns, T_odom_base)
+        if not self._robot.odometry_fault:
+            self._output.base.add_odometry(stamp_ns, T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from_msg(message.pose.pose)

@@ -29,6 +29,7 @@ class Driven:
         self.silent = set()
         self.poses = 1
         self.fast = 1.0
+        self.late_ns = 0
         self.T = np.zeros(3)
         node._map._on_map(messages.grid_from_msg(empty_hall()))
         node._drive_to((pose(4.0, 0.0, 0.0),))
@@ -61,7 +62,7 @@ class Driven:
         T = self.T
         if 'odometry' not in self.silent:
             frames = ('odom', 'base_link')
-            odometry = messages.odometry_msg(T, (0.0, 0.0), frames, self.now_ns)
+            odometry = messages.odometry_msg(T, (0.0, 0.0), frames, self.now_ns - self.late_ns)
             self.node._odometry._on_odometry(odometry)
         if 'laser' not in self.silent:
             noise = 0.01 * np.random.default_rng(self.now_ns).standard_normal(61)
@@ -229,3 +230,15 @@ def test_a_base_that_is_discovered_is_told_to_stand_and_one_that_creeps_as_long_
     driven.creep(3.0, 0.0)
     assert diagnose(driven)[0] != ERROR
     assert not commands_of_idle(driven, other, heard)
+
+
+def test_motion_that_odometry_reports_late_is_no_creeping(driven, other):
+    assert other.create_subscription(Twist, 'cmd_vel', print, 1)
+    driven.step(20)
+    driven.node._output.command(0.0, 0.0)
+    driven.silent = {'odometry'}
+    driven.creep(4.0, 0.0)
+    driven.silent = set()
+    driven.late_ns = 4 * 10**9
+    driven.creep(4.0, 0.15)
+    assert diagnose(driven)[0] != ERROR

@@ -69,6 +69,11 @@ class RobotState:
             self._scan_offset_ns = self._offset_ns(scan.stamp_ns)
             self._record('laser', scan.stamp_ns)
 
+    @property
+    def odometry_fault(self) -> str:
+        """Why the odometry is not that of now; '' for no reason."""
+        return self._streams['odometry'].fault(self._time.now_ns())
+
     def has_two_localizers(self) -> bool:
         """Whether poses come from two sources."""
         return self._streams['localizer'].is_mixed(self._time.now_ns())
