@@ -227,11 +227,3 @@ def test_before_the_first_command_nothing_is_known():
     for k in range(100):
         supervisor.add_odometry(0.1 * k, 10**8 * k, np.array([0.1 * k, 0.0, 0.0]))
     assert not supervisor.fault
-
-
-@pytest.mark.parametrize('slowly', [0.1, 4.0])
-def test_a_simulation_in_its_own_time_is_as_any_other(slowly):
-    """All times are of the simulation: how long it takes does not matter."""
-    base = Base(20.0 * slowly if slowly < 1 else 20.0)
-    assert base.drive(5.0, 0.4) == ('', None)
-    assert base.drive(5.0) == ('', None)
