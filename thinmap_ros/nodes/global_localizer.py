@@ -41,6 +41,7 @@ from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
 from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.tf.odometry_source import OdometrySource
 from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
@@ -149,6 +150,7 @@ class _SearchDriver:
         self._time = time
         self._velocity = velocity
         self._is_driving = False
+        self._is_held = False
         self.reset()
 
     def reset(self) -> None:
@@ -181,9 +183,16 @@ class _SearchDriver:
         if self.search is not None:
             self.search.take(result, T_odom_base)
 
+    def hold(self, stop: StopTopic) -> None:
+        """Stand while the stop has a reason."""
+        self._is_held = bool(stop.reason)
+        self.stop()
+        if self._velocity is not None:
+            self._velocity.hold(self._is_held)
+
     def step(self) -> None:
         """Publish the next command, or stop while inputs are missing or too old."""
-        if self.search is None or self._scan is None or self._T_odom_base is None:
+        if self._is_held or self.search is None or self._scan is None or self._T_odom_base is None:
             self.stop()
             return
         if not self._is_recent(self._scan.stamp_ns):
@@ -309,7 +318,9 @@ class GlobalLocalizerNode(ThinmapNode):
         base_frame = self._laser_transform.base_frame
         velocity = VelocityPublisher(self, base_frame, self._settings.stamped_commands)
         self.create_active_timer(CONTROL_PERIOD_S, lambda: self._driver.step())
-        return _SearchDriver(self.elapsed_time, velocity)
+        driver = _SearchDriver(self.elapsed_time, velocity)
+        StopTopic(self, driver.hold)
+        return driver
 
     def reset_state(self) -> None:
         """Discard the search and all inputs but the map."""

@@ -24,7 +24,6 @@ from thinmap_ros.nodes.navigation.base_watch import BaseWatch
 from thinmap_ros.nodes.navigation.map_input import MapInput, MapTimeoutConfig
 from thinmap_ros.nodes.navigation.robot_state import RobotState
 from thinmap_ros.nodes.navigation.tasks import (
-    STOPPED,
     ErrorCode,
     NavigationTask,
     TaskReader,
@@ -35,7 +34,7 @@ from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.stop_topic import subscribe_to_stop
+from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.tf.odometry_source import OdometrySource
 from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
@@ -72,6 +71,8 @@ class _NavigatorPublishers:
         self._velocity = VelocityPublisher(node, base_frame, declare_stamped(node))
         self._plan = node.create_publisher(Path, 'plan', qos.LATCHED)
         self._published_path: Array | None = None
+        self.is_moving = False  # by the last command
+        self._stop_topic: StopTopic | None = None
 
     @property
     def is_interrupted(self) -> bool:
@@ -80,6 +81,7 @@ class _NavigatorPublishers:
     def command(self, v: float, w: float) -> None:
         self._velocity.publish(v, w)
         self.base.add_sent(v, w)
+        self.is_moving = v != 0.0 or w != 0.0
 
     def stand(self) -> None:
         """Without a goal, tell to stand who has just subscribed, and a base that moves."""
@@ -90,6 +92,18 @@ class _NavigatorPublishers:
         if self._stops > 0 or self.base.is_creeping:
             self._stops -= self._stops > 0
             self.command(0.0, 0.0)
+
+    def add_stop(self, topic: StopTopic) -> None:
+        """Protective stops are published on a topic."""
+        self._stop_topic = topic
+
+    def protect(self) -> None:
+        """Begin a protective stop, which lasts until it is released."""
+        assert self._stop_topic is not None
+        self._stop_topic.hold()
+
+    def hold(self, is_held: bool) -> None:
+        self._velocity.hold(is_held)
 
     def stop(self) -> None:
         self._velocity.stop()
@@ -108,8 +122,9 @@ class NavigatorNode(ThinmapNode):
     Actions navigate_to_pose and navigate_through_poses, as Nav2's: one goal at a time, a newer one
     replaces it. /goal_pose sends a goal to navigate_to_pose. Goals in other frames than the map's
     are transformed when they arrive. Where somebody publishes /topology, distant goals are planned
-    on it. While /stop is true, the robot stands, and all goals are aborted. It does not drive into
-    areas of /keep_out, and aborts goals inside; a robot that is in one may leave it.
+    on it. While any publisher of /stop says true, or is gone after it did, the robot stands, and
+    all goals are aborted: ~/release_stop. It does not drive into areas of /keep_out, and aborts
+    goals inside; a robot that is in one may leave it.
 
     With team: true it plans over the ground that the other robots of /team/tiles know, too, and
     gives way to those of /team/claims.
@@ -140,7 +155,6 @@ class NavigatorNode(ThinmapNode):
         subscribe_guarded(self, KeepOut, 'keep_out', self._on_keep_out, qos.LATCHED)
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, PoseStamped, 'goal_pose', self._on_goal_pose, qos.STREAM)
-        subscribe_to_stop(self, self._on_stop)
         self._goals = SingleGoalServer(
             self,
             NavigateToPose,
@@ -155,6 +169,7 @@ class NavigatorNode(ThinmapNode):
         # As in Nav2, a goal from RViz is one of the action: its status is public.
         self._own_client = ActionClient(self, NavigateToPose, 'navigate_to_pose')
         self._check_inputs()
+        self._output.add_stop(StopTopic(self, self._on_stop))
         self.create_active_timer(CONTROL_PERIOD_S, self._control)
 
     def _check_inputs(self) -> None:
@@ -235,12 +250,13 @@ class NavigatorNode(ThinmapNode):
         except InputError as error:
             self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, str(error))
 
-    def _on_stop(self, is_stopped: bool) -> None:
-        if self._tasks.is_stopped and not is_stopped:
+    def _on_stop(self, stop: StopTopic) -> None:
+        if self._tasks.stop_reason and not stop.reason:
             self._output.base.release()
-        self._tasks.is_stopped = is_stopped
-        if is_stopped:
-            self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, STOPPED)
+        self._tasks.stop_reason = stop.reason
+        self._output.hold(bool(stop.reason))
+        if stop.reason:
+            self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, stop.reason)
         else:
             self.diagnostics.set_state(OK, 'released')
 
@@ -296,11 +312,7 @@ class NavigatorNode(ThinmapNode):
         None before all inputs are received.
         """
         if fault := self._robot.stop_reason() or self._map.fault or self.diagnostics.error:
-            reason = f'{fault}: standing still'
-            self.get_logger().warning(reason, throttle_duration_sec=WARN_PERIOD_S)
-            self.diagnostics.set_state(WARN, reason)
-            self._navigator.reset_velocity()
-            return Command(0.0, 0.0, 'blocked', reason)
+            return self._stand(fault)
         patch = self._map.patch
         scan = self._robot.scan
         T_map_base = self._robot.pose()
@@ -315,6 +327,17 @@ class NavigatorNode(ThinmapNode):
             patch = self._map.keep_out.laid_on(self._team.completed(patch), T_map_base)
             command = self._navigator.step(T_map_base, patch, scan, CONTROL_PERIOD_S)
             return self._team.allowed(self._navigator, T_map_base, command, CONTROL_PERIOD_S)
+
+    def _stand(self, fault: str) -> Command:
+        """The command of a protective stop; a robot that stands waits in any case."""
+        reason = f'{fault}: standing still'
+        self.get_logger().warning(reason, throttle_duration_sec=WARN_PERIOD_S)
+        self.diagnostics.set_state(WARN, reason)
+        self._navigator.reset_velocity()
+        if self._config.resume_after_stop or not self._output.is_moving:
+            return Command(0.0, 0.0, 'blocked', reason)
+        self._output.protect()
+        return Command(0.0, 0.0, 'failed', f'{reason} until it is released: ~/release_stop')
 
     def _publish_feedback(self, speed_m_s: float) -> None:
         """Publish feedback; current_pose has no frame while the pose is unknown."""

@@ -30,7 +30,6 @@ from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.stop_topic import subscribe_to_stop
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.web import access, links, server
 from thinmap_ros.web.board import Board
@@ -131,7 +130,6 @@ class WebNode(ThinmapNode):
         )
         subscribe_guarded(self, LocalizedScan, 'localized_scan', picture.localized_scan, qos.STREAM)
         subscribe_guarded(self, DiagnosticArray, '/diagnostics', picture.diagnostics, qos.STREAM)
-        subscribe_to_stop(self, self._steering.stop_heard)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from_msg(message.pose.pose)

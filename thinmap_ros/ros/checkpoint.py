@@ -26,11 +26,16 @@ class Checkpoint:
     belongs to this user alone and is no link; otherwise no checkpoint is saved, with a warning.
     """
 
-    def __init__(self, node: Node, limit_s: float, ending: str = '.npz') -> None:
-        """limit_s: age up to which a checkpoint is loaded, s; 0: no checkpoints."""
+    def __init__(
+        self, node: Node, limit_s: float, ending: str = '.npz', owner: str | None = None
+    ) -> None:
+        """limit_s: age up to which a checkpoint is loaded, s; 0: no checkpoints.
+
+        owner: full name of what it is the state of, where that is not the node.
+        """
         self._limit_s = limit_s
         self._node = node
-        name = node.get_fully_qualified_name().strip('/').replace('/', '.')
+        name = (owner or node.get_fully_qualified_name()).strip('/').replace('/', '.')
         file_name = f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}{ending}'
         self._path: Path | None = None
         if limit_s <= 0.0:

@@ -319,18 +319,32 @@ class NodeDiagnostics:
         return next((each.fault for each in self._checks if each.level == ERROR and each.fault), '')
 
     def check_sole_publisher(
-        self, topic: str, level: bytes = ERROR, is_heard: Callable[[], bool] = lambda: True
+        self,
+        topic: str,
+        level: bytes = ERROR,
+        is_heard: Callable[[], bool] = lambda: True,
+        partners: str | None = None,
     ) -> None:
         """Report at a level that several nodes publish a topic, an output or an input.
 
         is_heard: whether several do so now; a node that was killed is still known for a while.
+        partners: topic whose publishers may publish this one, too.
         """
         name = self._node.resolve_topic_name(topic)
+        own = self._node.get_fully_qualified_name()
+
+        def allowed() -> set[str]:
+            if partners is None:
+                return set()
+            return {*publisher_names(self._node, self._node.resolve_topic_name(partners))} - {own}
 
         def rivals() -> str:
             if self._node.count_publishers(name) < 2 or not is_heard():
                 return ''
-            nodes = publisher_names(self._node, name)
+            others = allowed()
+            nodes = [each for each in publisher_names(self._node, name) if each not in others]
+            if len(nodes) < 2:
+                return ''
             return f'{len(nodes)} nodes publish {name}: {", ".join(nodes)}: stop all but one'
 
         self.add_check(level, rivals)

@@ -14,6 +14,8 @@ from support.doctor import Doctor
 from support.halls import AT_START, START
 from support.peers.still_robot import StillRobot
 
+from thinmap_msgs.msg import SlamStatus
+from thinmap_msgs.srv import ReleaseStop
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -215,6 +217,26 @@ def test_goal_pose_of_rviz_is_a_goal_of_the_action(client):
     publisher.publish(pose_at(2.0, 2.0, 'moon'))
     graph.until(lambda: doctor.number('navigator', 'goal_pose: rejected') == 1, 'it is counted')
     assert "goal_pose: frame 'moon'" in graph.log('navigator')
+
+
+def test_after_a_protective_stop_it_drives_on_only_when_it_is_told_to(graph):
+    graph.start('navigator', laser_pose='0,0,0', resume_after_stop=False)
+    StillRobot(graph)
+    client = Client(graph)
+    states = graph.node.create_publisher(SlamStatus, 'slam_status', 10)
+    first = client.to(-3.0, -3.0)
+    graph.until(lambda: any(abs(c.angular.z) > 0.1 for c in client.commands), 'it turns')
+    states.publish(SlamStatus(state=SlamStatus.LOST))
+    status, _, reason = client.ended(first)
+    assert status == GoalStatus.STATUS_ABORTED
+    assert 'lost' in reason and reason.endswith('until it is released: ~/release_stop')
+    states.publish(SlamStatus(state=SlamStatus.TRACKING))
+    _, _, reason = client.ended(client.to(-2.0, -2.0))
+    assert reason == 'goal: the robot is stopped: /stop: /navigator'
+    answer = graph.call(ReleaseStop, 'navigator/release_stop', ReleaseStop.Request())
+    assert answer.success and answer.message == 'released: /navigator'
+    client.to(-2.0, -2.0)
+    client.drives_to(-2.0, -2.0)
 
 
 @pytest.mark.parametrize('is_stamped', [False, True])

@@ -2,9 +2,13 @@
 
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.executors import SingleThreadedExecutor
+from std_msgs.msg import Bool
 from support.live_graph import graph as graph
 
+from thinmap_ros.ros import messages
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.velocity.commands import TOPIC, VelocityPublisher
 
@@ -44,3 +48,60 @@ def test_stamped_commands_have_the_frame_of_the_robot(driver, graph):
     assert commands[0].header.frame_id == 'base_footprint'
     assert commands[0].header.stamp.sec > 0
     assert commands[0].twist.linear.x == 0.3
+
+
+def spun(node):
+    """A function that does what a node has to do now, and returns False."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    return lambda: executor.spin_once(timeout_sec=0.0)
+
+
+def test_the_type_is_that_of_the_base_whenever_it_comes(driver, graph):
+    spin = spun(driver)
+    velocity = VelocityPublisher(driver, 'base_link', is_stamped=False)
+    velocity.hold(True)
+    commands = graph.heard(TOPIC, TwistStamped)
+    graph.until(lambda: spin() or velocity.publish(0.3, 0.0) or commands, 'a stamped command')
+    velocity.stop()
+
+
+def test_while_it_is_held_each_motion_of_another_is_answered_and_named(driver, graph):
+    spin = spun(driver)
+    reports = graph.heard('/diagnostics', DiagnosticArray)
+    velocity = VelocityPublisher(driver, 'base_link', is_stamped=False)
+    commands = graph.heard(TOPIC, Twist)
+    peer = graph.node.create_publisher(Twist, TOPIC, 10)
+    graph.until(lambda: peer.get_subscription_count() == 1, 'the base')
+    velocity.hold(True)
+    graph.until(lambda: peer.get_subscription_count() == 2, 'its guard')
+    for k in range(20):
+        peer.publish(messages.twist_msg(0.0, 1.0))
+        graph.until(lambda k=k: spin() or len(commands) == 2 * k + 2, 'an answer')
+        assert commands[-1] == Twist()
+
+    def is_named():
+        spin()
+        peer.publish(messages.twist_msg(0.0, 1.0))
+        return reports and 'test_client drives the stopped' in reports[-1].status[0].message
+
+    graph.until(is_named, 'who drives')
+    velocity.hold(False)
+    graph.until(lambda: spin() or peer.get_subscription_count() == 1, 'no guard')
+    velocity.stop()
+
+
+def test_a_page_beside_the_navigator_is_no_rival(driver, graph):
+    spin = spun(driver)
+    reports = graph.heard('/diagnostics', DiagnosticArray)
+    velocity = VelocityPublisher(driver, 'base_link', is_stamped=False)
+    graph.node.create_publisher(Twist, TOPIC, 10)
+
+    def says(words):
+        spin()
+        return reports and words in reports[-1].status[0].message
+
+    graph.until(lambda: says('2 nodes publish /cmd_vel'), 'a rival')
+    graph.node.create_publisher(Bool, 'stop', 1)
+    graph.until(lambda: says('running'), 'a node that can stop the robot is none')
+    velocity.stop()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.config import SAFE_HIGHER, Config, parameter, part
+from thinmap_ros.core.config import SAFE_HIGHER, SAFE_LOWER, Config, parameter, part
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.long_path import LONG_PATH_M, Band, route_band
 from thinmap_ros.core.planning.obstacle_points import ObstaclePoints
@@ -93,6 +93,13 @@ class NavigatorConfig(Config):
         'Time at standstill after which the goal is aborted (s). Raise it where people step aside.',
         low=0.1,
         high=1000.0,
+    )
+    resume_after_stop: bool = parameter(
+        True,
+        'Whether the robot drives on to its goal when the cause of a protective stop is over: a '
+        'silent sensor, a lost pose, a failed map. false: the goal is aborted, and the robot is '
+        'stopped until ~/release_stop. A stop for an obstacle is none: the path is planned anew.',
+        safe=SAFE_LOWER,
     )
     check_ahead_m: float = 4.0  # of the path, for obstacles in a new map
     scan_obstacle_range_m: float = 2.5  # nearer scan points are obstacles, beside those of the map

@@ -19,7 +19,6 @@ from thinmap_ros.ros.action_server import InvalidGoalError
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.tf.transform_listener import TransformListener
 
-STOPPED = 'the robot is stopped: topic stop'
 _MAX_POSES = 10_000
 _LOOKUP_STEP_NS = 20_000_000
 
@@ -57,12 +56,12 @@ class _TransformError(InputError):
 class TaskReader:
     """Reads goals in any frame that is connected to the map by transforms.
 
-    is_stopped: whether it refuses all of them.
+    stop_reason: why it refuses all of them, '' if it does not.
     """
 
     def __init__(self, node: ThinmapNode, map_frame: str, map_input: MapInput) -> None:
         """Declare the parameter `transform_tolerance`; map_input: has the keep-out areas."""
-        self.is_stopped = False
+        self.stop_reason = ''
         self._node = node
         self._map_frame = map_frame
         self._map = map_input
@@ -133,8 +132,8 @@ class TaskReader:
             logger.warning(f'behavior_tree {quoted(request.behavior_tree)} ignored: there is none')
         start_ns = self._node.elapsed_time.now_ns()
         try:
-            if self.is_stopped:
-                raise InputError(STOPPED)
+            if self.stop_reason:
+                raise InputError(self.stop_reason)
             task = NavigationTask(action, poses(), start_ns)
             self.require_open(task.poses)
             return task

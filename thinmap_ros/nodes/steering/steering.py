@@ -22,8 +22,9 @@ from thinmap_ros.nodes.steering.node_queue import NodeQueue
 from thinmap_ros.nodes.steering.session_merge import SessionMerge
 from thinmap_ros.nodes.steering.tasks import RobotTasks
 from thinmap_ros.nodes.steering.teleoperation import Teleoperation
-from thinmap_ros.ros import messages, qos, stop_topic
+from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.web.picture import Picture
 from thinmap_ros.web.requests import Request
 
@@ -56,11 +57,22 @@ class TopSpeeds:
 
 
 class Hold:
-    """Whether the robot is held, and by which stop: a page ends the one that it shows."""
+    """Whether the robot is held, and by which stop: a page ends the one that it shows.
+
+    topic: where the pages and others stop the robot.
+    """
+
+    topic: StopTopic
 
     def __init__(self) -> None:
-        self.is_on = False
+        self._is_own = False  # of a page
+        self._is_others = False
         self._stops = 0
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the robot is held."""
+        return self._is_own or self._is_others
 
     @property
     def number(self) -> int:
@@ -70,13 +82,19 @@ class Hold:
     def begin(self) -> None:
         """Hold the robot; one that is held, by a later stop."""
         self._stops += 1
-        self.is_on = True
+        self._is_own = True
 
     def end(self, stop: int) -> None:
-        """End a stop. Raises InputError where there was a later one."""
+        """End the stop of a page. Raises InputError where there was a later one."""
         if self.is_on and stop != self._stops:
             raise InputError('release: the robot was stopped again')
-        self.is_on = False
+        self._is_own = False
+
+    def set_by_others(self, is_stopped: bool) -> None:
+        """Whether another node stops the robot: no page ends that."""
+        if is_stopped and not self.is_on:
+            self._stops += 1
+        self._is_others = is_stopped
 
 
 class Steering:
@@ -98,7 +116,6 @@ class Steering:
         self._drive = Teleoperation(node, base_frame)
         self._tasks = RobotTasks(node, self._map_frame, self.tell, self._show_goal)
         self._publishers = {
-            stop_topic.TOPIC: node.create_publisher(Bool, stop_topic.TOPIC, qos.LATCHED),
             _RESUME: node.create_publisher(Bool, _RESUME, qos.STREAM),
             'initialpose': node.create_publisher(
                 PoseWithCovarianceStamped, 'initialpose', qos.STREAM
@@ -116,6 +133,8 @@ class Steering:
         self._later = NodeQueue(node, self.tell).put
         self._news = 0
         self._show_held()
+        self._held.topic = StopTopic(node, self._stop_changed)
+        self._held.topic.prepare()
 
     # In the server's thread.
 
@@ -141,15 +160,15 @@ class Steering:
     def stop(self) -> None:
         """Stop the robot, and hold it: it is published, and no goal is followed."""
         self._held.begin()
-        self._publishers[stop_topic.TOPIC].publish(Bool(data=True))
+        self._held.topic.publish(True)
         self._drive.halt()
         self._later(self._hold)
 
     def _release(self, stop: int) -> None:
         """End a stop, at once as it begins: a queued release could end a later one."""
         self._held.end(stop)
-        self._publishers[stop_topic.TOPIC].publish(Bool(data=False))
-        self._later(self._hold)
+        self._held.topic.publish(False)
+        self._later(self._released)
 
     # In the node's thread.
 
@@ -157,12 +176,6 @@ class Steering:
         """Show what has happened on all pages."""
         self._news += 1
         self._picture.board.put('news', [self._news, news])
-
-    def stop_heard(self, is_stopped: bool) -> None:
-        """Follow a stop that somebody else has published; a page releases the robot."""
-        if is_stopped and not self._held.is_on:
-            self._held.begin()
-            self._hold()
 
     def tick(self) -> None:
         """Keep a robot that is held standing; called ten times a second."""
@@ -176,6 +189,21 @@ class Steering:
         """Stop the robot, if a page drives it, and a merge."""
         self._drive.close()
         self._merge.close()
+
+    def _stop_changed(self, stop: StopTopic) -> None:
+        """Follow what others say; a page's own stop and release hold at once."""
+        was_on = self._held.is_on
+        self._held.set_by_others(bool(stop.others))
+        self._picture.board.put('held_by', stop.reason)
+        if self._held.is_on != was_on:
+            self._hold()
+
+    def _released(self) -> None:
+        """Release, too, what earlier processes of this node have left; not what others say."""
+        self._held.topic.release(self._node.get_fully_qualified_name())
+        if others := self._held.topic.others:
+            self.tell(f'released; still stopped by {others}')
+        self._hold()
 
     def _hold(self) -> None:
         self._tasks.hold(self._held.is_on)

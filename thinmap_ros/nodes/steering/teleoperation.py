@@ -3,21 +3,15 @@
 from threading import Lock
 from time import monotonic
 
-from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.duration import Duration
-from rclpy.publisher import Publisher
-
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.velocity.commands import TOPIC, declare_stamped
+from thinmap_ros.ros.velocity.commands import CommandPublisher, declare_stamped
 from thinmap_ros.ros.velocity.watchdog import CommandTimeout, CommandWatchdog
 
 # With the period of the watchdog, 0.1 s, the robot is stopped 0.3 s after the last request.
 _TIMEOUT_S = 0.2
 # After the last command the publisher stays as long as a stop may need to be received.
 _LINGER_S = 2.0
-_ACKNOWLEDGEMENT_S = 1.0
 
 
 class HoldTimeout(CommandTimeout):
@@ -40,11 +34,8 @@ class Teleoperation:
     """
 
     def __init__(self, node: ThinmapNode, base_frame: str) -> None:
-        self._node = node
-        self._frame = base_frame
-        self._kind = TwistStamped if declare_stamped(node) else Twist
+        self._output = CommandPublisher(node, base_frame, declare_stamped(node))
         self._lock = Lock()
-        self._publisher: Publisher | None = None
         self._sent_s = 0.0
         self._holder: int | None = None
         self._watchdog = CommandWatchdog(self._send, lambda seconds: None, HoldTimeout())
@@ -67,7 +58,7 @@ class Teleoperation:
 
     def drive(self, v: float, w: float) -> None:
         """Publish a velocity, m/s and rad/s; it holds for 0.3 s."""
-        self._open()
+        self._output.open()
         self._watchdog.send(v, w)
 
     def halt(self) -> None:
@@ -76,37 +67,21 @@ class Teleoperation:
 
     def keep_standing(self) -> None:
         """Stop the robot, whatever drives it."""
-        self._open()
+        self._output.hold(True)
         self._watchdog.send(0.0, 0.0)
 
     def tidy(self) -> None:
         """Destroy the publisher when nobody has driven for a while."""
-        with self._lock:
-            if self._publisher is not None and monotonic() - self._sent_s > _LINGER_S:
-                self._node.destroy_publisher(self._publisher)
-                self._publisher = None
+        self._output.hold(False)
+        if monotonic() - self._sent_s > _LINGER_S:
+            self._output.close()
 
     def close(self) -> None:
         """Stop the robot, if somebody drives, and wait until that is received."""
         self._watchdog.close()
         self.halt()
-        with self._lock:
-            if self._publisher is not None:
-                self._publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGEMENT_S))
-
-    def _open(self) -> None:
-        with self._lock:
-            if self._publisher is None:
-                self._publisher = self._node.create_publisher(self._kind, TOPIC, qos.STREAM)
+        self._output.wait_until_received()
 
     def _send(self, v: float, w: float) -> None:
-        with self._lock:
-            if self._publisher is None:
-                return
-            twist = messages.twist_msg(v, w)
-            if self._kind is TwistStamped:
-                header = messages.header(self._frame, self._node.get_clock().now().nanoseconds)
-                self._publisher.publish(TwistStamped(header=header, twist=twist))
-            else:
-                self._publisher.publish(twist)
+        if self._output.send(v, w):
             self._sent_s = monotonic()

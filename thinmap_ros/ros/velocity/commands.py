@@ -1,23 +1,40 @@
 """Velocity commands on cmd_vel, as Twist or TwistStamped: published and received."""
 
+import math
 from collections.abc import Callable
+from threading import Lock
+from time import monotonic
 
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros.diagnostics import WARN, NodeDiagnostics
-from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros import messages, parameters, qos, stop_topic
+from thinmap_ros.ros.diagnostics import (
+    ERROR,
+    WARN,
+    NodeDiagnostics,
+    full_name,
+    publisher_names,
+    subscriber_names,
+)
+from thinmap_ros.ros.lifecycle_node import RCLError, ThinmapNode
 from thinmap_ros.ros.velocity.watchdog import CommandTimeout, CommandWatchdog
 
 TOPIC = 'cmd_vel'
-KINDS: dict[str, type] = {
-    'geometry_msgs/msg/Twist': Twist,
-    'geometry_msgs/msg/TwistStamped': TwistStamped,
-}
+UNSTAMPED = 'geometry_msgs/msg/Twist'
+STAMPED = 'geometry_msgs/msg/TwistStamped'
+KINDS: dict[str, type] = {UNSTAMPED: Twist, STAMPED: TwistStamped}
 _CHECK_PERIOD_S = 0.25
+# Checks after which the type changes: a subscriber that follows the type of the publishers, as the
+# simulated robot, is given the time to do so.
+_MISMATCHES = 4
+_ECHO_S = 0.5  # after a robot is held, motions from before are still received
+_REPORT_S = 2.0  # a report stays so long: diagnostics look once a second
 _ACKNOWLEDGEMENT = Duration(seconds=1.0)
 
 
@@ -28,11 +45,158 @@ def declare_stamped(node: Node) -> bool:
             node,
             'enable_stamped_cmd_vel',
             False,
-            'Type of cmd_vel. true: geometry_msgs/TwistStamped in base_frame, for drivers of '
-            'ros2_control and TurtleBot 4 and beside Nav2 from Kilted on. false: '
-            'geometry_msgs/Twist, as Nav2 in Jazzy.',
+            'Type of cmd_vel while nobody subscribes to it, or to both types. Otherwise it is the '
+            'type of the subscriptions. true: geometry_msgs/TwistStamped in base_frame, as drivers '
+            'of ros2_control and TurtleBot 4, and Nav2 from Kilted on. false: geometry_msgs/Twist, '
+            'as Nav2 in Jazzy.',
         )
     )
+
+
+def base_subscriptions(node: Node) -> list[TopicEndpointInfo]:
+    """Subscriptions to cmd_vel, but of nodes that publish it: they look at each other."""
+    name = node.resolve_topic_name(TOPIC)
+    drivers = publisher_names(node, name)
+    found = node.get_subscriptions_info_by_topic(name)
+    return [info for info in found if full_name(info) not in drivers]
+
+
+class CommandPublisher:
+    """Publishes velocities on cmd_vel, in the type that the base subscribes to.
+
+    DDS allows a process one type for each topic, so the publisher is created again when the base
+    turns out to have the other one. While the robot is held, each motion that another publisher
+    commands is answered with a zero.
+    """
+
+    def __init__(self, node: ThinmapNode, base_frame: str, is_stamped: bool) -> None:
+        """base_frame: frame of stamped commands; is_stamped: type while nobody subscribes."""
+        self._node = node
+        self._frame = base_frame
+        self._preferred = STAMPED if is_stamped else UNSTAMPED
+        self._kind = self._preferred
+        self._lock = Lock()
+        self._is_wanted = False
+        self._publisher: Publisher | None = None
+        self._guard: Subscription | None = None
+        self._mismatches = 0
+        self._held_s = math.inf
+        self._answered_s = -math.inf
+        node.diagnostics.add_check(ERROR, self._fault)
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(_CHECK_PERIOD_S, self._follow_base, clock=wall)
+
+    def open(self) -> None:
+        """Create the publisher, at once or as soon as that is possible; in the node's thread."""
+        self._is_wanted = True
+        if self._publisher is not None:
+            return
+        wanted = self._wanted_kind()
+        others = [] if base_subscriptions(self._node) else list(KINDS.keys() - {wanted})
+        for kind in (wanted, *others):
+            try:
+                publisher = self._node.create_publisher(KINDS[kind], TOPIC, qos.STREAM)
+            except RCLError:
+                continue  # of another node in this process, the other type
+            with self._lock:
+                self._kind = kind
+                self._publisher = publisher
+            return
+
+    def close(self) -> None:
+        """Destroy the publisher; in the node's thread."""
+        self._is_wanted = False
+        self._destroy()
+
+    def send(self, v: float, w: float) -> bool:
+        """Publish a velocity, m/s and rad/s; from any thread. Returns False without a publisher."""
+        twist = messages.twist_msg(v, w)
+        with self._lock:
+            if self._publisher is None:
+                return False
+            if self._kind == UNSTAMPED:
+                self._publisher.publish(twist)
+            else:
+                header = messages.header(self._frame, self._node.get_clock().now().nanoseconds)
+                self._publisher.publish(TwistStamped(header=header, twist=twist))
+            return True
+
+    def wait_until_received(self) -> None:
+        """Wait until all subscribers have received what was sent, at most for a second."""
+        with self._lock:
+            if self._publisher is not None:
+                self._publisher.wait_for_all_acked(_ACKNOWLEDGEMENT)
+
+    def hold(self, is_held: bool) -> None:
+        """Whether the robot is held: motions that others command are answered."""
+        if not is_held:
+            self._held_s = math.inf
+            self._end_guard()
+            return
+        self._held_s = min(self._held_s, monotonic())
+        self.open()
+        if self._guard is None and self._publisher is not None:
+            self._guard = self._node.create_subscription(
+                KINDS[self._kind], TOPIC, self._on_command, qos.SENSOR
+            )
+
+    def _on_command(self, message: Twist | TwistStamped) -> None:
+        twist = message.twist if isinstance(message, TwistStamped) else message
+        if twist == Twist():
+            return
+        self.send(0.0, 0.0)
+        if monotonic() - self._held_s > _ECHO_S:
+            self._answered_s = monotonic()
+
+    def _destroy(self) -> None:
+        self._end_guard()
+        with self._lock:
+            if self._publisher is not None:
+                self._node.destroy_publisher(self._publisher)
+                self._publisher = None
+
+    def _end_guard(self) -> None:
+        if self._guard is not None:
+            self._node.destroy_subscription(self._guard)
+            self._guard = None
+
+    def _wanted_kind(self) -> str:
+        kinds = {info.topic_type for info in base_subscriptions(self._node)}.intersection(KINDS)
+        return self._preferred if not kinds or self._preferred in kinds else kinds.pop()
+
+    def _follow_base(self) -> None:
+        """Change to the type of the base, if it has had the other one for some time."""
+        if not self._is_wanted:
+            return
+        is_other = self._kind != self._wanted_kind() and bool(base_subscriptions(self._node))
+        self._mismatches = self._mismatches + 1 if is_other else 0
+        if self._publisher is not None and self._mismatches >= _MISMATCHES:
+            self._destroy()
+        if self._publisher is None:
+            self.open()
+            self._node.get_logger().info(f'{TOPIC}: published as {self._kind}')
+            if self._held_s < math.inf:
+                self.hold(True)
+
+    def _fault(self) -> str:
+        """Why commands are not received, or who drives a robot that is held; '' for nothing."""
+        if self._is_wanted and self._publisher is None:
+            return (
+                f'{TOPIC}: not published: subscribed to as {self._wanted_kind()}, and another node '
+                'of this process uses the other type'
+            )
+        if monotonic() - self._answered_s > _REPORT_S:
+            return ''
+        name = self._node.resolve_topic_name(TOPIC)
+        obeying = subscriber_names(self._node, self._node.resolve_topic_name(stop_topic.TOPIC))
+        obeying = [*obeying, self._node.get_fully_qualified_name()]
+        names = sorted(set(publisher_names(self._node, name)) - set(obeying))
+        if not names:
+            return ''
+        return (
+            f'{", ".join(names)} drives the stopped robot: {name} has several '
+            'publishers: expected a multiplexer, which alone can hold it (twist_mux)'
+        )
 
 
 class VelocityPublisher:
@@ -43,19 +207,18 @@ class VelocityPublisher:
     """
 
     def __init__(self, node: ThinmapNode, base_frame: str, is_stamped: bool) -> None:
-        """base_frame: frame of stamped commands."""
+        """base_frame: frame of stamped commands; is_stamped: type while nobody subscribes."""
         self._node = node
-        self._frame = base_frame
-        self._is_stamped = is_stamped
-        kind = TwistStamped if is_stamped else Twist
-        self._publisher = node.create_publisher(kind, TOPIC, qos.STREAM)
+        self._output = CommandPublisher(node, base_frame, is_stamped)
+        self._output.open()
         self._interruption = ''
         self._is_moving = False  # as commanded last
         self._watchdog = CommandWatchdog(
             self._send, self._on_interruption, CommandTimeout(node.elapsed_time.is_simulated)
         )
-        # A joystick or Nav2's behaviors may share the topic on purpose.
-        node.diagnostics.check_sole_publisher(TOPIC, WARN)
+        # A joystick or Nav2's behaviors may share the topic on purpose. A page ends what drives
+        # before it publishes, as it publishes the stop.
+        node.diagnostics.check_sole_publisher(TOPIC, WARN, partners=stop_topic.TOPIC)
         node.diagnostics.add_check(WARN, lambda: self._interruption)
         node.add_failure_callback(self._on_failure)
 
@@ -64,6 +227,10 @@ class VelocityPublisher:
         """Whether the watchdog has stopped the robot since the last command."""
         return bool(self._interruption)
 
+    def hold(self, is_held: bool) -> None:
+        """Whether the robot is held: motions that others command are answered with a zero."""
+        self._output.hold(is_held)
+
     def stop(self) -> None:
         """Publish a stop, the last command, and wait until it is received.
 
@@ -71,7 +238,7 @@ class VelocityPublisher:
         """
         self._watchdog.close()
         self.publish(0.0, 0.0)
-        self._publisher.wait_for_all_acked(_ACKNOWLEDGEMENT)
+        self._output.wait_until_received()
 
     def publish(self, v: float, w: float) -> None:
         """Publish a command: v m/s ahead, w rad/s to the left."""
@@ -80,12 +247,7 @@ class VelocityPublisher:
         self._watchdog.send(v, w)
 
     def _send(self, v: float, w: float) -> None:
-        twist = messages.twist_msg(v, w)
-        if not self._is_stamped:
-            self._publisher.publish(twist)
-            return
-        header = messages.header(self._frame, self._node.get_clock().now().nanoseconds)
-        self._publisher.publish(TwistStamped(header=header, twist=twist))
+        self._output.send(v, w)
 
     def _on_failure(self) -> None:
         """Stand until the next command, which begins at rest."""
@@ -120,7 +282,8 @@ class VelocitySubscription:
         self._topic = topic
         self._diagnostics = diagnostics
         self._on_command = on_command
-        self._kind = 'geometry_msgs/msg/Twist'
+        # A publisher in this process has decided the type.
+        self._kind = min(self._published_types().intersection(KINDS), default=UNSTAMPED)
         self._subscription = self._subscribe()
         diagnostics.expect_topic(topic)
         diagnostics.add_check(WARN, self._other_types)

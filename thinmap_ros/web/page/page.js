@@ -90,6 +90,9 @@ const takers = {
     find('stop').classList.toggle('held', isHeld);
     find('release').hidden = !isHeld;
   },
+  held_by: (reason) => {
+    find('held-by').textContent = reason;
+  },
   regions: (regions) => {
     const chosen = find('regions').value;
     find('regions').replaceChildren(...regions.map((region) => new Option(region.name, region.id)));
