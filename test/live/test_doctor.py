@@ -33,20 +33,23 @@ def test_a_robot_that_has_all_is_told_so(graph):
     assert all(line.startswith('✓') for line in said[:-1])
     assert '/scan' in table and '181 beams over 180 degrees' in table
     assert '/clock is published: use_sim_time:=true' in table
+    assert 'geometry_msgs/msg/Twist to /sim; nobody publishes it yet' in table
 
 
 def test_what_a_robot_lacks_is_named_with_what_to_do(graph):
     """Scans under another name, odometry of another type, and no frames."""
     scans = graph.node.create_publisher(LaserScan, 'front/scan', qos.SENSOR)
     wrong = graph.node.create_publisher(LaserScan, 'odom', qos.SENSOR)
-    assert scans and wrong
+    commands = graph.node.create_publisher(Twist, 'cmd_vel', 1)
+    assert scans and wrong and commands
     code, said = lines('--seconds', '2')
     table = '\n'.join(said)
     assert code == 1
     assert '✗ topic /scan' in table and 'no publisher; of its type: /front/scan, /odom' in table
     assert 'type sensor_msgs/msg/LaserScan' in table and 'expected nav_msgs/msg/Odometry' in table
     assert '✗ transform odom -> base_link' in table and 'none; frames: none' in table
-    assert said[-1] == '3 of 5 are wrong'
+    assert '✗ topic /cmd_vel' in table and 'driven; published by /test_client' in table
+    assert said[-1] == '4 of 6 are wrong'
 
 
 def test_a_driver_that_publishes_nothing_is_named(graph):

@@ -16,7 +16,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros import messages, qos, stop_topic
+from thinmap_ros.ros.diagnostics import full_name, publisher_names, subscriber_names
+from thinmap_ros.ros.velocity import commands as velocity
 
 _MAX_DELAY_S = 1.0  # of a stamp against the clock, beyond which clocks differ
 _MIN_RATE_HZ = 2.0
@@ -89,6 +91,7 @@ class RobotCheck:
             laser = self._scans[-1][0].header.frame_id
             advice = 'publish it on /tf_static (robot_state_publisher), or set laser_pose'
             yield self._frame(names.base_frame, laser, 'mount of the laser', advice)
+        yield self._commands()
         yield self._one_map()
         yield self._time()
 
@@ -175,6 +178,28 @@ class RobotCheck:
                 return None
             chain.append(above)
         return chain[::-1]
+
+    def _commands(self) -> Finding:
+        """Who drives the base, in which type, and whether it listens."""
+        node = self._node
+        name = node.resolve_topic_name(velocity.TOPIC)
+        what = f'topic {name}'
+        drivers = sorted(set(publisher_names(node, name)))
+        base = velocity.base_subscriptions(node)
+        by = f'published by {", ".join(drivers)}' if drivers else 'nobody publishes it yet'
+        if not base:
+            advice = f'start the driver of the base, or remap {velocity.TOPIC} to its topic'
+            return Finding(what, not drivers, f'nobody subscribes: cannot be driven; {by}', advice)
+        kinds = sorted({info.topic_type for info in base})
+        names = ', '.join(sorted(set(map(full_name, base))))
+        seen = f'{" and ".join(kinds)} to {names}; {by}'
+        if len(kinds) > 1 or kinds[0] not in velocity.KINDS:
+            return Finding(what, False, seen, f'expected one of {", ".join(velocity.KINDS)}')
+        # Nodes that follow the topic stop share the base on purpose.
+        obeying = subscriber_names(node, node.resolve_topic_name(stop_topic.TOPIC))
+        others = set(drivers) - set(obeying)
+        advice = 'put a multiplexer before the base (twist_mux): a stop cannot hold the others'
+        return Finding(what, not others or len(drivers) == 1, seen, advice)
 
     def _one_map(self) -> Finding:
         names = self._names
