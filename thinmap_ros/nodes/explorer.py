@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+from std_srvs.srv import Trigger
+
 from thinmap_msgs.action import Explore
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.live.mission_state import mission_state, resumed_mission
 from thinmap_ros.core.exploration.mission import (
     Action,
@@ -21,13 +22,14 @@ from thinmap_ros.files.sessions import EXPLORATION
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.exploration.checkpoint_state import ExplorerState
 from thinmap_ros.nodes.exploration.driver import Driver, ForeignDriver
-from thinmap_ros.nodes.exploration.mission_messages import mission_goal_from
 from thinmap_ros.nodes.exploration.mission_publishers import MissionPublishers
 from thinmap_ros.nodes.exploration.navigation_client import NavigationClient
 from thinmap_ros.nodes.exploration.observation_source import ObservationSource, RobotFrames
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
+from thinmap_ros.nodes.exploration.starts import ACTION, Starts
 from thinmap_ros.nodes.exploration.strategy_source import StrategySource
 from thinmap_ros.nodes.exploration.team_member import Progress, declare_team
+from thinmap_ros.nodes.navigation.tasks import STOPPED
 from thinmap_ros.ros import node_main, parameters
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.checkpoint import StateStamp
@@ -35,6 +37,7 @@ from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.stop_topic import subscribe_to_stop
 
 _CHECK_PERIOD_S = 1.0
 
@@ -43,10 +46,11 @@ class ExplorerNode(ThinmapNode):
     """Maps, /topology, /pose or /tf, /scan in; goals of navigate_to_pose, /end_nodes, ... out.
 
     Without thinmap's other nodes, /map and /tf are enough. Areas of /keep_out count as walls. An
-    exploration is started by the action explore, by explore/resume, or by itself. Service
-    save_exploration saves what was learned beside the map and the graph of a session. An explorer
-    that was killed and is started again continues with the exploration, and with the goal of its
-    client, who has to ask again for the result.
+    exploration is always a goal of the action explore, also one that starts by itself. It can be
+    paused and continued by explore/resume; /stop ends it for good, as ~/cancel does, whoever has
+    started it. Service save_exploration saves what was learned beside the map and the graph of a
+    session. An explorer that was killed and is started again continues with the exploration, and
+    with the goal of its client, who has to ask again for the result.
 
     With team: true it shares the unknown area with the other robots of /join_status, by
     /team/claims, and their maps, by /team/tiles.
@@ -70,9 +74,14 @@ class ExplorerNode(ThinmapNode):
             self, self._settings, frames, radius_m, self._on_observation
         )
         self._driver = self._make_driver(frames.map_frame)
+        self._starts = Starts(self)
         self.reset_state()
         self._output = MissionPublishers(self, frames.map_frame, self._on_resume)
-        self._goals = SingleGoalServer(self, Explore, 'explore', self._on_goal, self._on_preempted)
+        self._goals = SingleGoalServer(
+            self, Explore, ACTION, self._start, self._on_preempted, self._starts.read
+        )
+        subscribe_to_stop(self, self._on_stop)
+        self.create_service(Trigger, '~/cancel', self._on_cancel)
         self.create_service(SaveMap, 'save_exploration', self._on_save)
         self.create_active_timer(_CHECK_PERIOD_S, self._on_timer)
         self.enable_checkpoint(self._state, self._restore)
@@ -83,7 +92,7 @@ class ExplorerNode(ThinmapNode):
         self._team.reset()
         strategy = self._strategies.initial(self._session)
         self._mission = self._make_mission(MissionGoal(), strategy, MissionState.IDLE)
-        self._starts_itself = self._settings.autostart_exploration
+        self._starts.reset(self._settings.autostart_exploration)
         self._stamp = StateStamp()
 
     def _state(self) -> State:
@@ -102,7 +111,7 @@ class ExplorerNode(ThinmapNode):
         watchdog = self._source.watchdog
         self._team.attach(strategy)
         self._mission = resumed_mission(state.mission, strategy, watchdog, self._now_s())
-        self._starts_itself &= self._mission.state == MissionState.IDLE
+        self._starts.is_due &= self._mission.state == MissionState.IDLE
         self._stamp.restore(state.latest_ns)
         self._driver.adopt(state.drive_prefix)
         if state.goal_id and self._mission.is_running:
@@ -110,25 +119,24 @@ class ExplorerNode(ThinmapNode):
 
     def stop(self) -> None:
         """End the exploration."""
-        if self._mission.is_running:
-            self._execute(self._mission.cancel('the explorer was stopped or reset'))
+        self._cancel('the explorer was stopped or reset')
+
+    def _cancel(self, reason: str) -> bool:
+        """End the exploration, if there is one; returns whether there was."""
+        is_running = self._mission.is_running
+        if is_running:
+            self._execute(self._mission.cancel(reason))
+        return is_running
 
     def _make_driver(self, map_frame: str) -> Driver:
         if self._settings.drive:
             return NavigationClient(self, self._settings, map_frame, self._on_drive_ended)
         return ForeignDriver(self._on_drive_ended)
 
-    # Goals of the action, and explore/resume.
-
-    def _on_goal(self, message: Explore.Goal) -> None:
-        try:
-            self._start(mission_goal_from(message))
-        except InputError as error:
-            self._start(MissionGoal())
-            self._execute(self._mission.cancel(str(error)))
+    # Goals of the action, stops, and explore/resume.
 
     def _start(self, goal: MissionGoal) -> None:
-        self._starts_itself = False
+        self._starts.is_due = False
         returns = goal.return_to_start or self._settings.return_to_init
         goal = replace(goal, return_to_start=returns)
         strategy = self._strategies.next(self._mission, goal)
@@ -151,15 +159,33 @@ class ExplorerNode(ThinmapNode):
             self._mission.cancel('cancelled' if is_canceled else 'replaced by a newer goal')
         return Explore.Result(status=self._output.status_now(self._mission))
 
+    def _on_stop(self, is_stopped: bool) -> None:
+        self._starts.stop_heard(is_stopped)
+        if is_stopped:
+            self._cancel(STOPPED)
+
+    def _on_cancel(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        def cancel() -> str:
+            was_due = self._starts.is_due
+            self._starts.is_due = False
+            return 'exploration ended' if self._cancel('cancelled') or was_due else 'none to end'
+
+        return fill_response(response, cancel)
+
     def _on_resume(self, is_wanted: bool) -> None:
-        """Pause or continue the exploration; start one where there is none."""
-        if self._mission.is_running:
-            self._mission.is_paused = not is_wanted
-        elif is_wanted:
-            self._start(MissionGoal())
+        """Pause the exploration, or continue one that is paused."""
         if not is_wanted:
-            self._starts_itself = False
+            self._mission.is_paused = self._mission.is_running
+            self._starts.is_paused = self._starts.is_due
             self._driver.cancel()
+        elif self._mission.is_paused or self._starts.is_paused:
+            self._mission.is_paused = self._starts.is_paused = False
+        else:
+            self.get_logger().warning(
+                'explore/resume: no exploration is paused: expected a goal of the action explore '
+                'to start one'
+            )
+            return
         self._output.clear_target()
         self._publish_progress()
 
@@ -172,8 +198,8 @@ class ExplorerNode(ThinmapNode):
             self.reset('the robot was started again, too')
         self._stamp.latest_ns = stamp_ns
         self._team.observed(observation)
-        if self._starts_itself:
-            self._start(MissionGoal())
+        self._starts.send_if_due()
+        self._end_if_cancelled()
         if self._mission.is_running:
             self._driver.robot_moved(observation.T_map_base)
         if not self._mission.is_running:
@@ -194,10 +220,8 @@ class ExplorerNode(ThinmapNode):
         self._execute(self._mission.drive_ended(success, reason))
 
     def _on_timer(self) -> None:
+        self._end_if_cancelled()
         if not self._mission.is_running:
-            return
-        if self._goals.is_cancel_requested:
-            self._execute(self._mission.cancel('cancelled'))
             return
         self._execute(self._mission.check(self._now_s(), self._driver.is_driving))
         if self._mission.is_running:
@@ -205,6 +229,10 @@ class ExplorerNode(ThinmapNode):
             end_nodes = self._output.end_nodes_now(self._mission)
             self._goals.feedback(Explore.Feedback(status=status, end_nodes=end_nodes))
             self._output.frontiers(self._mission)
+
+    def _end_if_cancelled(self) -> None:
+        if self._goals.is_cancel_requested:
+            self._cancel('cancelled')
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:

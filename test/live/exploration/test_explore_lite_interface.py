@@ -8,6 +8,7 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist
 from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid
+from rclpy.action import ActionClient
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Bool, String
 from support.peers.room_robot import AT, RoomRobot, room
@@ -35,6 +36,11 @@ class Listener:
 
     def word_list(self):
         return [message.data for message in self.words]
+
+    def explores(self):
+        """An exploration has begun, with a goal of the action."""
+        self.graph.send_goal(ActionClient(self.graph.node, Explore, 'explore'), Explore.Goal())
+        self.until_word('exploration_in_progress')
 
     def until_word(self, word):
         self.graph.until(lambda: self.words and self.words[-1].data == word, word)
@@ -96,16 +102,19 @@ def test_it_starts_by_itself_pauses_and_returns_while_somebody_else_drives(graph
         'returned_to_origin',
     ]
     assert listener.status[-1].reason_code == ExplorationStatus.ALL_RESOLVED
-    # As in explore_lite, it may be started again.
-    listener.say(True, 'returned_to_origin')
-    graph.until(lambda: listener.word_list()[7:8] == ['exploration_started'], 'a second start')
+    # Nothing is paused any more: no word on explore/resume makes the robot drive.
+    targets = len(robot.targets)
+    listener.resume.publish(Bool(data=True))
+    graph.until(lambda: 'no exploration is paused' in graph.log('explorer'), 'a warning')
+    assert listener.word_list()[7:] == []
+    assert len(robot.targets) == targets
 
 
 def test_frontiers_are_published_and_short_ones_are_not(graph, listener):
     robot = RoomRobot(graph, scans=False)
     robot.patch.cells[1:36, 40] = 100  # leaves an opening of 3 cells, 0.3 m
     graph.start('explorer', **HERE, drive=False, min_frontier_size=0.2, robot_radius_m=0.1)
-    listener.say(True, 'exploration_in_progress')
+    listener.explores()
 
     def points():
         return [
@@ -139,7 +148,7 @@ def test_updates_of_a_costmap_are_processed(graph, listener):
     updates = graph.node.create_publisher(
         OccupancyGridUpdate, 'global_costmap/costmap_updates', qos.STREAM
     )
-    listener.say(True, 'exploration_in_progress')
+    listener.explores()
     graph.until(lambda: robot.targets, 'a target')
     robot.maps = False
     rest = room(60).cells[:, 40:]
@@ -155,7 +164,7 @@ def test_a_map_that_is_not_latched_is_heard(graph, listener):
     graph.node.destroy_publisher(robot.map)
     robot.map = graph.node.create_publisher(OccupancyGrid, 'map', qos.SENSOR)
     graph.start('explorer', **HERE, drive=False)
-    listener.say(True, 'exploration_in_progress')
+    listener.explores()
 
 
 @pytest.mark.slow
@@ -189,7 +198,7 @@ def test_the_robot_stands_still_where_somebody_else_drives(graph, listener):
     robot = RoomRobot(graph)
     graph.start('nav2', package='support.peers', **HERE)
     graph.start('explorer', **HERE, drive=False, progress_timeout=5.0)
-    listener.say(True, 'exploration_in_progress')
+    listener.explores()
     start_ns = robot.time_ns
     graph.until(lambda: robot.time_ns - start_ns > 10e9, 'ten seconds')
     assert not commands

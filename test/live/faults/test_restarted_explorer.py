@@ -7,11 +7,13 @@ import time
 import pytest
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from rclpy.action import ActionClient
-from std_msgs.msg import String
+from std_msgs.msg import Bool, String
+from std_srvs.srv import Trigger
 from support.peers.room_robot import RoomRobot
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
+from thinmap_ros.nodes.navigation.tasks import STOPPED
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -23,7 +25,7 @@ TIME_LIMIT_S = 60.0  # simulated: ten times as fast as the machine's
 class Exploration:
     """A robot that stands in a room, a substitute for Nav2, and an explorer."""
 
-    def __init__(self, graph):
+    def __init__(self, graph, **parameters):
         self.graph = graph
         self.robot = RoomRobot(graph)
         self.status = graph.heard('exploration_status', ExplorationStatus, qos.LATCHED)
@@ -34,18 +36,19 @@ class Exploration:
         self._mode = graph.node.create_publisher(String, 'nav2_mode', qos.LATCHED)
         self._mode.publish(String(data='stall'))
         self.start_nav2()
-        self.start()
+        self.start(**parameters)
 
     def start_nav2(self):
         self.graph.start('nav2', package='support.peers', laser_pose='0,0,0', use_sim_time=True)
 
-    def start(self, recovery_timeout_s=RECOVER_S):
+    def start(self, recovery_timeout_s=RECOVER_S, **parameters):
         self.graph.start(
             'explorer',
             laser_pose='0,0,0',
             use_sim_time=True,
             progress_timeout=0.0,
             recovery_timeout_s=recovery_timeout_s,
+            **parameters,
         )
 
     def kill(self):
@@ -136,3 +139,37 @@ def test_an_ordinary_client_has_feedback_again_can_cancel_and_asks_again_for_the
     exploration.kill()
     exploration.start(recovery_timeout_s=0.0)
     assert graph.result(handle, 'the goal', AGAIN_S).status == GoalStatus.STATUS_UNKNOWN
+
+
+def test_whatever_explores_is_a_goal_that_cancel_and_stop_end_for_good(graph):
+    """One that started by itself, also after a kill: paused, cancelled; then one that is stopped."""
+    stop = graph.node.create_publisher(Bool, 'stop', qos.LATCHED)
+    resume = graph.node.create_publisher(Bool, 'explore/resume', qos.STREAM)
+    own = {'autostart_exploration': True}
+    exploration = Exploration(graph, **own)
+    exploration.until_driving()
+    graph.until(lambda: exploration.explores, 'the status of its own goal')
+    goal, _ = last(exploration.explores)
+    resume.publish(Bool(data=False))
+    graph.until(lambda: exploration.words[-1].data == 'exploration_paused', 'a pause')
+    exploration.kill()
+    exploration.start(**own)
+    graph.until(lambda: exploration.explores, 'the status of the same goal')
+    assert last(exploration.explores) == (goal, GoalStatus.STATUS_EXECUTING)
+    assert graph.call(Trigger, 'explorer/cancel', Trigger.Request()).message == 'exploration ended'
+    graph.until(lambda: last(exploration.explores) == (goal, GoalStatus.STATUS_ABORTED), 'its end')
+    assert graph.call(Trigger, 'explorer/cancel', Trigger.Request()).message == 'none to end'
+    client = ActionClient(graph.node, Explore, 'explore')
+    driven = graph.send_goal(client, Explore.Goal())
+    exploration.until_driving()
+    stop.publish(Bool(data=True))
+    ended = graph.result(driven, 'the goal')
+    assert (ended.status, ended.result.status.reason) == (GoalStatus.STATUS_ABORTED, STOPPED)
+    refused = graph.act(Explore, 'explore', Explore.Goal())
+    assert (refused.status, refused.result.status.reason) == (GoalStatus.STATUS_ABORTED, STOPPED)
+    graph.until(lambda: last(exploration.drives)[1] == GoalStatus.STATUS_CANCELING, 'Nav2 is told')
+    stop.publish(Bool(data=False))
+    resume.publish(Bool(data=True))
+    graph.until(lambda: 'no exploration is paused' in graph.log('explorer'), 'a warning')
+    assert exploration.status[-1].state == ExplorationStatus.FINISHED
+    assert last(exploration.drives)[1] == GoalStatus.STATUS_CANCELING

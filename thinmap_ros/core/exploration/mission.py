@@ -323,4 +323,5 @@ class Mission:
     def _finish(self, end: Finish) -> Finish:
         self.end = end
         self.state = MissionState.FINISHED
+        self.is_paused = False
         return end

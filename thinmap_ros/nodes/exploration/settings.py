@@ -24,8 +24,8 @@ class ExplorationSettings(Config):
     )
     autostart_exploration: bool = parameter(
         False,
-        'Explore as soon as there is a map, as explore_lite does. false: wait for a goal of the '
-        'action explore, or true on explore/resume.',
+        'Explore as soon as there is a map, as explore_lite does, unless the robot is stopped. '
+        'false: wait for a goal of the action explore.',
     )
     return_to_init: bool = parameter(
         False,

@@ -1,0 +1,58 @@
+"""What starts an exploration: always a goal of the action explore, also of the explorer itself."""
+
+from rclpy.action import ActionClient
+from rclpy.node import Node
+
+from thinmap_msgs.action import Explore
+from thinmap_msgs.msg import ExplorationStatus
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.mission import MissionGoal
+from thinmap_ros.nodes.exploration.mission_messages import mission_goal_from
+from thinmap_ros.nodes.navigation.tasks import STOPPED
+from thinmap_ros.ros.action_server import InvalidGoalError
+
+ACTION = 'explore'
+
+
+class Starts:
+    """Starts the explorer by itself, and refuses goals while the robot is stopped.
+
+    The goal is one of the action, so that its status is public and anybody can cancel it. is_due:
+    whether it is still to be sent; is_paused: whether it waits to be continued.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.is_due = False
+        self.is_paused = False
+        self._is_stopped = False
+        self._client = ActionClient(node, Explore, ACTION)
+
+    def reset(self, is_due: bool) -> None:
+        """Begin again; a robot that is stopped does not start by itself."""
+        self.is_due = is_due and not self._is_stopped
+        self.is_paused = False
+
+    def stop_heard(self, is_stopped: bool) -> None:
+        """Follow the stop of the robot: what has not started yet does not start after it."""
+        self._is_stopped = is_stopped
+        self.is_due &= not is_stopped
+
+    def send_if_due(self) -> None:
+        """Send the goal, once, as soon as the server is found."""
+        if self.is_due and not self.is_paused and self._client.server_is_ready():
+            self.is_due = False
+            self._client.send_goal_async(Explore.Goal())
+
+    def read(self, message: Explore.Goal) -> MissionGoal:
+        """Goal of a message. Raises InvalidGoalError where it is invalid, or the robot stopped."""
+        try:
+            if self._is_stopped:
+                raise InputError(STOPPED)
+            return mission_goal_from(message)
+        except InputError as error:
+            status = ExplorationStatus(
+                state=ExplorationStatus.FINISHED,
+                reason_code=ExplorationStatus.CANCELLED,
+                reason=str(error),
+            )
+            raise InvalidGoalError(Explore.Result(status=status)) from error
