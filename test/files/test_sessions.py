@@ -29,6 +29,7 @@ from thinmap_ros.files.sessions import (
     load_edits,
     load_grid,
     save_grid,
+    save_localizer,
     stem_of,
 )
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
@@ -257,6 +258,50 @@ def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
         EXPLORATION.load_optional(stem)
     assert 'room.exploration.npz.old' in EXPLORATION.archive(stem)
     assert EXPLORATION.load_optional(stem) is None
+
+
+def mapped():
+    """What each part has of a robot that has driven a little, and what it has at first."""
+    poses = way()[:30]
+    laser = LaserScanner(LaserScannerConfig(), 1)
+    scans = [laser.scan(building(), T, k) for k, T in enumerate(poses)]
+    grid = OccupancyGrid(PAPER_GRID)
+    builder = TopologyBuilder()
+    drive(grid, builder, poses, seed=1)
+    localizer = Localizer()
+    for scan, T in zip(scans, poses, strict=True):
+        localizer.step(scan, T)
+    explorer = Explorer()
+    explorer.step(builder.map, grid.known_area(), scans[-1], poses[-1])
+    return {
+        'grid': (save_grid, grid, OccupancyGrid(PAPER_GRID)),
+        'topology': (TOPOLOGY.save, builder, TopologyBuilder()),
+        'localizer': (save_localizer, localizer, Localizer()),
+        'exploration': (EXPLORATION.save, explorer, Explorer()),
+    }
+
+
+def test_nothing_replaces_something_unless_that_is_wanted(tmp_path):
+    stem = str(tmp_path / 'floor')
+    values = mapped()
+    for part in (GRID, TOPOLOGY, LOCALIZER, EXPLORATION):
+        save, full, empty = values[part.name]
+        save(stem, empty)
+        save(stem, empty)
+        save(stem, full)
+        files = {path: path.read_bytes() for path in tmp_path.iterdir()}
+        said = f'floor{part.ending}: exists, and {part.node} has nothing to save yet: expected'
+        with pytest.raises(InputError, match=said) as refused:
+            save(stem, empty)
+        assert '\n' not in str(refused.value)
+        assert {path: path.read_bytes() for path in tmp_path.iterdir()} == files
+        save(stem, full)
+        # One of another version, which cannot be read, may hold anything.
+        part.file(stem).write_bytes(b'of another version')
+        with pytest.raises(InputError, match=said):
+            save(stem, empty)
+        save(stem, empty, overwrite=True)
+        save(stem, empty)
 
 
 def test_the_part_of_the_localizer_is_loaded_archived_or_rejected(tmp_path):

@@ -16,6 +16,9 @@ from support.doctor import Doctor
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import LocalGrid, TopologicalMap
+from thinmap_msgs.srv import SaveMap
+from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.files.sessions import EXPLORATION
 from thinmap_ros.ros import diagnostics, messages, qos
 
 pytestmark = pytest.mark.live
@@ -230,6 +233,14 @@ def test_a_node_that_becomes_active_has_what_was_latched(graph):
     maps.publish(empty)
     graph.until(lambda: doctor.number('explorer', 'local_grid: received') == 1.0, 'the latched map')
     assert doctor.number('explorer', 'local_grid: rejected') == 0.0
+    learned = {'ids': [1], 'places': [[1.0, 2.0]], 'visits': [1], 'cell_counts': [0]}
+    learned = {name: np.array(values) for name, values in learned.items()}
+    learned['cells'] = np.empty((0, 2), dtype=np.int64)
+    stem = str(graph.folder / 'floor')
+    EXPLORATION.save(stem, Explorer.from_state(learned))
+    save = SaveMap.Request(path=stem)
+    refused = graph.call(SaveMap, 'save_exploration', save)
+    assert not refused.success and 'explorer is not active: expected' in refused.message
     for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
         request = ChangeState.Request(transition=Transition(id=transition))
         assert graph.call(ChangeState, '/explorer/change_state', request).success
@@ -237,6 +248,13 @@ def test_a_node_that_becomes_active_has_what_was_latched(graph):
         lambda: doctor.number('explorer', 'local_grid: rejected') == 1.0, 'it is taken, and refused'
     )
     assert not graphs
+    # It has learned nothing: the other one knows more.
+    refused = graph.call(SaveMap, 'save_exploration', save)
+    assert not refused.success and 'overwrite: true' in refused.message
+    assert len(EXPLORATION.load(stem).state()['ids']) == 1
+    save.overwrite = True
+    assert graph.call(SaveMap, 'save_exploration', save).success
+    assert len(EXPLORATION.load(stem).state()['ids']) == 0
 
 
 def test_pause_and_reset(graph):

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+import numpy as np
+
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.edits import MapEdits
@@ -55,13 +57,15 @@ class SessionPart(Generic[Value, PartConfig]):
 
     node: its services save_NAME and load_NAME write and read the file. ending: of the file, after
     STEM. restore: makes the value from its arrays and a
-    configuration; raises InputError where they do not fit.
+    configuration; raises InputError where they do not fit. content: names of the arrays that are
+    zero or empty where there is nothing in the file.
     """
 
     name: str
     node: str
     ending: str
     restore: Callable[[State, PartConfig | None], Value]
+    content: tuple[str, ...] = ()
 
     def file(self, path: str) -> Path:
         """Path of the file. Raises InputError as `stem_of`."""
@@ -71,9 +75,13 @@ class SessionPart(Generic[Value, PartConfig]):
         """Whether the session has this part."""
         return _exists(self.file(path))
 
-    def save(self, path: str, value: Value) -> str:
-        """Write the file, whole or not at all; returns its path. Raises OSError."""
+    def save(self, path: str, value: Value, overwrite: bool = False) -> str:
+        """Write the file, whole or not at all; returns its path.
+
+        Raises OSError, and InputError as `require_no_loss`.
+        """
         file = self.file(path)
+        self.require_no_loss(path, value, overwrite)
         with atomic_write(file) as aside:
             self.write(aside, value)
         return str(file)
@@ -88,6 +96,30 @@ class SessionPart(Generic[Value, PartConfig]):
     def load_optional(self, path: str, config: PartConfig | None = None) -> Value | None:
         """Read the file; None where the session does not have it. Raises InputError as `load`."""
         return self.load(path, config) if self.exists(path) else None
+
+    def require_no_loss(self, path: str, value: Value, overwrite: bool = False) -> None:
+        """Raise InputError where nothing would replace something, unless that is wanted.
+
+        A file that cannot be read, as of another version, holds something.
+        """
+        if overwrite or not self.content or self._has_content(value.state()):
+            return
+        file = self.file(path)
+        if not _exists(file):
+            return
+        try:
+            with open_regular_file(file) as stream:
+                if not self._has_content(read_snapshot(stream, self.name)):
+                    return
+        except (InputError, OSError):
+            pass
+        raise InputError(
+            f'{file}: exists, and {self.node} has nothing to save yet: expected another name, or '
+            'overwrite: true'
+        )
+
+    def _has_content(self, state: State) -> bool:
+        return any(bool(np.any(state[name])) for name in self.content if name in state)
 
     def archive(self, path: str) -> str:
         """Rename the file of an earlier session to *.old; returns what was done, '' for nothing.
@@ -122,17 +154,29 @@ def _restore_localizer(state: State, config: StartConfig | None) -> AnyLocalizer
     return localizer_class(own).from_state(state, own)
 
 
-GRID = SessionPart('grid', 'grid_mapper', '.grid.npz', OccupancyGrid.from_state)
+GRID = SessionPart(
+    'grid', 'grid_mapper', '.grid.npz', OccupancyGrid.from_state, content=('log_odds',)
+)
 # Keep-out areas and erased parts: written and read with the grid.
 EDITS = SessionPart('edits', 'grid_mapper', '.edits.npz', MapEdits.from_state)
-TOPOLOGY = SessionPart('topology', 'topology_builder', '.topology.npz', TopologyBuilder.from_state)
+TOPOLOGY = SessionPart(
+    'topology',
+    'topology_builder',
+    '.topology.npz',
+    TopologyBuilder.from_state,
+    content=('nodes',),
+)
 # Ids of the regions: the node of the topology saves and loads them with it.
 REGIONS = SessionPart('regions', 'topology_builder', '.regions.npz', RegionTracker.from_state)
 # Line features or local map, by the configured localizer.
-LOCALIZER = SessionPart('localizer', 'localizer', '.slam.npz', _restore_localizer)
+LOCALIZER = SessionPart(
+    'localizer', 'localizer', '.slam.npz', _restore_localizer, content=('ids', 'hits')
+)
 # Of the local map: `save_localizer` and `load_localizer` write and read both files.
 KEYFRAMES = SessionPart('keyframes', 'localizer', '.keyframes.npz', SavedKeyframes.from_state)
-EXPLORATION = SessionPart('exploration', 'explorer', '.exploration.npz', Explorer.from_state)
+EXPLORATION = SessionPart(
+    'exploration', 'explorer', '.exploration.npz', Explorer.from_state, content=('ids',)
+)
 _OF_MAP: tuple[SessionPart[Any, Any], ...] = (GRID, EDITS, TOPOLOGY, REGIONS, LOCALIZER, KEYFRAMES)
 PARTS = (*_OF_MAP, EXPLORATION)
 # Parts that are saved, and archived, with that of the same node.
@@ -207,13 +251,17 @@ def save_grid(
     grid: OccupancyGrid,
     shown: GridPatch | None = None,
     edits: MapEdits | None = None,
+    overwrite: bool = False,
 ) -> str:
-    """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written. Raises OSError.
+    """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written.
+
+    Raises as `SessionPart.save`.
 
     shown: the cells of the image, where they differ from those of the grid. edits: of the map, in
     STEM.edits.npz; where there are none, those of an earlier session are archived.
     """
     stem = stem_of(path)
+    GRID.require_no_loss(path, grid, overwrite)
     # No file takes its name before all are written: a full disk leaves the old session unchanged.
     with atomic_write(GRID.file(path)) as aside:
         GRID.write(aside, grid)
@@ -264,12 +312,13 @@ def load_scans(path: str) -> list[tuple[Scan, Array]]:
     return [] if keyframes is None else keyframes.scans
 
 
-def save_localizer(path: str, localizer: AnyLocalizer) -> str:
+def save_localizer(path: str, localizer: AnyLocalizer, overwrite: bool = False) -> str:
     """Write STEM.slam.npz, and STEM.keyframes.npz of a map that is made of keyframes.
 
-    The keyframes of an earlier session are archived otherwise. Returns what was written. Raises
-    OSError.
+    The keyframes of an earlier session are archived otherwise. Returns what was written. Raises as
+    `SessionPart.save`.
     """
+    LOCALIZER.require_no_loss(path, localizer, overwrite)
     keyframes = localizer.saved_keyframes() if isinstance(localizer, Localizer) else None
     # Neither file takes its name before both are written.
     with atomic_write(LOCALIZER.file(path)) as aside:

@@ -82,7 +82,7 @@ class ExplorerNode(ThinmapNode):
         )
         subscribe_to_stop(self, self._on_stop)
         self.create_service(Trigger, '~/cancel', self._on_cancel)
-        self.create_service(SaveMap, 'save_exploration', self._on_save)
+        self.create_active_service(SaveMap, 'save_exploration', self._on_save)
         self.create_active_timer(_CHECK_PERIOD_S, self._on_timer)
         self.enable_checkpoint(self._state, self._restore)
 
@@ -237,7 +237,7 @@ class ExplorerNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve_for_saving(request.path, EXPLORATION)
-            return self._strategies.save(path, self._mission.strategy)
+            return self._strategies.save(path, self._mission.strategy, request.overwrite)
 
         return fill_response(response, save)
 

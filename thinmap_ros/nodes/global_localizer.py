@@ -309,7 +309,7 @@ class GlobalLocalizerNode(ThinmapNode):
         self._odometry.subscribe()
         scan_topic = self._laser_transform.scan_topic
         subscribe_guarded(self, LaserScan, scan_topic, self._on_scan, qos.SENSOR)
-        self.create_service(LocalizeGlobally, 'localize_globally', self._on_request)
+        self.create_active_service(LocalizeGlobally, 'localize_globally', self._on_request)
         self.create_active_timer(1.0, self._report_missing_inputs)
 
     def _create_driver(self) -> _SearchDriver:

@@ -132,10 +132,10 @@ class GridMapperNode(ThinmapNode):
         # old map reaches the new graph.
         reentrant = ReentrantCallbackGroup()
         self._session_client = SessionClient(self, reentrant)
-        self.create_service(SaveMap, 'save_map', self._on_save, callback_group=reentrant)
+        self.create_active_service(SaveMap, 'save_map', self._on_save, callback_group=reentrant)
         self.create_service(LoadMap, 'load_map', self._on_load)
         for name in ('map', 'dynamic_map'):
-            self.create_service(GetMap, name, self._on_get_map)
+            self.create_active_service(GetMap, name, self._on_get_map)
         self._map_timer = self._create_map_timer()
 
     def _create_map_timer(self) -> Timer:
@@ -285,13 +285,13 @@ class GridMapperNode(ThinmapNode):
         self._mapper.replace(grid, keep_out)
         self._map_replaced()
 
-    def _save_grid(self, path: str) -> str:
+    def _save_grid(self, path: str, overwrite: bool = False) -> str:
         """Save the map, after all of it follows the newest correction."""
         if self._mapper.finish() is not None:
             self._publish_map()
         shown = self._settings.output.trinary(self._mapper.whole_map().patch)
-        mapper = self._mapper
-        return f'saved {sessions.save_grid(path, mapper.grid.shown, shown, mapper.edits)}'
+        grid = self._mapper.grid.shown
+        return f'saved {sessions.save_grid(path, grid, shown, self._mapper.edits, overwrite)}'
 
     def _save_at_end(self, path: str) -> str:
         is_changed = self._settings.mapping or self._editing.is_edited
@@ -304,10 +304,14 @@ class GridMapperNode(ThinmapNode):
         folder = self._save_directory
         fill_response(
             response,
-            lambda: self._save_grid(folder.resolve_for_saving(request.path, sessions.GRID)),
+            lambda: self._save_grid(
+                folder.resolve_for_saving(request.path, sessions.GRID), request.overwrite
+            ),
         )
         if response.success:
-            others = await self._session_client.save(folder.resolve(request.path))
+            others = await self._session_client.save(
+                folder.resolve(request.path), request.overwrite
+            )
             response.success = others.success
             response.message = f'{response.message}; {others.message}'
         return response

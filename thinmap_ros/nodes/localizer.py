@@ -221,7 +221,7 @@ class LocalizerNode(ThinmapNode):
         )
         self._given.source.subscribe(self, self._on_new_map)
         self._given.create_interface(self._output.map_frame, poses)
-        self.create_service(SaveMap, 'save_localizer', self._on_save)
+        self.create_active_service(SaveMap, 'save_localizer', self._on_save)
         self.create_service(LoadMap, 'check_localizer', self._on_check)
         self.create_service(LoadMap, 'load_localizer', self._on_load)
 
@@ -370,7 +370,7 @@ class LocalizerNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve_for_saving(request.path, LOCALIZER)
-            return f'saved {save_localizer(path, self._localizer)}'
+            return f'saved {save_localizer(path, self._localizer, request.overwrite)}'
 
         return fill_response(response, save)
 

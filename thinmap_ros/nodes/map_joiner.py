@@ -57,8 +57,8 @@ class MapJoinerNode(ThinmapNode):
         self._worker = Worker(_SHARE)
         self._turns = Turns()
         self.reset_state()
-        self.create_service(JoinMaps, 'join_maps', self._on_join)
-        self.create_service(SeparateMaps, 'separate_maps', self._on_separate)
+        self.create_active_service(JoinMaps, 'join_maps', self._on_join)
+        self.create_active_service(SeparateMaps, 'separate_maps', self._on_separate)
         wall = Clock(clock_type=ClockType.STEADY_TIME)
         discovery_s = 1.0 / config.discovery_rate
         self.create_active_timer(discovery_s, self._robots.discover, clock=wall)

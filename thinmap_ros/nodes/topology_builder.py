@@ -119,7 +119,7 @@ class TopologyBuilderNode(ThinmapNode):
         warm_up.topology_builder()
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(self, LocalGrid, 'local_grid', self._on_local_grid, qos.STREAM)
-        self.create_service(SaveMap, 'save_topology', self._on_save)
+        self.create_active_service(SaveMap, 'save_topology', self._on_save)
         self.create_service(LoadMap, 'check_topology', self._on_check)
         self.create_service(LoadMap, 'load_topology', self._on_load)
         self.diagnostics.check_sole_publisher('topology')
@@ -214,14 +214,14 @@ class TopologyBuilderNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve_for_saving(request.path, TOPOLOGY)
-            saved = self._save(path)
+            saved = self._save(path, request.overwrite)
             self._route_graph.graph_saved()
             return saved
 
         return fill_response(response, save)
 
-    def _save(self, path: str) -> str:
-        saved = TOPOLOGY.save(path, self._topology.builder)
+    def _save(self, path: str, overwrite: bool = False) -> str:
+        saved = TOPOLOGY.save(path, self._topology.builder, overwrite)
         REGIONS.save(path, self._regions.tracker)
         return f'saved {saved}'
 

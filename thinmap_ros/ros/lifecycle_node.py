@@ -1,7 +1,9 @@
 """What the nodes of a robot share: lifecycle, diagnostics, pause, reset, checkpoint, time jump."""
 
+import inspect
 import math
 from collections.abc import Callable
+from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
@@ -94,6 +96,28 @@ class ThinmapNode(LifecycleNode):
                 work()
 
         return self.create_timer(period_s, guarded, clock=clock or self.elapsed_time.timer_clock)
+
+    def create_active_service(
+        self, kind: Any, name: str, work: Callable[[Any, Any], Any], **options: Any
+    ) -> None:
+        """Create a service that is refused while the node is not active, and has nothing to give.
+
+        work: returns the response to request and response, or is a coroutine. options: as of
+        `create_service`. A response without `success` stays empty, as that of Nav2's map_server.
+        """
+
+        async def guarded(request: Any, response: Any) -> Any:
+            if self.is_active:
+                answer = work(request, response)
+                return await answer if inspect.isawaitable(answer) else answer
+            reason = f'{name}: {self.get_name()} is not active: expected it to be activated first'
+            self.get_logger().warning(reason)
+            if hasattr(response, 'success'):
+                response.success = False
+                response.message = reason
+            return response
+
+        self.create_service(kind, name, guarded, **options)
 
     def enable_checkpoint(
         self,

@@ -47,8 +47,8 @@ class SessionClient:
         self._check = {part.name: client(LoadMap, 'check', part) for part in _LOADED}
         self._load = {part.name: client(LoadMap, 'load', part) for part in _LOADED}
 
-    async def save(self, path: str) -> PartResult:
-        """Save the parts of all other nodes.
+    async def save(self, path: str, overwrite: bool) -> PartResult:
+        """Save the parts of all other nodes; overwrite: as in SaveMap.
 
         The part of a node that is not running is archived, as it belongs to an earlier session,
         unless saving has failed before.
@@ -56,7 +56,8 @@ class SessionClient:
         stem = str(stem_of(path))
         result = PartResult(True, '')
         for part in _SAVED:
-            result = _joined(result, await self._save_part(part, stem, archives=result.success))
+            request = SaveMap.Request(path=stem, overwrite=overwrite)
+            result = _joined(result, await self._save_part(part, request, result.success))
         return result
 
     async def load(self, path: str, load_grid: Callable[[], None]) -> PartResult:
@@ -90,12 +91,12 @@ class SessionClient:
             return PartResult(False, f'{client.srv_name}: not found yet: expected a moment later')
         return PartResult(True, '')
 
-    async def _save_part(self, part: Part, stem: str, archives: bool) -> PartResult:
-        answer = await call(self._node, self._save[part.name], SaveMap.Request(path=stem))
+    async def _save_part(self, part: Part, request: SaveMap.Request, archives: bool) -> PartResult:
+        answer = await call(self._node, self._save[part.name], request)
         if answer is not None:
             return PartResult(answer.success, answer.message)
         try:
-            archived = _archived(part, stem) if archives else ''
+            archived = _archived(part, request.path) if archives else ''
         except (ThinmapError, OSError) as error:
             return PartResult(False, str(error))
         absent = _absent(part)

@@ -75,13 +75,13 @@ class StrategySource:
             return Explorer.from_state(state, self._config)
         return self._new()
 
-    def save(self, path: str, strategy: Strategy) -> str:
+    def save(self, path: str, strategy: Strategy, overwrite: bool) -> str:
         """Save what a strategy has learned, if it can be saved; returns what was done.
 
-        Raises OSError where writing fails.
+        Raises as `SessionPart.save`.
         """
         if self._name == DEFAULT and isinstance(strategy, Explorer):
-            return f'saved {sessions.EXPLORATION.save(path, strategy)}'
+            return f'saved {sessions.EXPLORATION.save(path, strategy, overwrite)}'
         archived = sessions.EXPLORATION.archive(path)
         nothing = f'strategy {self._name} has nothing to save'
         return f'{nothing}; {archived}' if archived else nothing

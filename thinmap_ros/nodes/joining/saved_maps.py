@@ -29,8 +29,8 @@ class SavedMaps:
         self._directory = SaveDirectory(node)
         self._add = add
         self._merge = merge
-        node.create_service(AddSubmap, 'map_merging/add_submap', self._on_add)
-        node.create_service(MergeMaps, 'map_merging/merge_submaps', self._on_merge)
+        node.create_active_service(AddSubmap, 'map_merging/add_submap', self._on_add)
+        node.create_active_service(MergeMaps, 'map_merging/merge_submaps', self._on_merge)
 
     def _on_add(
         self, request: AddSubmap.Request, response: AddSubmap.Response

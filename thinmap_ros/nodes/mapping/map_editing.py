@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from nav2_msgs.msg import CostmapFilterInfo
 from nav_msgs.msg import OccupancyGrid
-from rclpy.node import Node
 
 from thinmap_msgs.msg import KeepOut as KeepOutMsg
 from thinmap_msgs.msg import KeepOutArea as KeepOutAreaMsg
@@ -18,6 +17,7 @@ from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.services import fill_response
 
 _FREE = np.int8(0)
@@ -34,7 +34,7 @@ class MapEditing:
 
     def __init__(
         self,
-        node: Node,
+        node: ThinmapNode,
         frame_id: str,
         mapper: Mapper,
         latest_ns: Callable[[], int | None],
@@ -54,9 +54,9 @@ class MapEditing:
         self._areas = node.create_publisher(KeepOutMsg, 'keep_out', qos.LATCHED)
         self._mask = node.create_publisher(OccupancyGrid, 'keepout_filter_mask', qos.LATCHED)
         self._info = node.create_publisher(CostmapFilterInfo, 'costmap_filter_info', qos.LATCHED)
-        node.create_service(AddKeepOut, 'add_keep_out', self._on_add)
-        node.create_service(RemoveKeepOut, 'remove_keep_out', self._on_remove)
-        node.create_service(EraseArea, 'erase_area', self._on_erase)
+        node.create_active_service(AddKeepOut, 'add_keep_out', self._on_add)
+        node.create_active_service(RemoveKeepOut, 'remove_keep_out', self._on_remove)
+        node.create_active_service(EraseArea, 'erase_area', self._on_erase)
 
     def publish(self) -> None:
         """Publish the areas and their mask, if they have changed."""

@@ -24,7 +24,7 @@ class RegionNaming:
         self._regions = regions
         self._corrected_ns = 0
         self._of: RegionTracker | None = None  # whose names follow this correction
-        node.create_service(NameRegion, 'name_region', self._on_name)
+        node.create_active_service(NameRegion, 'name_region', self._on_name)
 
     def follow(self, whole: WholeMap) -> None:
         """Move the names as a correction has moved the map."""
