@@ -270,8 +270,7 @@ def claims(draw, ns=10**9):
     message.settled = [SettledPlace(x=1.0, y=2.0, visits=1)] * 2
 
     def number(part, name):
-        strange = STRANGE if part == 'pose' else STRANGE_32
-        return lambda: setattr(getattr(message, part), name, draw(strange))
+        return lambda: setattr(getattr(message, part), name, draw(STRANGE_32))
 
     def own(name):
         return lambda: setattr(message, name, draw(STRANGE_32))
@@ -289,7 +288,8 @@ def claims(draw, ns=10**9):
     def state():
         message.state = draw(st.integers(0, 255))
 
-    points = [number(part, axis) for part in ('pose', 'goal', 'frontier') for axis in 'xy']
+    points = [number(part, axis) for part in ('goal', 'frontier') for axis in 'xy']
+    points += pose_setters(draw, message.pose)
     changed(draw, [*points, *map(own, ('v', 'w', 'remaining_m')), place, count, name, state])
     return message
 
@@ -317,7 +317,10 @@ def tiles(draw, ns=10**9):
         data[draw(st.integers(0, len(data) - 1))] = draw(st.integers(0, 255))
         message.data = array('B', zlib.compress(bytes(data)))
 
-    changed(draw, [name, cut, byte, plain])
+    def layout():
+        message.layout = draw(st.integers(0, 255))
+
+    changed(draw, [name, cut, byte, plain, layout])
     return message
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Qos
+from rosbags.interfaces import Nodetype, Qos
 from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core import validation
@@ -39,6 +39,7 @@ from thinmap_ros.logs.storage import McapStorage, RawMessage, SqliteStorage, Sto
 _SCAN = 'sensor_msgs/msg/LaserScan'
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 EXPECTED = 'a rosbag2 folder, an MCAP or SQLite file, or a ROS 1 bag'
+_IDL_NAMES = {'byte': 'octet', 'char': 'uint8'}
 _ZSTD = b'\x28\xb5\x2f\xfd'  # begin of a message that is compressed by itself
 _MAX_WARNINGS = 8
 _USUAL_TOPICS = {_SCAN: '/scan', _ODOMETRY: '/odom'}
@@ -133,11 +134,16 @@ class Bag:
                 f'{where}: no {validation.quoted_name(message.type_name)}: {reason}'
             ) from error
 
-    def field_names(self, topic: str) -> list[str]:
-        """Names of the fields of a topic's type in the bag; empty if the bag does not define it."""
+    def fields(self, topic: str) -> dict[str, str]:
+        """Types of the fields of a topic's type in the bag, by name, in the words of rclpy.
+
+        Empty if the bag does not define it.
+        """
         type_name = self.topics[topic]
         definitions = self._typestore(topic, type_name).fielddefs
-        return [name for name, _ in definitions[type_name][1]] if type_name in definitions else []
+        if type_name not in definitions:
+            return {}
+        return {name: _type_words(kind) for name, kind in definitions[type_name][1]}
 
     def _typestore(self, topic: str, type_name: str) -> Typestore:
         holders = (s for s in self._storages if s.topics.get(topic) == type_name)
@@ -160,6 +166,20 @@ class Bag:
             self.offers.setdefault(
                 topic, offers
             )  # the files of a bag repeat the entries of their topics
+
+
+def _type_words(field: Any) -> str:
+    """Type of a field, as `get_fields_and_field_types` of a message writes it."""
+    kind, what = field
+    if kind is Nodetype.NAME:
+        return str(what).replace('/msg/', '/')
+    if kind is Nodetype.BASE:
+        name, limit = what
+        return f'{_IDL_NAMES.get(name, name)}{f"<{limit}>" if limit else ""}'
+    of, count = what
+    if kind is Nodetype.ARRAY:
+        return f'{_type_words(of)}[{count}]'
+    return f'sequence<{_type_words(of)}{f", {count}" if count else ""}>'
 
 
 def _storage_of(path: Path) -> Storage:

@@ -160,7 +160,7 @@ class BagPlayerNode(Node):
         profile = qos.as_recorded(topic, self._bag.offers.get(topic, []))
         try:
             kind = message_class(self._bag.topics[topic])
-            self._require_same_fields(topic, list(kind.get_fields_and_field_types()))
+            self._require_same_fields(topic, kind.get_fields_and_field_types())
             self._publishers_by_topic[topic] = self.create_publisher(kind, name, profile)
         except (InputError, NameValidationException) as error:
             reason = ' '.join(str(error).split())[:200]
@@ -168,12 +168,19 @@ class BagPlayerNode(Node):
                 raise InputError(f'{validation.quoted_name(topic)}: {reason}') from error
             self.get_logger().warning(f'{validation.quoted_name(topic)} is not played: {reason}')
 
-    def _require_same_fields(self, topic: str, installed: list[str]) -> None:
-        recorded = self._bag.field_names(topic)
-        if recorded not in ([], installed):
+    def _require_same_fields(self, topic: str, installed: dict[str, str]) -> None:
+        recorded = self._bag.fields(topic)
+        was = list(recorded)
+        now = list(installed)
+        if was == now:
+            was, now = (
+                [f'{kind} {name}' for name, kind in fields.items() if kind != others[name]]
+                for fields, others in ((recorded, installed), (installed, recorded))
+            )
+        if was and was != now:
             raise InputError(
-                f'{self._bag.topics[topic]} of another version, with {", ".join(recorded)}: '
-                f'expected {", ".join(installed)}'
+                f'{self._bag.topics[topic]} of another version, with {", ".join(was)}: '
+                f'expected {", ".join(now)}'
             )
 
     def _has_subscribers(self) -> bool:

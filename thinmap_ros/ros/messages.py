@@ -125,6 +125,15 @@ def quaternion_msg(yaw_rad: float) -> Quaternion:
     return Quaternion(z=math.sin(yaw_rad / 2.0), w=math.cos(yaw_rad / 2.0))
 
 
+def require_layout(message: Any) -> None:
+    """Raise InputError where the bytes of a message are not of the layout of its definition."""
+    if message.layout != message.LAYOUT:
+        raise InputError(
+            f'{type(message).__name__} of layout {message.layout}: expected {message.LAYOUT}: is '
+            'its robot of another version?'
+        )
+
+
 def pose_from_msg(message: Pose) -> Array:
     """Planar pose (3,). Raises InputError where it is beyond 1000 km or no rotation."""
     return decode.checked_pose(message)

@@ -66,7 +66,7 @@ class Robots:
         for number, frame in enumerate(driven.piece.keyframes):
             edges = [SentEdge(e.a, e.b, e.information) for e in driven.edges if e.b == number]
             message = KeyframeMessage(number, 0, frame.T_map_base, frame.scan, tuple(edges))
-            publisher.publish(Keyframe(session=7, data=message.encode()))
+            publisher.publish(Keyframe(session=7, layout=1, data=message.encode()))
 
     def publisher(self, kind, topic, profile):
         if topic not in self.publishers:
@@ -156,7 +156,7 @@ def test_the_joint_map_bends_by_keyframes_that_were_sent_before(graph, robots):
         robots.publish_keyframes(name, *drive)
     # Bytes that are no message, and a correction of another session: both are left out.
     broken = robots.publisher(Keyframe, '/robot1/keyframes', qos.KEYFRAMES)
-    broken.publish(Keyframe(session=7, data=b'nothing'))
+    broken.publish(Keyframe(session=7, layout=1, data=b'nothing'))
     poses = robots.publisher(KeyframePoses, '/robot1/keyframe_poses', qos.LATCHED)
     poses.publish(KeyframePoses(session=6, revision=1, poses=[1.0, 2.0, 3.0]))
     graph.start('map_joiner', **QUICK)

@@ -1,6 +1,9 @@
 """Messages between robots of a team, there and back, and what is refused."""
 
 import math
+import struct
+import zlib
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -38,7 +41,7 @@ def claimed(state=RobotState.DRIVING, visits=1):
 def test_a_claim_arrives_as_it_was(state):
     sent = claimed(state)
     found = claim_from_msg(claim_msg(sent, 'map'))
-    assert np.array_equal(found.claim.pose, POSE)
+    assert found.claim.pose == pytest.approx(POSE, abs=1e-12)
     for name in ('robot', 'stamp_ns', 'place', 'remaining_m', 'settled', 'explores'):
         assert getattr(found.claim, name) == getattr(sent.claim, name), name
     assert (found.motion.v, found.motion.w) == (0.5, -0.25)
@@ -65,8 +68,8 @@ def test_a_claim_is_moved_with_the_map_of_its_robot():
 def damaged(**values):
     message = claim_msg(claimed(), 'map')
     for name, value in values.items():
-        owner, _, field = name.rpartition('__')
-        setattr(getattr(message, owner) if owner else message, field, value)
+        *owners, field = name.split('__')
+        setattr(reduce(getattr, owners, message), field, value)
     return message
 
 
@@ -76,8 +79,9 @@ def damaged(**values):
         ({'robot': ''}, "robot ''"),
         ({'robot': 'x' * 201}, 'robot'),
         ({'state': 4}, 'state 4'),
-        ({'pose__x': math.nan}, 'place: nan'),
-        ({'pose__theta': math.inf}, 'place: inf'),
+        ({'pose__position__x': math.nan}, "robot '/a': "),
+        ({'pose__orientation__z': math.inf}, "robot '/a': "),
+        ({'pose__orientation__w': 0.0, 'pose__orientation__z': 0.0}, "robot '/a': "),
         ({'goal__y': math.nan}, 'place: nan'),
         ({'frontier__x': 1e30}, 'place: 1'),
         ({'v': math.inf}, 'speed: inf'),
@@ -114,8 +118,27 @@ def test_tiles_arrive_and_damaged_ones_are_refused():
     assert (message.robot, message.session) == ('/a', 3)
     assert tiles_from_msg(message).tiles == sender.changes_after(0).tiles
     with pytest.raises(InputError, match='expected a name'):
-        tiles_from_msg(MapTiles(data=message.data))
+        tiles_from_msg(MapTiles(layout=1, data=message.data))
     with pytest.raises(InputError, match='map tiles'):
-        tiles_from_msg(MapTiles(robot='/a', data=message.data[:-9]))
+        tiles_from_msg(MapTiles(robot='/a', layout=1, data=message.data[:-9]))
     with pytest.raises(InputError, match='map tiles'):
-        tiles_from_msg(MapTiles(robot='/a'))
+        tiles_from_msg(MapTiles(robot='/a', layout=1))
+    with pytest.raises(InputError, match='MapTiles of layout 2: expected 1: is its robot of'):
+        tiles_from_msg(MapTiles(robot='/a', layout=2, data=message.data))
+
+
+def test_the_bytes_of_tiles_have_the_documented_layout():
+    cells = np.full((20, 20), -1, dtype=np.int8)
+    cells[1, 2:6] = (0, 100, 50, -1)
+    patch = GridPatch(GridFrame(0.5, -1.0, 0.1), cells)
+    sender = TileSender(patch.frame)
+    sender.update(patch)
+    message = tiles_msg(messages.header('map', 1), '/a', 3, sender.changes_after(0))
+    assert message.layout == MapTiles.LAYOUT == 1
+    plain = zlib.decompress(bytes(message.data))
+    assert struct.unpack_from('<3I3d2i', plain) == (0, 1, 1, 0.5, -1.0, 0.1, 0, 0)
+    packed = np.frombuffer(plain[44:], dtype=np.uint8)
+    assert packed.size == 64
+    bits = (packed[:, None] >> np.array([0, 2, 4, 6]) & 3).reshape(16, 16)
+    assert bits[1, 2:6].tolist() == [1, 2, 3, 0]
+    assert np.count_nonzero(bits) == 3

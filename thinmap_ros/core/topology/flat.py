@@ -13,17 +13,19 @@ Flat = dict[str, NDArray[Any]]
 Mask = NDArray[np.bool_]
 
 FIELDS = {
-    'node_ids': np.uint64,
+    'node_ids': np.uint32,
     'node_kinds': np.uint8,
     'node_xy': np.float64,
     'node_clearance_m': np.float32,
-    'edge_ids': np.uint64,
+    'edge_ids': np.uint32,
     'edge_nodes': np.uint32,
     'edge_length_m': np.float32,
     'edge_clearance_m': np.float32,
     'edge_first': np.uint32,
     'edge_xy': np.float32,
 }
+# Ids of bags of before 0.3.1 have 64 bits.
+_READ = {'node_ids': np.uint64, 'edge_ids': np.uint64}
 _PAIRS = ('node_xy', 'edge_nodes')
 _POINTS = 'edge_xy'
 _KINDS = {int(kind): kind for kind in NodeKind}
@@ -88,7 +90,7 @@ def _arrays(message: Any) -> Flat:
     """Arrays of a message by field. Raises InputError where it is of another layout."""
     try:
         return {
-            name: np.asarray(getattr(message, name), dtype).ravel()
+            name: np.asarray(getattr(message, name), _READ.get(name, dtype)).ravel()
             for name, dtype in FIELDS.items()
         }
     except AttributeError as error:

@@ -15,7 +15,7 @@ from thinmap_ros.core.slam.joining.team_map import RobotMap
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.nodes.joining.settings import MapJoinerConfig
-from thinmap_ros.ros import qos
+from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN
 from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -108,6 +108,7 @@ class RobotMaps:
 
 
 def _take(received: ReceivedKeyframes, message: KeyframeMsg) -> None:
+    messages.require_layout(message)
     decoded = KeyframeMessage.decode(bytes(message.data))
     received.add(message.session, message.map_id, decoded)
 

@@ -46,5 +46,11 @@ class KeyframeOutput:
         message = self._sender.next_message()
         if message is not None:
             self._keyframes.publish(
-                Keyframe(header=header, map_id=map_id, session=self._session, data=message.encode())
+                Keyframe(
+                    header=header,
+                    map_id=map_id,
+                    session=self._session,
+                    layout=Keyframe.LAYOUT,
+                    data=message.encode(),
+                )
             )

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
-from geometry_msgs.msg import Point32, Pose2D
+from geometry_msgs.msg import Point32, Pose
 from std_msgs.msg import Header
 
 from thinmap_msgs.msg import MapTiles, TeamClaim, TileRequest
@@ -69,12 +69,11 @@ class RobotClaim:
 def claim_msg(sent: RobotClaim, frame_id: str) -> TeamClaim:
     """Message of a claim; frame_id: of the map of the robot."""
     claim = sent.claim
-    x, y, theta = claim.pose.tolist()
     return TeamClaim(
         header=messages.header(frame_id, claim.stamp_ns),
         robot=claim.robot,
         session=sent.session,
-        pose=Pose2D(x=x, y=y, theta=theta),
+        pose=messages.pose_msg(claim.pose),
         v=sent.motion.v,
         w=sent.motion.w,
         state=int(sent.state),
@@ -105,10 +104,9 @@ def claim_from_msg(message: TeamClaim) -> RobotClaim:
             f'claim of robot {quoted(name)}: {len(message.settled)} settled places: expected '
             f'{MAX_SETTLED} at most'
         )
-    pose = message.pose
     places = [(place.x, place.y) for place in message.settled]
     points = [(message.goal.x, message.goal.y), (message.frontier.x, message.frontier.y)]
-    numbers = [pose.x, pose.y, pose.theta, *np.ravel([*places, *points]).tolist()]
+    numbers = np.ravel([*places, *points]).tolist()
     validation.require_bounded(f'claim of robot {quoted(name)}: place', numbers)
     validation.require_bounded(f'claim of robot {quoted(name)}: path', [message.remaining_m])
     speeds = [message.v, message.w]
@@ -119,7 +117,7 @@ def claim_from_msg(message: TeamClaim) -> RobotClaim:
         )
     state = RobotState(message.state)
     is_driving = state is RobotState.DRIVING
-    T = se2.pose(pose.x, pose.y, pose.theta)
+    T = _pose(name, message.pose)
     claim = Claim(
         name,
         messages.stamp_ns(message.header.stamp),
@@ -135,7 +133,7 @@ def claim_from_msg(message: TeamClaim) -> RobotClaim:
 
 def tiles_msg(header: Header, robot: str, session: int, tiles: TileMessage) -> MapTiles:
     """Message of tiles of a robot's map."""
-    message = MapTiles(header=header, robot=robot, session=session)
+    message = MapTiles(header=header, robot=robot, session=session, layout=MapTiles.LAYOUT)
     message.data.frombytes(tiles.encode())
     return message
 
@@ -143,6 +141,7 @@ def tiles_msg(header: Header, robot: str, session: int, tiles: TileMessage) -> M
 def tiles_from_msg(message: MapTiles) -> TileMessage:
     """Tiles of a message. Raises InputError where it is invalid."""
     _name(message.robot)
+    messages.require_layout(message)
     return TileMessage.decode(message.data.tobytes())
 
 
@@ -156,6 +155,14 @@ def _name(name: str) -> str:
     if not 0 < len(name) <= _MAX_NAME:
         raise InputError(f'robot {quoted(name)}: expected a name of 1 to {_MAX_NAME} characters')
     return name
+
+
+def _pose(name: str, message: Pose) -> Array:
+    """Pose (3,) of a robot. Raises InputError where it is none."""
+    try:
+        return messages.pose_from_msg(message)
+    except InputError as error:
+        raise InputError(f'claim of robot {quoted(name)}: {error}') from error
 
 
 def _point_msg(place: Place | None) -> Point32:

@@ -1,5 +1,6 @@
 """Keyframes as bytes: what comes is what was sent, and damage is an error."""
 
+import struct
 import zlib
 
 import numpy as np
@@ -18,6 +19,7 @@ from thinmap_ros.core.slam.joining.keyframe_messages import (
 )
 
 T = se2.pose(2.0, 2.5, 0.4)
+UPPER = np.triu_indices(3)
 INFORMATION = np.array([[4e4, 1e3, 5e4], [1e3, 5e4, -2e4], [5e4, -2e4, 9e5]])
 
 
@@ -42,6 +44,24 @@ def test_what_comes_is_what_was_sent_to_a_millimetre():
     np.testing.assert_allclose(edge.information, INFORMATION, rtol=1e-6)
     beams = sent.scan.ranges_m.size
     assert len(data) < 2 * beams, 'smaller than its ranges in 16 bit'
+
+
+def test_the_bytes_have_the_documented_layout():
+    scan = Scan.create(5, [1.5, np.inf, np.nan, -np.inf, 2.0], -1.0, 0.5, 0.05, 30.0)
+    plain = zlib.decompress(message(scan=scan).encode())
+    number, revision, edges, unit_mm, x, y, yaw, *laser = struct.unpack_from('<3IH13f', plain)
+    assert (number, revision, edges, unit_mm) == (3, 2, 1, 1)
+    assert (x, y, yaw) == pytest.approx(tuple(T))
+    expected = [-1.0, 0.5, 0.05, 30.0, *scan.T_base_laser, scan.max_range_m, 0.0, 0.0]
+    assert laser == pytest.approx(expected)
+    assert struct.unpack_from('<II', plain, 66) == (0, 3)
+    assert struct.unpack_from('<6f', plain, 74) == pytest.approx(INFORMATION[UPPER].tolist())
+    at = 0
+    ranges = []
+    for u in (a + 256 * b for a, b in zip(plain[98:103], plain[103:], strict=True)):
+        at = (at + ((u >> 1) ^ -(u & 1))) % 2**16
+        ranges.append(at)
+    assert ranges == [1500, 65535, 65533, 65534, 2000]
 
 
 @settings(max_examples=60, deadline=None)
