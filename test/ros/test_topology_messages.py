@@ -15,6 +15,8 @@ from thinmap_ros import InputError, topology_from_msg
 from thinmap_ros.core.topology.flat import FIELDS, flat_topology
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.files.package_data import message_definitions
+from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.ros import messages
 
 NAME = 'thinmap_msgs/msg/TopologicalMap'
@@ -188,6 +190,27 @@ def test_ids_of_64_bits_are_read_from_older_bags():
     wide['edge_ids'][0] = 2**32
     with pytest.raises(InputError, match='edge id 4294967296: expected 1 to 4294967295'):
         topology_from_msg(types.types[NAME](header=header, map_id=7, **flat | wide))
+
+
+def test_the_types_of_a_bag_are_in_the_words_of_rclpy(tmp_path):
+    """So that the player finds a topic whose fields have other types under the same names."""
+    names = [NAME, 'sensor_msgs/msg/LaserScan', 'nav_msgs/msg/Odometry', 'tf2_msgs/msg/TFMessage']
+    names += ['geometry_msgs/msg/PoseWithCovariance', 'diagnostic_msgs/msg/DiagnosticStatus']
+    definitions = message_definitions('thinmap_msgs')
+    old = definitions[NAME].replace('uint32[]', 'uint64[]')
+    for words in (definitions, {NAME: old}):
+        folder = tmp_path / str(len(words))
+        writer = BagWriter(folder, live=True, definitions=words)
+        for number, name in enumerate(names):
+            writer.write(f'/t{number}', name, number + 1, b'0000')
+        writer.close()
+        bag = Bag(folder)
+        for topic, name in bag.topics.items():
+            expected = messages.message_class(name).get_fields_and_field_types()
+            if words is not definitions and name == NAME:
+                expected = {k: v.replace('uint32', 'uint64') for k, v in expected.items()}
+            assert bag.fields(topic) == expected
+        assert set(bag.topics.values()) == set(names)
 
 
 def test_a_message_of_an_older_layout_is_refused():

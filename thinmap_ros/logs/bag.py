@@ -39,7 +39,13 @@ from thinmap_ros.logs.storage import McapStorage, RawMessage, SqliteStorage, Sto
 _SCAN = 'sensor_msgs/msg/LaserScan'
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 EXPECTED = 'a rosbag2 folder, an MCAP or SQLite file, or a ROS 1 bag'
-_IDL_NAMES = {'byte': 'octet', 'char': 'uint8'}
+_IDL_NAMES = {
+    'bool': 'boolean',
+    'byte': 'octet',
+    'char': 'uint8',
+    'float32': 'float',
+    'float64': 'double',
+}
 _ZSTD = b'\x28\xb5\x2f\xfd'  # begin of a message that is compressed by itself
 _MAX_WARNINGS = 8
 _USUAL_TOPICS = {_SCAN: '/scan', _ODOMETRY: '/odom'}

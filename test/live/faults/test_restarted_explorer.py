@@ -142,7 +142,7 @@ def test_an_ordinary_client_has_feedback_again_can_cancel_and_asks_again_for_the
 
 
 def test_whatever_explores_is_a_goal_that_cancel_and_stop_end_for_good(graph):
-    """One that started by itself, also after a kill: paused, cancelled; then one that is stopped."""
+    """One that started by itself is paused, killed and cancelled; one of a client is stopped."""
     stop = graph.node.create_publisher(Bool, 'stop', qos.LATCHED)
     resume = graph.node.create_publisher(Bool, 'explore/resume', qos.STREAM)
     own = {'autostart_exploration': True}
