@@ -29,7 +29,6 @@ from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.nodes.exploration.starts import ACTION, Starts
 from thinmap_ros.nodes.exploration.strategy_source import StrategySource
 from thinmap_ros.nodes.exploration.team_member import Progress, declare_team
-from thinmap_ros.nodes.navigation.tasks import STOPPED
 from thinmap_ros.ros import node_main, parameters
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.checkpoint import StateStamp
@@ -37,7 +36,7 @@ from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
-from thinmap_ros.ros.stop_topic import subscribe_to_stop
+from thinmap_ros.ros.stop_topic import StopTopic
 
 _CHECK_PERIOD_S = 1.0
 
@@ -80,7 +79,7 @@ class ExplorerNode(ThinmapNode):
         self._goals = SingleGoalServer(
             self, Explore, ACTION, self._start, self._on_preempted, self._starts.read
         )
-        subscribe_to_stop(self, self._on_stop)
+        StopTopic(self, self._on_stop)
         self.create_service(Trigger, '~/cancel', self._on_cancel)
         self.create_active_service(SaveMap, 'save_exploration', self._on_save)
         self.create_active_timer(_CHECK_PERIOD_S, self._on_timer)
@@ -116,6 +115,8 @@ class ExplorerNode(ThinmapNode):
         self._driver.adopt(state.drive_prefix)
         if state.goal_id and self._mission.is_running:
             self._goals.restore(state.goal_id)
+        if self._starts.stop_reason:
+            self._cancel(self._starts.stop_reason)
 
     def stop(self) -> None:
         """End the exploration."""
@@ -159,10 +160,10 @@ class ExplorerNode(ThinmapNode):
             self._mission.cancel('cancelled' if is_canceled else 'replaced by a newer goal')
         return Explore.Result(status=self._output.status_now(self._mission))
 
-    def _on_stop(self, is_stopped: bool) -> None:
-        self._starts.stop_heard(is_stopped)
-        if is_stopped:
-            self._cancel(STOPPED)
+    def _on_stop(self, stop: StopTopic) -> None:
+        self._starts.stop_changed(stop.reason)
+        if stop.reason:
+            self._cancel(stop.reason)
 
     def _on_cancel(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         def cancel() -> str:

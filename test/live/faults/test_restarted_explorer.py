@@ -13,7 +13,6 @@ from support.peers.room_robot import RoomRobot
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
-from thinmap_ros.nodes.navigation.tasks import STOPPED
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -164,9 +163,10 @@ def test_whatever_explores_is_a_goal_that_cancel_and_stop_end_for_good(graph):
     exploration.until_driving()
     stop.publish(Bool(data=True))
     ended = graph.result(driven, 'the goal')
-    assert (ended.status, ended.result.status.reason) == (GoalStatus.STATUS_ABORTED, STOPPED)
+    stopped = 'the robot is stopped: /stop: /test_client'
+    assert (ended.status, ended.result.status.reason) == (GoalStatus.STATUS_ABORTED, stopped)
     refused = graph.act(Explore, 'explore', Explore.Goal())
-    assert (refused.status, refused.result.status.reason) == (GoalStatus.STATUS_ABORTED, STOPPED)
+    assert (refused.status, refused.result.status.reason) == (GoalStatus.STATUS_ABORTED, stopped)
     graph.until(lambda: last(exploration.drives)[1] == GoalStatus.STATUS_CANCELING, 'Nav2 is told')
     stop.publish(Bool(data=False))
     resume.publish(Bool(data=True))

@@ -8,7 +8,6 @@ from thinmap_msgs.msg import ExplorationStatus
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.mission import MissionGoal
 from thinmap_ros.nodes.exploration.mission_messages import mission_goal_from
-from thinmap_ros.nodes.navigation.tasks import STOPPED
 from thinmap_ros.ros.action_server import InvalidGoalError
 
 ACTION = 'explore'
@@ -18,24 +17,25 @@ class Starts:
     """Starts the explorer by itself, and refuses goals while the robot is stopped.
 
     The goal is one of the action, so that its status is public and anybody can cancel it. is_due:
-    whether it is still to be sent; is_paused: whether it waits to be continued.
+    whether it is still to be sent; is_paused: whether it waits to be continued. stop_reason: why
+    the robot is stopped, '' if it is not.
     """
 
     def __init__(self, node: Node) -> None:
         self.is_due = False
         self.is_paused = False
-        self._is_stopped = False
+        self.stop_reason = ''
         self._client = ActionClient(node, Explore, ACTION)
 
     def reset(self, is_due: bool) -> None:
         """Begin again; a robot that is stopped does not start by itself."""
-        self.is_due = is_due and not self._is_stopped
+        self.is_due = is_due and not self.stop_reason
         self.is_paused = False
 
-    def stop_heard(self, is_stopped: bool) -> None:
+    def stop_changed(self, reason: str) -> None:
         """Follow the stop of the robot: what has not started yet does not start after it."""
-        self._is_stopped = is_stopped
-        self.is_due &= not is_stopped
+        self.stop_reason = reason
+        self.is_due = self.is_due and not reason
 
     def send_if_due(self) -> None:
         """Send the goal, once, as soon as the server is found."""
@@ -46,8 +46,8 @@ class Starts:
     def read(self, message: Explore.Goal) -> MissionGoal:
         """Goal of a message. Raises InvalidGoalError where it is invalid, or the robot stopped."""
         try:
-            if self._is_stopped:
-                raise InputError(STOPPED)
+            if self.stop_reason:
+                raise InputError(self.stop_reason)
             return mission_goal_from(message)
         except InputError as error:
             status = ExplorationStatus(
