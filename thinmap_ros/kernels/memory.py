@@ -31,8 +31,10 @@ def compiler_memory_releaser(
 
 def _shared_bytes() -> int:
     """File-backed memory of the process, such as libraries; 0 without /proc."""
-    statm = Path('/proc/self/statm')
-    return int(statm.read_text().split()[2]) * mmap.PAGESIZE if statm.exists() else 0
+    try:
+        return int(Path('/proc/self/statm').read_text().split()[2]) * mmap.PAGESIZE
+    except OSError:  # no /proc, or no further file may be opened now
+        return 0
 
 
 def release_free_pages() -> None:
@@ -50,12 +52,13 @@ def release_compiler_pages() -> None:
     happens.
     """
     gc.collect()
-    smaps = Path('/proc/self/smaps')
-    if not smaps.exists():
+    try:
+        smaps = Path('/proc/self/smaps').read_text()
+    except OSError:
         return
     release_free_pages()
     libc = ctypes.CDLL(None)
-    for first, last in _clean_mappings(smaps.read_text(), 'llvmlite'):
+    for first, last in _clean_mappings(smaps, 'llvmlite'):
         libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), mmap.MADV_DONTNEED)
 
 

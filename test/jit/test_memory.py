@@ -1,0 +1,19 @@
+"""Memory is released where it can be, and nothing else happens where it cannot."""
+
+import os
+import resource
+
+from thinmap_ros.kernels import memory
+
+
+def test_without_a_file_that_may_be_opened_nothing_is_released_and_nothing_raised():
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    lowest = os.dup(0)
+    os.close(lowest)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest, limits[1]))
+    try:
+        release = memory.compiler_memory_releaser(period_s=-1.0)
+        release()
+        memory.release_compiler_pages()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
