@@ -2,6 +2,7 @@
 
 import base64
 import io
+import os
 import random
 import re
 import signal
@@ -149,9 +150,26 @@ def test_a_joystick_drives_while_it_is_held_and_no_longer(graph):
     other.ask('drive', ahead=1.0, left=0.0)
     other.until(lambda: other.refusals, 'a refusal')
     assert 'another page drives' in other.refusals[0]
+    page.refusals.clear()
     # Held no longer, without a word.
     page.ask('drive', ahead=0.5, left=-1.0)
     site.until(lambda: velocities(commands[-1:]) == [STANDS], 'the stop of a silent page')
+    # The node is held up: what the page has asked for meanwhile is old when it is read.
+    process = graph.processes['web'].pid
+    page.until(lambda: 'beat' in page.items, 'a beat')
+    os.kill(process, signal.SIGSTOP)
+    heard = page.items['beat']
+    for _ in range(20):
+        page.ask_at(heard, 'drive', ahead=0.5, left=-1.0)
+    page.ask_at(heard, 'initial_pose', x=1.0, y=1.0, theta=0.0)
+    time.sleep(2.1)
+    commands.clear()
+    os.kill(process, signal.SIGCONT)
+    page.until(lambda: len(page.refusals) == 21, 'refusals')
+    assert all('late' in text for text in page.refusals)
+    assert set(velocities(commands)) <= {STANDS}
+    page.ask('resume')
+    site.until(lambda: 'no exploration is paused' in news(page), 'nothing to continue')
     # The connection is lost.
     commands.clear()
     site.until(drives, 'commands again')

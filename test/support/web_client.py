@@ -9,12 +9,15 @@ from support.timeouts import PATIENCE_S
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import websocket_connect
 
+_LATE = 's late: nothing is done'
+
 
 class WebClient:
     """A socket of a page, in a thread of its own.
 
     items: the newest value of each item; refusals: errors that were shown here; opened, then
-    closed: events; bytes: received so far.
+    closed: events; bytes: received so far. Each request says the newest beat, as those of the
+    page do; one that a busy machine delays too long is asked again, as by a person.
     """
 
     def __init__(self, port, token='', origin=None, host='127.0.0.1'):
@@ -29,6 +32,7 @@ class WebClient:
         self._token = token
         self._loop = asyncio.new_event_loop()
         self._socket = None
+        self._asked = {}
         threading.Thread(target=self._run, daemon=True).start()
         assert self.opened.wait(PATIENCE_S)
 
@@ -52,7 +56,9 @@ class WebClient:
         while (text := await self._socket.read_message()) is not None:
             self.bytes += len(text)
             for name, value in json.loads(text):
-                if name == 'refused':
+                if name == 'refused' and _LATE in value and value.split(':')[0] in self._asked:
+                    self.ask(value.split(':')[0], **self._asked[value.split(':')[0]])
+                elif name == 'refused':
                     self.refusals.append(value)
                 else:
                     self.items[name] = value
@@ -69,7 +75,14 @@ class WebClient:
         await self._socket.write_message(text, binary=isinstance(text, bytes))
 
     def ask(self, action, **values):
-        self.send_text(json.dumps({'action': action, **values}))
+        self.ask_at(self.items.get('beat'), action, **values)
+        self._asked[action] = values
+
+    def ask_at(self, beat, action, **values):
+        """Ask as a page that has heard nothing since a beat, once."""
+        self._asked.pop(action, None)
+        heard = {} if beat is None else {'beat': beat}
+        self.send_text(json.dumps({'action': action, **heard, **values}))
 
     def close(self):
         if self._socket is not None and not self.closed.is_set():

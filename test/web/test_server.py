@@ -1,20 +1,30 @@
 """The server with real sockets: who sees what, what is passed on, and what is closed."""
 
+import contextlib
 import http.client
 import json
 import re
 import socket
+import time
 
 import pytest
 from support.web_client import WebClient
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.web.access import Gate, Tokens
+from thinmap_ros.web import handlers
+from thinmap_ros.web.access import Gate, Role, Tokens
 from thinmap_ros.web.board import Board
-from thinmap_ros.web.pages import MAX_PAGES, Pages
+from thinmap_ros.web.pages import MAX_PAGES, MAX_STRANGERS, Pages
+from thinmap_ros.web.requests import beat
 from thinmap_ros.web.server import Address, Server
 
 TOKENS = Tokens('s' * 20, 'w' * 20)
+
+# A web socket that says no token yet.
+HELLO = (
+    b'GET /socket HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n'
+    b'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n'
+)
 
 
 class Taken:
@@ -47,6 +57,11 @@ class Site:
     def open(self, **settings):
         self.clients.append(WebClient(self.port, **settings))
         return self.clients[-1]
+
+    def connect(self, text=b''):
+        stream = socket.create_connection(('127.0.0.1', self.port), timeout=10)
+        stream.sendall(text)
+        return stream
 
     def get(self, path, host=None, method='GET', body=None):
         connection = http.client.HTTPConnection('127.0.0.1', self.port, timeout=10)
@@ -173,22 +188,23 @@ def test_too_many_messages_too_long_ones_and_too_many_pages_are_ended(site):
     long = one.open()
     long.send_text('x' * 100_000)
     assert long.closed.wait(10)
-    pages = [one.open() for _ in range(MAX_PAGES + 1)]
-    assert '503' in str(pages[-1].error) and all(page.error is None for page in pages[:-1])
+    fast.until(lambda: not one.pages.open, 'no page')
+    pages = [one.open() for _ in range(MAX_PAGES)]
+    for page in pages:
+        page.until(lambda page=page: 'hello' in page.items, 'the answer')
+    assert one.open().closed.wait(10) and not one.pages.has_place(Role.STEER)
+    assert all(not page.closed.is_set() for page in pages)
     pages[0].close()
-    pages[1].until(lambda: not one.pages.is_full, 'room for a page')
-    assert one.open().error is None
+    pages[1].until(lambda: one.pages.has_place(Role.STEER), 'room for a page')
+    late = one.open()
+    late.until(lambda: 'hello' in late.items, 'the answer')
 
 
 def test_a_page_that_takes_nothing_does_not_fill_the_memory(site):
     """What is not yet sent is one message; what changes meanwhile is sent once, as it is then."""
     one = site()
-    slow = socket.create_connection(('127.0.0.1', one.port))
+    slow = one.connect(HELLO)
     slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    slow.sendall(
-        b'GET /socket HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n'
-        b'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n'
-    )
     hello = json.dumps({'token': ''}).encode()
     mask = b'\x00\x00\x00\x00'
     slow.sendall(bytes([0x81, 0x80 | len(hello)]) + mask + hello)
@@ -211,3 +227,98 @@ def test_an_address_that_is_taken_is_one_clear_line(site):
     one = site()
     with pytest.raises(InputError, match=f'127.0.0.1:{one.port}: .*in use'):
         Server(Address('127.0.0.1', one.port), one.pages)
+
+
+def test_a_link_that_is_late_moves_nothing_and_stops_all(site):
+    one = site()
+    page = one.open()
+    page.until(lambda: page.items.get('beat', 0) > 0, 'a beat')
+    old = page.items['beat'] - 600
+    page.ask_at(old, 'drive', ahead=1.0, left=0.0)
+    page.ask_at(old - 1500, 'goal', x=1.0, y=1.0, theta=0.0)
+    page.ask_at(beat() + 60_000, 'home')
+    page.ask_at(None, 'resume')
+    page.until(lambda: len(page.refusals) == 4, 'four refusals')
+    assert 's late: nothing is done' in page.refusals[0]
+    assert 's late: nothing is done' in page.refusals[1]
+    assert not one.robot.requests
+    page.ask_at(old, 'drive', ahead=0.0, left=0.0)
+    page.ask_at(old, 'stop')
+    page.ask('home')
+    page.until(lambda: len(one.robot.requests) == 3, 'what is in time')
+    assert [action for _, action in one.robot.requests] == ['drive', 'stop', 'home']
+    first = page.items['beat']
+    page.until(lambda: page.items['beat'] > first, 'a later beat')
+
+
+def test_a_stop_at_the_end_of_what_a_cut_has_held_back_is_heard(site):
+    one = site()
+    page = one.open()
+    page.until(lambda: 'beat' in page.items, 'a beat')
+    for _ in range(200):
+        page.ask_at(page.items['beat'] - 600, 'drive', ahead=1.0, left=0.0)
+    page.ask('stop')
+    page.until(lambda: one.robot.requests, 'the stop')
+    assert one.robot.requests == [(1, 'stop')]
+
+
+@pytest.mark.parametrize('text', [b'', b'GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n', HELLO])
+def test_connections_that_say_no_token_keep_nobody_out(site, text):
+    """Whatever they wait with, the oldest is closed for the newest."""
+    one = site(TOKENS)
+    limit = MAX_STRANGERS if text == HELLO else handlers.MAX_CONNECTIONS
+    first = one.open(token=TOKENS.steer)
+    first.until(lambda: 'hello' in first.items, 'a page of before')
+    idle = [one.connect(text) for _ in range(3 * limit)]
+    page = one.open(token=TOKENS.steer)
+    page.until(lambda: 'hello' in page.items, 'a page between them')
+    assert one.get('/')[0].status == 200
+    for stream in idle[: 2 * limit - 2]:
+        with contextlib.suppress(ConnectionResetError):
+            while stream.recv(4096):
+                pass  # the answer to a hello
+    idle[-1].settimeout(0.0)
+    with pytest.raises(BlockingIOError):
+        while idle[-1].recv(4096):
+            pass
+    assert len(one.pages.open) <= MAX_STRANGERS + 2
+    page.ask('stop')
+    first.until(lambda: one.robot.requests, 'a stop')
+    assert not first.closed.is_set()
+    for stream in idle:
+        stream.close()
+
+
+def test_headers_that_come_slowly_have_an_end(site, monkeypatch):
+    monkeypatch.setattr(handlers, '_HEADERS_S', 0.3)
+    slow = site().connect(b'GET / HTTP/1.1\r\n')
+    end = time.monotonic() + 10
+    with pytest.raises(OSError, match=r'reset|pipe'):
+        while time.monotonic() < end:
+            slow.sendall(b'X: y\r\n')
+            time.sleep(0.02)
+
+
+def test_who_watches_takes_no_place_of_those_who_steer(site):
+    one = site(TOKENS)
+    for _ in range(MAX_PAGES):
+        page = one.open(token=TOKENS.watch)
+        page.until(lambda page=page: 'hello' in page.items, 'the answer')
+    assert one.open(token=TOKENS.watch).closed.wait(10)
+    driver = one.open(token=TOKENS.steer)
+    driver.ask('stop')
+    driver.until(lambda: one.robot.requests, 'the stop')
+
+
+def test_a_flood_of_wrong_tokens_keeps_nobody_out(site):
+    one = site(TOKENS)
+    guessers = [one.connect(HELLO) for _ in range(2 * MAX_STRANGERS)]
+    guess = json.dumps({'token': 'x' * 20}).encode()
+    for stream in guessers:
+        # Of those closed before: nothing is left to say.
+        with contextlib.suppress(OSError):
+            stream.sendall(bytes([0x81, 0x80 | len(guess)]) + b'\x00' * 4 + guess)
+    page = one.open(token=TOKENS.steer)
+    page.until(lambda: 'hello' in page.items, 'a page')
+    for stream in guessers:
+        stream.close()

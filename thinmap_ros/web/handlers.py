@@ -5,17 +5,23 @@ import json
 from importlib.resources import files
 from typing import Any
 
-from tornado.iostream import StreamClosedError
+from tornado.http1connection import HTTP1ServerConnection
+from tornado.httpserver import HTTPServer
+from tornado.iostream import IOStream, StreamClosedError
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.web.access import Role
-from thinmap_ros.web.pages import Pages, PageState, role_of
+from thinmap_ros.web.pages import MAX_PAGES, Pages, PageState, role_of
 from thinmap_ros.web.requests import MAX_MESSAGE_BYTES, parse
 
 _PING_S = 5.0
 _REFUSED = 1008
+_AGAIN = 1013  # the page connects again
+# Connections that are no socket of a page (yet), and the time that they have to ask for something.
+MAX_CONNECTIONS = 64
+_HEADERS_S = 5.0
 _TYPES = {
     'html': 'text/html',
     'js': 'text/javascript',
@@ -72,21 +78,34 @@ class Page(WebSocketHandler):
         origin = self.request.headers.get('Origin')
         if not gate.allows_host(host) or not gate.allows_origin(origin, host):
             raise HTTPError(403)
-        if self._pages.is_full:
-            raise HTTPError(503)
+
+    @property
+    def role(self) -> Role | None:
+        """What the page may do; None: it has not said a token."""
+        return self._state.role
+
+    @property
+    def number(self) -> int:
+        """Of the page, in the order of opening."""
+        return self._state.number
 
     def open(self, *args: str, **kwargs: str) -> None:
         """Begin; nothing is sent before the token is known."""
         self.set_nodelay(True)
-        self._pages.open.add(self)
         self._state.number = self._pages.new_number()
+        self._pages.add(self)
+
+    def drop(self) -> None:
+        """Close the connection at once, without a word."""
+        self.on_close()
+        stream = self.ws_connection.stream if self.ws_connection else None
+        if stream is not None:
+            stream.close()
 
     def on_message(self, message: str | bytes) -> None:
         """Take the token, and then requests."""
         if self._state.role is None:
             self._on_hello(message)
-        elif not self._state.is_within_rate():
-            self.close(_REFUSED, 'too many messages')
         else:
             self._on_request(message)
 
@@ -95,14 +114,24 @@ class Page(WebSocketHandler):
         if role is None:
             self.close(_REFUSED, 'wrong token')
             return
+        if not self._pages.has_place(role):
+            self.close(_AGAIN, f'{MAX_PAGES} pages to {role.value} are open')
+            return
         self._state.role = role
         self._say('hello', {'role': role.value})
 
     def _on_request(self, message: str | bytes) -> None:
+        is_within_rate = self._state.is_within_rate()
+        if not is_within_rate:
+            self.close(_AGAIN, 'too many messages')
         try:
             request = parse(message)
+            # A link that was cut brings all at once: the last of it may be a stop.
+            if not is_within_rate and request.action != 'stop':
+                return
             if self._state.role is not Role.STEER:
                 raise InputError(f'{request.action}: this link is for watching only')
+            request.require_recent()
             self._pages.robot.requested(self._state.number, request)
         except InputError as error:
             self._say('refused', str(error))
@@ -115,7 +144,7 @@ class Page(WebSocketHandler):
         state = self._state
         if state.role is None or state.is_stuck():
             if state.is_overdue():
-                self.close(_REFUSED, 'no answer')
+                self.close(_AGAIN if state.role else _REFUSED, 'no answer')
             return
         if state.change not in encoded:
             encoded[state.change] = self._pages.board.since(state.change)
@@ -134,6 +163,39 @@ class Page(WebSocketHandler):
         if self in self._pages.open:
             self._pages.open.discard(self)
             self._pages.robot.page_closed(self._state.number)
+
+
+class LimitedServer(HTTPServer):
+    """Closes connections that ask for nothing: in time, and of too many the oldest.
+
+    Who asks does so at once, and so gets in between any number of connections that say nothing.
+    Sockets of pages do not count: `Pages` has the limits of these.
+    """
+
+    def initialize(self, pages: Pages) -> None:  # type: ignore[override]
+        """Serve the files of the page, and its socket."""
+        super().initialize(
+            application(pages),
+            max_body_size=0,
+            max_header_size=MAX_MESSAGE_BYTES,
+            idle_connection_timeout=_HEADERS_S,
+        )
+        self._asking: dict[IOStream, None] = {}  # oldest first
+
+    def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
+        """Take a connection."""
+        while len(self._asking) >= MAX_CONNECTIONS:
+            oldest = next(iter(self._asking))
+            del self._asking[oldest]
+            oldest.close()
+        self._asking[stream] = None
+        super().handle_stream(stream, address)
+
+    def on_close(self, server_conn: object) -> None:
+        """Forget a connection: it is closed, or the socket of a page."""
+        super().on_close(server_conn)
+        if isinstance(server_conn, HTTP1ServerConnection):
+            self._asking.pop(server_conn.stream, None)
 
 
 def application(pages: Pages) -> Application:

@@ -7,10 +7,11 @@ from typing import Any, Protocol
 
 from thinmap_ros.web.access import Gate, Role
 from thinmap_ros.web.board import Board
-from thinmap_ros.web.requests import Request
+from thinmap_ros.web.requests import Request, beat
 
 PERIOD_S = 0.1
-MAX_PAGES = 16
+MAX_PAGES = 16  # of each role: who may only watch takes no place of those who steer
+MAX_STRANGERS = 64  # sockets that have not said a token yet
 _MAX_REQUESTS_PER_S = 50
 _HELLO_S = 5.0
 # A page that takes nothing for so long is gone.
@@ -75,10 +76,19 @@ class Pages:
         self.open: set[Any] = set()
         self._last = 0
 
-    @property
-    def is_full(self) -> bool:
-        """Whether no other page may be opened."""
-        return len(self.open) >= MAX_PAGES
+    def has_place(self, role: Role) -> bool:
+        """Whether another page of a role may be opened."""
+        return sum(page.role is role for page in self.open) < MAX_PAGES
+
+    def add(self, page: Any) -> None:
+        """Open a page; of too many that have said no token, the oldest is closed.
+
+        One that has a token says it at once, however many others come.
+        """
+        strangers = [other for other in self.open if other.role is None]
+        if len(strangers) >= MAX_STRANGERS:
+            min(strangers, key=lambda other: other.number).drop()
+        self.open.add(page)
 
     def new_number(self) -> int:
         """Number of a page."""
@@ -89,6 +99,7 @@ class Pages:
         """Send to each page, ten times a second, what has changed."""
         while True:
             await asyncio.sleep(PERIOD_S)
+            self.board.put('beat', beat())
             encoded: dict[int, tuple[int, str]] = {}
             for page in list(self.open):
                 page.send(encoded)

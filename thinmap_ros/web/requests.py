@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from time import monotonic
 from typing import Any
 
 from thinmap_ros.core.errors import InputError, quoted
@@ -14,6 +15,20 @@ from thinmap_ros.core.se2 import MAX_COORDINATE_M
 MAX_MESSAGE_BYTES = 16_384
 _MAX_CORNERS = 200
 _MAX_ID = 2**32 - 1
+_MAX_BEAT = 2**53  # what a page can count to
+# Ages, there and back, beyond which a request no longer says what a person wants now: a hand on
+# the joystick has moved on; who has clicked and seen nothing for two seconds clicks again, or walks
+# up to the robot. What stops the robot is never too old.
+_MAX_AGE_S = {
+    'drive': 0.5,
+    'goal': 2.0,
+    'go_to_region': 2.0,
+    'home': 2.0,
+    'explore': 2.0,
+    'resume': 2.0,
+    'release': 2.0,
+    'initial_pose': 2.0,
+}
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9_-]{0,63}')
 
 
@@ -21,11 +36,37 @@ _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9_-]{0,63}')
 class Request:
     """A request of a page.
 
-    action: its name; values: its fields, each of the type and in the range that the action has.
+    action: its name; values: its fields, each of the type and in the range that the action has;
+    beat: the newest that the page had received, where it says one.
     """
 
     action: str
     values: dict[str, Any]
+    beat: int | None = None
+
+    @property
+    def max_age_s(self) -> float:
+        """Age until which it is done; a joystick that is let go is never too late."""
+        is_zero = self.action == 'drive' and not any(self.values.values())
+        return math.inf if is_zero else _MAX_AGE_S.get(self.action, math.inf)
+
+    def require_recent(self) -> None:
+        """Raise InputError where the page has asked too long ago, by the beat that it heard."""
+        if self.beat is None:
+            return  # `parse` refuses those that need one
+        age_s = (beat() - self.beat) / 1000
+        if self.max_age_s < math.inf and age_s < 0.0:
+            raise InputError(f'{self.action}: beat {self.beat}: expected one that was sent')
+        if age_s > self.max_age_s:
+            raise InputError(
+                f'{self.action}: the link is {age_s:.1f} s late: nothing is done: '
+                f'expected at most {self.max_age_s:g} s'
+            )
+
+
+def beat() -> int:
+    """Time of this machine, ms, that pages receive again and again, and send back."""
+    return int(1000 * monotonic())
 
 
 def _number(limit: float) -> Callable[[Any], float]:
@@ -126,7 +167,8 @@ _ACTIONS: dict[str, dict[str, Callable[[Any], Any]]] = {
 def parse(text: str | bytes) -> Request:
     """Request of a message of a page.
 
-    Raises InputError where it is not one JSON object with `action` and exactly its fields.
+    Raises InputError where it is not one JSON object with `action`, exactly its fields, and the
+    beat: of what moves the robot, or lets it move, the age is known.
     """
     if len(text) > MAX_MESSAGE_BYTES:
         raise InputError(f'{len(text)} bytes: expected at most {MAX_MESSAGE_BYTES}')
@@ -140,10 +182,21 @@ def parse(text: str | bytes) -> Request:
     fields = _ACTIONS.get(action) if isinstance(action, str) else None
     if fields is None:
         raise InputError(f'action {quoted(action)}: expected one of {", ".join(_ACTIONS)}')
+    heard = _beat(action, content.pop('beat')) if 'beat' in content else None
     if content.keys() != fields.keys():
         names = ', '.join(fields) or 'none'
         raise InputError(f'{action}: fields {quoted(sorted(content))}: expected {names}')
-    return Request(action, {name: _checked(action, name, content[name]) for name in fields})
+    values = {name: _checked(action, name, content[name]) for name in fields}
+    request = Request(action, values, heard)
+    if heard is None and request.max_age_s < math.inf:
+        raise InputError(f'{action}: no beat: expected the newest that the page has received')
+    return request
+
+
+def _beat(action: str, value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _MAX_BEAT:
+        raise InputError(f'{action}: beat: {quoted(value)}: expected a number of milliseconds')
+    return value
 
 
 def _checked(action: str, name: str, value: Any) -> Any:

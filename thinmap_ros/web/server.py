@@ -7,7 +7,6 @@ from threading import Event, Thread
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.web.pages import Pages
-from thinmap_ros.web.requests import MAX_MESSAGE_BYTES
 
 _START_S = 10.0
 
@@ -78,14 +77,11 @@ class Server:
             page.on_close()
 
     async def _listen(self, address: Address) -> None:
-        from tornado.httpserver import HTTPServer
         from tornado.netutil import bind_sockets
 
-        from thinmap_ros.web.handlers import application
+        from thinmap_ros.web.handlers import LimitedServer
 
-        server = HTTPServer(
-            application(self._pages), max_body_size=0, max_header_size=MAX_MESSAGE_BYTES
-        )
+        server = LimitedServer(self._pages)
         sockets = bind_sockets(address.port, address.host)
         server.add_sockets(sockets)
         self.port = int(sockets[0].getsockname()[1])

@@ -75,6 +75,11 @@ class Hold:
         return self._is_own or self._is_others
 
     @property
+    def last(self) -> int:
+        """Number of the last stop, ended or not; 0: none."""
+        return self._stops
+
+    @property
     def number(self) -> int:
         """Number of the stop that holds the robot; 0: none."""
         return self._stops if self.is_on else 0
@@ -151,7 +156,8 @@ class Steering:
             raise InputError(f'{action}: the robot is stopped: expected it to be released first')
         if action == 'drive' and self._drive.take(page):
             self._later(self._tasks.cancel_all)
-        self._later(lambda: self._do(request))
+        stops = self._held.last
+        self._later(lambda: self._do(request, stops))
 
     def page_closed(self, page: int) -> None:
         """Stop the robot if this page drives it."""
@@ -162,6 +168,8 @@ class Steering:
         self._held.begin()
         self._held.topic.publish(True)
         self._drive.halt()
+        # Also where the release comes before the node has had the time to hold the robot.
+        self._later(self._tasks.cancel_all)
         self._later(self._hold)
 
     def _release(self, stop: int) -> None:
@@ -215,9 +223,12 @@ class Steering:
     def _show_goal(self, pose: Array | None) -> None:
         self._picture.board.put('goal', None if pose is None else pose.tolist())
 
-    def _do(self, request: Request) -> None:
-        if self._held.is_on and request.action not in _ALWAYS:
-            return  # stopped since it was taken
+    def _do(self, request: Request, stops: int) -> None:
+        """Do a request; stops: number of the last stop when it was taken."""
+        is_stopped = self._held.is_on or self._held.last != stops
+        if is_stopped and request.action not in _ALWAYS:
+            return  # stopped since it was taken, and perhaps released
+        request.require_recent()  # it may have waited for the node
         getattr(self, f'_do_{request.action}')(**request.values)
 
     def _do_goal(self, x: float, y: float, theta: float) -> None:
@@ -251,6 +262,7 @@ class Steering:
         self.tell('exploration paused')
 
     def _do_resume(self) -> None:
+        self._tasks.require_paused()
         self._publishers[_RESUME].publish(Bool(data=True))
         self.tell('exploration continues')
 

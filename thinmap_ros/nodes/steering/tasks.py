@@ -8,6 +8,7 @@ from action_msgs.srv import CancelGoal
 from nav2_msgs.action import NavigateToPose
 from rclpy.action import ActionClient
 from rclpy.task import Future
+from std_msgs.msg import String
 
 from thinmap_msgs.action import Explore
 from thinmap_ros.core.errors import InputError
@@ -17,6 +18,7 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 NAVIGATE = 'navigate_to_pose'
 EXPLORE = 'explore'
+_PAUSED = 'exploration_paused'  # as explore_lite has it, on explore/status
 _DRIVING = (NAVIGATE, 'navigate_through_poses')
 _ACTIVE = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING)
 _OUTCOMES = {
@@ -48,6 +50,10 @@ class RobotTasks:
             for name in (EXPLORE, *_DRIVING)
         }
         self._is_held = False
+        self._cancels_asked = 0
+        self._active = {name: False for name in self._cancels}
+        self._word = ''
+        node.create_subscription(String, 'explore/status', self._on_word, qos.LATCHED)
         self._newest: Future | None = None
         for name in self._cancels:
             node.create_subscription(
@@ -64,7 +70,8 @@ class RobotTasks:
             self.cancel_all()
 
     def cancel_all(self) -> None:
-        """Cancel all goals of all clients."""
+        """Cancel all goals of all clients, and those of the page that are on their way."""
+        self._cancels_asked += 1
         for name in self._cancels:
             self._cancel(name)
 
@@ -75,6 +82,11 @@ class RobotTasks:
         target = messages.pose_stamped_msg(pose, self._map_frame, now_ns)
         self._on_goal(pose)
         self._send(self._navigate, NavigateToPose.Goal(pose=target), 'goal')
+
+    def require_paused(self) -> None:
+        """Raise InputError unless there is an exploration that waits to be continued."""
+        if not self._active[EXPLORE] or self._word != _PAUSED:
+            raise InputError('resume: no exploration is paused: expected one, or Explore to start')
 
     def explore(self, area: list[tuple[float, float]], return_home: bool) -> None:
         """Start an exploration inside a polygon, m. Raises InputError where no explorer runs."""
@@ -90,14 +102,17 @@ class RobotTasks:
         sent = client.send_goal_async(goal)
         if what == 'goal':
             self._newest = sent
-        sent.add_done_callback(lambda future: self._on_answer(future, what))
+        cancels = self._cancels_asked
+        sent.add_done_callback(lambda future: self._on_answer(future, what, cancels))
 
-    def _on_answer(self, sent: Future, what: str) -> None:
+    def _on_answer(self, sent: Future, what: str, cancels: int) -> None:
         handle = sent.result()
         if handle is None or not handle.accepted:
             self._end(sent, f'{what} rejected')
             return
         self._on_news(f'{what} accepted')
+        if cancels != self._cancels_asked:
+            handle.cancel_goal_async()  # all goals were cancelled before this one was known
         handle.get_result_async().add_done_callback(
             lambda future: self._on_result(sent, future.result(), what)
         )
@@ -119,5 +134,9 @@ class RobotTasks:
             self._cancels[name].call_async(CancelGoal.Request())
 
     def _on_status(self, name: str, message: GoalStatusArray) -> None:
-        if self._is_held and any(status.status in _ACTIVE for status in message.status_list):
+        self._active[name] = any(status.status in _ACTIVE for status in message.status_list)
+        if self._is_held and self._active[name]:
             self._cancel(name)
+
+    def _on_word(self, message: String) -> None:
+        self._word = message.data

@@ -5,6 +5,8 @@ import { Plot } from './plot.js';
 
 const DRIVE_PERIOD_MS = 100;
 const RETRY_MS = 1000;
+const LATE_MS = 500; // a page that has heard nothing for so long does not drive
+const GONE_MS = 1500; // and says so
 const HINTS = {
   pan: '',
   goal: 'Click where the robot should go; drag for its heading.',
@@ -27,17 +29,32 @@ let socket = null;
 let mode = 'pan';
 let limit = [];
 let drawn = []; // corners of what is being drawn: an area, a wall, a part to erase
-const state = { isHeld: false, opened: performance.now() };
+const state = { isHeld: false, opened: performance.now(), heard: 0, link: '' };
 window.thinmap = { items, view }; // for tests and the curious
 
 function ask(action, values = {}) {
-  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ action, ...values }));
+  // The newest beat says how old a request is when it arrives.
+  const beat = items.get('beat');
+  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ action, beat, ...values }));
   else say('not connected: nothing was sent');
 }
 
 function say(text) {
   find('news').textContent = text;
 }
+
+function showLink(text, isBad) {
+  find('link').textContent = text;
+  find('link').className = isBad ? 'bad' : '';
+}
+
+const silentMs = () => performance.now() - state.heard;
+
+setInterval(() => {
+  if (!state.link) return;
+  const isLate = silentMs() > GONE_MS;
+  showLink(isLate ? `late: nothing heard for ${Math.round(silentMs() / 1000)} s` : state.link, isLate);
+}, LATE_MS);
 
 function connect() {
   const scheme = location.protocol === 'https:' ? 'wss' : 'ws';
@@ -47,8 +64,8 @@ function connect() {
   socket.onclose = (event) => {
     release();
     const isRefused = event.code === 1008;
-    find('link').textContent = isRefused ? event.reason || 'refused' : 'lost: trying again';
-    find('link').className = 'bad';
+    state.link = '';
+    showLink(isRefused ? event.reason || 'refused' : `${event.reason || 'lost'}: trying again`, true);
     if (!isRefused) setTimeout(connect, RETRY_MS);
   };
 }
@@ -59,8 +76,12 @@ const takers = {
     items.clear();
     view.newMap();
     document.body.classList.toggle('watch', role !== 'steer');
-    find('link').textContent = role === 'steer' ? 'connected' : 'watching';
-    find('link').className = '';
+    state.heard = performance.now();
+    state.link = role === 'steer' ? 'connected' : 'watching';
+    showLink(state.link, false);
+  },
+  beat: () => {
+    state.heard = performance.now();
   },
   map: () => view.newMap(),
   graph: ({ edges }) => {
@@ -157,7 +178,7 @@ function take(name, value) {
   }
   if (name !== 'hello') items.set(name, value);
   takers[name]?.(value);
-  view.redraw();
+  if (name !== 'beat') view.redraw();
 }
 
 // Stop: also while something else has the focus, except the name of a region.
@@ -357,7 +378,9 @@ function push(event) {
 }
 
 function drive() {
-  if (hold && !state.isHeld) ask('drive', { ahead: hold.ahead, left: hold.left });
+  if (!hold || state.isHeld) return;
+  if (silentMs() > LATE_MS) say('the link is late: the joystick does not drive');
+  else ask('drive', { ahead: hold.ahead, left: hold.left });
 }
 
 function release() {
