@@ -16,7 +16,6 @@ if there are any.
 import argparse
 import csv
 import os
-import random
 import re
 import signal
 import subprocess
@@ -25,6 +24,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ import psutil
 from benchmarks.faults.judge import Record
 from benchmarks.faults.kinds import KINDS, random_faults
 from benchmarks.interruption import Interruption
+from benchmarks.speed.node_process import use_own_domain
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
@@ -143,18 +144,29 @@ class Driver:
                     self.step_ms[name] = float(median[1])
 
 
-def start(name: str, parameters: str) -> psutil.Popen:
-    """Start a node, its parameters given as name:=value and separated by spaces."""
+def start(name: str, parameters: str, state: Path) -> psutil.Popen:
+    """Start a node, its parameters given as name:=value and separated by spaces.
+
+    state: folder of its checkpoint.
+    """
     words = [word for parameter in parameters.split() for word in ('-p', parameter)]
     command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', '--ros-args', *words]
-    return psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    environment = {**os.environ, 'THINMAP_STATE_DIR': str(state)}
+    return psutil.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment
+    )
 
 
-def start_all(world: str, at: np.ndarray, rate: float, seed: int) -> dict[str, psutil.Popen]:
-    """Start nodes and simulator; returns the nodes, and the simulator as `sim`."""
+def start_all(
+    world: str, at: np.ndarray, rate: float, seed: int, state: Path
+) -> dict[str, psutil.Popen]:
+    """Start nodes and simulator; returns the nodes, and the simulator as `sim`.
+
+    state: folder of the checkpoints of the nodes.
+    """
     pose = f'initial_x_m:={at[0]} initial_y_m:={at[1]} initial_yaw_rad:={at[2]}'
     found = {
-        name: start(name, f'use_sim_time:=true {pose if name == "localizer" else ""}')
+        name: start(name, f'use_sim_time:=true {pose if name == "localizer" else ""}', state)
         for name in _NODES
     }
     place = f'start:={at[0]},{at[1]},{at[2]}'
@@ -162,6 +174,7 @@ def start_all(world: str, at: np.ndarray, rate: float, seed: int) -> dict[str, p
         'sim',
         f'world:={world} {place} real_time_factor:={rate} seed:={seed} '
         'lockstep:=local_topology wait_for_subscribers:=3',
+        state,
     )
     return found
 
@@ -246,12 +259,13 @@ def _drive(arguments: argparse.Namespace, path: Path, world: World) -> bool:
     """Drive, measure and print the verdict; returns whether it is good."""
     driver = Driver(world, arguments.seed)
     rate = arguments.rate or _RATE
-    nodes = start_all(str(path), world.start, rate, arguments.seed)
-    try:
-        samples = measure(driver, nodes, arguments, arguments.out / 'endurance.csv')
-    finally:
-        stop(nodes)
-        driver.close()
+    with TemporaryDirectory() as state:
+        nodes = start_all(str(path), world.start, rate, arguments.seed, Path(state))
+        try:
+            samples = measure(driver, nodes, arguments, arguments.out / 'endurance.csv')
+        finally:
+            stop(nodes)
+            driver.close()
     return verdict(samples, driver)
 
 
@@ -285,12 +299,6 @@ def _drive_with_faults(arguments: argparse.Namespace, path: Path, world: World) 
     finally:
         print(report.table(records))
     return not any(record.violations() for record in records)
-
-
-def use_own_domain() -> None:
-    """Let nobody else be on the graph."""
-    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 
 def work(arguments: argparse.Namespace) -> None:

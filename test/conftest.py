@@ -16,8 +16,9 @@ import pytest
 from hypothesis import settings
 from support.forks import forked
 from support.hidden_library import hide_ros
-from support.ros_domains import free_domain
 from support.timeouts import limited_cpu_time as limited_cpu_time
+
+from thinmap_ros.evaluation.ros_domains import free_domain
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = next(

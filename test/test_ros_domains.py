@@ -6,17 +6,25 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
-from pathlib import Path
 
 import pytest
-from support import ros_domains
 from support.timeouts import PATIENCE_S
 
+from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.evaluation import ros_domains
+
 ANOTHER = """
-import ros_domains
+from thinmap_ros.evaluation import ros_domains
 with ros_domains.free_domain() as domain:
     print(domain, flush=True)
     input()
+"""
+PROGRAM = """
+import os
+from benchmarks.speed.node_process import use_own_domain
+use_own_domain()
+print(os.environ['ROS_DOMAIN_ID'], flush=True)
+input()
 """
 NODE = """
 import rclpy
@@ -35,16 +43,16 @@ def test_no_domain_is_given_twice_and_all_can_be_had_again():
 
 
 @pytest.mark.programs
-def test_a_domain_that_another_process_has_is_left_alone(monkeypatch):
+@pytest.mark.parametrize('code', [ANOTHER, PROGRAM], ids=['test', 'program'])
+def test_a_domain_that_another_process_has_is_left_alone(monkeypatch, code):
     other = subprocess.Popen(
-        [sys.executable, '-c', ANOTHER],
+        [sys.executable, '-c', code],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        cwd=Path(ros_domains.__file__).parent,
     )
     domain = int(other.stdout.readline())
     monkeypatch.setattr(ros_domains, 'DOMAINS', range(domain, domain + 1))
-    with pytest.raises(RuntimeError, match='none of the ROS domains'), ros_domains.free_domain():
+    with pytest.raises(ThinmapError, match='none of the ROS domains'), ros_domains.free_domain():
         pass
     other.kill()
     other.communicate()
@@ -55,7 +63,7 @@ def domains_until_free(domain: int) -> Iterator[int]:
     """The domain again, once tests beside this one, which may have it for a moment, let it go."""
     end = time.monotonic() + PATIENCE_S
     while time.monotonic() < end:
-        with suppress(RuntimeError), ros_domains.free_domain() as again:
+        with suppress(ThinmapError), ros_domains.free_domain() as again:
             yield again
             return
         time.sleep(0.05)
@@ -89,7 +97,7 @@ def test_a_domain_on_which_a_node_listens_is_left_alone(monkeypatch):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as node:
         node.bind(('127.0.0.1', 7400 + 250 * domain + 10 + 2 * 2))
         with (
-            pytest.raises(RuntimeError, match='none of the ROS domains'),
+            pytest.raises(ThinmapError, match='none of the ROS domains'),
             ros_domains.free_domain(),
         ):
             pass

@@ -3,22 +3,22 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from benchmarks.faults.kinds import Fault
+from benchmarks.faults.kinds import WRONG_S, Fault
 from benchmarks.faults.map_watch import Drawn
 from benchmarks.faults.track import Located
 
 ERROR_M = 0.1
-LASTS_S = 3.0
 
 
 @dataclass
 class PoseWatch:
     """Watches for a pose error that lasts and is not reported.
 
-    since_s: time since which it is so, None while it is not; worst_m: largest error of a pose that
-    counts as known.
+    limit_s: how long it may last. since_s: time since which it is so, None while it is not;
+    worst_m: largest error of a pose that counts as known.
     """
 
+    limit_s: float = WRONG_S
     since_s: float | None = None
     worst_m: float = 0.0
     longest_s: float = 0.0
@@ -39,7 +39,7 @@ class PoseWatch:
     @property
     def is_violated(self) -> bool:
         """Whether an error has lasted for too long without a report."""
-        return self.longest_s > LASTS_S
+        return self.longest_s > self.limit_s
 
 
 @dataclass

@@ -12,6 +12,8 @@ STOP = 'stop'
 _GAP_S = (10.0, 30.0)
 # Speed and deceleration of the robot are 0.5 m/s and 0.4 m/s^2: a stop takes 0.3 m.
 _SILENT_M = 0.75
+WRONG_S = 3.0
+_KIDNAPPED_S = 5.0  # as docs/development/targets.md has it
 _POSE_M = 2.25  # the navigator drives for 3 s without a pose
 
 
@@ -22,7 +24,8 @@ class Kind:
     seconds: shortest and longest duration (simulated). stop_m: how far the robot may drive while it
     lasts. stand_s: after this time, all commands must be zero. resets: nodes discard their state,
     as documented, so that all of them are started again afterwards. may_end_lost: the robot need
-    not drive again, as long as it says that its pose is unknown.
+    not drive again, as long as it says that its pose is unknown. wrong_s: how long a wrong pose may
+    last without a report.
     """
 
     name: str
@@ -31,6 +34,7 @@ class Kind:
     stand_s: float = math.inf
     resets: bool = False
     may_end_lost: bool = False
+    wrong_s: float = WRONG_S
     node: str = ''
 
     @property
@@ -83,7 +87,8 @@ KINDS = {
         Kind('late_data', (5.0, 10.0), _SILENT_M, 2.0),
         Kind('wheels_blocked', (3.0, 20.0)),
         Kind('use_sim_time', (1.0, 1.0)),
-        Kind('carried_off', (1.0, 1.0), may_end_lost=True),
+        # No motion was observed: only the scans contradict the map.
+        Kind('carried_off', (1.0, 1.0), may_end_lost=True, wrong_s=_KIDNAPPED_S),
         Kind('reset_localizer', (1.0, 1.0), resets=True),
         Kind('forget_localizer', (0.5, 3.0), _POSE_M, node='localizer', may_end_lost=True),
     )

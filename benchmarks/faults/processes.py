@@ -22,7 +22,8 @@ _LAST_LINES = 300
 class Processes:
     """Processes by name.
 
-    Logs are in a folder, and so is the state that killed nodes leave. speed_m_s: of the robot.
+    Logs are in a folder, and until `close` so is the state that killed nodes leave. speed_m_s: of
+    the robot.
     """
 
     def __init__(self, folder: Path, speed_m_s: float) -> None:
@@ -49,7 +50,7 @@ class Processes:
 
     def start_nodes(self, T_map_base: Array) -> None:
         """Start all nodes with an empty map and the robot at a pose (3,)."""
-        shutil.rmtree(self._folder / 'state', ignore_errors=True)
+        self._remove_state()
         x, y, yaw = T_map_base.tolist()
         self._initial = {'initial_x_m': x, 'initial_y_m': y, 'initial_yaw_rad': yaw}
         for name in NODES:
@@ -82,8 +83,8 @@ class Processes:
             process.wait()
 
     def forget(self, name: str) -> None:
-        """Remove the checkpoint of a node that was killed."""
-        for path in (self._folder / 'state').glob(f'*.{name}.npz'):
+        """Remove the checkpoints of a node that was killed, whatever the parts of its state."""
+        for path in (self._folder / 'state').glob(f'*.{name}.*'):
             path.unlink()
 
     def ended(self) -> dict[str, str]:
@@ -106,7 +107,12 @@ class Processes:
         for process in psutil.wait_procs(running, timeout=_STOP_S)[1]:
             with suppress(psutil.NoSuchProcess):
                 process.kill()
+                process.wait()
         self._running = {}
+        self._remove_state()
+
+    def _remove_state(self) -> None:
+        shutil.rmtree(self._folder / 'state', ignore_errors=True)
 
     def _start(
         self,

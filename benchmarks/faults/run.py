@@ -156,7 +156,7 @@ class FaultRun:
         if fault.kind.resets:
             self._spin_until(lambda: track.time_s > begun_s + _REALIGN_S)
             self._observer.align_map()
-            self._record.pose = PoseWatch()
+            self._record.pose = PoseWatch(fault.kind.wrong_s)
         drives = False
         watch = self._record.pose
 
@@ -186,7 +186,8 @@ class FaultRun:
 
     def _begin_record(self, fault: Fault | None) -> None:
         track = self._observer.track
-        self._record = Record(fault, track.time_s, drawn=self._observer.map.begin())
+        watch = PoseWatch(fault.kind.wrong_s) if fault else PoseWatch()
+        self._record = Record(fault, track.time_s, pose=watch, drawn=self._observer.map.begin())
         self._begun_m = track.travelled_m
 
     def _end_record(self, report: Callable[[Record], None]) -> None:

@@ -1,7 +1,6 @@
 """Nodes as processes on a ROS graph of their own, and what a subscriber receives of them."""
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -10,13 +9,15 @@ from collections import Counter
 
 import psutil
 
+from thinmap_ros.evaluation.ros_domains import use_free_domain
+
 _STOP_S = 10.0
 _DRIVE_PERIOD_S = 0.1
 
 
 def use_own_domain() -> None:
     """Let nobody else be on the graph."""
-    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
+    use_free_domain()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 

@@ -12,7 +12,6 @@ import argparse
 import csv
 import math
 import os
-import random
 import tempfile
 import time
 from collections.abc import Mapping
@@ -35,6 +34,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.evaluation.ros_domains import use_free_domain
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, qos
@@ -287,7 +287,8 @@ def main() -> None:
     parser.add_argument('--time-limit-s', type=float, default=3000.0, help='simulated s')
     parser.add_argument('--folder', type=Path, default=WORLDS, help='folder with worlds.json')
     arguments = parser.parse_args()
-    os.environ.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randrange(1, 102)))
+    if 'ROS_DOMAIN_ID' not in os.environ:
+        use_free_domain()
     rclpy.init()
     for name in arguments.worlds:
         world, path = _world(arguments.folder, name)

@@ -170,6 +170,19 @@ def test_an_error_that_lasts_and_is_not_reported_is_a_violation(
     assert watch.is_violated == violated
 
 
+@pytest.mark.parametrize(
+    ('kind', 'seconds', 'violated'),
+    [('carried_off', 3.4, False), ('carried_off', 5.4, True), ('odom_jump', 3.4, True)],
+)
+def test_a_kidnapping_may_be_noticed_later_than_other_faults(
+    kind: str, seconds: float, violated: bool
+) -> None:
+    watch = PoseWatch(KINDS[kind].wrong_s)
+    for time_s in (0.0, seconds):
+        watch.add(Located(time_s, 2.0, True, 0), is_reported=False)
+    assert watch.is_violated == violated
+
+
 def test_late_data_keep_their_stamps_and_order_and_come_at_once_in_the_end() -> None:
     faults = StreamFaults(100 * SECOND_NS)
     faults.begin('late_data', 1)
@@ -242,10 +255,13 @@ def test_a_robot_is_carried_to_a_clear_place_some_metres_away() -> None:
 
 def test_a_checkpoint_is_forgotten(tmp_path: Path) -> None:
     (tmp_path / 'state').mkdir()
-    for name in ('63.localizer.npz', '63.grid_mapper.npz'):
+    for name in ('63.localizer.npz', '63.localizer.dear', '63.grid_mapper.npz'):
         (tmp_path / 'state' / name).touch()
-    Processes(tmp_path, 0.5).forget('localizer')
+    processes = Processes(tmp_path, 0.5)
+    processes.forget('localizer')
     assert [path.name for path in (tmp_path / 'state').iterdir()] == ['63.grid_mapper.npz']
+    processes.close()
+    assert not list(tmp_path.iterdir())
 
 
 def drawn_map(*points: tuple[float, float]) -> GridPatch:

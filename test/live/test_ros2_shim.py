@@ -20,9 +20,9 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.duration import Duration
 from std_msgs.msg import String
 from support.live_graph import Graph
-from support.ros_domains import free_domain
 from support.timeouts import PATIENCE_S
 
+from thinmap_ros.evaluation.ros_domains import free_domain
 from thinmap_ros.ros import qos
 
 pytestmark = pytest.mark.live

@@ -7,7 +7,6 @@ import argparse
 import contextlib
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -25,6 +24,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation import recorded_run, recorded_team_run
 from thinmap_ros.evaluation.exploration_metrics import exploration_title
 from thinmap_ros.evaluation.processes import end_with_parent
+from thinmap_ros.evaluation.ros_domains import use_free_domain
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_starts, read_world
 from thinmap_ros.sim.other_robots import MAX_ROBOTS, starts_in
@@ -223,7 +223,7 @@ def _prepare(out: Path) -> None:
 def _choose_domain() -> None:
     """Choose a separate ROS domain, unless the user has set one, to isolate simultaneous demos."""
     if 'ROS_DOMAIN_ID' not in os.environ:
-        os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
+        use_free_domain()
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     print(f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}', file=sys.stderr)
 

@@ -1,6 +1,6 @@
-"""ROS domains for tests: one test at a time uses a domain on this machine.
+"""ROS domains for tests and programs: one of them at a time uses a domain on this machine.
 
-Nodes of two tests on one domain would communicate, also if different users run the tests.
+Nodes of two of them on one domain would communicate, also if different users run them.
 """
 
 import errno
@@ -9,8 +9,10 @@ import os
 import re
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+
+from thinmap_ros.core.errors import ThinmapError
 
 # Above it, the ports of a domain are in the range of ephemeral ports.
 DOMAINS = range(1, 102)
@@ -22,11 +24,23 @@ _PARTICIPANTS = 32
 SHARED_MEMORY = Path('/dev/shm')
 # Each test uses another domain, and processes start at different ones.
 _turns = itertools.count(os.getpid())
+_of_this_process = ExitStack()
+
+
+def use_free_domain() -> None:
+    """Set ROS_DOMAIN_ID of this process and its children; the domain is theirs until it ends.
+
+    Raises ThinmapError if no domain is free.
+    """
+    os.environ['ROS_DOMAIN_ID'] = str(_of_this_process.enter_context(free_domain()))
 
 
 @contextmanager
 def free_domain() -> Iterator[int]:
-    """A domain that no other test uses, and without nodes on this machine."""
+    """A domain that no other test or program uses, and without nodes on this machine.
+
+    Raises ThinmapError if there is none.
+    """
     for _ in DOMAINS:
         domain = DOMAINS[next(_turns) % len(DOMAINS)]
         lock = _lock(domain)
@@ -37,7 +51,7 @@ def free_domain() -> Iterator[int]:
                 _remove_stale_ports(domain)
                 yield domain
                 return
-    raise RuntimeError(f'none of the ROS domains {DOMAINS[0]} to {DOMAINS[-1]} is free')
+    raise ThinmapError(f'none of the ROS domains {DOMAINS[0]} to {DOMAINS[-1]} is free')
 
 
 def _lock(domain: int) -> socket.socket | None:
