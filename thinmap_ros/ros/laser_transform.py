@@ -1,6 +1,7 @@
 """The pose of the laser on the robot, from /tf_static or from a parameter."""
 
 import math
+from contextlib import suppress
 
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
@@ -13,8 +14,7 @@ from thinmap_ros.logs.frames.laser_mount import Mount, StaticTransforms, parse_l
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-
-_MAX_FRAMES = 1000
+from thinmap_ros.ros.tf.transform_reader import TransformReader
 
 
 class _FirstScans:
@@ -72,6 +72,7 @@ class LaserTransform:
         self._laser = parameters.declare_config(node, LaserConfig)
         self._fixed = Mount(parse_laser_pose(str(given)), upside_down=False) if given else None
         self._transforms = StaticTransforms()
+        self._reader = TransformReader(lambda frame: frame in self._mounts)
         self._mounts: dict[str, Mount] = {}
         self._changes: dict[str, str] = {}
         self._first = _FirstScans(node, self.scan_topic)
@@ -79,7 +80,7 @@ class LaserTransform:
             node.diagnostics.add_check(WARN, lambda: '; '.join(self._changes.values()))
         if self._fixed is None:
             node.create_subscription(
-                TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
+                TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS, raw=True
             )
 
     def to_scan(self, message: LaserScan) -> Scan:
@@ -113,13 +114,11 @@ class LaserTransform:
             self._mounts[frame_id] = found
         return self._mounts[frame_id]
 
-    def _on_static(self, message: TFMessage) -> None:
-        for transform in message.transforms:
-            try:
-                if len(self._transforms.frames) < _MAX_FRAMES:
+    def _on_static(self, data: bytes) -> None:
+        with suppress(InputError):  # the frames of an invalid message stay unknown
+            for transform in self._reader.read(data):
+                with suppress(InputError):
                     self._transforms.add(transform)
-            except InputError:
-                continue  # the frame of an invalid transform stays unknown
         self._changes = {
             frame: f'static transform of laser {quoted(frame)} {change}: the first one is used; '
             'expected a laser that does not move on the robot: restart the node for the new one'

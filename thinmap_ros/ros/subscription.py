@@ -156,7 +156,10 @@ class AdaptiveSubscription:
         topic: str,
         on_message: Callable[[Any, dict[str, Any]], None],
         profile: QoSProfile,
+        raw: bool = False,
     ) -> None:
+        """raw: messages are given as they were sent, serialized."""
+        self._raw = raw
         self._node = node
         self._kind = kind
         self._topic = topic
@@ -173,6 +176,7 @@ class AdaptiveSubscription:
             self._on_message,
             self._profile,
             event_callbacks=events,
+            raw=self._raw,
         )
 
     def _on_incompatible_qos(self, event: QoSRequestedIncompatibleQoSInfo) -> None:

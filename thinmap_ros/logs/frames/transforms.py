@@ -15,7 +15,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.frames.laser_mount import rotation_matrix
 
-_MAX_FRAMES = 1000
+_MAX_FRAMES = 10_000
 
 
 class _Edge:
@@ -49,6 +49,11 @@ class TransformBuffer:
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
+        self._used: set[str] = set()
+
+    def is_used(self, frame: str) -> bool:
+        """Whether a transform to this child frame was needed for a lookup."""
+        return _frame_name(frame) in self._used
 
     def clear(self) -> None:
         """Forget all but the static transforms: the time was set back."""
@@ -76,6 +81,7 @@ class TransformBuffer:
         Raises InputError where the frames are not connected, or not at that time.
         """
         up, down = self._path(target_frame, source_frame)
+        self._used.update(up, down)
         ns = (self._latest_common_ns(up + down) or 0) if stamp_ns is None else stamp_ns
         return se2.compose(se2.invert(self._chain(up, ns)), self._chain(down, ns))
 
@@ -85,6 +91,7 @@ class TransformBuffer:
             up, down = self._path(target_frame, source_frame)
         except InputError:
             return None
+        self._used.update(up, down)
         return self._latest_common_ns(up + down)
 
     def _path(self, target_frame: str, source_frame: str) -> tuple[list[str], list[str]]:
@@ -169,6 +176,10 @@ class TransformOdometry:
         """Forget all but the static transforms: the time was set back."""
         self._buffer.clear()
         self._last_ns = None
+
+    def is_used(self, frame: str) -> bool:
+        """Whether the transform to this child frame is one of those to the robot."""
+        return self._buffer.is_used(frame)
 
     def add(self, transform: Any, is_static: bool) -> None:
         """Add a geometry_msgs/TransformStamped. Raises InputError where it is invalid."""

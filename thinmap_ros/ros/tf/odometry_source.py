@@ -17,6 +17,7 @@ from thinmap_ros.logs.frames.transforms import TransformOdometry
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded
+from thinmap_ros.ros.tf.transform_reader import TransformReader
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,9 @@ class OdometrySource:
             lambda note: node.get_logger().info(f'odom: {note}'),
         )
         self._transforms = TransformOdometry(self.odom_frame, base_frame)
+        self._readers = {
+            is_static: TransformReader(self._transforms.is_used) for is_static in (False, True)
+        }
 
     def subscribe(self) -> None:
         """Start to receive samples."""
@@ -66,7 +70,9 @@ class OdometrySource:
             subscribe_guarded(node, Odometry, 'odom', self._on_odometry, qos.STREAM)
         elif self.source == TF:
             self._subscribe_static()
-            AdaptiveSubscription(node, TFMessage, '/tf', self._on_transforms, qos.TRANSFORMS)
+            AdaptiveSubscription(
+                node, TFMessage, '/tf', self._on_transforms, qos.TRANSFORMS, raw=True
+            )
             node.diagnostics.add_update_callback(self._report)
 
     def reset(self) -> None:
@@ -84,16 +90,16 @@ class OdometrySource:
 
     def _subscribe_static(self) -> None:
         AdaptiveSubscription(
-            self._node, TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
+            self._node, TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS, raw=True
         )
 
-    def _on_static(self, message: TFMessage, _info: dict[str, Any]) -> None:
-        self._add(message, is_static=True)
+    def _on_static(self, data: bytes, _info: dict[str, Any]) -> None:
+        self._add(data, is_static=True)
 
-    def _on_transforms(self, message: TFMessage, _info: dict[str, Any]) -> None:
+    def _on_transforms(self, data: bytes, _info: dict[str, Any]) -> None:
         """Add transforms; the sample is that of the newest time at which all of them are known."""
         self._node.handle_time_jump()
-        self._add(message, is_static=False)
+        self._add(data, is_static=False)
         if not self._node.is_active:
             return
         try:
@@ -103,14 +109,20 @@ class OdometrySource:
         except InputError as error:
             self._node.diagnostics.message_rejected('/tf', str(error))
 
-    def _add(self, message: TFMessage, is_static: bool) -> None:
-        for transform in message.transforms:
-            try:
-                self._transforms.add(transform, is_static)
-                if is_static:
-                    self._frames.add_static(transform)
-            except InputError as error:
-                self._node.diagnostics.message_rejected('/tf', str(error))
+    def _add(self, data: bytes, is_static: bool) -> None:
+        try:
+            for transform in self._readers[is_static].read(data):
+                self._add_transform(transform, is_static)
+        except InputError as error:
+            self._node.diagnostics.message_rejected('/tf', str(error))
+
+    def _add_transform(self, transform: Any, is_static: bool) -> None:
+        try:
+            self._transforms.add(transform, is_static)
+            if is_static:
+                self._frames.add_static(transform)
+        except InputError as error:
+            self._node.diagnostics.message_rejected('/tf', str(error))
 
     def _report(self) -> None:
         """Report on /diagnostics what is missing of the chain of transforms."""
