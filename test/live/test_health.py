@@ -97,7 +97,7 @@ def test_another_publisher_of_velocity_commands_is_reported(graph):
     )
 
 
-def test_two_sources_of_scans_and_odometry_are_reported_by_name(graph):
+def test_second_sources_of_scans_odometry_and_clock_are_named_and_not_followed(graph):
     doctor = Doctor(graph)
     localizer = {'use_sim_time': True, 'initial_x_m': 2.0, 'initial_y_m': 2.0}
     graph.start('localizer', **localizer)
@@ -108,10 +108,15 @@ def test_two_sources_of_scans_and_odometry_are_reported_by_name(graph):
         return received and doctor.level('localizer') == DiagnosticStatus.OK
 
     graph.until(is_healthy, 'one simulation')
-    graph.start('sim', label='other', remap=('__node:=other', 'clock:=other_clock'))
-    for topic in ('scan', 'odom'):
+    graph.start('sim', label='other', remap=('__node:=other',))
+    for topic in ('scan', 'odom', 'clock'):
         line = f'2 nodes publish /{topic}: /other, /sim: stop all but one'
         graph.until(lambda text=line: text in graph.log('localizer'), f'two sources of {topic}')
+    for topic in ('scan', 'odom', '/clock'):
+        refused = f'dropped: {topic}: from another publisher'
+        graph.until(lambda key=refused: doctor.number('localizer', key) > 5, f'{topic} is refused')
+    # The clock of the other simulation starts at zero.
+    assert 'clock jumped back' not in graph.log('localizer')
     # The log comes before the diagnostics.
     graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.WARN, 'the warning')
     graph.stop('other')

@@ -20,6 +20,7 @@ from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
 from thinmap_ros.ros.foreign.translation import translate
 from thinmap_ros.ros.private_rclpy import RCLError
 from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.sole_source import follow_one_clock
 
 _CHECKPOINT_PERIOD_S = 0.5
 _DEAR_INTERVAL = 200.0  # half a percent of the time
@@ -50,6 +51,7 @@ class ThinmapNode(LifecycleNode):
         )
         self._recovery_timeout_s = parameters.declare_recovery(self) if recovers else 0.0
         self.diagnostics = NodeDiagnostics(self)
+        follow_one_clock(self, self.diagnostics)
         self.is_active = False
         self.is_paused = False
         self.time_jumps = TimeJumps(self.get_clock())

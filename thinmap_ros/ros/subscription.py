@@ -24,17 +24,19 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import LocalizedScan, TeamClaim
+from thinmap_msgs.msg import LocalizedScan, SlamStatus, TeamClaim
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.sole_source import SourceByFrame
 
 WARN_PERIOD_S = 5.0  # between two warnings of the same kind
 _TIMEOUT_S = 3.0
 _SCANS = (LaserScan, LocalizedScan)
 # Data of one sensor: those of two mixed are of none. Positions of two odometries jump.
-_SOLE_SOURCE = (*_SCANS, Odometry)
+_SOLE_SOURCE = (*_SCANS, Odometry, SlamStatus)
+_POSE = 'pose'  # of the same type as initial poses, which may come from many nodes
 # Stamps by different clocks: losses are not counted.
 _MANY_SOURCES = (TeamClaim, DiagnosticArray)
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
@@ -78,9 +80,11 @@ class _GuardedSubscription:
         self._last_ns = 0
         self._time_jumps = 0
         self._losses = MessageLossCounter()
+        self._sources: SourceByFrame | None = None
         node.diagnostics.expect_topic(topic)
         AdaptiveSubscription(node, kind, topic, self._on_message, profile)
-        if kind in _SOLE_SOURCE:
+        if kind in _SOLE_SOURCE or topic == _POSE:
+            self._sources = SourceByFrame(node, topic)
             node.diagnostics.check_sole_publisher(topic, WARN)
         if self._is_scan:
             node.diagnostics.add_timeout_check(topic, _TIMEOUT_S)
@@ -90,6 +94,9 @@ class _GuardedSubscription:
     def _on_message(self, message: Any, info: dict[str, Any]) -> None:
         node = self._node
         node.diagnostics.message_received(self._topic)
+        if self._sources and not self._sources.accepts(message, info):
+            node.diagnostics.count_drops(f'{self._topic}: from another publisher', 1)
+            return
         last_ns = self._last_ns
         self._last_ns = _stamp_ns(message)
         if self._counts_losses:

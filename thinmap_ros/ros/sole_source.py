@@ -1,0 +1,139 @@
+"""Of several publishers of a topic, the first is followed.
+
+rclpy does not tell the publisher of a message, but the message's number at its publisher and when
+it was received: each publisher numbers its messages one by one.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.node import Node
+
+from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.ros.diagnostics import WARN, NodeDiagnostics
+
+# Without a message of the followed publisher, the next one is followed: a driver was started again.
+# A publisher that was killed is on the graph for up to 20 s.
+_SILENCE_NS = 3 * SECOND_NS
+_MAX_RIVALS = 8
+_MAX_FRAMES = 8
+_UNKNOWN = 0.5  # periods between the expected time and that of a message, where none is known
+
+
+@dataclass
+class _Stream:
+    """Messages of one publisher: number and time of the last, ns; mean time between two, ns."""
+
+    number: int
+    received_ns: int
+    period_ns: float = 0.0
+
+    def surprise(self, number: int, received_ns: int) -> float | None:
+        """How far from the expected time a message with a number was received, in periods.
+
+        None where it cannot belong to this stream: it is an old one, or in the time since the last
+        one the publisher cannot have sent those between them.
+        """
+        steps = number - self.number
+        elapsed_ns = received_ns - self.received_ns
+        if steps <= 0 or (steps - 1) * self.period_ns > 2.0 * elapsed_ns:
+            return None
+        if not self.period_ns:
+            return _UNKNOWN
+        return abs(elapsed_ns - steps * self.period_ns) / self.period_ns
+
+    def add(self, number: int, received_ns: int) -> None:
+        """Add a message that belongs to this stream."""
+        period_ns = max(received_ns - self.received_ns, 0) / (number - self.number)
+        self.period_ns += 0.2 * (period_ns - self.period_ns) if self.period_ns else period_ns
+        self.number = number
+        self.received_ns = received_ns
+
+
+class SoleSource:
+    """Tells the messages of the publisher that is followed from those of others.
+
+    At the moment at which the numbers of both are the same, one message may be mistaken.
+    """
+
+    def __init__(self, count_publishers: Callable[[], int]) -> None:
+        self._count_publishers = count_publishers
+        self._followed: _Stream | None = None
+        self._rivals: list[_Stream] = []
+
+    def accepts(self, info: dict[str, Any]) -> bool:
+        """Whether a message is to be used; info: what rclpy gives with it.
+
+        A middleware without numbers of messages has all of them accepted.
+        """
+        number = info.get('publication_sequence_number')
+        if number is None:
+            return True
+        received_ns = int(info['received_timestamp'])
+        stream = self._stream(number, received_ns)
+        followed = self._followed
+        if stream is followed:
+            return True
+        is_alive = followed is not None and abs(received_ns - followed.received_ns) < _SILENCE_NS
+        if is_alive and self._count_publishers() > 1:
+            return False
+        self._followed = stream
+        self._rivals = []
+        return True
+
+    def _stream(self, number: int, received_ns: int) -> _Stream:
+        """The stream to which a message is added, a new one where it belongs to none."""
+        known = [*([self._followed] if self._followed else []), *self._rivals]
+        surprises = [(each.surprise(number, received_ns), each) for each in known]
+        fitting = [(surprise, each) for surprise, each in surprises if surprise is not None]
+        if fitting:
+            stream = min(fitting, key=lambda pair: pair[0])[1]
+            stream.add(number, received_ns)
+            return stream
+        stream = _Stream(number, received_ns)
+        self._rivals = [*self._rivals[1 - _MAX_RIVALS :], stream]
+        return stream
+
+
+class SourceByFrame:
+    """The publisher that is followed for each frame: several lasers may share a topic."""
+
+    def __init__(self, node: Node, topic: str) -> None:
+        self._node = node
+        self._topic = node.resolve_topic_name(topic)
+        self._sources: dict[str, SoleSource] = {}
+
+    def accepts(self, message: Any, info: dict[str, Any]) -> bool:
+        """Whether a message with a header is to be used; info: what rclpy gives with it."""
+        frame = message.header.frame_id
+        if frame not in self._sources and len(self._sources) >= _MAX_FRAMES:
+            self._sources.clear()
+        source = self._sources.setdefault(frame, SoleSource(self._count_publishers))
+        return source.accepts(info)
+
+    def _count_publishers(self) -> int:
+        return int(self._node.count_publishers(self._topic))
+
+
+def follow_one_clock(node: Node, diagnostics: NodeDiagnostics) -> None:
+    """Let a node in simulated time follow the first publisher of /clock; others are reported.
+
+    rclpy sets the time by each message on /clock: between two simulations or bags it would jump to
+    and fro, and the node would be reset each time.
+    """
+    topic = node.resolve_topic_name('/clock')
+    subscription = next((each for each in node.subscriptions if each.topic_name == topic), None)
+    if subscription is None:
+        return
+    source = SoleSource(lambda: int(node.count_publishers(topic)))
+    set_time = subscription.callback
+
+    def set_time_of_source(message: Any, info: dict[str, Any]) -> None:
+        if source.accepts(info):
+            set_time(message)
+        else:
+            diagnostics.count_drops(f'{topic}: from another publisher', 1)
+
+    subscription.callback = set_time_of_source
+    diagnostics.check_sole_publisher(topic, WARN)
