@@ -8,9 +8,9 @@ from thinmap_ros.ros.subscription import MessageLossCounter
 STEP_NS = 200_000_000
 
 
-def counted(came):
+def counted(came, is_sole=False):
     """Sums of lost and missing messages over received (time in steps, number)."""
-    losses = MessageLossCounter()
+    losses = MessageLossCounter(is_sole)
     found = [losses.record(10**12 + steps * STEP_NS, number) for steps, number in came]
     return sum(lost for lost, _ in found), sum(missing for _, missing in found)
 
@@ -37,3 +37,9 @@ def test_two_publishers_in_turn_have_lost_nothing():
 
 def test_a_restarted_publisher_or_clock_counts_no_losses():
     assert counted([(0, 500), (1, 501), (2, 1), (3, 2), (-400, 3), (-399, 4)]) == (0, 0)
+
+
+def test_what_is_lost_while_the_clock_is_set_back_is_counted_by_the_numbers_of_a_sole_publisher():
+    came = [(0, 1), (1, 2), (2, 3), (-400, 5), (-399, 6), (-800, 900), (-900, 7)]
+    assert counted(came, is_sole=True) == (1, 0)
+    assert counted(came) == (0, 0)

@@ -13,9 +13,10 @@ from rclpy.node import Node
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.ros.diagnostics import WARN, NodeDiagnostics
 
-# Without a message of the followed publisher, the next one is followed: a driver was started again.
-# A publisher that was killed is on the graph for up to 20 s.
+# After a time without a message of the followed publisher, the next one is followed: a driver that
+# was killed is on the graph for up to 20 s. A simulation may be paused for a while.
 _SILENCE_NS = 3 * SECOND_NS
+_PAUSE_NS = 30 * SECOND_NS
 _MAX_RIVALS = 8
 _MAX_FRAMES = 8
 _UNKNOWN = 0.5  # periods between the expected time and that of a message, where none is known
@@ -57,8 +58,10 @@ class SoleSource:
     At the moment at which the numbers of both are the same, one message may be mistaken.
     """
 
-    def __init__(self, count_publishers: Callable[[], int]) -> None:
+    def __init__(self, count_publishers: Callable[[], int], silence_ns: int = _SILENCE_NS) -> None:
+        """silence_ns: time without a message after which another publisher is followed."""
         self._count_publishers = count_publishers
+        self._silence_ns = silence_ns
         self._followed: _Stream | None = None
         self._rivals: list[_Stream] = []
 
@@ -75,7 +78,9 @@ class SoleSource:
         followed = self._followed
         if stream is followed:
             return True
-        is_alive = followed is not None and abs(received_ns - followed.received_ns) < _SILENCE_NS
+        is_alive = (
+            followed is not None and abs(received_ns - followed.received_ns) < self._silence_ns
+        )
         if is_alive and self._count_publishers() > 1:
             return False
         self._followed = stream
@@ -126,7 +131,7 @@ def follow_one_clock(node: Node, diagnostics: NodeDiagnostics) -> None:
     subscription = next((each for each in node.subscriptions if each.topic_name == topic), None)
     if subscription is None:
         return
-    source = SoleSource(lambda: int(node.count_publishers(topic)))
+    source = SoleSource(lambda: int(node.count_publishers(topic)), _PAUSE_NS)
     set_time = subscription.callback
 
     def set_time_of_source(message: Any, info: dict[str, Any]) -> None:

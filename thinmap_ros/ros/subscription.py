@@ -39,6 +39,7 @@ _SOLE_SOURCE = (*_SCANS, Odometry, SlamStatus)
 _POSE = 'pose'  # of the same type as initial poses, which may come from many nodes
 # Stamps by different clocks: losses are not counted.
 _MANY_SOURCES = (TeamClaim, DiagnosticArray)
+_MAX_AT_JUMP = 50  # larger steps of the number are another publisher's
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 
@@ -79,12 +80,12 @@ class _GuardedSubscription:
         self._logged_s = -WARN_PERIOD_S
         self._last_ns = 0
         self._time_jumps = 0
-        self._losses = MessageLossCounter()
-        self._sources: SourceByFrame | None = None
+        is_sole = kind in _SOLE_SOURCE or topic == _POSE
+        self._losses = MessageLossCounter(is_sole)
+        self._sources = SourceByFrame(node, topic) if is_sole else None
         node.diagnostics.expect_topic(topic)
         AdaptiveSubscription(node, kind, topic, self._on_message, profile)
-        if kind in _SOLE_SOURCE or topic == _POSE:
-            self._sources = SourceByFrame(node, topic)
+        if is_sole:
             node.diagnostics.check_sole_publisher(topic, WARN)
         if self._is_scan:
             node.diagnostics.add_timeout_check(topic, _TIMEOUT_S)
@@ -228,10 +229,13 @@ class MessageLossCounter:
     """Counts the messages of a stream that were lost in transport or never sent.
 
     It compares the sequence numbers of the publisher with the evenly spaced stamps. Either alone is
-    not enough: two publishers have independent numbers, and a silent sensor has lost nothing.
+    not enough: two publishers have independent numbers, and a silent sensor has lost nothing. Where
+    the clock was set back, only the numbers of a sole publisher tell.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, is_sole: bool = False) -> None:
+        """is_sole: whether the stream is of one publisher at a time."""
+        self._is_sole = is_sole
         self._last_ns = 0
         self._last_number = 0
         self._steps_ns: deque[int] = deque(maxlen=50)
@@ -247,7 +251,7 @@ class MessageLossCounter:
         skipped = (number or 0) - self._last_number - 1
         self._last_number = number or 0
         if step_ns <= 0:
-            return 0, 0
+            return (skipped if self._is_sole and 0 < skipped <= _MAX_AT_JUMP else 0), 0
         spaces = round(step_ns / min(self._steps_ns, default=step_ns)) - 1
         self._steps_ns.append(step_ns)
         lost = min(max(skipped, 0), max(spaces, 0))
