@@ -1,4 +1,4 @@
-"""Ctrl-C for programs that spin a node.
+"""Ctrl-C and SIGTERM for programs that spin a node.
 
 An exception raised in a callback of rclpy or in compiled code is replaced by another one, or lost.
 """
@@ -7,14 +7,18 @@ import signal
 
 
 class Interruption:
-    """Records SIGINT until `check` is called; the second one raises KeyboardInterrupt at once."""
+    """Records SIGINT and SIGTERM until `check` is called.
+
+    The second one raises KeyboardInterrupt at once.
+    """
 
     def __init__(self) -> None:
         self._is_requested = False
-        signal.signal(signal.SIGINT, self._request)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._request)
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt if SIGINT was received."""
+        """Raise KeyboardInterrupt if a signal was received."""
         if self._is_requested:
             raise KeyboardInterrupt
 

@@ -70,6 +70,25 @@ def test_a_restarted_publisher_that_is_alone_is_followed_at_once():
     assert len(accepted(first, again, publishers=1)) == len(first + again)
 
 
+def test_the_queued_messages_of_a_second_publisher_that_has_ended_are_refused():
+    publishers = [2]
+    source = SoleSource(lambda: publishers[0], now_ns=lambda: round(10.5 * S))
+    messages = [*stream('first', 10.0, 0.0, 10.0), *stream('second', 10.0, 2.0, 9.9)]
+
+    def accepts(time_s, number):
+        info = {'publication_sequence_number': number, 'received_timestamp': round(S * time_s)}
+        return source.accepts(info)
+
+    for time_s, number, _ in sorted(messages):
+        accepts(time_s, number)
+    publishers[0] = 1
+    assert not accepts(10.0, 80)
+    assert not accepts(10.1, 81)
+    assert accepts(10.15, 101)
+    # The other one has ended: whoever continues is the one that is left.
+    assert accepts(10.6, 86)
+
+
 @pytest.mark.parametrize('jump_s', [-3600.0, 3600.0])
 def test_a_clock_of_the_machine_that_is_set_does_not_stop_the_stream(jump_s):
     first = stream('first', 10.0, 5000.0, 5010.0)

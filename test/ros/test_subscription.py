@@ -39,7 +39,8 @@ def test_a_restarted_publisher_or_clock_counts_no_losses():
     assert counted([(0, 500), (1, 501), (2, 1), (3, 2), (-400, 3), (-399, 4)]) == (0, 0)
 
 
-def test_what_is_lost_while_the_clock_is_set_back_is_counted_by_the_numbers_of_a_sole_publisher():
-    came = [(0, 1), (1, 2), (2, 3), (-400, 5), (-399, 6), (-800, 900), (-900, 7)]
-    assert counted(came, is_sole=True) == (1, 0)
+def test_what_a_sole_publisher_skips_is_lost_even_if_stamps_repeat_or_go_back():
+    came = [(0, 1), (1, 2), (2, 3), (-400, 5), (-399, 6), (-399, 9), (-800, 900), (-900, 7)]
+    assert counted(came, is_sole=True) == (1 + 2, 0)
+    assert counted([(0, 30), (1, 31)], is_sole=True) == (0, 0)
     assert counted(came) == (0, 0)

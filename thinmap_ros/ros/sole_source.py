@@ -6,6 +6,7 @@ it was received: each publisher numbers its messages one by one.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from time import time_ns
 from typing import Any
 
 from rclpy.node import Node
@@ -29,6 +30,7 @@ class _Stream:
     number: int
     received_ns: int
     period_ns: float = 0.0
+    is_refused: bool = False
 
     def surprise(self, number: int, received_ns: int) -> float | None:
         """How far from the expected time a message with a number was received, in periods.
@@ -58,12 +60,22 @@ class SoleSource:
     At the moment at which the numbers of both are the same, one message may be mistaken.
     """
 
-    def __init__(self, count_publishers: Callable[[], int], silence_ns: int = _SILENCE_NS) -> None:
-        """silence_ns: time without a message after which another publisher is followed."""
+    def __init__(
+        self,
+        count_publishers: Callable[[], int],
+        silence_ns: int = _SILENCE_NS,
+        now_ns: Callable[[], int] = time_ns,
+    ) -> None:
+        """silence_ns: time without a message after which another publisher is followed.
+
+        now_ns: the clock of the times of receipt.
+        """
         self._count_publishers = count_publishers
+        self._now_ns = now_ns
         self._silence_ns = silence_ns
         self._followed: _Stream | None = None
         self._rivals: list[_Stream] = []
+        self._alone_ns: int | None = None  # since when the graph has one publisher
 
     def accepts(self, info: dict[str, Any]) -> bool:
         """Whether a message is to be used; info: what rclpy gives with it.
@@ -75,17 +87,25 @@ class SoleSource:
             return True
         received_ns = int(info['received_timestamp'])
         stream = self._stream(number, received_ns)
-        followed = self._followed
-        if stream is followed:
-            return True
-        is_alive = (
-            followed is not None and abs(received_ns - followed.received_ns) < self._silence_ns
-        )
-        if is_alive and self._count_publishers() > 1:
-            return False
-        self._followed = stream
-        self._rivals = []
+        if stream is not self._followed:
+            stream.is_refused = self._is_of_another(stream, received_ns)
+            if stream.is_refused:
+                return False
+            self._followed = stream
+            self._rivals = []
         return True
+
+    def _is_of_another(self, stream: _Stream, received_ns: int) -> bool:
+        """Whether a stream that is not followed is of another publisher than the one that is."""
+        if self._followed is None:
+            return False
+        if self._count_publishers() > 1:
+            self._alone_ns = None
+            return abs(received_ns - self._followed.received_ns) < self._silence_ns
+        if self._alone_ns is None:
+            self._alone_ns = self._now_ns()
+        # The last messages of a rival are still in the queue when it has left the graph.
+        return stream.is_refused and received_ns <= self._alone_ns
 
     def _stream(self, number: int, received_ns: int) -> _Stream:
         """The stream to which a message is added, a new one where it belongs to none."""

@@ -39,7 +39,7 @@ _SOLE_SOURCE = (*_SCANS, Odometry, SlamStatus)
 _POSE = 'pose'  # of the same type as initial poses, which may come from many nodes
 # Stamps by different clocks: losses are not counted.
 _MANY_SOURCES = (TeamClaim, DiagnosticArray)
-_MAX_AT_JUMP = 50  # larger steps of the number are another publisher's
+_MAX_SKIPPED = 50  # larger steps of the number may be those to another publisher
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 
@@ -229,8 +229,8 @@ class MessageLossCounter:
     """Counts the messages of a stream that were lost in transport or never sent.
 
     It compares the sequence numbers of the publisher with the evenly spaced stamps. Either alone is
-    not enough: two publishers have independent numbers, and a silent sensor has lost nothing. Where
-    the clock was set back, only the numbers of a sole publisher tell.
+    not enough: two publishers have independent numbers, and a silent sensor has lost nothing. A few
+    numbers that a sole publisher skips are losses, whatever the stamps: they may repeat or go back.
     """
 
     def __init__(self, is_sole: bool = False) -> None:
@@ -248,14 +248,15 @@ class MessageLossCounter:
         """
         step_ns = stamp_ns - self._last_ns
         self._last_ns = stamp_ns
-        skipped = (number or 0) - self._last_number - 1
+        skipped = (number or 0) - self._last_number - 1 if self._last_number else 0
         self._last_number = number or 0
-        if step_ns <= 0:
-            return (skipped if self._is_sole and 0 < skipped <= _MAX_AT_JUMP else 0), 0
-        spaces = round(step_ns / min(self._steps_ns, default=step_ns)) - 1
-        self._steps_ns.append(step_ns)
-        lost = min(max(skipped, 0), max(spaces, 0))
-        return lost, spaces - lost if spaces > 0 and step_ns < _MAX_GAP_NS else 0
+        spaces = 0
+        if step_ns > 0:
+            spaces = round(step_ns / min(self._steps_ns, default=step_ns)) - 1
+            self._steps_ns.append(step_ns)
+        is_near = self._is_sole and skipped <= _MAX_SKIPPED
+        lost = max(skipped, 0) if is_near else min(max(skipped, 0), max(spaces, 0))
+        return lost, spaces - lost if spaces > lost and step_ns < _MAX_GAP_NS else 0
 
 
 def _stamp_ns(message: Any) -> int:

@@ -1,4 +1,4 @@
-"""scripts/endurance --faults on a live graph: a few faults, and its end by Ctrl-C."""
+"""scripts/endurance --faults on a live graph: a few faults, and its end by a signal."""
 
 import math
 import signal
@@ -66,7 +66,12 @@ def test_faults_strike_a_live_graph_and_are_judged(ros_domain: int, tmp_path: Pa
     assert not psutil.Process().children(recursive=True)
 
 
-def test_ctrl_c_ends_all_processes(ros_domain: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    'number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
+def test_a_signal_ends_all_processes_and_leaves_no_state(
+    ros_domain: int, tmp_path: Path, number: signal.Signals
+) -> None:
     words = ['--faults', '--only', 'laser_nan', '-o', str(tmp_path / 'out')]
     program = subprocess.Popen(
         [sys.executable, '-c', PROGRAM, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True
@@ -76,7 +81,7 @@ def test_ctrl_c_ends_all_processes(ros_domain: int, tmp_path: Path) -> None:
     while len(children) < len(NODES) + 2 and time.monotonic() < end_s:
         time.sleep(0.1)
         children = psutil.Process(program.pid).children(recursive=True)
-    program.send_signal(signal.SIGINT)
+    program.send_signal(number)
     said = program.communicate(timeout=PATIENCE_S)[0]
     assert program.returncode == 130
     # DDS may log lines of its own, in colour.
@@ -87,3 +92,4 @@ def test_ctrl_c_ends_all_processes(ros_domain: int, tmp_path: Path) -> None:
     while any(map(is_running, children)) and time.monotonic() < end_s:
         time.sleep(0.1)
     assert not [child for child in children if is_running(child)]
+    assert not (tmp_path / 'out' / 'state').exists()
