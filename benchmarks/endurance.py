@@ -356,8 +356,12 @@ def parser() -> argparse.ArgumentParser:
 
 def main() -> None:
     """Run the program."""
-    use_own_domain()
-    cli.run(work, parser())
+
+    def work_alone(arguments: argparse.Namespace) -> None:
+        use_own_domain()
+        work(arguments)
+
+    cli.run(work_alone, parser())
 
 
 if __name__ == '__main__':
