@@ -18,7 +18,14 @@ from thinmap_ros.ros.private_rclpy import RCLError, declared_names, given_parame
 PACKAGE = Path(thinmap_ros.__file__).parent
 TRIED = '7.1.'
 # Names of rclpy, in any module but one, and the module that it hides them in.
-NAMES = ('_parameter_overrides', '_parameters', '_goal_handles', '_result_futures', '_update_state')
+NAMES = (
+    '_parameter_overrides',
+    '_parameters',
+    '_goal_handles',
+    '_result_futures',
+    '_update_state',
+    '_wake_executor',
+)
 HIDDEN = ('rclpy.impl', 'rclpy._rclpy_pybind11')
 
 

@@ -11,7 +11,7 @@ from thinmap_msgs.srv import ReleaseStop
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros import qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.publisher_gid import GID_SIZE
+from thinmap_ros.ros.private_rclpy import GID_SIZE
 from thinmap_ros.ros.stop_topic import TOPIC, StopSources, StopTopic
 
 A = bytes([1] * GID_SIZE)

@@ -152,8 +152,9 @@ def _accept_integer(node: Node, name: str, default: Any) -> None:
     """Take an integer that was given for a float as that float, as in many parameter files."""
     overrides = given_parameters(node)
     given = overrides.get(name)
-    is_integer = given is not None and given.type_ == Parameter.Type.INTEGER
-    if isinstance(default, float) and is_integer:
+    if given is None or not isinstance(default, float):
+        return
+    if given.type_ == Parameter.Type.INTEGER:
         overrides[name] = Parameter(name, value=float(given.value))
 
 
@@ -163,8 +164,9 @@ def given_text(node: Node, name: str, default: str) -> str:
     A value of another type is left to the declaration, which rejects it.
     """
     given = given_parameters(node).get(name)
-    is_text = given is not None and given.type_ == Parameter.Type.STRING
-    return str(given.value) if is_text else default
+    if given is None or given.type_ != Parameter.Type.STRING:
+        return default
+    return str(given.value)
 
 
 def freeze_clock(node: Node) -> None:

@@ -3,28 +3,36 @@
 Tried with rclpy of Jazzy, 7.1: test/ros/test_private_rclpy.py tells when another one is installed.
 """
 
+import ctypes
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.action import ActionServer
 from rclpy.action.server import ServerGoalHandle
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 from rclpy.task import Future
+from rclpy.type_support import check_is_valid_msg_type
+from std_msgs.msg import Bool
 
 # Raised by rcl. Without it, a node without keys or with a wrong transition ends in a traceback.
 RCLError = rclpy_implementation.RCLError
 # Raised for unknown arguments after --ros-args, which would end in a traceback, too.
 UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
+_RCL = ctypes.CDLL('librcl.so')
+GID_SIZE = 16  # RMW_GID_STORAGE_SIZE of Jazzy
 
 
-def given_parameters(node: Node) -> dict[str, Parameter]:
-    """Parameters that a node was given, by name; what is changed here is what it declares.
+def given_parameters(node: Node) -> dict[str, Any]:
+    """The `Parameter`s that a node was given, by name; what is changed here is what it declares.
 
     Without it: no warning of a misspelled name, no parameters of other packages, and an integer
     for a float is an error.
     """
-    given: dict[str, Parameter] = node._parameter_overrides
+    given: dict[str, Any] = node._parameter_overrides
     return given
 
 
@@ -55,3 +63,68 @@ def begin_goal(handle: ServerGoalHandle) -> None:
     """
     event: Any = rclpy_implementation.GoalEvent.EXECUTE
     handle._update_state(event)
+
+
+class _Gid(ctypes.Structure):
+    """rmw_gid_t."""
+
+    _fields_ = (
+        ('implementation', ctypes.c_char_p),
+        ('data', ctypes.c_uint8 * GID_SIZE),
+    )
+
+
+class _MessageInfo(ctypes.Structure):
+    """rmw_message_info_t."""
+
+    _fields_ = (
+        ('source_timestamp', ctypes.c_int64),
+        ('received_timestamp', ctypes.c_int64),
+        ('publication_sequence_number', ctypes.c_uint64),
+        ('reception_sequence_number', ctypes.c_uint64),
+        ('publisher_gid', _Gid),
+        ('from_intra_process', ctypes.c_bool),
+    )
+
+
+class _Handle(rclpy_implementation.Subscription):
+    """A subscription to std_msgs/Bool that takes the GID together with each message."""
+
+    def take_message(self, kind: type, raw: bool) -> tuple[Bool, _MessageInfo] | None:
+        """Called by the executor, as the method of rclpy."""
+        value = ctypes.c_bool()  # the whole of a std_msgs__msg__Bool
+        info = _MessageInfo()
+        pointer = ctypes.c_void_p(self.pointer)
+        if _RCL.rcl_take(pointer, ctypes.byref(value), ctypes.byref(info), None) != 0:
+            return None
+        return Bool(data=value.value), info
+
+
+def subscribe_with_gid(
+    node: Node,
+    topic: str,
+    on_message: Callable[[bool, bytes, tuple[int, int]], None],
+    profile: QoSProfile,
+) -> None:
+    """Subscribe to a std_msgs/Bool as `Node.create_subscription` does, with who published it.
+
+    Without it: whoever spoke last on the stop decides for all.
+
+    on_message: receives the value, the GID of the publisher, as of
+    `get_publishers_info_by_topic`, and the publisher's number and stamp (ns) of the message.
+    """
+
+    def received(message: Bool, info: _MessageInfo) -> None:
+        sent = info.publication_sequence_number, info.source_timestamp
+        on_message(bool(message.data), bytes(info.publisher_gid.data), sent)
+
+    check_is_valid_msg_type(Bool)  # it loads the type support
+    with node.handle:
+        handle = _Handle(node.handle, Bool, topic, profile.get_c_qos_profile())
+    group = node.default_callback_group
+    # Publishers that offer less than the profile requests do not match: no warning.
+    events = SubscriptionEventCallbacks(use_default_callbacks=False)
+    subscription = Subscription(handle, Bool, topic, received, group, profile, False, events)
+    group.add_entity(subscription)
+    node._subscriptions.append(subscription)
+    node._wake_executor()

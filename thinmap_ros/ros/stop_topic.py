@@ -15,7 +15,7 @@ from thinmap_ros.ros import qos
 from thinmap_ros.ros.checkpoint import Checkpoint
 from thinmap_ros.ros.diagnostics import WARN, full_name
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.publisher_gid import GID_SIZE, subscribe_with_gid
+from thinmap_ros.ros.private_rclpy import GID_SIZE, subscribe_with_gid
 from thinmap_ros.ros.services import fill_response
 
 TOPIC = 'stop'

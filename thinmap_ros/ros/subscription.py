@@ -36,7 +36,6 @@ _TIMEOUT_S = 3.0
 _SCANS = (LaserScan, LocalizedScan)
 # Data of one sensor: those of two mixed are of none. Positions of two odometries jump.
 _SOLE_SOURCE = (*_SCANS, Odometry, SlamStatus)
-_POSE = 'pose'  # of the same type as initial poses, which may come from many nodes
 # Stamps by different clocks: losses are not counted.
 _MANY_SOURCES = (TeamClaim, DiagnosticArray)
 _MAX_SKIPPED = 50  # larger steps of the number may be those to another publisher
@@ -80,7 +79,7 @@ class _GuardedSubscription:
         self._logged_s = -WARN_PERIOD_S
         self._last_ns = 0
         self._time_jumps = 0
-        is_sole = kind in _SOLE_SOURCE or topic == _POSE
+        is_sole = kind in _SOLE_SOURCE
         self._losses = MessageLossCounter(is_sole)
         self._sources = SourceByFrame(node, topic) if is_sole else None
         node.diagnostics.expect_topic(topic)

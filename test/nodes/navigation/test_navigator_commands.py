@@ -1,5 +1,7 @@
 """What a navigator commands while it knows everything, and while it must not drive."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import rclpy
@@ -181,8 +183,8 @@ def test_a_base_that_is_too_fast_is_an_error_until_a_stop_is_released(driven, ot
     driven.fast = 1.0
     driven.step(30)
     assert diagnose(driven)[0] == ERROR
-    for is_stopped in (True, False):
-        driven.node._on_stop(is_stopped)
+    for reason in ('somebody says true', ''):
+        driven.node._on_stop(SimpleNamespace(reason=reason))
     driven.step(30)
     assert diagnose(driven)[0] != ERROR
 

@@ -22,7 +22,8 @@ from thinmap_ros.ros.diagnostics import (
     publisher_names,
     subscriber_names,
 )
-from thinmap_ros.ros.lifecycle_node import RCLError, ThinmapNode
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.private_rclpy import RCLError
 from thinmap_ros.ros.velocity.watchdog import CommandTimeout, CommandWatchdog
 
 TOPIC = 'cmd_vel'
