@@ -85,7 +85,7 @@ def test_the_queued_messages_of_a_second_publisher_that_has_ended_are_refused():
     assert not accepts(10.0, 80)
     assert not accepts(10.1, 81)
     assert accepts(10.15, 101)
-    # The other one has ended: whoever continues is the one that is left.
+    # The other one has ended: what continues is the one that is left.
     assert accepts(10.6, 86)
 
 

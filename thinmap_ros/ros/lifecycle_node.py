@@ -185,7 +185,7 @@ class ThinmapNode(LifecycleNode):
         self._failure_callbacks.append(work)
 
     def step_failed(self, step: str, error: Exception) -> None:
-        """Report a step that an error has ended, which nobody expects; the node goes on.
+        """Report a step that an error has ended, which nobody expects; the node continues.
 
         step: what was processed, with its stamp if it has one.
         """

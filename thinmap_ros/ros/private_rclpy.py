@@ -108,7 +108,7 @@ def subscribe_with_gid(
 ) -> None:
     """Subscribe to a std_msgs/Bool as `Node.create_subscription` does, with who published it.
 
-    Without it: whoever spoke last on the stop decides for all.
+    Without it: the last message on the stop decides for all.
 
     on_message: receives the value, the GID of the publisher, as of
     `get_publishers_info_by_topic`, and the publisher's number and stamp (ns) of the message.

@@ -1,4 +1,4 @@
-"""Bases that move more than they are told, and all that is no such case."""
+"""Bases that move more than they are commanded, and what is no such case."""
 
 from collections import deque
 
@@ -73,7 +73,7 @@ def test_a_base_at_twice_the_speed_is_named_within_its_first_metre(rate_hz):
     base = Base(rate_hz, acceleration=2.0)
     base.executed = lambda v, w: (2.0 * v, w)
     fault, after_s = base.drive(3.0, 0.5)
-    assert fault.startswith('the base moves at ') and fault.endswith('told at most 0.50 m/s')
+    assert fault.startswith('the base moves at ') and fault.endswith('commanded at most 0.50 m/s')
     assert after_s < 1.4 + 1.0 / rate_hz
 
 
@@ -100,7 +100,7 @@ def test_a_base_that_creeps_is_named_until_it_stands(rate_hz, creep, words, most
     assert base.drive(4.0) == ('', None)
     base.executed = lambda v, w: creep
     fault, after_s = base.drive(6.0)
-    assert words in fault and fault.endswith('and is told to stand')
+    assert words in fault and fault.endswith('and is commanded to stand')
     assert after_s < most_s + 3.0 / rate_hz
     assert base.supervisor.is_creeping
     base.executed = lambda v, w: (v, w)
@@ -113,7 +113,7 @@ def test_a_base_that_does_not_stop_is_named():
     base.drive(4.0, 0.5)
     base.executed = lambda v, w: (0.5, 0.0)
     fault, after_s = base.drive(5.0)
-    assert fault.endswith('and is told to stand')
+    assert fault.endswith('and is commanded to stand')
     assert after_s < 4.0
 
 
@@ -219,7 +219,7 @@ def test_a_command_that_somebody_left_standing_is_creeping():
     assert base.drive(2.0) == ('', None)
     base.supervisor.set_unheard(base.now_s, False)
     fault, after_s = base.drive(8.0)
-    assert fault.endswith('and is told to stand') and after_s < 5.0
+    assert fault.endswith('and is commanded to stand') and after_s < 5.0
 
 
 def test_before_the_first_command_nothing_is_known():

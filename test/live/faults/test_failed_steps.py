@@ -1,4 +1,4 @@
-"""Errors that nobody expects, in a step of each stage: reported, and the nodes go on."""
+"""Errors that nobody expects, in a step of each stage: reported, and the nodes continue."""
 
 from itertools import pairwise
 

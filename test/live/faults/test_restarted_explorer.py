@@ -167,7 +167,10 @@ def test_whatever_explores_is_a_goal_that_cancel_and_stop_end_for_good(graph):
     assert (ended.status, ended.result.status.reason) == (GoalStatus.STATUS_ABORTED, stopped)
     refused = graph.act(Explore, 'explore', Explore.Goal())
     assert (refused.status, refused.result.status.reason) == (GoalStatus.STATUS_ABORTED, stopped)
-    graph.until(lambda: last(exploration.drives)[1] == GoalStatus.STATUS_CANCELING, 'Nav2 is told')
+    graph.until(
+        lambda: last(exploration.drives)[1] == GoalStatus.STATUS_CANCELING,
+        'Nav2 has the cancellation',
+    )
     stop.publish(Bool(data=False))
     resume.publish(Bool(data=True))
     graph.until(lambda: 'no exploration is paused' in graph.log('explorer'), 'a warning')

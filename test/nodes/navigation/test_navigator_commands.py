@@ -225,7 +225,7 @@ def test_a_base_that_is_discovered_is_told_to_stand_and_one_that_creeps_as_long_
     level, message = diagnose(driven)
     assert level == ERROR
     assert message.startswith('the base moves at 0.1') and message.endswith(
-        ', and is told to stand'
+        ', and is commanded to stand'
     )
     told = commands_of_idle(driven, other, heard)
     assert len(told) > 10 and set(told) == {(0.0, 0.0)}

@@ -98,7 +98,7 @@ class NavigatorConfig(Config):
         True,
         'Whether the robot drives on to its goal when the cause of a protective stop is over: a '
         'silent sensor, a lost pose, a failed map. false: the goal is aborted, and the robot is '
-        'stopped until ~/release_stop. A stop for an obstacle is none: the path is planned anew.',
+        'stopped until ~/release_stop. A stop for an obstacle is none: the path is planned again.',
         safe=SAFE_LOWER,
     )
     check_ahead_m: float = 4.0  # of the path, for obstacles in a new map

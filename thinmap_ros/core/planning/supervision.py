@@ -1,4 +1,4 @@
-"""Bases that move more than they are told: too fast, or while they are to stand."""
+"""Bases that move more than they are commanded: too fast, or while they are to stand."""
 
 import math
 from collections import deque
@@ -42,7 +42,7 @@ class _Command(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """Motion between two samples: x, y (m, odometry frame), turn (rad), duration and allowed way.
+    """Motion between two samples: x, y (m, odometry frame), turn (rad), duration and allowed path.
 
     at_s: stamp of its end.
     """
@@ -56,26 +56,28 @@ class _Step(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """Way (m) and turn (rad) in some time (s), and the way that was allowed (m)."""
+    """Path (m) and turn (rad) in some time (s), and the path that was allowed (m)."""
 
-    way_m: float
+    path_m: float
     turn: float
     seconds: float
     allowed_m: float
 
     def exceeds(self, lever_m: float) -> bool:
         """Whether it is more than was commanded, with turns at a lever."""
-        way_m = max(self.way_m, lever_m * self.turn)
-        return way_m > max(_TOLERANCE * self.allowed_m, self.allowed_m + _SLACK_M)
+        path_m = max(self.path_m, lever_m * self.turn)
+        return path_m > max(_TOLERANCE * self.allowed_m, self.allowed_m + _SLACK_M)
 
     def words(self, lever_m: float, is_to_stand: bool) -> str:
         """What is wrong with it."""
-        is_turn = lever_m * self.turn > self.way_m
+        is_turn = lever_m * self.turn > self.path_m
         unit, scale = ('rad/s', lever_m) if is_turn else ('m/s', 1.0)
-        amount = (self.turn if is_turn else self.way_m) / self.seconds
-        told_m_s = self.allowed_m / self.seconds / scale
-        told = 'and is told to stand' if is_to_stand else f'told at most {told_m_s:.2f} {unit}'
-        return f'the base {"turns" if is_turn else "moves"} at {amount:.2f} {unit}, {told}'
+        amount = (self.turn if is_turn else self.path_m) / self.seconds
+        commanded_m_s = self.allowed_m / self.seconds / scale
+        order = f'commanded at most {commanded_m_s:.2f} {unit}'
+        if is_to_stand:
+            order = 'and is commanded to stand'
+        return f'the base {"turns" if is_turn else "moves"} at {amount:.2f} {unit}, {order}'
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ class _Limits:
 
 
 class BaseSupervisor:
-    """Compares the odometry with the commands: the way of the outermost point of the robot.
+    """Compares the odometry with the commands: the path of the outermost point of the robot.
 
     A speed counts as commanded for the time that a command may take to act, and then falls as a
     base brakes. A robot that moves less than commanded is no case of this: see `StuckDetector`.
@@ -225,5 +227,5 @@ class BaseSupervisor:
     def _stands(self, stamp_s: float) -> bool:
         """Whether the robot has not moved in the first window, but for noise."""
         motion = self._motion(stamp_s - _WINDOWS_S[0])
-        way_m = max(motion.way_m, self._limits.lever_m * motion.turn)
-        return motion.seconds > 0.0 and way_m < _SLACK_M / _WINDOWS_S[-1]
+        path_m = max(motion.path_m, self._limits.lever_m * motion.turn)
+        return motion.seconds > 0.0 and path_m < _SLACK_M / _WINDOWS_S[-1]

@@ -1,4 +1,4 @@
-"""Whether the base does what it is told."""
+"""Whether the base moves as commanded."""
 
 from thinmap_ros.core.planning.navigator import NavigatorConfig
 from thinmap_ros.core.planning.supervision import BaseSupervisor

@@ -22,7 +22,7 @@ _COMMANDED_S = 2.0
 _STOPS = 10  # at the end
 # A base that turns on after so long has no time-out that helps: at 0.5 m/s it drives a metre.
 WATCHED_S = 2.0
-# A turn rate is taken over so long: noise of 0.01 rad is then a fifth of what counts as turning.
+# A turn rate is a mean over so long: noise of 0.01 rad is then a fifth of what counts as turning.
 _LOOK_S = 0.5
 _TURNS_RAD_S = 0.1
 # Odometry that takes so many times longer than its stamps is silent.
@@ -45,7 +45,7 @@ def try_watchdog(odom_topic: str, base_frame: str) -> Finding:
 
 
 class BaseTrial:
-    """Drives the base of a robot, and listens to its odometry, whose stamps are the time."""
+    """Drives the base of a robot, and receives its odometry, whose stamps are the time."""
 
     def __init__(self, node: Node, odom_topic: str, base_frame: str) -> None:
         self._node = node
@@ -55,7 +55,7 @@ class BaseTrial:
         node.create_subscription(Odometry, odom_topic, self._on_odometry, qos.SENSOR)
 
     def finding(self) -> Finding:
-        """Try it; the robot is told to stand at the end, whatever happens."""
+        """Try it; the robot is commanded to stand at the end, whatever happens."""
         if self._turn_rate_after(2.0 * _LOOK_S) > _TURNS_RAD_S:
             raise InputError('the robot turns: expected one that stands')
         kind = self._require_free_base()
