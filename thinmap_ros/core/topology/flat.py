@@ -24,7 +24,7 @@ FIELDS = {
     'edge_first': np.uint32,
     'edge_xy': np.float32,
 }
-# Ids of bags of before 0.3.1 have 64 bits.
+# Ids of bags of 0.3.0 and before have 64 bits.
 _READ = {'node_ids': np.uint64, 'edge_ids': np.uint64}
 _PAIRS = ('node_xy', 'edge_nodes')
 _POINTS = 'edge_xy'
