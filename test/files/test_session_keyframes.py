@@ -173,7 +173,7 @@ def test_localization_reads_no_keyframes(half: Half) -> None:
 def test_keyframes_of_another_session_are_archived(half: Half, tmp_path: Path) -> None:
     stem = str(tmp_path / 'block')
     save_localizer(stem, half.localizer)
-    message = save_localizer(stem, EkfLocalizer())
+    message = save_localizer(stem, EkfLocalizer(), overwrite=True)
     assert 'block.keyframes.npz of an earlier session renamed to' in message
     names = sorted(file.name for file in tmp_path.iterdir())
     assert names == ['block.keyframes.npz.old', 'block.slam.npz']
