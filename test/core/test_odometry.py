@@ -1,6 +1,5 @@
 """Odometry at the stamp of a scan, for any order of arrival."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -69,17 +68,6 @@ def test_a_scan_waits_for_odometry_as_new_as_itself():
     ((scan, T_odom_base),) = pairing.add_odometry(SECOND * 3 // 2, se2.pose(1.5, 0, 0))
     assert scan.stamp_ns == SECOND
     assert T_odom_base[0] == pytest.approx(1.0)
-
-
-def test_a_scan_that_is_received_again_is_left_out_and_counted():
-    pairing = ScanOdometrySynchronizer()
-    for second in range(6):
-        pairing.add_odometry(second * SECOND, se2.pose(second, 0, 0))
-    for second in (1, 2, 1, 3, 3, 2):
-        pairing.add_scan(scan_at(second * SECOND))
-    other = dataclasses.replace(scan_at(3 * SECOND), ranges_m=scan_at(0).ranges_m + 1.0)
-    assert len(pairing.add_scan(other)) == 1, 'another scan with the stamp of one before'
-    assert pairing.repeated == 3
 
 
 def driven(pairing, seconds, ahead_s=lambda s: 0.0):

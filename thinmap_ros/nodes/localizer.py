@@ -307,7 +307,6 @@ class LocalizerNode(ThinmapNode):
         diagnostics.set_drop_total(
             'scans without odometry at their time', self._input.pairing.dropped
         )
-        diagnostics.set_drop_total('scans received again', self._input.pairing.repeated)
         discarded = self._input.pairing.discarded_odometry
         diagnostics.set_drop_total('odometry with stamps ahead of those after it', discarded)
         diagnostics.set_drop_total('invalid scans or odometry', self._localizer.rejected)

@@ -3,8 +3,6 @@
 from collections import deque
 from dataclasses import replace
 
-import numpy as np
-
 from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, OdometryBuffer
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -12,15 +10,12 @@ from thinmap_ros.core.sensing.deskewing import SweepTiming, deskewed
 from thinmap_ros.core.sensing.laser_monitor import LaserMonitor
 from thinmap_ros.core.stamps import SECOND_NS
 
-_RECENT = 50  # scans among which a repeated one is found
-
 
 class ScanOdometrySynchronizer:
     """Interpolates odometry at the stamp of each scan, in the order of the scans.
 
-    A scan waits until newer odometry has arrived. One that is received again is left out: with its
-    stamp the robot would jump back to where it was. One that the laser did not measure is blind
-    (see `LaserMonitor`). Live nodes and replay use it alike, so that both process the same pairs.
+    A scan waits until newer odometry has arrived. One that the laser did not measure is blind (see
+    `LaserMonitor`). Live nodes and replay use it alike, so that both process the same pairs.
     """
 
     def __init__(self, capacity: int = 20) -> None:
@@ -30,9 +25,7 @@ class ScanOdometrySynchronizer:
         self._silence_s = 0.0  # since the last scan
         self._waiting: deque[Scan] = deque()
         self._capacity = capacity
-        self._recent: deque[Scan] = deque(maxlen=_RECENT)
         self.dropped = 0
-        self.repeated = 0
 
     @property
     def discarded_odometry(self) -> int:
@@ -59,10 +52,6 @@ class ScanOdometrySynchronizer:
 
     def add_scan(self, scan: Scan) -> list[tuple[Scan, Array]]:
         """Add a scan; returns the scans that are ready now, each with its T_odom_base (3,)."""
-        if any(_is_same(scan, other) for other in self._recent):
-            self.repeated += 1
-            return []
-        self._recent.append(scan)
         # A scan with a stamp more than a second ahead would block all later ones.
         while self._waiting and self._waiting[-1].stamp_ns > scan.stamp_ns + SECOND_NS:
             self._waiting.pop()
@@ -118,10 +107,3 @@ class ScanOdometrySynchronizer:
             return scan
         sweep = self._buffer.between(scan.begin_ns, scan.end_ns)
         return scan if sweep is None else deskewed(scan, *sweep)
-
-
-def _is_same(scan: Scan, other: Scan) -> bool:
-    """Whether two scans are one; different ones of a real log may have the same stamp."""
-    return scan.stamp_ns == other.stamp_ns and np.array_equal(
-        scan.ranges_m, other.ranges_m, equal_nan=True
-    )
