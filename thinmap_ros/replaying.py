@@ -22,7 +22,7 @@ from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
-from thinmap_ros.logs.log import Log, ScanEvent
+from thinmap_ros.logs.log import Log
 from thinmap_ros.logs.order.unused_scans import UnusedScans
 from thinmap_ros.logs.reading import WAITING_SCANS, complete_scans, recording_events
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
@@ -122,13 +122,9 @@ def replay(
     with _errors_kept(result, keep_partial), ProgressBar('replay', not show_progress) as bar:
         expected = None
         for number, event in enumerate(recording_events(log)):
-            repeated = pairing.repeated
             unused.add(event)
             for stamp_ns in _process(result, complete_scans(pairing, event), watcher):
                 unused.pair(stamp_ns)
-            if isinstance(event, ScanEvent) and pairing.repeated > repeated:
-                unused.pair(event.scan.stamp_ns)  # as the scan that it repeats
-                log.skipped.add('scan received again')
             tidy_up()
             if show_progress:
                 # Of a bag it is known once the bag has been opened.

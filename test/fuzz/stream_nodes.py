@@ -1,6 +1,7 @@
 """Streams of messages through the nodes themselves and the core behind them, in this process."""
 
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,9 @@ class NodeInProcess:
             return
         self._numbers[topic] = self._numbers.get(topic, 0) + 1
         if subscription._callback_type is Subscription.CallbackType.WithMessageInfo:
-            subscription.callback(message, {'publication_sequence_number': self._numbers[topic]})
+            number = self._numbers[topic]
+            info = {'publication_sequence_number': number, 'received_timestamp': time.time_ns()}
+            subscription.callback(message, info)
         else:
             subscription.callback(message)
 

@@ -153,7 +153,8 @@ def test_a_closed_pipe_and_ctrl_c_end_it_quietly(robot):
 
 def test_a_service_is_called(robot):
     said = output('service', 'call', '/save_map', 'thinmap_msgs/srv/SaveMap', '{path: maps/room}')
-    assert "requester: making request: thinmap_msgs.srv.SaveMap_Request(path='maps/room')" in said
+    request = "thinmap_msgs.srv.SaveMap_Request(path='maps/room', overwrite=False)"
+    assert f'requester: making request: {request}' in said
     assert '\nresponse:\nthinmap_msgs.srv.SaveMap_Response(success=True' in said
     assert (robot.folder / 'maps' / 'room.yaml').exists()
     said = output('service', 'call', '/localizer/pause', 'std_srvs/srv/SetBool')

@@ -168,7 +168,7 @@ def test_claims_keep_the_other_robot_away_until_their_robot_is_silent(graph):
     assert hall.claimed_x(TWO) == pytest.approx(17.0, abs=0.3)
     last = next(claim for claim in reversed(hall.claims) if claim.robot == ONE)
     assert messages.stamp_ns(last.header.stamp) > 0
-    assert (last.pose.x, last.pose.y) == pytest.approx((7.0, 2.0))
+    assert (last.pose.position.x, last.pose.position.y) == pytest.approx((7.0, 2.0))
     assert last.remaining_m == pytest.approx(math.dist((7.0, 2.0), (last.goal.x, last.goal.y)))
 
     stranger = TeamClaim(robot=TWO, session=1, header=messages.header('map', 1))
