@@ -63,10 +63,6 @@ NOT_RUN = {
     'export ROS_SECURITY_KEYSTORE=$PWD/keys ROS_SECURITY_ENABLE=true '
     'ROS_SECURITY_STRATEGY=Enforce': 'as above',
     'ros2 run thinmap_ros thinmap --ros-args --enclave /robot': 'as above',
-    'ros2 run twist_mux twist_mux --ros-args --params-file mux.yaml '
-    '-r cmd_vel_out:=cmd_vel &': 'another package',
-    'ros2 run thinmap_ros thinmap --ros-args -r cmd_vel:=cmd_vel_navigation &': 'as above',
-    'ros2 run thinmap_ros web --ros-args -r cmd_vel:=cmd_vel_page &': 'as above',
     'ros2 run thinmap_ros web --ros-args -p host:=0.0.0.0 '
     '-p web_token_file:=$HOME/thinmap_tokens': 'writes into the home of the user',
     'scripts/fuzz': 'hours; test/fuzz runs a part of it',

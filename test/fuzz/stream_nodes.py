@@ -36,6 +36,10 @@ _LAST_S = 4.0  # of the undisturbed part: answers to these messages are expected
 _PARAMETERS = ('use_sim_time:=true', 'laser_pose:=0,0,0', 'strict_parameters:=false')
 
 
+def _raise(step: str, error: Exception) -> None:
+    raise error
+
+
 class NodeInProcess:
     """A node whose callbacks are called as an executor would, without a middleware between.
 
@@ -52,6 +56,7 @@ class NodeInProcess:
             signal_handler_options=SignalHandlerOptions.NO,
         )
         self.node = make()
+        self.node.step_failed = _raise  # a node reports what nobody expects, and continues
         self.node.start()
         self.published: list[tuple[str, int, Any]] = []
         self._numbers: dict[str, int] = {}
