@@ -1,7 +1,8 @@
 """Of several publishers of a topic, the first is followed.
 
 rclpy does not tell the publisher of a message, but the message's number at its publisher and when
-it was received: each publisher numbers its messages one by one.
+it was received: each publisher numbers its messages one by one. `private_rclpy` takes the publisher
+from rcl itself, but of a Bool alone.
 """
 
 from collections.abc import Callable
