@@ -27,6 +27,15 @@ def test_a_pose_is_saved_into_a_folder_that_does_not_exist_and_loaded_again(grap
     assert lines(capfd) == []
 
 
+def test_the_pose_that_came_last_is_saved_at_the_end(graph, tmp_path):
+    pose = last_pose(graph, tmp_path / 'pose.yaml', rate=1e-3)
+    pose.save(POSE)
+    pose.save(2.0 * POSE)
+    np.testing.assert_array_equal(pose.load(), POSE)
+    pose.save_latest()
+    np.testing.assert_array_equal(pose.load(), 2.0 * POSE)
+
+
 def test_the_default_file_is_below_the_state_folder_of_the_user(graph, tmp_path, monkeypatch):
     monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path))
     monkeypatch.setenv('ROS_DOMAIN_ID', '7')

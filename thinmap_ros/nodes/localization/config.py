@@ -51,8 +51,9 @@ class LocalizationConfig(Config):
     )
     save_pose_rate: float = parameter(
         0.5,
-        'Rate at which the last pose is saved for the next start in mode localization (1/s). 0 or '
-        'less: it is not saved. Raise it where the robot is switched off while it drives.',
+        'Rate at which the last pose is saved for the next start in mode localization (1/s), and '
+        'at the end. 0 or less: it is not saved. Raise it where the robot is switched off while it '
+        'drives.',
         low=-1.0,
         high=10.0,
     )

@@ -37,6 +37,7 @@ class GivenMap:
         self._last_pose = LastPose(
             node, self._settings.pose_file, self._settings.save_pose_rate, self.source.name
         )
+        node.add_end_callback(self._last_pose.save_latest)
         self._amcl: AmclInterface | None = None
         self._given_covariance: Array | None = None  # of an initial pose without a map
 

@@ -28,6 +28,7 @@ class LastPose:
         self._period_s = 1.0 / rate if rate > 0.0 else math.inf
         self._map_name = map_name
         self._saved_at_s = -math.inf
+        self._unsaved: Array | None = None
 
     def load(self) -> Array | None:
         """The pose (3,) in this map; None without one: no file, a broken one, or another map."""
@@ -50,11 +51,19 @@ class LastPose:
 
     def save(self, T_map_base: Array) -> None:
         """Save a pose (3,), unless the last one was saved recently."""
-        now_s = time.monotonic()
-        if now_s - self._saved_at_s < self._period_s or math.isinf(self._period_s):
+        if math.isinf(self._period_s):
             return
-        self._saved_at_s = now_s
-        values = zip(_KEYS, (round(value, 4) for value in T_map_base.tolist()), strict=True)
+        self._unsaved = T_map_base
+        if time.monotonic() - self._saved_at_s >= self._period_s:
+            self.save_latest()
+
+    def save_latest(self) -> None:
+        """Save the pose that was given last, if it is not saved: at the end of the node."""
+        if self._unsaved is None:
+            return
+        self._saved_at_s = time.monotonic()
+        values = zip(_KEYS, (round(value, 4) for value in self._unsaved.tolist()), strict=True)
+        self._unsaved = None
         try:
             write_text(self._path, yaml.safe_dump({'map': self._map_name, **dict(values)}))
         except OSError as error:
