@@ -46,7 +46,7 @@ class ExplorerNode(ThinmapNode):
 
     Without thinmap's other nodes, /map and /tf are enough. Areas of /keep_out count as walls. An
     exploration is always a goal of the action explore, also one that starts by itself. It can be
-    paused and continued by explore/resume; /stop ends it for good, as ~/cancel does, whoever has
+    paused and continued by explore/resume; /stop ends it for good, as ~/cancel does, whatever has
     started it. Service save_exploration saves what was learned beside the map and the graph of a
     session. An explorer that was killed and is started again continues with the exploration, and
     with the goal of its client, who has to ask again for the result.

@@ -12,7 +12,7 @@ from thinmap_ros.tools.arguments import Parser
 from thinmap_ros.tools.ros_check import require_ros
 
 _QUESTION = (
-    'The robot turns on the spot, by up to 2 rad, also without a stop by this program. '
+    'The robot turns in place, by up to 2 rad, also without a stop by this program. '
     'Is there room all around it, and a hand at its emergency stop? yes: '
 )
 
