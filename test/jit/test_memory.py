@@ -15,5 +15,7 @@ def test_without_a_file_that_may_be_opened_nothing_is_released_and_nothing_raise
         release = memory.compiler_memory_releaser(period_s=-1.0)
         release()
         memory.release_compiler_pages()
+        assert memory._shared_bytes() == 0
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert memory._shared_bytes() > 0
