@@ -17,6 +17,7 @@ from thinmap_ros.core.places.observation_model import calibrate
 from thinmap_ros.core.places.place_database import (
     DIRECTIONS,
     NEAR_UNIT_M,
+    NODE_WINDOW_M,
     RANGE_UNIT_M,
     SIGHT_UNIT_M,
     Places,
@@ -78,7 +79,7 @@ def test_nodes_in_sight_of_a_block_are_those_of_the_map_that_nothing_hides(place
             == (row // places.block_cells, col // places.block_cells)
         ).all(1)
         lead = places.standing[own][0]
-        reach = CONFIG.node_window_m / 2.0 / CELL_M + places.block_cells
+        reach = NODE_WINDOW_M / 2.0 / CELL_M + places.block_cells
         expected = [
             node
             for node, cell in zip(places.nodes, cells, strict=True)

@@ -27,13 +27,6 @@ class GlobalLocalizationConfig(Config):
     )
     compared_range_m: float = 15.0  # longer ranges decide little and take time
     robot_radius_m: float = robot_radius()
-    node_window_m: float = parameter(
-        10.0,
-        'Side length of the window in which observed nodes are compared (m). Set it to the range '
-        'of the laser.',
-        low=2.0,
-        high=50.0,
-    )
     laser_range_noise_m: float = laser_range_noise()
     map_noise_m: float = parameter(
         0.05,
@@ -41,39 +34,6 @@ class GlobalLocalizationConfig(Config):
         'a map with errors.',
         low=0.001,
         high=1.0,
-    )
-    heading_noise_rad: float = parameter(
-        0.01,
-        'Standard deviation of the heading of a correct hypothesis (rad). Raise it for a map with '
-        'errors.',
-        low=0.0,
-        high=0.2,
-    )
-    odometry_noise_ratio: float = parameter(
-        0.05,
-        'Standard deviation of odometry per metre or radian of motion. Raise it for wheels that '
-        'slip.',
-        low=0.0,
-        high=1.0,
-    )
-    update_distance_m: float = parameter(
-        0.1,
-        'Travelled distance between updates (m). Lower: sooner localized, more computing time.',
-        low=0.01,
-        high=5.0,
-    )
-    update_angle_rad: float = parameter(
-        0.1,
-        'Rotation between updates (rad). Lower: sooner localized, more computing time.',
-        low=0.01,
-        high=3.0,
-    )
-    odometry_discontinuity_m: float = parameter(
-        1.5,
-        'A larger odometry increment between two scans restarts the search (m). Raise it for fast '
-        'robots with slow scanners.',
-        low=0.1,
-        high=100.0,
     )
     accept_weight: float = parameter(
         0.99,
@@ -94,20 +54,6 @@ class GlobalLocalizationConfig(Config):
         'Smallest inlier ratio of an accepted hypothesis, relative to the expected one. Lower it '
         'where furniture has moved, raise it against false localization.',
         low=0.3,
-        high=1.0,
-    )
-    accept_sigma_m: float = parameter(
-        0.15,
-        'Largest standard deviation of the position of an accepted hypothesis (m). Raise it to be '
-        'localized sooner.',
-        low=0.01,
-        high=5.0,
-    )
-    accept_sigma_rad: float = parameter(
-        0.07,
-        'Largest standard deviation of the heading of an accepted hypothesis (rad). Raise it to '
-        'be localized sooner.',
-        low=0.005,
         high=1.0,
     )
     not_in_map_distance_m: float = parameter(

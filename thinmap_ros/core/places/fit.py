@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
-from thinmap_ros.core.places.likelihood import Judge
+from thinmap_ros.core.places.likelihood import HEADING_NOISE_RAD, Judge
 from thinmap_ros.core.places.observation import observed_beams
 from thinmap_ros.core.places.observation_model import random_pose, simulated_scan
 from thinmap_ros.core.places.place_database import Places
@@ -36,7 +36,7 @@ def usual_share(
         scan = simulated_scan(places, T, like)
         noisy = scan.ranges_m + rng.normal(0.0, config.beam_noise_m, scan.ranges_m.size)
         seen = observed_beams(replace(scan, ranges_m=noisy), config)
-        noise = (config.map_noise_m, config.map_noise_m, config.heading_noise_rad)
+        noise = (config.map_noise_m, config.map_noise_m, HEADING_NOISE_RAD)
         off = rng.normal(size=3) * noise
         explained, silent = judge.explained((T + off)[None], seen)
         counts += float(explained[0])

@@ -21,13 +21,16 @@ from thinmap_ros.core.places.likelihood import Judge
 from thinmap_ros.core.places.observation import Observation, observe
 from thinmap_ros.core.places.observation_model import NodeModel, calibrate
 from thinmap_ros.core.places.place_database import Places
-from thinmap_ros.core.places.search import KeyView, candidates, judged_before, moved
+from thinmap_ros.core.places.search import ODOMETRY_NOISE, KeyView, candidates, judged_before, moved
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Result', 'State']
 
+# Nearer to the last update, a scan shows the same again.
+_LOOK_M = 0.1
+_LOOK_RAD = 0.1
 # Updates from about the same place meet the same errors of the map; they are independent after so
 # much motion.
 _NEW_WAY_M = 0.5
@@ -49,11 +52,16 @@ _WORTHLESS_ROUGH = 0.5
 _MANY_UPDATES = 16.0
 _LASTING_SHARE = 0.4
 _LASTING_UPDATES = 20.0
+# Largest standard deviations of an accepted pose: half the basin of convergence of scan matching.
+_SURE_M = 0.15
+_SURE_RAD = 0.07
 _VIEWS = 6
 _FRESH_SHARE = 0.2  # of the samples: drawn from the whole map during the search
 _FRESH_BEST = 100
 # Samples whose beams are followed, where the likeliest pose of a place leaves some unexplained.
 _LOOKED_ALONG = 300
+# Odometry that moves farther from one scan to the next has been reset, or the robot was carried.
+_JUMP_M = 1.5
 _JUMP_RAD = 2.0
 _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
 # A search that looked at all of the map and did not find the right place: this often. So who turns
@@ -200,7 +208,7 @@ class GlobalLocalization:
         if self._T_step is None:
             return False
         motion = se2.between(self._T_step, T_odom_base)
-        far = math.hypot(motion[0], motion[1]) > self.config.odometry_discontinuity_m
+        far = math.hypot(motion[0], motion[1]) > _JUMP_M
         return far or abs(float(motion[2])) > _JUMP_RAD
 
     def _novelty(self, T_odom_base: Array) -> float:
@@ -213,7 +221,7 @@ class GlobalLocalization:
         motion = se2.between(self._T_look, T_odom_base)
         way = math.hypot(motion[0], motion[1])
         turn = abs(float(motion[2]))
-        if way < self.config.update_distance_m and turn < self.config.update_angle_rad:
+        if way < _LOOK_M and turn < _LOOK_RAD:
             return 0.0
         return min(1.0, way / _NEW_WAY_M + turn / _NEW_TURN_RAD)
 
@@ -272,7 +280,7 @@ class GlobalLocalization:
         way = math.hypot(motion[0], motion[1])
         turn = abs(float(motion[2]))
         self._way_m += way
-        noise = self.config.odometry_noise_ratio
+        noise = ODOMETRY_NOISE
         spread = (noise * way + _STANDING_NOISE[0], noise * (way + turn) + _STANDING_NOISE[1])
         self._known.move(motion, spread, self._rng)
         self._drawn = moved(self._drawn, motion)
@@ -286,9 +294,7 @@ class GlobalLocalization:
         found, complete = candidates(self.places, judge, seen, drawn, self._rng)
         if len(found):
             poses = np.concatenate([self._known.poses, found])
-            counts, silent = judged_before(
-                judge, self._views, poses, T_odom_base, self.config.odometry_noise_ratio
-            )
+            counts, silent = judged_before(judge, self._views, poses, T_odom_base)
             new = slice(len(self._known), None)
             missed = np.zeros(len(poses))
             beams = 0.0
@@ -365,8 +371,8 @@ class GlobalLocalization:
         return (
             float(known.weights[best]) >= config.accept_weight
             and float(self._fits[best]) >= config.min_inlier_ratio
-            and sigma_m <= config.accept_sigma_m
-            and math.sqrt(max(float(known.covariances[best][2, 2]), 0.0)) <= config.accept_sigma_rad
+            and sigma_m <= _SURE_M
+            and math.sqrt(max(float(known.covariances[best][2, 2]), 0.0)) <= _SURE_RAD
         )
 
     def _lasting(self) -> NDArray[np.bool_]:

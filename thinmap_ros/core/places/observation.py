@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
-from thinmap_ros.core.places.place_database import DIRECTIONS, RANGE_UNIT_M
+from thinmap_ros.core.places.place_database import DIRECTIONS, NODE_WINDOW_M, RANGE_UNIT_M
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyConfig, build
@@ -73,7 +73,7 @@ def observed_nodes(
 
     Source: topological map paper section 2.1; the active window is a square round the robot.
     """
-    half = config.node_window_m / 2.0
+    half = NODE_WINDOW_M / 2.0
     grid = OccupancyGrid(
         OccupancyConfig(
             resolution_m=resolution_m,
@@ -83,7 +83,7 @@ def observed_nodes(
         )
     )
     grid.add_scan(replace(scan, max_range_m=min(scan.max_range_m, half)), np.zeros(3))
-    window = grid.window(0.0, 0.0, config.node_window_m)
+    window = grid.window(0.0, 0.0, NODE_WINDOW_M)
     topology = build(window, (0.0, 0.0), TopologyConfig(robot_radius_m=config.robot_radius_m))
     nodes = np.array([node.position for node in topology.nodes.values()]).reshape(-1, 2)
     return nodes, np.array([int(node.kind) for node in topology.nodes.values()], dtype=np.int64)

@@ -7,7 +7,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.observation import observed_nodes
-from thinmap_ros.core.places.place_database import FREE, Bytes, Places, free_way
+from thinmap_ros.core.places.place_database import FREE, NODE_WINDOW_M, Bytes, Places, free_way
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind
@@ -54,7 +54,7 @@ def calibrate(
         for kind, distance in zip(kinds.tolist(), nearest.tolist(), strict=True):
             distances[kind].append(distance)
     chance = _chance(places)
-    window = _VIEW_SHARE * config.node_window_m**2
+    window = _VIEW_SHARE * NODE_WINDOW_M**2
     found = np.zeros(len(NodeKind))
     spread = np.full(len(NodeKind), places.frame.resolution)
     for kind in NodeKind:

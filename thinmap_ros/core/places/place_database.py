@@ -21,6 +21,8 @@ Bytes = NDArray[np.uint8]
 Short = NDArray[np.int16]
 
 DIRECTIONS = 72
+# Side of the square round the robot in which the nodes of a scan are observed and compared.
+NODE_WINDOW_M = 10.0
 NEAR_UNIT_M = 0.004  # of the distance to the nearest wall: up to 1.02 m in a byte
 RANGE_UNIT_M = 0.05  # of the ranges all round: up to 12.75 m in a byte
 _NEAR_CAP = 255
@@ -97,7 +99,7 @@ class Places:
         around = ranges_around(states, patch.frame.in_cells(spots), patch.frame.resolution)
         nodes = np.array([node.position for node in topology.nodes.values()])
         block_cells = max(1, round(_BLOCK_M / patch.frame.resolution))
-        blocks, first, in_sight = _sights(states, standing, nodes, patch.frame, block_cells, config)
+        blocks, first, in_sight = _sights(states, standing, nodes, patch.frame, block_cells)
         return Places(
             patch.frame,
             states,
@@ -188,7 +190,6 @@ def _sights(
     nodes: Array,
     frame: GridFrame,
     block_cells: int,
-    config: GlobalLocalizationConfig,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], Short]:
     """Nodes in sight of each block in which the robot can stand: see Places."""
     rows, cols = states.shape
@@ -199,7 +200,7 @@ def _sights(
     )
     blocks.ravel()[numbers] = np.arange(len(numbers), dtype=np.int32)
     cells = frame.cells_of(nodes)
-    reach = config.node_window_m / 2.0 / frame.resolution + block_cells
+    reach = NODE_WINDOW_M / 2.0 / frame.resolution + block_cells
     first, in_sight = _list_sights(states == FREE, standing[leads].astype(np.int64), cells, reach)
     # Coordinates, not numbers of nodes: samples look at these lists in no order, and each look is
     # one short run of whole numbers, which the compiler compares several at a time.

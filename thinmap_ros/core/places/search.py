@@ -11,6 +11,8 @@ from thinmap_ros.core.places.observation import Observation, profile
 from thinmap_ros.core.places.place_database import DIRECTIONS, RANGE_UNIT_M, Places
 from thinmap_ros.core.se2 import Array
 
+# Standard deviation of odometry per metre and radian: of wheels that slip a little.
+ODOMETRY_NOISE = 0.05
 _MIN_WALLS = 6  # beams that met something, below which a scan could be anywhere
 _MAX_SPOTS = 3000
 _MAX_REFINED = 600
@@ -97,7 +99,6 @@ def judged_before(
     views: list[KeyView],
     poses: Array,
     T_odom_base: Array,
-    odometry_noise_ratio: float,
 ) -> tuple[Array, Array]:
     """How many beams of earlier views (V) the map explains from poses (N, 3) held now.
 
@@ -111,18 +112,19 @@ def judged_before(
         view = views[k]
         # From view to view: what odometry is off does not add up.
         back = se2.between(at, view.T_odom_base)
-        drift = _drift(back, odometry_noise_ratio)
+        drift = _drift(back)
         now = judge.refined(moved(now, back), view.seen, np.broadcast_to(drift, (len(now), 3, 3)))
         at = view.T_odom_base
         counts[k], silent[k] = judge.explained(now, view.seen)
     return counts, silent
 
 
-def _drift(motion: Array, noise: float) -> Array:
+def _drift(motion: Array) -> Array:
     """Covariance (3, 3) of a motion (3,) by odometry."""
     way = float(np.hypot(motion[0], motion[1]))
     turn = abs(float(motion[2]))
-    return np.diag(np.square([noise * way, noise * way, noise * (way + turn)]))
+    position_m = ODOMETRY_NOISE * way
+    return np.diag(np.square([position_m, position_m, ODOMETRY_NOISE * (way + turn)]))
 
 
 def moved(poses: Array, motion: Array) -> Array:
