@@ -64,6 +64,14 @@ def test_a_wide_room_is_a_hall_and_a_wide_door_separates_only_up_to_a_width() ->
     assert narrow.regions[right].kind == RegionKind.HALL
 
 
+@pytest.mark.parametrize(('width_m', 'kind'), [(3.2, RegionKind.ROOM), (4.5, RegionKind.CORRIDOR)])
+def test_how_wide_a_corridor_may_be_is_set(width_m: float, kind: RegionKind) -> None:
+    cells = np.full((44, 304), 100, dtype=np.int8)
+    cells[2:42, 2:302] = 0
+    found = find_regions(patch_of(cells), RegionConfig(max_corridor_width_m=width_m))
+    assert [region.kind for region in found.regions.values()] == [kind]
+
+
 def test_noise_changes_no_region(rng: np.random.Generator) -> None:
     found = find_regions(patch_of(noisy(office(), rng)))
     assert len(set(at(found, CORRIDOR, LEFT, RIGHT))) == len(found.regions) == 3

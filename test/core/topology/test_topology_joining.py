@@ -7,6 +7,7 @@ from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.joining import join_topologies
+from thinmap_ros.core.topology.registry import MATCH_RADIUS_M
 
 FRAME = GridFrame(0.0, 0.0, 0.1)
 
@@ -37,7 +38,7 @@ def test_nodes_of_both_keep_ids_and_shared_ones_have_that_of_the_first():
     assert shared
     for own, new in ids.items():
         away = graph.nodes[new].position - second.nodes[own].position
-        assert np.hypot(*away) <= 2.0 * TopologyConfig().node_match_radius_m
+        assert np.hypot(*away) <= 2.0 * MATCH_RADIUS_M
         assert (new in first.nodes) or new >= next_id
     stayed = first.nodes.keys() & graph.nodes.keys()
     assert len(stayed) >= len(first.nodes) - 4  # the ends at its border are gone

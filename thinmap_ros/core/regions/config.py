@@ -31,13 +31,6 @@ class RegionConfig(Config):
         low=0.5,
         high=10.0,
     )
-    min_region_area_m2: float = parameter(
-        3.0,
-        'A smaller part joins the region behind its widest passage (m2). Raise it if niches become '
-        'regions, lower it for small cabins.',
-        low=0.0,
-        high=1000.0,
-    )
     max_corridor_width_m: float = parameter(
         3.2,
         'Largest width of a corridor (m); a region that is wider in most of its area is a room or '

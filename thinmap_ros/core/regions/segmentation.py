@@ -29,6 +29,7 @@ Mask = NDArray[np.bool_]
 # join the corridor, less and noise divides regions.
 _SEED = 1 / 3
 # Free cells this near to a region lie within its outline: regions end before the walls, m.
+_MIN_AREA_M2 = 3.0  # a smaller part is a niche of the one behind its widest passage
 _WALL_MARGIN_M = 0.5
 
 
@@ -57,7 +58,7 @@ def segment(patch: GridPatch, config: RegionConfig) -> Segmentation:
     resolution = patch.frame.resolution
     space = room_space(patch, config)
     clearance = clearance_m(space, resolution)
-    least_cells = int(config.min_region_area_m2 / resolution**2)
+    least_cells = int(_MIN_AREA_M2 / resolution**2)
     seed_cells = max(1, int(_SEED * least_cells))
     neck = Neck(config.neck_ratio, 0.5 * config.max_door_width_m, seed_cells)
     basins, saddles = flood(clearance, neck)

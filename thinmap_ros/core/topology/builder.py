@@ -73,7 +73,7 @@ def build_again(
     """Registry with the map of `build`, whose ids continue those of the last grid of the place.
 
     The grids may differ in their frames. A node keeps its id where the last map has a node within
-    node_match_radius_m, nearest pairs first; edges between the same nodes keep theirs.
+    MATCH_RADIUS_M, nearest pairs first; edges between the same nodes keep theirs.
     """
     registry = Registry(patch.frame, config)
     if last is not None:

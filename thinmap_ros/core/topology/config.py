@@ -38,17 +38,3 @@ class TopologyConfig(Config):
         low=0.0,
         high=5.0,
     )
-    branch_merge_distance_m: float = parameter(
-        0.4,
-        'Branch nodes closer than this along the skeleton are merged (m). Raise it for fewer '
-        'nodes at wide junctions.',
-        low=0.0,
-        high=5.0,
-    )
-    node_match_radius_m: float = parameter(
-        0.5,
-        'A node that moved less than this keeps its id (m). Raise it if ids change while the map '
-        'grows.',
-        low=0.0,
-        high=10.0,
-    )

@@ -6,6 +6,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.registry import MATCH_RADIUS_M
 
 Ids = dict[int, int]
 
@@ -21,11 +22,11 @@ def join_topologies(
 
     first, second: with their nodes at their places in the joined grid; next_id: smallest number
     that no node or edge of the first map has had. Ids of the first map stay. A node of the second
-    one within node_match_radius_m of one of the first takes its id, nearest pairs first; others,
+    one within MATCH_RADIUS_M of one of the first takes its id, nearest pairs first; others,
     and all edges, get new ids. Nodes that the joined grid does not have are left out.
     """
     config = config or TopologyConfig()
-    ids = _new_ids(first, second, next_id, config.node_match_radius_m)
+    ids = _new_ids(first, second, next_id)
     nodes = [
         *first.nodes.values(),
         *(
@@ -46,14 +47,14 @@ def join_topologies(
     return builder, {own: ids[own] for own in second.nodes if ids[own] in there}
 
 
-def _new_ids(first: TopologicalMap, second: TopologicalMap, next_id: int, radius_m: float) -> Ids:
+def _new_ids(first: TopologicalMap, second: TopologicalMap, next_id: int) -> Ids:
     """Ids of the nodes and edges of the second map in the joined one."""
     ids: Ids = {}
     pairs = []
     for node in second.nodes.values():
-        for other in first.nodes_near(node.x, node.y, radius_m):
+        for other in first.nodes_near(node.x, node.y, MATCH_RADIUS_M):
             away = (node.x - other.x) ** 2 + (node.y - other.y) ** 2
-            if away <= radius_m**2:
+            if away <= MATCH_RADIUS_M**2:
                 pairs.append((away, node.id, other.id))
     used: set[int] = set()
     for _, own, other_id in sorted(pairs):

@@ -20,7 +20,9 @@ from thinmap_ros.core.topology.layers.clearances import (
 )
 from thinmap_ros.core.topology.layers.lattice import Cells, Lattice, rows_and_cols
 
-_OTHER_KIND = 0.5  # share of node_match_radius_m by which a node of another kind is farther away
+# A node that moved less than this while the map grew keeps its id.
+MATCH_RADIUS_M = 0.5
+_OTHER_KIND = 0.5  # share of MATCH_RADIUS_M by which a node of another kind is farther away
 _LONGEST_UNEVEN_M = 8.0
 _EVEN_M = 0.5
 _NOWHERE = np.array([[0, 0, -1, -1]])
@@ -152,7 +154,6 @@ class Registry:
         self.next_id = next_id
         self._predecessor = predecessor
         self._frame = frame
-        self._match_radius_m = config.node_match_radius_m
         lengths_m = (config.robot_radius_m, _LONGEST_UNEVEN_M, _EVEN_M)
         self._limits = _Limits(*(length_m / frame.resolution for length_m in lengths_m))
         self._passages: dict[int, _Passage] = {}
@@ -167,7 +168,7 @@ class Registry:
     def update(self, lattice: Lattice, changes: Changes) -> bool:
         """Publish the changes; returns whether there were any.
 
-        A new node gets the id of a removed one within node_match_radius_m, nearest pairs
+        A new node gets the id of a removed one within MATCH_RADIUS_M, nearest pairs
         first; so does an edge between the same nodes.
         """
         new = {
@@ -253,9 +254,9 @@ class Registry:
         corner, old_corner = (
             np.array([node.kind is NodeKind.CORNER for node in some]) for some in (fresh, old)
         )
-        penalty = _OTHER_KIND * self._match_radius_m * (corner[:, None] != old_corner)
+        penalty = _OTHER_KIND * MATCH_RADIUS_M * (corner[:, None] != old_corner)
         cost = distance + penalty * (distance > 0.1 * self._frame.resolution)
-        pairs = np.argwhere(distance <= self._match_radius_m)
+        pairs = np.argwhere(distance <= MATCH_RADIUS_M)
         ids: dict[int, int] = {}
         used: set[int] = set()
         for i, j in pairs[np.argsort(cost[pairs[:, 0], pairs[:, 1]], kind='stable')].tolist():

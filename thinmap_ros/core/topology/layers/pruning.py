@@ -33,10 +33,12 @@ BORDERS_UNKNOWN = 2
 COLUMNS = 3
 _END = 1
 _BRANCH = 3
+# Branch nodes closer than this along the skeleton are one, at wide junctions.
+_BRANCH_MERGE_M = 0.4
 
 
 class Limits(NamedTuple):
-    """Lengths in cells: robot radius, min_branch_length, branch_merge_distance; and the ratio."""
+    """Lengths in cells: robot radius, min_branch_length, edges that are merged; and the ratio."""
 
     radius: float
     branch_length: float
@@ -49,7 +51,7 @@ class Limits(NamedTuple):
         return Limits(
             config.robot_radius_m / resolution_m,
             config.min_branch_length_m / resolution_m,
-            config.branch_merge_distance_m / resolution_m,
+            _BRANCH_MERGE_M / resolution_m,
             config.min_branch_ratio,
         )
 
