@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.candidates import ASSIGNMENT_RADIUS_M
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.viewpoints import search_beside
@@ -19,7 +20,7 @@ from thinmap_ros.core.planning.traversability import (
     reachable_cells,
     traversable_cells,
 )
-from thinmap_ros.core.planning.wavefront import WavefrontConfig
+from thinmap_ros.core.planning.wavefront import START_ESCAPE_M, WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -125,11 +126,11 @@ class FrontierFinder:
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
             return np.zeros_like(standing)
         if self._recent_path is None:
-            ways = escape_cells(standing, free, frame, xy, _PLANNER.start_escape_distance_m)
+            ways = escape_cells(standing, free, frame, xy, START_ESCAPE_M)
             return reachable_cells(ways, (row, col)) & standing
         trail = self._recent_path.cells(frame, free.shape)
         return reachable_cells(
-            escape_cells(standing, free, frame, xy, _PLANNER.start_escape_distance_m, trail),
+            escape_cells(standing, free, frame, xy, START_ESCAPE_M, trail),
             (row, col),
         )
 
@@ -144,6 +145,6 @@ class FrontierFinder:
         """Centre (2,), m, of the allowed cell at a frontier (N, 2) nearest to a point, m."""
         frame = self.map.frame
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
-        max_steps = int(_EXPLORER.frontier_assignment_radius_m / frame.resolution)
+        max_steps = int(ASSIGNMENT_RADIUS_M / frame.resolution)
         cell, _ = search_beside(self.map.free, cells, allowed, allowed, max_steps, (row, col))
         return None if cell is None else np.asarray(frame.centres_of(np.array([cell]))[0])

@@ -31,6 +31,14 @@ def test_a_heading_at_the_goal_is_turned_to():
     assert abs(se2.wrap(ride.pose[2] + 2.0)) < 0.2
 
 
+def test_a_goal_is_reached_within_the_tolerances_that_a_user_sets():
+    config = NavigatorConfig(xy_goal_tolerance_m=0.6, yaw_goal_tolerance_rad=0.5)
+    ride = Ride(room(), (1.0, 1.0, 0.0), config=config)
+    assert ride.go((3.0, 1.0, -2.0))[-1].state == 'reached'
+    assert 0.4 < math.dist(ride.pose[:2], (3.0, 1.0)) < 0.65
+    assert 0.3 < abs(se2.wrap(ride.pose[2] + 2.0)) < 0.55
+
+
 @pytest.mark.parametrize('speed', [0.2, 0.5, 1.2])
 def test_waypoints_are_passed_without_a_stop_and_the_goal_is_reached(speed):
     config = NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=speed))

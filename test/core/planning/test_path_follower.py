@@ -48,7 +48,7 @@ def test_it_arrives_and_stays_near_the_path_round_sharp_corners():
 
 @pytest.mark.parametrize('speed', [0.2, 0.5])
 def test_commands_keep_all_limits(speed):
-    config = PathFollowerConfig(max_speed_m_s=speed)
+    config = PathFollowerConfig(max_speed_m_s=speed, max_angular_acceleration_rad_s2=1.0)
     _, commands = drive(CORNERS, (0.0, 0.0, 2.5), config)
     v, w = commands.T
     assert (v >= 0.0).all()
@@ -89,6 +89,17 @@ def test_in_a_narrow_passage_the_speed_is_the_shorter_lookahead_over_its_time(
     for _ in range(30):
         v, w = follower.command(np.zeros(3), path, DT, margin_m)
     assert (v, w) == pytest.approx((expected, 0.0))
+
+
+def test_a_shorter_lookahead_leads_back_to_the_path_sooner():
+    path = dense([(0.0, 0.0), (8.0, 0.0)])
+    off_m = []
+    for lookahead_distance_m in (0.3, 0.6, 1.2):
+        config = PathFollowerConfig(lookahead_distance_m=lookahead_distance_m)
+        poses, _ = drive(path, (0.0, 0.2, 0.0), config)
+        off_m.append(np.abs(poses[:, 1]).sum())
+    assert off_m == sorted(off_m)
+    assert off_m[0] < 0.7 * off_m[-1]
 
 
 def test_turning_to_a_heading_ends_there():

@@ -31,6 +31,12 @@ from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 SETTLED = 0.999  # probability of an end node without a frontier
 _RIM_M = 0.5  # at the end of its range the laser sees little
 _NEAR_M = 1.5
+# A frontier belongs to the nearest end node in sight within this distance; without
+# one it is a candidate of its own.
+ASSIGNMENT_RADIUS_M = 3.0
+# Depth behind a frontier that a viewpoint must be able to see: more leads closer to the middle of
+# openings.
+_VIEW_DEPTH_M = 2.0
 _RENEW_S = 5.0
 _RENEW_S_M = 0.5  # of a candidate far away: so much per metre, as its surroundings do not change
 
@@ -47,20 +53,6 @@ class CandidateConfig(Config):
         'coverage.',
         low=0.0,
         high=5.0,
-    )
-    frontier_assignment_radius_m: float = parameter(
-        3.0,
-        'A frontier belongs to the nearest visible end node within this distance (m). Raise it in '
-        'halls.',
-        low=0.1,
-        high=50.0,
-    )
-    view_depth_m: float = parameter(
-        2.0,
-        'Depth behind a frontier that a viewpoint must be able to see (m). Raise it to drive '
-        'closer to the middle of openings.',
-        low=0.1,
-        high=20.0,
     )
 
 
@@ -196,7 +188,7 @@ class CandidateFinder:
         at = frontiers.frame.cells_of(places)
         cells = frontiers.frame.cells_of(points)
         away_m = cdist(points, places)
-        pairs = np.argwhere(away_m <= self._config.frontier_assignment_radius_m)
+        pairs = np.argwhere(away_m <= ASSIGNMENT_RADIUS_M)
         owners = [-1] * len(middles)
         for i, k in pairs[away_m[tuple(pairs.T)].argsort(kind='stable')].tolist():
             if owners[i] < 0 and line_is_clear(frontiers.free, *at[k], *cells[i]):
@@ -230,7 +222,7 @@ class CandidateFinder:
     ) -> Iterator[Cell]:
         """Cells that see behind a frontier, the best one first."""
         resolution = frontiers.frame.resolution
-        views = [(range_max_m - _RIM_M, self._config.view_depth_m), (_NEAR_M, 0.0)]
+        views = [(range_max_m - _RIM_M, _VIEW_DEPTH_M), (_NEAR_M, 0.0)]
         for reach_m, depth_m in views[min(candidate.evidence.visits, 1) :]:
             cell = place_for(
                 frontiers.free,
@@ -248,7 +240,7 @@ class CandidateFinder:
         self, candidate: Candidate, frontiers: FrontierMap, reachable: Reachable
     ) -> tuple[Cell | None, bool]:
         """The nearest cell on the way to a frontier, None without one; whether it is enclosed."""
-        steps = int(self._config.frontier_assignment_radius_m / frontiers.frame.resolution)
+        steps = int(ASSIGNMENT_RADIUS_M / frontiers.frame.resolution)
         row, col = frontiers.frame.cells_of(np.array([candidate.middle]))[0]
         return search_beside(
             frontiers.free,

@@ -54,6 +54,12 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 
 _TURN_FROM_M = 0.3  # paths that are shorter begin with no turn
 _SAME_PLACE_M = 1.5  # a target or viewpoint that moves less is the same one
+_TURN_COST_M_RAD = 0.2  # driven in the time of a turn by one radian, at 0.2 m/s and 1 rad/s
+_SWITCH_MARGIN_M = (
+    2.0  # saving for which the target is changed, so that the robot does not oscillate
+)
+_SWITCH_MARGIN_M = 2.0
+_FIND_PERIOD_S = 1.0  # between two searches for candidates, which take time in large maps
 _MAX_VISITS = 3  # until a candidate is given up
 _MAX_FAILURES = 2
 _MAX_RESOLVED_M2 = 2.0  # of area that candidates may hide of which none is worth a visit
@@ -71,26 +77,6 @@ class ExplorerConfig(CandidateConfig):
         'coverage, lower it for shorter paths.',
         low=0.5,
         high=0.999,
-    )
-    turn_cost_m_rad: float = parameter(
-        0.2,
-        'Path length that a turn by one radian is worth (m/rad). Raise it for a robot that turns '
-        'slowly.',
-        low=0.0,
-        high=10.0,
-    )
-    switch_margin_m: float = parameter(
-        2.0,
-        'Smallest saving for which the target is changed (m). Raise it if the robot oscillates.',
-        low=0.0,
-        high=100.0,
-    )
-    candidate_period_s: float = parameter(
-        1.0,
-        'Period at which frontiers are assigned and candidates are found (s). Raise it to save '
-        'time.',
-        low=0.0,
-        high=60.0,
     )
 
 
@@ -232,7 +218,7 @@ class Explorer:
     def _is_due(self) -> bool:
         """Whether candidates are found again: once in a while, and when the target is gone."""
         age_s = (self._clock.now_ns - self._clock.found_ns) / SECOND_NS
-        if self._frame != self.frontier_map.frame or age_s >= self.config.candidate_period_s:
+        if self._frame != self.frontier_map.frame or age_s >= _FIND_PERIOD_S:
             return True
         return age_s > _GONE_S and not self._target_remains()
 
@@ -257,7 +243,7 @@ class Explorer:
         self._look.stop()
         own = self.claim(self._clock.now_ns, T_map_base)
         ready = self.team.share(
-            self._ready(worth), own, self._space.path_lengths_from, self.config.switch_margin_m
+            self._ready(worth), own, self._space.path_lengths_from, _SWITCH_MARGIN_M
         )
         if ready:
             self._drive_to(self._best(self._costs(ready, T_map_base)), T_map_base)
@@ -275,7 +261,7 @@ class Explorer:
         if kept is None or kept is best:
             return best
         known_area_m2 = self.frontier_map.known_area_m2
-        margin_m = self.config.switch_margin_m * 2.0 ** best.evidence.times_left(known_area_m2)
+        margin_m = _SWITCH_MARGIN_M * 2.0 ** best.evidence.times_left(known_area_m2)
         if costs[best] >= costs[kept] - margin_m:
             return kept
         kept.evidence.leave(known_area_m2)
@@ -351,7 +337,7 @@ class Explorer:
         """Cost, m, of driving to each candidate: the path, and the turn with which it begins."""
         goals = np.array([candidate.goal for candidate in candidates])
         lengths = self._space.path_lengths(T_map_base, goals[:, :2])
-        costs = lengths + self.config.turn_cost_m_rad * _turns(T_map_base, goals)
+        costs = lengths + _TURN_COST_M_RAD * _turns(T_map_base, goals)
         return dict(zip(candidates, costs.tolist(), strict=True))
 
     # The decision.

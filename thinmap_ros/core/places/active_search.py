@@ -16,7 +16,7 @@ from thinmap_ros.core.places.place_database import FREE, UNKNOWN, WALL, Bytes, P
 from thinmap_ros.core.places.search import distinct_indices
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
 from thinmap_ros.core.planning.traversability import escape_cells, traversable_cells
-from thinmap_ros.core.planning.wavefront import WavefrontConfig, navigation_function
+from thinmap_ros.core.planning.wavefront import START_ESCAPE_M, WavefrontConfig, navigation_function
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import kernel
@@ -257,7 +257,7 @@ def _in_reach(
     resolution = patch.frame.resolution
     xy = (float(T_odom_base[0]), float(T_odom_base[1]))
     standing = traversable_cells(patch.free, driving.robot_radius_m, resolution)
-    ways = escape_cells(standing, patch.free, patch.frame, xy, driving.start_escape_distance_m)
+    ways = escape_cells(standing, patch.free, patch.frame, xy, START_ESCAPE_M)
     middle = patch.shape[0] // 2, patch.shape[1] // 2
     metres = navigation_function(np.where(ways, 1.0, np.inf), middle) * resolution
     near_by = np.argwhere(standing & (metres >= _NEAREST_M) & np.isfinite(metres))

@@ -17,7 +17,12 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.graph_search import path_points, shortest_route
 from thinmap_ros.core.planning.grid_search import distance_field_from
 from thinmap_ros.core.planning.traversability import nearest_true, path_collides
-from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, cost_of_cells
+from thinmap_ros.core.planning.wavefront import (
+    START_ESCAPE_M,
+    Obstacles,
+    WavefrontConfig,
+    cost_of_cells,
+)
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.jit import kernel
@@ -150,7 +155,7 @@ def route_band(
     checked = _Checked(topology, patch, config, obstacles)
     ends = []
     for xy, reach_m in (
-        (start_xy, config.start_escape_distance_m),
+        (start_xy, START_ESCAPE_M),
         (goal_xy, config.goal_search_radius_m),
     ):
         entrance = _entrance(checked, xy, reach_m)

@@ -39,6 +39,7 @@ _MAX_WAYPOINT_PASS_M = 0.7
 NO_PATH = 'no path'
 _OBSTACLE = 'an obstacle blocks the path'
 _HIDDEN = 'the laser does not see the path: sector of invalid beams'
+_REPLAN_PERIOD_S = 5.0  # while nothing is in the way
 _REPLAN_S = 0.5  # after a stop for an obstacle
 # Points around another robot, so far apart that no path leads between them.
 _RING = np.array([[math.cos(a), math.sin(a)] for a in np.linspace(0.0, 2.0 * math.pi, 13)[:-1]])
@@ -84,9 +85,6 @@ class NavigatorConfig(Config):
         'goal.',
         low=0.01,
         high=3.2,
-    )
-    replan_period_s: float = parameter(
-        5.0, 'Period of replanning (s). Lower it among moving obstacles.', low=0.1, high=1000.0
     )
     blocked_timeout_s: float = parameter(
         8.0,
@@ -261,9 +259,7 @@ class Navigator:
         """
         ring_m = distance_m + _RING_MARGIN_M - self.config.stop_radius_m
         self._progress.robots = (robots[:, None] + ring_m * _RING).reshape(-1, 2)
-        self._progress.path_age_s = max(
-            self._progress.path_age_s, self.config.replan_period_s - _REPLAN_S
-        )
+        self._progress.path_age_s = max(self._progress.path_age_s, _REPLAN_PERIOD_S - _REPLAN_S)
         self._progress.yielded_s += dt_s
         if self._progress.yielded_s > self.config.blocked_timeout_s:
             self.cancel()
@@ -308,7 +304,7 @@ class Navigator:
         changed = patch is not self._patch
         self._patch = patch
         self._progress.path_age_s += dt_s
-        if self.path is None or self._progress.path_age_s >= self.config.replan_period_s:
+        if self.path is None or self._progress.path_age_s >= _REPLAN_PERIOD_S:
             return True
         x = float(T_map_base[0])
         y = float(T_map_base[1])
@@ -458,9 +454,7 @@ class Navigator:
         heading = self._heading_of_path(T_map_base)
         if abs(se2.wrap(heading - float(T_map_base[2]))) > self.config.aim_tolerance_rad:
             return Command(*self._follower.turn_to(T_map_base, heading, dt_s), 'driving')
-        self._progress.path_age_s = max(
-            self._progress.path_age_s, self.config.replan_period_s - _REPLAN_S
-        )
+        self._progress.path_age_s = max(self._progress.path_age_s, _REPLAN_PERIOD_S - _REPLAN_S)
         return Command(*self._follower.override_speed(0.0, 0.0), 'blocked', reason)
 
     def _heading_of_path(self, T_map_base: Array) -> float:

@@ -12,6 +12,9 @@ from thinmap_ros.core.config import SAFE_LOWER, Config, parameter
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.jit import kernel
 
+_MAX_CORNER_CUT_M = 0.05  # largest distance between the driven arc and the path: one cell
+_TURN_IN_PLACE_RAD = 0.9  # heading error above which the robot turns in place, and drives no arc
+
 
 @dataclass(frozen=True)
 class PathFollowerConfig(Config):
@@ -50,18 +53,6 @@ class PathFollowerConfig(Config):
         low=0.0,
         high=10.0,
     )
-    max_corner_cut_m: float = parameter(
-        0.05,
-        'Largest distance between the driven arc and the path (m). Lower it in narrow passages.',
-        low=0.0,
-        high=1.0,
-    )
-    rotate_to_heading_angle_rad: float = parameter(
-        0.9,
-        'Heading error above which the robot rotates in place (rad). Raise it to drive more arcs.',
-        low=0.1,
-        high=3.0,
-    )
     # In narrow passages: minimum lookahead, its growth with the clearance margin, and a speed that
     # is always allowed.
     narrow_lookahead_m: float = 0.1
@@ -92,16 +83,12 @@ class PathFollower:
         )
         reach = min(max(config.lookahead_distance_m, config.lookahead_time_s * self.v), narrow)
         x, y, theta = T_map_base.tolist()
-        ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.max_corner_cut_m)
+        ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, _MAX_CORNER_CUT_M)
         dx = ahead_x - x
         dy = ahead_y - y
         error = wrap(math.atan2(dy, dx) - theta) if dx or dy else 0.0
         # Hysteresis: once turning, the robot turns until the path is nearly straight ahead.
-        least = (
-            0.3 * config.rotate_to_heading_angle_rad
-            if self._turning
-            else config.rotate_to_heading_angle_rad
-        )
+        least = 0.3 * _TURN_IN_PLACE_RAD if self._turning else _TURN_IN_PLACE_RAD
         self._turning = abs(error) > least
         if self._turning:
             return self._limited(0.0, self._turn_rate(error, dt_s), dt_s)

@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path
+from thinmap_ros.core.planning.wavefront import (
+    START_ESCAPE_M,
+    Obstacles,
+    WavefrontConfig,
+    find_path,
+)
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
 
@@ -108,7 +113,7 @@ def _least_detour(
 
 def _rim_cells(resolution: float, config: WavefrontConfig, obstacles: Obstacles | None) -> int:
     """Cells at the rim whose cost may differ from that in the map."""
-    reach_m = max(config.inflation_radius_m, config.robot_radius_m, config.start_escape_distance_m)
+    reach_m = max(config.inflation_radius_m, config.robot_radius_m, START_ESCAPE_M)
     if obstacles is not None:
         reach_m = max(reach_m, obstacles.radius_m)
     return math.ceil((reach_m + _GAP_M) / resolution) + 1

@@ -25,6 +25,8 @@ from thinmap_ros.jit import inlined, kernel
 Mask = NDArray[np.bool_]
 _STEP_CELLS = 0.5
 _TOPOLOGY = TopologyConfig()
+# A start in collision may leave inflated cells within this distance, that of the usual inflation.
+START_ESCAPE_M = 0.6
 # Distances are whole cells times the resolution:
 # rounding must not close a passage as wide as the robot.
 _HAIR_M = 1e-6
@@ -62,13 +64,6 @@ class WavefrontConfig(Config):
     goal_search_radius_m: float = parameter(
         0.3,
         'A goal in collision is moved by at most this distance (m). 0: such a goal fails.',
-        low=0.0,
-        high=5.0,
-    )
-    start_escape_distance_m: float = parameter(
-        0.6,
-        'A start in collision may leave inflated cells within this distance (m). Raise it if the '
-        'robot gets stuck beside obstacles.',
         low=0.0,
         high=5.0,
     )
@@ -223,7 +218,7 @@ def _open_escape_cells(
     Occupied cells stay forbidden, except the cell of the robot itself. So do cells
     from which a step over a corner leads through a wall.
     """
-    where, within = disc(cost, start, config.start_escape_distance_m / resolution)
+    where, within = disc(cost, start, START_ESCAPE_M / resolution)
     opened = np.argwhere(within & ~np.isfinite(cost[where]) & ~occupied[where])
     opened += (where[0].start, where[1].start)
     rows, cols = opened[~_beside_thin_wall(occupied, opened)].T
