@@ -11,7 +11,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
+from thinmap_ros.core.ekf_slam.feature_map import MAX_MISSES, FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.features import FeatureTrack
 from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, Lines, extract_lines
 
@@ -238,7 +238,7 @@ def test_a_door_that_opens_leaves_the_map_and_a_wall_behind_a_person_does_not():
     for _ in range(10):
         features.observe(ekf, seen_lines(far), scan_in(person, np.zeros(3)))
     assert sorted(round(f.r_m) for f in features.line_features(ekf)) == [2, 5]
-    for _ in range(FeatureConfig().max_misses):
+    for _ in range(MAX_MISSES):
         assert len(features) == 2
         features.observe(ekf, seen_lines(far), scan_in(person[1:], np.zeros(3)))
     left = features.line_features(ekf)

@@ -10,7 +10,7 @@ from support.slam_room import BLIND
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.association import AssociationConfig
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
+from thinmap_ros.core.ekf_slam.feature_map import WALL_FLATNESS_M, FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.ekf_slam.models import observe_line
 
@@ -53,7 +53,7 @@ def look(rng, truth):
     ends = np.array([se2.transform_points(se2.invert(truth), WALLS[i]) for i in seen])
     ends = ends.reshape(-1, 2, 2)
     lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
-    wall = FEATURES.wall_flatness_m * np.column_stack([np.ones(len(z)), 1.0 / lengths])
+    wall = WALL_FLATNESS_M * np.column_stack([np.ones(len(z)), 1.0 / lengths])
     z = z + rng.multivariate_normal([0.0, 0.0], SEEN, len(z)) + wall * rng.normal(size=(len(z), 2))
     return Lines(z, np.tile(SEEN, (len(z), 1, 1)), ends)
 

@@ -34,6 +34,10 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
 
+# Standard deviations of real walls about a straight line; with less, the filter is overconfident.
+WALL_FLATNESS_M = 0.02
+_WALL_FLATNESS_RAD = 0.006
+MAX_MISSES = 5  # consecutive scans through a feature until it is removed: a door has opened
 _SPARE = 8  # additional features that may stay in the local area
 _ROUNDING = 1e-6  # relative rounding error that is accepted in a covariance
 FIELDS = {
@@ -70,20 +74,6 @@ FIELDS = {
 class FeatureConfig(Config):
     """Parameters of feature management."""
 
-    wall_flatness_m: float = parameter(
-        0.02,
-        'Standard deviation of real walls about a straight line (m). Raise it for rough walls: too '
-        'low, and the filter becomes overconfident.',
-        low=0.0,
-        high=1.0,
-    )
-    wall_flatness_rad: float = parameter(
-        0.006,
-        'Standard deviation of the direction of real walls (rad). Raise it for rough walls: too '
-        'low, and the filter becomes overconfident.',
-        low=0.0,
-        high=0.5,
-    )
     min_observations: int = parameter(
         4,
         'Number of observations after which a line becomes a feature. Raise it against features '
@@ -97,13 +87,6 @@ class FeatureConfig(Config):
         'it for walls that are often hidden.',
         low=1,
         high=10_000,
-    )
-    max_misses: int = parameter(
-        5,
-        'Number of consecutive observations through a feature after which it is removed. Raise it '
-        'to keep walls longer, lower it to forget doors that have opened.',
-        low=1,
-        high=1000,
     )
 
 
@@ -121,7 +104,7 @@ class FeatureMap:
         self._config = config
         self._association = association
         self._local_areas = local_areas
-        self._wall = np.diag(np.square([config.wall_flatness_m, config.wall_flatness_rad]))
+        self._wall = np.diag(np.square([WALL_FLATNESS_M, _WALL_FLATNESS_RAD]))
         self._features: dict[int, FeatureTrack] = {}
         self._candidates = FeatureCandidates(
             config.min_observations,
@@ -210,7 +193,7 @@ class FeatureMap:
         The error at the ends is the same as elsewhere, so a short line has an uncertain direction.
         """
         lengths = np.hypot(*(lines.ends[:, 1] - lines.ends[:, 0]).T)
-        sigma_m = self._config.wall_flatness_m
+        sigma_m = WALL_FLATNESS_M
         walls = np.zeros((len(lines), 2, 2))
         walls[:, 0, 0] = sigma_m**2
         walls[:, 1, 1] = np.square(sigma_m / np.maximum(lengths, sigma_m))
@@ -262,7 +245,7 @@ class FeatureMap:
             i for i, gone in zip(ekf.area, through, strict=True) if gone and i not in seen
         ]:
             self._features[feature_id].misses += 1
-            if self._features[feature_id].misses >= self._config.max_misses:
+            if self._features[feature_id].misses >= MAX_MISSES:
                 self._drop(ekf, feature_id, None)
 
     def _merge(self, ekf: CompressedEkf, seen: Iterable[int]) -> None:
@@ -307,7 +290,7 @@ class FeatureMap:
     @property
     def _near(self) -> float:
         """Largest distance between two lines that may be one wall, m."""
-        return 3.0 * self._config.wall_flatness_m
+        return 3.0 * WALL_FLATNESS_M
 
     def _drop(self, ekf: CompressedEkf, feature_id: int, heir: int | None) -> None:
         ekf.remove(ekf.area.index(feature_id))

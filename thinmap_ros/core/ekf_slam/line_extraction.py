@@ -24,6 +24,8 @@ from thinmap_ros.jit import kernel
 _FLATTEST_RAD = math.radians(10.0)  # smallest usable angle between wall and beam
 _WIDEST_GAP_M = 0.6  # largest gap in a wall: narrower than a door
 _MAX_MISSING = 2  # largest number of adjacent beams without return inside a wall
+_MIN_LENGTH_M = 0.8  # of a line: furniture is shorter
+_MAX_SAGITTA_M = 0.02  # rise of the points over the chord of a line: that of rough walls
 _MAX_CHI2 = 3.0  # per degree of freedom: rough walls pass, clutter does not
 _TRIM_SIGMAS = 3.0  # end points with a larger distance are mixed pixels or on the next wall
 # Columns of a fit.
@@ -65,20 +67,6 @@ class LineConfig(Config):
         'laser with few beams.',
         low=4,
         high=1000,
-    )
-    min_length_m: float = parameter(
-        0.8,
-        'Smallest length of a line (m). Raise it against lines on furniture, lower it in narrow '
-        'rooms.',
-        low=0.05,
-        high=10.0,
-    )
-    max_sagitta_m: float = parameter(
-        0.02,
-        'Largest rise of the points over the chord of a line (m). Raise it for rough walls, lower '
-        'it to reject curved surfaces.',
-        low=0.001,
-        high=1.0,
     )
     split_sigmas: float = 4.0
 
@@ -122,8 +110,8 @@ def extract_lines(scan: Scan, config: LineConfig) -> Lines:
     fits, count = _extract(x, y, ranges, angles, beams, step, sigmas, config.min_points)
     fits = fits[:count]
     length = fits[:, _HIGH] - fits[:, _LOW]
-    straight = (fits[:, _BOW] < config.max_sagitta_m) | (fits[:, _BOW] < 3.0 * fits[:, _BOW_SIGMA])
-    good = (length >= config.min_length_m) & (fits[:, _CHI2] < _MAX_CHI2) & straight
+    straight = (fits[:, _BOW] < _MAX_SAGITTA_M) | (fits[:, _BOW] < 3.0 * fits[:, _BOW_SIGMA])
+    good = (length >= _MIN_LENGTH_M) & (fits[:, _CHI2] < _MAX_CHI2) & straight
     return _in_robot_frame(fits[good], scan.T_base_laser)
 
 
