@@ -3,11 +3,15 @@
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
+from thinmap_ros.core.slam.matching.local_map import (
+    MAX_WALL_DISTANCE_M,
+    MIN_HIT_RATIO,
+    LocalMapConfig,
+)
 
 CELL_M = LocalMapConfig().resolution_m
 
-REACH = round(LocalMapConfig().max_wall_distance_m / CELL_M)
+REACH = round(MAX_WALL_DISTANCE_M / CELL_M)
 
 
 def cells_of(local_map):
@@ -27,7 +31,7 @@ def read_cells(local_map, *rectangle):
 
 
 def walls_of(cells):
-    return cells['hits'] > LocalMapConfig().occupied_min_hit_ratio * cells['seen']
+    return cells['hits'] > MIN_HIT_RATIO * cells['seen']
 
 
 def nearest(cells):

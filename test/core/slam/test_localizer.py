@@ -18,7 +18,7 @@ from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
+from thinmap_ros.core.slam.matching.local_map import MIN_HIT_RATIO, LocalMapConfig
 from thinmap_ros.sim.drives import DriveConfig
 from thinmap_ros.sim.drives import drive as drive_along
 from thinmap_ros.sim.laser import LaserScannerConfig
@@ -466,10 +466,7 @@ def from_walls(points):
 def walls_in(localizer):
     """Centres (N, 2) of the wall cells in the localizer's state."""
     state = localizer.state()
-    tile, row, col = np.nonzero(
-        state['hits']
-        > localizer.config.local_map.occupied_min_hit_ratio * state['seen'].astype(float)
-    )
+    tile, row, col = np.nonzero(state['hits'] > MIN_HIT_RATIO * state['seen'].astype(float))
     size = state['hits'].shape[1]
     cells = state['tiles'][tile] * size + np.column_stack([row, col])
     return float(state['cell_m']) * (cells[:, ::-1] + 0.5)

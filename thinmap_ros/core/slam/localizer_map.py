@@ -24,6 +24,9 @@ from thinmap_ros.core.slam.tracker import Surroundings, Tracker
 from thinmap_ros.core.slam.wall_compass import Reference
 from thinmap_ros.core.snapshot import State
 
+# A scan is added to the local map after so much motion: nearer ones show the same walls again.
+_UPDATE_M = 0.2
+_UPDATE_RAD = 0.2
 _VIEW_M = 1.0  # path length after which the errors of two matches are independent
 
 
@@ -93,12 +96,11 @@ class LocalizerMap:
             raise
 
     def _add(self, scan: Scan, points: Array) -> None:
-        config = self._config.local_map
         track = self._tracker.track
         moved = track.since_update
         path_m = 0.0 if moved is None else math.hypot(moved[0], moved[1])
         turn = 0.0 if moved is None else abs(float(moved[2]))
-        is_near = path_m < config.update_distance_m and turn < config.update_angle_rad
+        is_near = path_m < _UPDATE_M and turn < _UPDATE_RAD
         if moved is not None and is_near:
             return
         if track.evidence.needs_submap:

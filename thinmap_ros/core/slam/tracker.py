@@ -135,9 +135,7 @@ class Tracker:
 
     def slip_covariance(self) -> Array:
         """Covariance (3, 3) of a pose after the largest expected wheel slip."""
-        config = self._config.matching
-        slip = np.array([*[config.wheel_slip_m] * 2, config.wheel_slip_rad])
-        return np.diag(np.square(_SIGMAS * slip))
+        return np.diag(np.square(_SIGMAS * np.array(self._config.matching.wheel_slip)))
 
     def random_covariance(self, anchor: Anchor) -> Array:
         """Covariance (3, 3) of the independent errors of the pose, map frame."""

@@ -168,7 +168,7 @@ AMCL = Package(
         _row('initial_pose.z', '0.0', 'localizer/initial_pose.z', note='not used'),
         _row('initial_pose.yaw', '0.0', 'localizer/initial_pose.yaw'),
         _row('lambda_short', '0.1', note=_NO_BEAM_MODEL),
-        _row('laser_likelihood_max_dist', '2.0', note='no: `local_map.max_wall_distance_m`'),
+        _row('laser_likelihood_max_dist', '2.0', note='no: 0.5 m'),
         _row('laser_max_range', '100.0', 'localizer/max_range_m'),
         _row('laser_min_range', '-1.0', note='no: range_min of the scan'),
         _row('laser_model_type', 'likelihood_field', note=_NO_BEAM_MODEL),

@@ -250,10 +250,14 @@ def test_a_false_match_is_left_out_of_consistent_ones(straight):
     assert set(map(id, found)) == set(map(id, edges))
 
 
-@pytest.mark.parametrize(('matches', 'inlier_ratio', 'closes'), [(4, 0.95, True), (4, 0.9, False)])
+@pytest.mark.parametrize(
+    ('matches', 'inlier_ratio', 'least', 'closes'),
+    [(4, 0.95, 5, True), (4, 0.9, 5, False), (4, 0.9, 4, True), (5, 0.9, 8, False)],
+)
 def test_matches_that_fit_better_close_a_loop_in_smaller_number(
-    straight, matches, inlier_ratio, closes
+    straight, matches, inlier_ratio, least, closes
 ):
+    straight.adjust(LoopClosureConfig(min_consistent_matches=least), MatchingConfig())
     edges = same_correction(straight, matches)
     straight._requested.extend(replace(edge, inlier_ratio=inlier_ratio) for edge in edges)
     assert len(straight._closing_edges()) == matches * closes

@@ -10,7 +10,7 @@ from support.slam_room import ROOM, around, map_of, seen_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.matching import correlative_search
 from thinmap_ros.core.slam.matching.correlative_search import search
-from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
+from thinmap_ros.core.slam.matching.local_map import MAX_WALL_DISTANCE_M, LocalMapConfig
 from thinmap_ros.core.slam.matching.matching_cost import SLIP_SIGMAS, UNSEEN_COST
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, weighted_points
 
@@ -18,7 +18,7 @@ MATCHER = Matcher()
 CELL_M = LocalMapConfig().resolution_m
 SIGMA_M = MATCHER.config.noise_m
 NOISE = (SIGMA_M, MATCHER.config.kernel_scale_m / SIGMA_M)
-FAR = LocalMapConfig().max_wall_distance_m / SIGMA_M
+FAR = MAX_WALL_DISTANCE_M / SIGMA_M
 PLENTY = 1_000_000  # nodes
 ROOT_M = 4.0 * CELL_M  # half the size of a root
 

@@ -9,7 +9,13 @@ from support.slam_room import ROOM, around, map_of, on_wall, seen_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.matching import matching_cost
-from thinmap_ros.core.slam.matching.local_map import HERE, LocalMap, LocalMapConfig, off_wall
+from thinmap_ros.core.slam.matching.local_map import (
+    HERE,
+    MAX_WALL_DISTANCE_M,
+    LocalMap,
+    LocalMapConfig,
+    off_wall,
+)
 from thinmap_ros.core.slam.matching.matching_cost import (
     FITS_SIGMAS,
     SLIP_SIGMAS,
@@ -27,7 +33,7 @@ SIGMA_M = MATCHER.config.noise_m
 WIDTH = MATCHER.config.kernel_scale_m / SIGMA_M
 NOISE = (SIGMA_M, WIDTH)
 CELL_M = LocalMapConfig().resolution_m
-FAR = LocalMapConfig().max_wall_distance_m / SIGMA_M
+FAR = MAX_WALL_DISTANCE_M / SIGMA_M
 DOUBT = np.diag(np.square([0.1, 0.1, 0.1]))
 AXES = np.eye(3)
 

@@ -43,6 +43,9 @@ from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
 _RECENT = 8  # recent candidates among which consistent ones are searched
+# Covariance (3, 3) that an edge between two visits has beside that of its match: of 5 cm and
+# 0.02 rad. More, and the path is changed less.
+EDGE_NOISE = np.diag(np.square([0.05, 0.05, 0.02]))
 # Scans within which a keyframe is matched. With three matches for each of the scans of a sparse
 # log, and one done at a time, a loop was closed up to 344 scans after its keyframes.
 _LATEST = 20
@@ -69,20 +72,6 @@ class LoopClosureConfig(Config):
         'Smallest ratio of points on the walls of an earlier visit for a loop-closure candidate. '
         'Raise it against false loops, lower it where furniture moves.',
         low=0.0,
-        high=1.0,
-    )
-    noise_m: float = parameter(
-        0.05,
-        'Standard deviation of the position in a loop-closure edge (m). Raise it to change the '
-        'path less, lower it to trust loops more.',
-        low=0.001,
-        high=1.0,
-    )
-    noise_rad: float = parameter(
-        0.02,
-        'Standard deviation of the heading in a loop-closure edge (rad). Raise it to change the '
-        'path less, lower it to trust loops more.',
-        low=0.001,
         high=1.0,
     )
     min_consistent_matches: int = parameter(
@@ -153,7 +142,7 @@ class LoopClosure:
         """Search with other parameters from now on; keyframes and edges stay."""
         self._config = config
         # No wheel slip here: the covariance along the graph contains it.
-        own = replace(matching, wheel_slip_m=0.001, wheel_slip_rad=0.001)
+        own = replace(matching, wheel_slip=(0.001, 0.001, 0.001))
         self._matcher = Matcher(own)
         reach_m = config.reach_m(math.inf)
         far = (reach_m, reach_m, own.max_search[2])
@@ -371,16 +360,14 @@ class LoopClosure:
         else:
             base, submap = self._submaps.around(frames, j, here.path_m)
         config = self._config
-        floor = np.diag(np.square([2.0 * config.noise_m] * 2 + [2.0 * config.noise_rad]))
         prior = se2.between(base, here.T_map_base)
-        relative = rotated_covariance(job.covariance, -float(base[2])) + floor
+        relative = rotated_covariance(job.covariance, -float(base[2])) + 4.0 * EDGE_NOISE
         is_ambiguous = not is_step and self._is_ambiguous(job.covariance)
         matcher = self._far_matcher if is_ambiguous else self._matcher
         match = matcher.match(here.points, here.scan.T_base_laser, submap, prior, relative)
         if match.inlier_ratio < config.min_inlier_ratio:
             return
-        own = np.diag(np.square([config.noise_m] * 2 + [config.noise_rad]))
-        covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + own
+        covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + EDGE_NOISE
         off = se2.pose_difference(match.pose, prior)
         if float(off @ np.linalg.solve(relative + covariance, off)) > CHI2:
             return

@@ -12,14 +12,13 @@ from thinmap_ros.core.places.recognition.recognition import Hypothesis
 from thinmap_ros.core.places.recognition.views import View
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, view_difference_m
-from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
+from thinmap_ros.core.slam.graph.loop_closure import EDGE_NOISE, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.graph.submaps import Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS, Matcher, MatchingConfig
 
 _CONFIG = LoopClosureConfig()
-_OWN = np.diag(np.square([_CONFIG.noise_m, _CONFIG.noise_m, _CONFIG.noise_rad]))
 # How far the place of a view is off at its other keyframes.
 _PRIOR = np.diag(np.square([DRIFT.match_m, DRIFT.match_m, DRIFT.match_rad]))
 # Less than of a loop: the place is known. With 0.75, errors between real halves were a fifth more.
@@ -63,7 +62,7 @@ def match_keyframes(
         if match.inlier_ratio < _MIN_INLIER_RATIO:
             yield None
             continue
-        covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + _OWN
+        covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + EDGE_NOISE
         T_j_base = se2.between(poses[j], base)
         information = inverse(rotated_covariance(covariance, float(T_j_base[2])))
         yield Edge(j, k, se2.compose(T_j_base, match.pose), information, robust=True)

@@ -50,6 +50,11 @@ _SHIFT = TILE.bit_length() - 1
 TILE_MASK = TILE - 1
 _MAX_SEEN = 255
 _MAX_EXTENT_TILES = 1 << 20  # at cells of 0.05 m 3.3 km in each direction, mostly without tiles
+# Largest distance at which a point still finds its wall; at most TILE - 1 cells.
+MAX_WALL_DISTANCE_M = 0.5
+# Smallest ratio of hits to observations of a wall: more, and poles are lost; less, and people who
+# move leave walls behind.
+MIN_HIT_RATIO = 0.25
 _FAR_M = 1e4  # distance from which the walls of an occupancy map are taken to be observed
 
 
@@ -62,34 +67,6 @@ class LocalMapConfig(Config):
         'Edge of a cell of the local map (m). Lower: more accurate and more memory.',
         low=0.01,
         high=0.5,
-    )
-    max_wall_distance_m: float = parameter(
-        0.5,
-        'Largest distance at which a point still finds its wall (m); at most '
-        f'{TILE - 1} cells. Raise for a robot with poor odometry, lower to save time.',
-        low=0.05,
-        high=2.0,
-    )
-    occupied_min_hit_ratio: float = parameter(
-        0.25,
-        'Smallest ratio of hits to observations with which a cell is a wall. Raise it where moving '
-        'people leave walls behind, lower it for thin walls and poles.',
-        low=0.01,
-        high=0.95,
-    )
-    update_distance_m: float = parameter(
-        0.2,
-        'Travelled distance after which a scan is added to the local map (m). Lower: a denser map '
-        'and more computing time.',
-        low=0.0,
-        high=5.0,
-    )
-    update_angle_rad: float = parameter(
-        0.2,
-        'Rotation after which a scan is added to the local map (rad). Lower: a denser map and more '
-        'computing time.',
-        low=0.0,
-        high=3.0,
     )
 
 
@@ -141,8 +118,8 @@ class LocalMap:
 
     @property
     def _reach_cells(self) -> int:
-        """`max_wall_distance_m` in cells; below a tile, so that only adjacent tiles are read."""
-        cells = math.ceil(self.config.max_wall_distance_m / self.config.resolution_m)
+        """MAX_WALL_DISTANCE_M in cells; below a tile, so that only adjacent tiles are read."""
+        cells = math.ceil(MAX_WALL_DISTANCE_M / self.config.resolution_m)
         return min(int(cells), TILE - 1)
 
     def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
@@ -155,7 +132,7 @@ class LocalMap:
         laser = np.ascontiguousarray(T_base_laser[:2])
         ends_map = se2.transform_points(T_map_base, points[:, :2])
         self._reach(ends_map, se2.transform_points(T_map_base, laser[None])[0])
-        _add(points, laser, T_map_base, self.lattice, self.config.occupied_min_hit_ratio)
+        _add(points, laser, T_map_base, self.lattice, MIN_HIT_RATIO)
 
     def distances(self, points_map: Array) -> Array:
         """Distances (N,) of points (N, 2), map frame, from walls, m; at most the reach."""
@@ -172,7 +149,7 @@ class LocalMap:
             points[:, 3] = 2.0 * normal[0] * normal[1]
             self._reach(np.ascontiguousarray(points[:, :2]), points[0, :2])
             far = points[:, :2].mean(axis=0) + _FAR_M * normal
-            _hit(points, far, np.zeros(3), self.lattice, self.config.occupied_min_hit_ratio)
+            _hit(points, far, np.zeros(3), self.lattice, MIN_HIT_RATIO)
 
     def add_free_cells(self, free: NDArray[np.bool_], row: int, col: int) -> None:
         """Add cells (H, W) that an occupancy map knows to be free, the first one at (row, col).
@@ -235,7 +212,7 @@ class LocalMap:
         cells['seen'] = state['seen']
         values = [state[name] for name in ('means', 'normals', 'faces')]
         self._surface_values[:] = np.concatenate(values, axis=-1)
-        _lead(places * TILE, self.lattice, self.config.occupied_min_hit_ratio)
+        _lead(places * TILE, self.lattice, MIN_HIT_RATIO)
 
     def _reach(self, points_map: Array, laser_map: Array) -> None:
         """Allocate all tiles that the beams touch, and those within reach of their ends."""

@@ -25,9 +25,10 @@ MIN_POINTS = 10
 class MatchingConfig(Config):
     """Parameters of scan matching.
 
-    Besides the parameters: poses are searched within search_sigmas of the prior and max_search (m,
-    m, rad) to either side, with search_points points and at most search_nodes nodes; basin (m, rad)
-    of convergence, compared with these sigmas of the prior.
+    Besides the parameters: wheel_slip (m, m, rad), standard deviations of a pose after wheels have
+    slipped: how far is searched then; poses are searched within search_sigmas of the prior and
+    max_search (m, m, rad) to either side, with search_points points and at most search_nodes nodes;
+    basin (m, rad) of convergence, compared with these sigmas of the prior.
     """
 
     noise_m: float = parameter(
@@ -52,20 +53,7 @@ class MatchingConfig(Config):
         low=0.0,
         high=1.0,
     )
-    wheel_slip_m: float = parameter(
-        0.2,
-        'Standard deviation of the position after wheels have slipped (m): how far is searched. '
-        'Raise it for slippery floors, lower it to save time.',
-        low=0.001,
-        high=5.0,
-    )
-    wheel_slip_rad: float = parameter(
-        0.15,
-        'Standard deviation of the heading after wheels have slipped (rad): how far is searched. '
-        'Raise it for slippery floors, lower it to save time.',
-        low=0.001,
-        high=3.0,
-    )
+    wheel_slip: tuple[float, float, float] = (0.2, 0.2, 0.15)
     search_sigmas: float = 3.0
     max_search: tuple[float, float, float] = (3.0, 3.0, 1.5)
     search_points: int = 90
@@ -132,8 +120,9 @@ class Matcher:
         if not fits_badly and not self.config.is_wide(covariance):
             return match
         if fits_badly:  # wheels may have slipped
-            slip = np.array([*[self.config.wheel_slip_m] * 2, self.config.wheel_slip_rad])
-            reach = self.config.search_sigmas * np.sqrt(np.diag(covariance) + slip**2)
+            reach = self.config.search_sigmas * np.sqrt(
+                np.diag(covariance) + np.square(self.config.wheel_slip)
+            )
         start = search(
             _thinned(scan, self.config.search_points),
             prior,

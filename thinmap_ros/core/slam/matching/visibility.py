@@ -10,6 +10,7 @@ from thinmap_ros.core.grid.tiles import NO_TILE
 from thinmap_ros.core.scan import Scan, is_most_missed
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.local_map import (
+    MIN_HIT_RATIO,
     TILE_MASK,
     LocalMap,
     LocalMapView,
@@ -40,8 +41,7 @@ def misses_walls(scan: Scan, local_map: LocalMap, T_map_base: Array, covariance:
         return False
     T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
     angles = T_map_laser[2] + scan.angles_rad[scan.no_return]
-    hit_ratio = local_map.config.occupied_min_hit_ratio
-    missed = _count_walls(angles, T_map_laser, reach_m, local_map.lattice, hit_ratio)
+    missed = _count_walls(angles, T_map_laser, reach_m, local_map.lattice, MIN_HIT_RATIO)
     return is_most_missed(scan, missed)
 
 
@@ -71,8 +71,7 @@ def seen_through(
     T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
     angles = T_map_laser[2] + scan.angles_rad[returned]
     reaches_m = scan.ranges_m[returned] - _BEHIND_M - _uncertainty_m(covariance)
-    hit_ratio = local_map.config.occupied_min_hit_ratio
-    walls = _walls_through(angles, reaches_m, T_map_laser, local_map.lattice, hit_ratio)
+    walls = _walls_through(angles, reaches_m, T_map_laser, local_map.lattice, MIN_HIT_RATIO)
     return SeenThrough(walls, len(walls) / total)
 
 
