@@ -15,6 +15,7 @@ from thinmap_ros.jit import kernel
 from thinmap_ros.sim.world import World
 
 _INTO_CELL = 1e-6
+_DEPTH_EDGE_M = 0.3  # between neighbouring beams: less is one surface seen at a slant
 
 
 @dataclass(frozen=True)
@@ -43,12 +44,6 @@ class LaserScannerConfig(Config):
     range_resolution_m: float = parameter(0.001, 'Resolution of a range (m).', low=0.0, high=0.1)
     mixed_pixel_ratio: float = parameter(
         0.3, 'Ratio of depth edges with a range in between (mixed pixel).', low=0.0, high=1.0
-    )
-    mixed_pixel_edge_m: float = parameter(
-        0.3,
-        'Range difference of neighbouring beams that makes a depth edge (m).',
-        low=0.01,
-        high=10.0,
     )
     laser_x_m: float = parameter(
         0.0, 'Position of the laser ahead of the robot centre (m).', low=-2.0, high=2.0
@@ -109,7 +104,7 @@ class LaserScanner:
         """
         edges = _edges(
             ranges,
-            self.config.mixed_pixel_edge_m,
+            _DEPTH_EDGE_M,
             self._increment / math.sin(math.radians(self.config.min_incidence_deg)),
         )
         mixed = edges[self._rng.random(ranges.size - 1)[edges] < self.config.mixed_pixel_ratio]

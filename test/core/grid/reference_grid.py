@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.occupancy import PAPER_GRID, log_odds
+from thinmap_ros.core.grid.occupancy import P_MAX, P_MIN, PAPER_GRID, log_odds
 
 FLAT_M = 0.06
 LONGEST_SURFACE_M = 3.0
@@ -100,7 +100,7 @@ class PlainGrid:
     def is_grazed(self, cell):
         """Whether a cell is certainly occupied, and others in line with it along the beam."""
         config = self.config
-        sure = min(self.thousandths(SURELY_OCCUPIED), self.thousandths(config.p_max))
+        sure = min(self.thousandths(SURELY_OCCUPIED), self.thousandths(P_MAX))
         if self.odds.get(cell, 0) < sure:
             return False
         away = np.array([cell[0] + 0.5 - self.laser[1], cell[1] + 0.5 - self.laser[0]])
@@ -123,6 +123,6 @@ class PlainGrid:
 
         Even odds are stored as one thousandth, because 0 is an unobserved cell.
         """
-        low = self.thousandths(self.config.p_min)
-        high = self.thousandths(self.config.p_max)
+        low = self.thousandths(P_MIN)
+        high = self.thousandths(P_MAX)
         self.odds[cell] = min(max((self.odds.get(cell, 0) + step) or 1, low), high)

@@ -13,7 +13,14 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid import rerendering
 from thinmap_ros.core.grid.correctable import MAX_OPEN, CorrectableGrid
-from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyConfig, OccupancyGrid, log_odds
+from thinmap_ros.core.grid.occupancy import (
+    P_MAX,
+    P_MIN,
+    PAPER_GRID,
+    OccupancyConfig,
+    OccupancyGrid,
+    log_odds,
+)
 from thinmap_ros.core.grid.patch import UNKNOWN
 from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.tiles import TILE
@@ -327,7 +334,7 @@ def test_tiles_hold_the_sum_of_grids_within_the_limits():
     added = tiles_of(other)
     both = tiles_of(total)
     nothing = np.zeros((TILE, TILE), dtype=np.int16)
-    low, high = (round(1000 * log_odds(p)) for p in (one.config.p_min, one.config.p_max))
+    low, high = (round(1000 * log_odds(p)) for p in (P_MIN, P_MAX))
     for place in map(tuple, places.tolist()):
         a = single.get(place, nothing)
         b = added.get(place, nothing)

@@ -8,7 +8,14 @@ import pytest
 from reference_grid import PlainGrid
 
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyConfig, OccupancyGrid, log_odds
+from thinmap_ros.core.grid.occupancy import (
+    P_MAX,
+    P_MIN,
+    PAPER_GRID,
+    OccupancyConfig,
+    OccupancyGrid,
+    log_odds,
+)
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.grid.tiles import TILE
@@ -82,8 +89,8 @@ def test_each_cell_counts_once_a_scan_and_is_clamped():
     assert percent(grid, 0.25, 0.05) == round(once)
     for _ in range(50):
         grid.add_scan(wall, pose(0.05, 0.05, 0))
-    assert percent(grid, 0.25, 0.05) == round(100 * config.p_min)
-    assert percent(grid, 1.05, 0.05) == round(100 * config.p_max)
+    assert percent(grid, 0.25, 0.05) == round(100 * P_MIN)
+    assert percent(grid, 1.05, 0.05) == round(100 * P_MAX)
 
 
 def test_a_wall_that_went_away_is_unlearned():

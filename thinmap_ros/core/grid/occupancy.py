@@ -30,6 +30,9 @@ _TILE_BITS = TILE.bit_length() - 1
 # range that the others predict, m.
 _FLAT_M = 0.06
 _MAX_SURFACE_GAP_M = 3.0
+# Clamps of the occupancy probability, so that a cell that has changed is relearned soon.
+P_MIN = 0.05
+P_MAX = 0.97
 FIELDS = {
     'frame': Field(
         np.float64,
@@ -65,18 +68,6 @@ class OccupancyConfig(Config):
         'noise as well.',
         low=0.51,
         high=0.99,
-    )
-    p_min: float = parameter(
-        0.05,
-        'Lower clamp of the occupancy probability. Lower: free cells change more slowly.',
-        low=0.003,
-        high=0.4,
-    )
-    p_max: float = parameter(
-        0.97,
-        'Upper clamp of the occupancy probability. Higher: occupied cells change more slowly.',
-        low=0.6,
-        high=0.997,
     )
     no_return_clear_range_m: float = parameter(
         NO_RETURN_CLEAR_RANGE_M,
@@ -160,7 +151,7 @@ class OccupancyGrid:
         grid = OccupancyGrid(config, patch.frame)
         # A table takes a tenth of the memory that arithmetic on the cells of a large map takes.
         values = np.arange(1 << 8, dtype=np.uint8).view(np.int8)
-        clamped = np.clip(values / 100.0, grid.config.p_min, grid.config.p_max)
+        clamped = np.clip(values / 100.0, P_MIN, P_MAX)
         odds = np.round(_SCALE * np.log(clamped / (1.0 - clamped))).astype(np.int16)
         odds[values == UNKNOWN] = 0
         grid._write(0, 0, odds[patch.cells.view(np.uint8)])
@@ -360,8 +351,7 @@ def _steps(config: OccupancyConfig) -> NDArray[np.int16]:
     cell.
     """
     free, hit, low, high = (
-        round(_SCALE * log_odds(p))
-        for p in (config.p_miss, config.p_hit, config.p_min, config.p_max)
+        round(_SCALE * log_odds(p)) for p in (config.p_miss, config.p_hit, P_MIN, P_MAX)
     )
     sure = min(round(_SCALE * log_odds(config.p_surely_occupied)), high)
     return np.array([free, hit, low, high, sure], dtype=np.int16)
