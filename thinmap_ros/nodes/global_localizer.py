@@ -82,7 +82,13 @@ class GlobalLocalizerConfig(Config):
     drive: bool = parameter(
         False, 'Drive towards disambiguating viewpoints while localizing. Publishes cmd_vel.'
     )
-    drive_speed_m_s: float = parameter(0.3, 'Speed of that drive (m/s).', low=0.01, high=5.0)
+    drive_speed_m_s: float = parameter(
+        0.3,
+        'Speed of that drive (m/s). Set it to that of the navigator: lower among people, higher in '
+        'halls.',
+        low=0.01,
+        high=5.0,
+    )
     map_path: str = parameter(
         '', 'map_server YAML file. Empty: map and topology are taken from their topics.'
     )

@@ -47,7 +47,9 @@ class LocalizationConfig(Config):
         'pose. Only with set_initial_pose.',
     )
     first_map_only: bool = parameter(
-        False, 'In mode localization, ignore all but the first message of topic map.'
+        False,
+        'In mode localization, ignore all but the first message of topic map. Set it where another '
+        'node draws into the map that the robot was placed in.',
     )
     save_pose_rate: float = parameter(
         0.5,
