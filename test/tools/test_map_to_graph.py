@@ -101,6 +101,26 @@ def test_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert nodes('--start=-50,0') == 0
 
 
+def test_nodes_are_fewer_the_larger_the_node_spacing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grey = np.zeros((70, 200), dtype=np.uint8)
+    grey[30:37, 5:195] = 254
+    for number, col in enumerate(range(15, 185, 12)):  # niches of 1 m on both sides
+        grey[(20 if number % 2 else 37) : (30 if number % 2 else 49), col : col + 7] = 254
+    path = written(tmp_path, grey)
+    out = tmp_path / 'g.graphml'
+
+    def nodes(*words: object) -> int:
+        assert run(monkeypatch, path, '-o', out, *words) == 0
+        return len(networkx.read_graphml(out))
+
+    dense, usual, sparse = (nodes('--node-spacing-m', spacing_m) for spacing_m in (0.3, 1.2, 3.0))
+    assert dense > 2 * usual >= 2 * sparse
+    assert usual == nodes()
+    assert nodes('--detail-m', 3.0) == nodes('--detail-m', 3.0, '--node-spacing-m', 3.0)
+
+
 def test_no_edge_of_a_file_crosses_the_unknown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -126,6 +146,12 @@ def test_no_edge_of_a_file_crosses_the_unknown(
         (['-o', 'g.graphml', '--max-unknown-gap-m', '-0.1'], 'max_unknown_gap_m'),
         (['-o', 'g.graphml', '--start', 'here'], 'start'),
         (['-o', 'g.graphml', '--detail-m', '-1'], '--detail-m -1'),
+        (['-o', 'g.graphml', '--node-spacing-m', '0'], '--node-spacing-m 0.0: expected 0.05 m'),
+        (['-o', 'g.graphml', '--node-spacing-m', '-2'], '--node-spacing-m -2.0: expected'),
+        (['-o', 'g.graphml', '--node-spacing-m', 'nan'], '--node-spacing-m nan: expected'),
+        (['-o', 'g.graphml', '--node-spacing-m', 'inf'], '--node-spacing-m inf: expected'),
+        (['-o', 'g.graphml', '--node-spacing-m', '1e-9'], '--node-spacing-m 1e-09: expected'),
+        (['-o', 'g.graphml', '--node-spacing-m', '2', '--detail-m', '0'], '--detail-m above 0'),
         (['-o', 'g.geojson', '--speed-limit', '1'], '--speed-limit=1'),
         (['-o', 'g.geojson', '--speed-limit', '1,0'], 'speed limit of 0'),
         (['-o', 'g.graphml', '--speed-limit', '1,50'], '.geojson'),

@@ -17,7 +17,11 @@ from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.topology.builder import TopologyConfig, build_along
 from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.core.topology.routes.route_graph import DETAIL_M, route_graph
+from thinmap_ros.core.topology.routes.route_graph import (
+    DETAIL_M,
+    MIN_NODE_SPACING_M,
+    route_graph,
+)
 from thinmap_ros.evaluation.batch import (
     REASON,
     Batch,
@@ -43,6 +47,7 @@ _OPTIONS = (
     'prune_m',
     'max_unknown_gap_m',
     'detail_m',
+    'node_spacing_m',
     'speed_limit',
     'start',
     'format',
@@ -86,6 +91,19 @@ def _config(arguments: argparse.Namespace) -> TopologyConfig:
     )
 
 
+def _check_node_spacing(arguments: argparse.Namespace) -> None:
+    """Raise InputError for a node spacing that makes no graph."""
+    spacing_m = arguments.node_spacing_m
+    if spacing_m is None:
+        return
+    if not MIN_NODE_SPACING_M <= spacing_m < math.inf:
+        raise InputError(f'--node-spacing-m {spacing_m}: expected {MIN_NODE_SPACING_M} m or more')
+    if arguments.detail_m == 0.0:
+        raise InputError(
+            f'--node-spacing-m {spacing_m}: expected --detail-m above 0: with 0 all nodes stay'
+        )
+
+
 @dataclass(frozen=True)
 class _Graph:
     """What was found in a map: counts, and why there is nothing, if so.
@@ -102,12 +120,16 @@ class _Graph:
 
 
 def _graph_of(
-    patch: GridPatch, start: tuple[float, float] | None, config: TopologyConfig, detail_m: float
+    patch: GridPatch, config: TopologyConfig, arguments: argparse.Namespace
 ) -> TopologicalMap:
-    """The route graph of a map; detail_m 0: its whole skeleton."""
+    """The route graph of a map; --detail-m 0: its whole skeleton."""
+    start = _start(arguments.start)
+    detail_m = arguments.detail_m
     standing = select_free_space(patch, start, config)
     whole = build_along(patch, standing, None, config)
-    return route_graph(whole, patch, standing, config, detail_m) if detail_m > 0.0 else whole
+    if detail_m == 0.0:
+        return whole
+    return route_graph(whole, patch, standing, config, detail_m, arguments.node_spacing_m)
 
 
 def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Namespace) -> _Graph:
@@ -117,7 +139,7 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
     patch = occupancy_maps.read_map(path, keeps_unknown=True)
     keep_out = load_edits(str(path)).keep_out
     drivable = keep_out.as_walls(patch)
-    topology = _graph_of(drivable, start, config, arguments.detail_m)
+    topology = _graph_of(drivable, config, arguments)
     found = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius_m))
     session = REGIONS.load_optional(str(path))
     regions = found if session is None else session.names.named(found)
@@ -175,6 +197,7 @@ def _work(arguments: argparse.Namespace) -> None:
     _speed_limit(arguments.speed_limit)
     if not 0.0 <= arguments.detail_m < math.inf:
         raise InputError(f'--detail-m {arguments.detail_m}: expected 0 m or more')
+    _check_node_spacing(arguments)
     maps = _without_images(arguments.maps)
     default = f'{maps[0].stem}.{arguments.format}' if len(maps) == 1 else 'graphs'
     arguments.out = arguments.out or Path('out') / default
@@ -248,10 +271,15 @@ def main() -> None:
     gap_help = 'unknown gaps up to this width between free cells count as free, m (default 0)'
     parser.add_argument('--max-unknown-gap-m', type=float, default=0.0, help=gap_help)
     detail_help = (
-        'smaller obstacles are passed on one side only, and nodes nearer to each other are one, m '
-        f'(default {DETAIL_M}; 0: the whole skeleton, as while a robot maps)'
+        f'smaller obstacles are passed on one side only, m (default {DETAIL_M}; 0: the whole '
+        'skeleton, as while a robot maps)'
     )
     parser.add_argument('--detail-m', type=float, default=DETAIL_M, help=detail_help)
+    spacing_help = (
+        'nodes nearer to each other than this are one, m: more for fewer nodes, less for a node at '
+        'each junction (default: as --detail-m)'
+    )
+    parser.add_argument('--node-spacing-m', type=float, help=spacing_help)
     speed_help = (
         'WIDTH,PERCENT: speed_limit of edges narrower than WIDTH, m; of others it is 100 (GeoJSON)'
     )

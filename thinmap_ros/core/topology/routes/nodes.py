@@ -14,28 +14,29 @@ from thinmap_ros.core.topology.routes.sight import Sight
 
 Cells = NDArray[np.int64]
 _REACH_M = 6.0  # of a place from an edge on which a node may show it
-_SPACING_M = 0.25  # of the points on edges where nodes may be put
+_SPLIT_STEP_M = 0.25  # between the points on edges where nodes may be put
 
 
-def merge_nodes(graph: EditedGraph, sight: Sight, detail_m: float) -> None:
+def merge_nodes(graph: EditedGraph, sight: Sight, node_spacing_m: float, detail_m: float) -> None:
     """Let nodes stand for others, as long as as many places see the node nearest to them.
 
     A node goes, the one with the least clearance first, if a neighbour sees all of its other
-    neighbours and can have its edges: one nearer than detail_m or the clearance of either, any of
-    two neighbours (a straight edge stays), or the only one where a ring was opened.
+    neighbours and can have its edges: one nearer than node_spacing_m or the clearance of either,
+    any of two neighbours (a straight edge stays), or the only one where a ring was opened. Both
+    paths round an obstacle of detail_m or more stay.
     """
     order = sorted(graph.map.nodes.values(), key=lambda node: (-node.clearance_m, node.id))
     open_ids = dict.fromkeys(node.id for node in order)
     while open_ids:
         number, _ = open_ids.popitem()
         around = graph.map.neighbours(number)
-        heir = _heir(graph, number, detail_m)
+        heir = _heir(graph, number, node_spacing_m, detail_m)
         if heir and sight.drop(graph.map.nodes[number], graph.map):
             _move_edges(graph, number, heir)
             open_ids |= dict.fromkeys(around)
 
 
-def _heir(graph: EditedGraph, number: int, detail_m: float) -> int:
+def _heir(graph: EditedGraph, number: int, node_spacing_m: float, detail_m: float) -> int:
     """The nearest neighbour that can have the edges of a node; 0: none."""
     node = graph.map.nodes[number]
     around = [i for i in graph.map.neighbours(number) if i != number]
@@ -43,7 +44,7 @@ def _heir(graph: EditedGraph, number: int, detail_m: float) -> int:
     is_chain = len(around) == 2 and len(graph.map.edges_at(number)) == 2
     by_distance = sorted((math.dist(node.position, graph.map.nodes[i].position), i) for i in around)
     for away_m, other in by_distance:
-        room_m = max(detail_m, node.clearance_m, graph.map.nodes[other].clearance_m)
+        room_m = max(node_spacing_m, node.clearance_m, graph.map.nodes[other].clearance_m)
         if not (is_opened or is_chain or away_m <= room_m):
             continue
         rest = [i for i in around if i != other]
@@ -85,7 +86,7 @@ class _EdgePoints:
         owners = [np.empty(0, dtype=np.int64)]
         for edge in graph.map.edges.values():
             ends = np.array([graph.map.nodes[i].position for i in (edge.a, edge.b)])
-            count = int(math.dist(*ends) / _SPACING_M)
+            count = int(math.dist(*ends) / _SPLIT_STEP_M)
             inner = graph.frame.cells_of(np.linspace(ends[0], ends[1], count + 1)[1:-1])
             cells.append(inner.reshape(-1, 2))
             owners.append(np.full(len(inner), edge.id))

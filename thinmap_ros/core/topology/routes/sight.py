@@ -14,7 +14,7 @@ from thinmap_ros.jit import kernel
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
-_SPACING_M = 0.5
+_LATTICE_M = 0.5  # between the places that should see a node
 _REACH_M = 10.0  # a node that is farther off is out of sight
 _MIN_GAIN = 3  # places that a node must show
 
@@ -29,7 +29,7 @@ class Sight:
         self, frame: GridFrame, standing: Mask, known: Mask, nodes: Iterable[Node]
     ) -> None:
         """Begin with some nodes: standing (H, W), traversable cells; known (H, W), cells seen."""
-        step = max(round(_SPACING_M / frame.resolution), 1)
+        step = max(round(_LATTICE_M / frame.resolution), 1)
         self._frame = frame
         self._known = known
         self._cells = np.ascontiguousarray(np.argwhere(standing[::step, ::step]) * step)
