@@ -6,6 +6,8 @@ import numpy as np
 
 from thinmap_ros.core.se2 import Array
 
+BOUND_SIGMAS = 3.0  # an error of more standard deviations than this is not noise
+
 
 def rotation(theta: float) -> Array:
     """Matrix R (3, 3) that rotates increments by theta, and covariances C by R C R'."""

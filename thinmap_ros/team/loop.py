@@ -10,7 +10,7 @@ from thinmap_ros.closed_loop import CONTROL_STEPS, ClosedLoop, ExplorationOutcom
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.team.claims import Claim
-from thinmap_ros.core.planning.give_way import Motion, must_stop
+from thinmap_ros.core.planning.give_way import NEAR_ROBOT_M, Motion, must_stop
 from thinmap_ros.core.planning.navigator import Command
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.robots_in_scan import without_robots
@@ -21,7 +21,6 @@ from thinmap_ros.team.maps import TeamMaps
 from thinmap_ros.team.radio import Radio, Trouble
 
 _CLAIM_PERIOD_S = 1.0
-_NEAR_M = 3.0  # robots that drive so near to another one send their motion ten times a second
 _CLAIM_BYTES = 104  # of thinmap_msgs with header, pose, speed, place and path length
 _SETTLED_BYTES = 12
 # Beyond the radius of a robot: noise of the laser, and its motion in the tenth of a second since.
@@ -190,7 +189,7 @@ class TeamLoop:
             others = {other: motion for other, motion in motions.items() if other != number}
             self.members[number].motions |= {i: (now_s, motion) for i, motion in others.items()}
             is_near = any(
-                math.dist(own.pose[:2], other.pose[:2]) < _NEAR_M for other in others.values()
+                math.dist(own.pose[:2], other.pose[:2]) < NEAR_ROBOT_M for other in others.values()
             )
             is_moving = own.v != 0.0 or own.w != 0.0
             self.claims.sent_bytes += _CLAIM_BYTES * (is_near and is_moving)

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import rotation
+from thinmap_ros.core.covariances import BOUND_SIGMAS, rotation
 from thinmap_ros.core.se2 import Array
 
-_SIGMAS = 3.0
 _ITERATIONS = 3
 
 
@@ -66,13 +65,13 @@ class MountError:
 
         In a corridor one wrong match can turn the estimate to the other direction.
         """
-        least = abs(self.yaw_rad) - _SIGMAS * self.yaw_sigma_rad
+        least = abs(self.yaw_rad) - BOUND_SIGMAS * self.yaw_sigma_rad
         return least if self.yaw_support > 0.5 else min(least, 0.0)
 
     @property
     def least_offset_m(self) -> float:
         """Least offset within three sigmas; negative where none is certain."""
-        return math.hypot(*self.offset_m) - _SIGMAS * self.offset_sigma_m
+        return math.hypot(*self.offset_m) - BOUND_SIGMAS * self.offset_sigma_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +174,7 @@ class MountErrorEstimator:
         possible += (scale * length) ** 2 + (swing * place) ** 2
         # A laser may point anywhere: then it swings to the other side.
         opposite = 2.0 * swing * math.hypot(T_base_laser[0], T_base_laser[1])
-        if abs(math.hypot(F[0], F[1]) - length) > _SIGMAS * math.sqrt(possible) + opposite:
+        if abs(math.hypot(F[0], F[1]) - length) > BOUND_SIGMAS * math.sqrt(possible) + opposite:
             return None
         H = np.column_stack([[along, aside], [aside, -along], lever])
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))

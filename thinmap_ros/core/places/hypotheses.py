@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.covariances import BOUND_SIGMAS
 from thinmap_ros.core.places.likelihood import LOG_ODDS_A_BEAM, SILENT_COUNTS
 from thinmap_ros.core.places.search import distinct_indices, moved
 from thinmap_ros.core.se2 import Array
@@ -15,7 +16,6 @@ from thinmap_ros.jit import kernel
 # lie, always.
 _EDGE_SHARE = 0.05
 _LASTING_SHARE = 0.01
-_SIGMAS = 3.0
 # A single scan may mislead (a person in the way, a door that has moved): its evidence is limited.
 _MAX_MISSING_BEAMS = 14.0  # beams
 _MIN_LOG_WEIGHT = -14.0
@@ -41,7 +41,7 @@ def missed_beams(judged: tuple[Array, Array], beams: int) -> Array:
 def allowed_beams(beams: Array) -> Array:
     """How many of so many beams, over all updates, one place may explain more than its double."""
     spread = np.sqrt(beams * _EDGE_SHARE * (1.0 - _EDGE_SHARE))
-    return np.asarray(_SIGMAS * spread + _LASTING_SHARE * beams)
+    return np.asarray(BOUND_SIGMAS * spread + _LASTING_SHARE * beams)
 
 
 @dataclass(eq=False)

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from thinmap_ros.core.covariances import BOUND_SIGMAS
 from thinmap_ros.core.places import likelihood_kernels
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.observation import Observation
@@ -20,7 +21,6 @@ LOG_ODDS_A_BEAM = 0.35
 # A beam of which the map says nothing, counted in beams that it explains: what is unknown there may
 # well be like that.
 SILENT_COUNTS = 0.75
-_SIGMAS = 3.0
 HEADING_NOISE_RAD = 0.01  # standard deviation of the heading of a correct hypothesis
 # From afar to near: how wide a wall's pull is, 1 sigma, m, and the steps uphill, m and rad.
 _PULLS: tuple[tuple[float, Array], ...] = (
@@ -50,7 +50,7 @@ class Judge:
         # A wall lies anywhere in its cell, and so does the end of a beam: uniform, twice.
         cells = places.frame.resolution / math.sqrt(6.0)
         sigma = math.sqrt(config.beam_noise_m**2 + config.map_noise_m**2 + cells**2)
-        self.tolerance = (_SIGMAS * sigma, _SIGMAS * HEADING_NOISE_RAD)
+        self.tolerance = (BOUND_SIGMAS * sigma, BOUND_SIGMAS * HEADING_NOISE_RAD)
         off = np.arange(256) * NEAR_UNIT_M / sigma
         bell = np.exp(-0.5 * off**2)
         self._log_table = np.log((1.0 - _OUTLIERS) * bell + _OUTLIERS) / _BEAMS_PER_OBSERVATION

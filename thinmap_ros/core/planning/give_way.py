@@ -14,6 +14,7 @@ import numpy as np
 from thinmap_ros.core.se2 import Array
 
 MESSAGE_PERIOD_S = 1.0
+NEAR_ROBOT_M = 3.0  # robots this close to another one send their motion ten times a second
 _STEPS = 8
 _APPROACH_M = 1e-3  # two robots that are too close already may not come closer by more
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import rotated_covariance, rotation
+from thinmap_ros.core.covariances import BOUND_SIGMAS, rotated_covariance, rotation
 from thinmap_ros.core.ekf_slam.models import odometry_slip
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
@@ -23,7 +23,6 @@ from thinmap_ros.core.slam.matching.visibility import (
 from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction, Prediction
 from thinmap_ros.core.slam.track import Track
 
-_SIGMAS = 3.0
 _NO_RETURNS = 'no returns from walls of the map'
 
 
@@ -135,7 +134,7 @@ class Tracker:
 
     def slip_covariance(self) -> Array:
         """Covariance (3, 3) of a pose after the largest expected wheel slip."""
-        return np.diag(np.square(_SIGMAS * np.array(self._config.matching.wheel_slip)))
+        return np.diag(np.square(BOUND_SIGMAS * np.array(self._config.matching.wheel_slip)))
 
     def random_covariance(self, anchor: Anchor) -> Array:
         """Covariance (3, 3) of the independent errors of the pose, map frame."""
@@ -155,7 +154,7 @@ class Tracker:
 
     def _is_stationary(self, prediction: Prediction) -> bool:
         """Whether the robot has moved by no more than the odometry noise."""
-        slip = _SIGMAS * odometry_slip(self._config.odometry)
+        slip = BOUND_SIGMAS * odometry_slip(self._config.odometry)
         is_still = self.track.uncertainty.is_stationary(prediction.prior, slip)
         return prediction.motion.is_stationary and is_still
 

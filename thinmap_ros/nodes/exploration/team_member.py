@@ -16,7 +16,7 @@ from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Strategy
 from thinmap_ros.core.exploration.team.claims import Claim, Place
 from thinmap_ros.core.exploration.team.team import Team, TeamConfig
-from thinmap_ros.core.planning.give_way import MESSAGE_PERIOD_S, Motion, moved_on
+from thinmap_ros.core.planning.give_way import MESSAGE_PERIOD_S, NEAR_ROBOT_M, Motion, moved_on
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.nodes.exploration.tile_output import TileOutput
@@ -30,8 +30,7 @@ from thinmap_ros.ros.team.received_tiles import TileReceiver
 from thinmap_ros.ros.team.team_messages import RobotClaim, RobotState, claim_msg
 
 _NEAR_PERIOD_S = 0.1
-_NEAR_M = 3.0  # so near to another robot, its pose must not be old:
-_NEAR_STEP_M = 0.05  # it is sent after each cell, and not while the robot stands
+_NEAR_STEP_M = 0.05  # near to another robot the pose is sent after each cell, not at standstill
 _TILE_PERIOD_S = 5.0
 
 
@@ -217,7 +216,7 @@ class _ClaimOutput:
         self._track.add(*progress.located, now_s)
         T_map_base = self._track.pose_at(now_s)
         claim = self._claim(progress, T_map_base)
-        is_near = any(math.dist(T_map_base[:2], other.pose[:2]) < _NEAR_M for other in others)
+        is_near = any(math.dist(T_map_base[:2], other.pose[:2]) < NEAR_ROBOT_M for other in others)
         has_moved = math.dist(T_map_base[:2], self._told_xy) > _NEAR_STEP_M
         is_due = not 0.0 <= now_s - self._told_s < MESSAGE_PERIOD_S
         place = claim.claim.place

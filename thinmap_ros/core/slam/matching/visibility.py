@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.covariances import BOUND_SIGMAS
 from thinmap_ros.core.grid.tiles import NO_TILE
 from thinmap_ros.core.scan import Scan, is_most_missed
 from thinmap_ros.core.se2 import Array
@@ -24,7 +25,6 @@ from thinmap_ros.jit import kernel
 _REACH = 0.9  # of range_max: a farther wall may be out of range
 _STEP_CELLS = 0.5
 _BETWEEN_CELLS = 2.0  # a way may end in a cell whose offset is longer by less than this
-_SIGMAS = 3.0
 _BEHIND_M = 0.3  # by which a beam ends behind a wall that it has passed through
 _MIN_HITS = 2  # of a cell that is a wall for certain
 _MAX_COSINE = 0.5  # cosine; more oblique beams pass the cells of a wall beside them
@@ -77,7 +77,7 @@ def seen_through(
 
 def _uncertainty_m(covariance: Array) -> float:
     """How far a position with a covariance (3, 3) may be off, m."""
-    return _SIGMAS * math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+    return BOUND_SIGMAS * math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
 
 
 @kernel
