@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
@@ -21,6 +20,7 @@ from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.playback import Playback, is_scan
 from thinmap_ros.logs.storage import RawMessage
 from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
 from thinmap_ros.ros.lockstep import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep
 from thinmap_ros.ros.messages import message_class
@@ -128,7 +128,7 @@ class BagPlayerNode(Node):
         self.finished = False
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.create_service(Trigger, '~/step', self._on_step)
-        self.create_timer(_SECONDS.tick, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(_SECONDS.tick, self._tick, clock=STEADY)
 
     def close(self) -> None:
         """Wait until the last messages are acknowledged, and log how many were sent."""

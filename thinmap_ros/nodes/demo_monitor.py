@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from thinmap_msgs.msg import JoinStatus
@@ -22,6 +21,7 @@ from thinmap_ros.files.worlds import read_world
 from thinmap_ros.nodes.simulation.requested_exploration import RequestedExploration
 from thinmap_ros.nodes.simulation.starts import poses_from
 from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.other_robots import MAX_ROBOTS
 from thinmap_ros.sim.robot import PRESETS
@@ -78,7 +78,7 @@ class DemoMonitorNode(Node):
         self._is_joined = False
         if self._is_team:
             self.create_subscription(JoinStatus, 'join_status', self._on_joined, qos.LATCHED)
-        self.create_timer(_PERIOD_S, self._work, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(_PERIOD_S, self._work, clock=STEADY)
 
     def close(self) -> None:
         """End the bar, so that the next output starts on a new line."""

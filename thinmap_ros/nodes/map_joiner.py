@@ -2,8 +2,6 @@
 
 import time
 
-from rclpy.clock import Clock, ClockType
-
 from thinmap_msgs.srv import JoinMaps, SeparateMaps
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
@@ -23,6 +21,7 @@ from thinmap_ros.nodes.joining.settings import (
 from thinmap_ros.nodes.joining.team_publishers import TeamPublishers
 from thinmap_ros.nodes.joining.worker import Result, Turns, Worker
 from thinmap_ros.ros import messages, node_main, parameters
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.services import fill_response
@@ -59,10 +58,9 @@ class MapJoinerNode(ThinmapNode):
         self.reset_state()
         self.create_active_service(JoinMaps, 'join_maps', self._on_join)
         self.create_active_service(SeparateMaps, 'separate_maps', self._on_separate)
-        wall = Clock(clock_type=ClockType.STEADY_TIME)
         discovery_s = 1.0 / config.discovery_rate
-        self.create_active_timer(discovery_s, self._robots.discover, clock=wall)
-        self.create_active_timer(_POLL_S, self._work, clock=wall)
+        self.create_active_timer(discovery_s, self._robots.discover, clock=STEADY)
+        self.create_active_timer(_POLL_S, self._work, clock=STEADY)
         self.add_activation_callback(self._robots.discover)
 
     def reset_state(self) -> None:

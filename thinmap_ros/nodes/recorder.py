@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
@@ -15,6 +14,7 @@ from thinmap_ros.files import package_data
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.ros import node_main, parameters
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
 from thinmap_ros.ros.messages import message_class
 
@@ -52,9 +52,8 @@ class RecorderNode(Node):
         self._written = 0
         self._diagnostics = NodeDiagnostics(self)
         # Not in the robot's time, which may stand still until all subscribers are there.
-        wall = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_DISCOVERY_PERIOD_S, self._discover_topics, clock=wall)
-        self.create_timer(_FLUSH_S, lambda: self._guarded(self._writer.flush), clock=wall)
+        self.create_timer(_DISCOVERY_PERIOD_S, self._discover_topics, clock=STEADY)
+        self.create_timer(_FLUSH_S, lambda: self._guarded(self._writer.flush), clock=STEADY)
 
     def close(self) -> None:
         """Finish the bag; one cut off by a full disk is readable, and `bag_repair` completes it."""

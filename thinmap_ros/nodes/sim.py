@@ -8,7 +8,6 @@ With `robots` of 2 or more each has its namespace, from robot1 on: /robot1/scan,
 from dataclasses import dataclass
 from time import monotonic
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMsg
 
@@ -19,6 +18,7 @@ from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.simulation.robot_interface import RobotInterface
 from thinmap_ros.nodes.simulation.starts import robot_starts
 from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
 from thinmap_ros.ros.lockstep import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep
 from thinmap_ros.sim.laser import LaserScannerConfig
@@ -95,8 +95,7 @@ class SimNode(Node):
         ]
         self._running = False
         self._repeated_s = 0.0
-        wall = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(STEP_NS / 1e9 / self._config.real_time_factor, self._tick, clock=wall)
+        self.create_timer(STEP_NS / 1e9 / self._config.real_time_factor, self._tick, clock=STEADY)
 
     def _tick(self) -> None:
         if not self._running:

@@ -7,7 +7,6 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMsg
-from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import (
@@ -26,6 +25,7 @@ from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.steering.steering import Steering, TopSpeeds
 from thinmap_ros.nodes.steering.team_view import TeamView
 from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.laser_transform import LaserTransform
@@ -98,7 +98,7 @@ class WebNode(ThinmapNode):
         self._server: server.Server | None = None
         self._subscribe()
         self._ticks = 0
-        self.create_timer(_PERIOD_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(_PERIOD_S, self._tick, clock=STEADY)
 
     def start(self) -> None:
         """Open the page. Raises InputError where its address cannot be used."""

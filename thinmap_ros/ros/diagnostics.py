@@ -11,7 +11,6 @@ from time import monotonic, perf_counter
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -20,6 +19,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from thinmap_ros.core.errors import counted, one_line_reason
 from thinmap_ros.ros import qos
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 
 _PERIOD_S = 1.0
 # For which a failed step is reported, unless another fails: five times what is published.
@@ -236,7 +236,7 @@ class NodeDiagnostics:
         self._update_callbacks: list[Callable[[], None]] = []
         self._topic = node.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
         # Not in the node's time: a clock that stands still is reported, too.
-        node.create_timer(_PERIOD_S, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node.create_timer(_PERIOD_S, self._publish, clock=STEADY)
 
     def expect_topic(self, topic: str) -> None:
         """Report a subscribed topic before its first message."""

@@ -3,11 +3,10 @@
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
-
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.files.sessions import SessionPart, require_own_files
 from thinmap_ros.ros import parameters
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 
@@ -54,9 +53,7 @@ class ExitSave:
         require_own_files(self._path, part)
         node.add_end_callback(self._save_now)
         if period_s > 0.0:
-            node.create_timer(
-                period_s, self._save_now, clock=Clock(clock_type=ClockType.STEADY_TIME)
-            )
+            node.create_timer(period_s, self._save_now, clock=STEADY)
 
     def _save_now(self) -> None:
         try:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
@@ -15,7 +15,7 @@ from thinmap_ros.core.errors import ThinmapError, one_line_reason
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint
-from thinmap_ros.ros.clocks.time_jumps import ElapsedTime, TimeJumps
+from thinmap_ros.ros.clocks.time_jumps import STEADY, ElapsedTime, TimeJumps
 from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
 from thinmap_ros.ros.foreign.translation import translate
 from thinmap_ros.ros.private_rclpy import RCLError
@@ -143,7 +143,7 @@ class ThinmapNode(LifecycleNode):
         self.create_timer(
             _CHECKPOINT_PERIOD_S,
             self._save_checkpoints,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
+            clock=STEADY,
         )
         saved = file.load()
         if saved is None:

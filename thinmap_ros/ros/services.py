@@ -5,11 +5,11 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.client import Client
-from rclpy.clock import Clock, ClockType
 from rclpy.logging import get_logger
 from rclpy.node import Node
 
 from thinmap_ros.core.errors import ThinmapError, one_line_reason
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 
 _TIMEOUT_S = 10.0
 
@@ -42,9 +42,8 @@ async def call(node: Node, client: Client, request: Any) -> Any | None:
     if not client.service_is_ready():
         return None
     future = client.call_async(request)
-    wall = Clock(clock_type=ClockType.STEADY_TIME)
     timer = node.create_timer(
-        _TIMEOUT_S, future.cancel, callback_group=client.callback_group, clock=wall
+        _TIMEOUT_S, future.cancel, callback_group=client.callback_group, clock=STEADY
     )
     await future
     node.destroy_timer(timer)

@@ -11,7 +11,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.qos import (
     DurabilityPolicy,
@@ -27,6 +26,7 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.msg import LocalizedScan, SlamStatus, TeamClaim
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.sole_source import SourceByFrame
@@ -197,8 +197,7 @@ class AdaptiveSubscription:
         elif self._timer is None:
             self._profile = profile
             # Not now: the event belongs to the subscription that is destroyed.
-            clock = Clock(clock_type=ClockType.STEADY_TIME)
-            self._timer = self._node.create_timer(0.0, self._replace, clock=clock)
+            self._timer = self._node.create_timer(0.0, self._replace, clock=STEADY)
 
     def _replace(self) -> None:
         self._node.destroy_timer(self._timer)

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.action.client import ClientGoalHandle
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
 
 from thinmap_ros.nodes.exploration.goal_monitor import action_servers
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 
 _PERIOD_S = 1.0
 # A request before the new server has discovered its client is lost.
@@ -36,9 +36,7 @@ class GoalResult:
         self._on_result = on_result
         self._servers = action_servers(node, action)
         self._requests_left = 0
-        self._timer = node.create_timer(
-            _PERIOD_S, self._check, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        self._timer = node.create_timer(_PERIOD_S, self._check, clock=STEADY)
         self._request()
 
     def _check(self) -> None:

@@ -7,7 +7,6 @@ from action_msgs.msg import GoalStatus
 from nav2_msgs.action import NavigateToPose
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
-from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 
 from thinmap_ros.core.exploration.live.drive_progress import DriveProgress
@@ -17,6 +16,7 @@ from thinmap_ros.nodes.exploration.driver import OnResult
 from thinmap_ros.nodes.exploration.goal_monitor import GoalMonitor, action_servers
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
 
@@ -71,9 +71,8 @@ class NavigationClient:
         self.goal: Array | None = None
         self._drive: _Drive | None = None
         self._retries = Retries()
-        wall = Clock(clock_type=ClockType.STEADY_TIME)
         # Only while there is a goal.
-        self._timer = node.create_active_timer(_PERIOD_S, self._advance, clock=wall)
+        self._timer = node.create_active_timer(_PERIOD_S, self._advance, clock=STEADY)
         self._timer.cancel()
 
     @property

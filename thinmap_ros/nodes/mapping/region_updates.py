@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from time import monotonic
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
 
 from thinmap_msgs.msg import RegionArray
 from thinmap_ros.core.config import Config, parameter, part
@@ -19,6 +18,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.kernels.memory import release_free_pages
 from thinmap_ros.nodes.mapping.region_messages import region_array_msg
 from thinmap_ros.ros import parameters, qos
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 _POLL_S = 0.1
@@ -104,10 +104,9 @@ class RegionUpdates:
         self.reset()
         if config.region_update_period_s > 0.0:
             self._publisher = node.create_publisher(RegionArray, 'regions', qos.LATCHED)
-            wall = Clock(clock_type=ClockType.STEADY_TIME)
-            node.create_active_timer(config.region_update_period_s, self._begin, clock=wall)
+            node.create_active_timer(config.region_update_period_s, self._begin, clock=STEADY)
             # Only while regions are computed.
-            self._poll = node.create_active_timer(_POLL_S, self._publish_computed, clock=wall)
+            self._poll = node.create_active_timer(_POLL_S, self._publish_computed, clock=STEADY)
             self._poll.cancel()
 
     @property

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from nav2_msgs.srv import SetRouteGraph
 from rclpy.client import Client
-from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 
 from thinmap_ros.core.config import Config, parameter
@@ -16,6 +15,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.files.graphs import write_geojson
 from thinmap_ros.jit.private_folder import private_folder, temporary_folder
 from thinmap_ros.ros import parameters
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
 
@@ -64,8 +64,7 @@ class RouteGraphUpdates:
         self._pending: Future | None = None
         if self._config.route_graph_period_s > 0.0:
             self._client = node.create_client(SetRouteGraph, _SERVICE)
-            wall = Clock(clock_type=ClockType.STEADY_TIME)
-            node.create_active_timer(self._config.route_graph_period_s, self._update, clock=wall)
+            node.create_active_timer(self._config.route_graph_period_s, self._update, clock=STEADY)
 
     def graph_changed(self) -> None:
         """Update the route server at the end of the period."""

@@ -7,6 +7,8 @@ from rclpy.duration import Duration
 
 from thinmap_ros.core.stamps import CLOCK_JUMP_NS
 
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+"""Clock of the machine, which nobody sets: for timers."""
 _BACKWARD = JumpThreshold(
     min_forward=None, min_backward=Duration(nanoseconds=-CLOCK_JUMP_NS), on_clock_change=False
 )
@@ -69,7 +71,7 @@ class ElapsedTime:
     @property
     def timer_clock(self) -> Clock:
         """Clock of timers; one on the clock of the machine waits for an hour that is set back."""
-        return self._clock if self.is_simulated else Clock(clock_type=ClockType.STEADY_TIME)
+        return self._clock if self.is_simulated else STEADY
 
     def now_ns(self) -> int:
         """Time since any moment, ns."""

@@ -6,7 +6,6 @@ from threading import Lock
 from time import monotonic
 
 from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -14,6 +13,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from thinmap_ros.ros import messages, parameters, qos, stop_topic
+from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import (
     ERROR,
     WARN,
@@ -84,8 +84,7 @@ class CommandPublisher:
         self._held_s = math.inf
         self._answered_s = -math.inf
         node.diagnostics.add_check(ERROR, self._fault)
-        wall = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(_CHECK_PERIOD_S, self._follow_base, clock=wall)
+        node.create_timer(_CHECK_PERIOD_S, self._follow_base, clock=STEADY)
 
     def open(self) -> None:
         """Create the publisher, at once or as soon as that is possible; in the node's thread."""
@@ -288,8 +287,7 @@ class VelocitySubscription:
         self._subscription = self._subscribe()
         diagnostics.expect_topic(topic)
         diagnostics.add_check(WARN, self._other_types)
-        wall = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(_CHECK_PERIOD_S, self._follow_publishers, clock=wall)
+        node.create_timer(_CHECK_PERIOD_S, self._follow_publishers, clock=STEADY)
 
     def _subscribe(self) -> object:
         return self._node.create_subscription(
