@@ -7,8 +7,7 @@ from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
 from thinmap_ros.core.grid.mapper import MapUpdate, WholeMap
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.nodes.mapping.map_topic import MapTopic
-from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
-from thinmap_ros.nodes.mapping.map_version import MapIdentity, MapVersion
+from thinmap_ros.nodes.mapping.map_values import MapIdentity, MapOutputConfig, MapVersion
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.decoding.map_identity import FollowedMap
 from thinmap_ros.ros.localized_scan import ReceivedScan

@@ -8,7 +8,7 @@ from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
 from rclpy.node import Node
 
 from thinmap_ros.core.grid.patch import Bounds, GridPatch, Margins
-from thinmap_ros.nodes.mapping.map_version import MapVersion
+from thinmap_ros.nodes.mapping.map_values import MapVersion
 from thinmap_ros.ros import diagnostics, messages, qos
 from thinmap_ros.ros.decoding.map_updates import updates_topic
 
