@@ -88,22 +88,22 @@ class MessageStatistics:
         self._published_faults = 0
         self._published_s = monotonic()
 
-    def topic(self, name: str) -> _Topic:
-        """The counters of a topic; created where missing."""
+    def expect_topic(self, name: str) -> _Topic:
+        """The counters of a topic, which is reported before its first message, too."""
         return self._topics.setdefault(name, _Topic())
 
-    def receive(self, name: str) -> None:
+    def message_received(self, name: str) -> None:
         """Count a message."""
-        topic = self.topic(name)
+        topic = self.expect_topic(name)
         topic.received += 1
         topic.last_s = monotonic()
 
-    def reject(self, name: str, reason: str) -> None:
-        """Count a message that could not be used."""
-        self.topic(name).reject(reason)
+    def message_rejected(self, name: str, reason: str) -> None:
+        """Count a message that could not be used, by reason."""
+        self.expect_topic(name).reject(reason)
         self._faults += 1
 
-    def drop(self, cause: str, count: int) -> None:
+    def count_drops(self, cause: str, count: int) -> None:
         """Count valid messages that were not used."""
         if count > 0:
             drops = self._drops.setdefault(cause, _Drops())
@@ -116,7 +116,7 @@ class MessageStatistics:
         drops = self._drops.setdefault(cause, _Drops())
         last = drops.total
         drops.total = total
-        self.drop(cause, total - last if total >= last else total)
+        self.count_drops(cause, total - last if total >= last else total)
 
     def new_faults(self) -> str:
         """Rejections and drops since the last diagnostics, in words; '' for none."""
@@ -217,7 +217,7 @@ class _Check:
         return bool(self.fault)
 
 
-class NodeDiagnostics:
+class NodeDiagnostics(MessageStatistics):
     """Publishes the state of a node once a second of the machine, whatever the node's clock does.
 
     A level above OK lasts as long as its cause: rejections and drops until a second without any, a
@@ -225,8 +225,8 @@ class NodeDiagnostics:
     """
 
     def __init__(self, node: Node) -> None:
+        super().__init__()
         self._node = node
-        self._messages = MessageStatistics()
         self._step_times = StepTimes()
         self._state = (OK, 'running')
         self._is_paused = False
@@ -237,26 +237,6 @@ class NodeDiagnostics:
         self._topic = node.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
         # Not in the node's time: a clock that stands still is reported, too.
         node.create_timer(_PERIOD_S, self._publish, clock=STEADY)
-
-    def expect_topic(self, topic: str) -> None:
-        """Report a subscribed topic before its first message."""
-        self._messages.topic(topic)
-
-    def message_received(self, topic: str) -> None:
-        """Count a message."""
-        self._messages.receive(topic)
-
-    def message_rejected(self, topic: str, reason: str) -> None:
-        """Count a message that could not be used, by reason."""
-        self._messages.reject(topic, reason)
-
-    def count_drops(self, cause: str, count: int) -> None:
-        """Count valid messages that were not used."""
-        self._messages.drop(cause, count)
-
-    def set_drop_total(self, cause: str, total: int) -> None:
-        """Report a count of drops that is kept elsewhere; one that was reset is added."""
-        self._messages.set_drop_total(cause, total)
 
     def record_step_time(self, step: str, milliseconds: float) -> None:
         """Record the duration of a step, ms."""
@@ -298,7 +278,7 @@ class NodeDiagnostics:
         name = self._node.resolve_topic_name(topic)
 
         def silence() -> str:
-            counters = self._messages.topic(topic)
+            counters = self.expect_topic(topic)
             if counters.last_s is None:
                 if monotonic() - counters.since_s < limit_s:
                     return ''  # discovery of other nodes may not be complete
@@ -356,11 +336,11 @@ class NodeDiagnostics:
         array = DiagnosticArray(status=[self._status(now_s)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._topic.publish(array)
-        self._messages.mark_published(now_s)
+        self.mark_published(now_s)
 
     def _status(self, now_s: float) -> DiagnosticStatus:
         level, message = self._level_and_message()
-        values = self._values | self._connections() | self._messages.values(now_s)
+        values = self._values | self._connections() | self.values(now_s)
         values |= self._step_times.values()
         name = self._node.get_fully_qualified_name()
         return DiagnosticStatus(
@@ -376,7 +356,7 @@ class NodeDiagnostics:
         if failed:
             worst = max(failed, key=lambda check: check.level)
             return (worst.level, worst.fault) if worst.level > level else (level, message)
-        faults = self._messages.new_faults()
+        faults = self.new_faults()
         return (WARN, faults) if faults and level == OK else (level, message)
 
     def _connections(self) -> dict[str, str]:
