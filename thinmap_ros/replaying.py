@@ -1,6 +1,5 @@
 """Replays a log or bag through localizer, grid and topology, and writes the results."""
 
-import json
 import resource
 from collections import Counter
 from collections.abc import Iterator
@@ -14,20 +13,16 @@ import numpy as np
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.regions.config import RegionConfig
-from thinmap_ros.core.regions.membership import membership_of
-from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.files import graphs, occupancy_maps, trajectories
-from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.logs.log import Log
 from thinmap_ros.logs.order.unused_scans import UnusedScans
 from thinmap_ros.logs.reading import WAITING_SCANS, complete_scans, recording_events
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view.progress_bar import ProgressBar
-from thinmap_ros.view.summary import summary_figure
+from thinmap_ros.view.run_folder import RunResult, Trajectory, write_report, write_run
 
 _REPEATED = 0.01  # m and rad: the pose of a scan that was matched twice differs by less
 
@@ -197,33 +192,33 @@ def _process(
 
 
 def write_outputs(
-    result: Replay, folder: Path, title: str, seconds: tuple[float, float]
+    result: Replay, folder: Path, title: str, seconds: tuple[float, float], command: str = ''
 ) -> dict[str, Any]:
     """Write all files into a folder; seconds: wall and CPU time taken. Returns the report."""
     pipeline = result.pipeline
-    patch = pipeline.grid.known_area()
     poses = np.array(result.poses)
-    folder.mkdir(parents=True, exist_ok=True)
-    _write_trajectory(folder / 'trajectory.tum', result.stamps_ns, poses)
     final = np.array(list(pipeline.localizer.optimized_trajectory())[: len(poses)])
-    _write_trajectory(folder / 'trajectory_final.tum', result.stamps_ns, final)
-    occupancy_maps.write_map(folder / 'map', patch)
-    topology = pipeline.topology.map
-    robot_radius_m = pipeline.config.topology.robot_radius_m
-    regions = find_regions(patch, RegionConfig(robot_radius_m=robot_radius_m))
-    graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
     release_compiler_pages()  # before matplotlib is loaded
-    apart = pipeline.localizer.apart_points()
-    summary_figure(
-        folder / 'summary.png', patch, topology, poses, title=title, regions=regions, apart=apart
+    run = RunResult(
+        pipeline.grid.known_area(),
+        pipeline.topology.map,
+        title,
+        {
+            'trajectory': _in_order(result.stamps_ns, poses),
+            'trajectory_final': _in_order(result.stamps_ns, final),
+        },
+        poses,
+        {'apart': pipeline.localizer.apart_points()},
+        RegionConfig(robot_radius_m=pipeline.config.topology.robot_radius_m),
     )
+    write_run(folder, run)
     report = _report(result, poses, seconds)
-    write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
+    write_report(folder, title, report, command)
     return report
 
 
-def _write_trajectory(path: Path, stamps_ns: list[int], poses: Array) -> None:
-    """Write poses (N, 3) in the order of their stamps, and a scan that came twice once.
+def _in_order(stamps_ns: list[int], poses: Array) -> Trajectory:
+    """Stamps and poses (N, 3) in the order of the stamps, and a scan that came twice once.
 
     Between scans with one stamp a robot may have moved all the same: the clocks of old logs are
     coarse.
@@ -234,7 +229,7 @@ def _write_trajectory(path: Path, stamps_ns: list[int], poses: Array) -> None:
     ordered = poses[order]
     moved = np.abs(np.diff(ordered, axis=0)).max(axis=1, initial=0.0) > _REPEATED
     is_new = np.append(True, (np.diff(stamps) > 0) | moved)
-    trajectories.write_tum(path, stamps[is_new].tolist(), list(ordered[is_new]))
+    return stamps[is_new].tolist(), list(ordered[is_new])
 
 
 def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[str, Any]:

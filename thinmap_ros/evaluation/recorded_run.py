@@ -1,6 +1,5 @@
 """Results of a run of the live graph, from its bag."""
 
-import json
 import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -15,8 +14,6 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.belief.model import MissingArea
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.regions.membership import membership_of
-from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -27,8 +24,6 @@ from thinmap_ros.evaluation.exploration_metrics import (
     hidden_places,
     missing_area_report,
 )
-from thinmap_ros.files import graphs, occupancy_maps, trajectories
-from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
@@ -37,7 +32,7 @@ from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.view import rerun_sinks
 from thinmap_ros.view.message_view import recording_from_bag
-from thinmap_ros.view.summary import summary_figure
+from thinmap_ros.view.run_folder import RunResult, write_report, write_run
 
 FILES = (
     'map.pgm',
@@ -145,7 +140,9 @@ def _missing_area(message: Any) -> MissingArea | None:
     return MissingArea(*areas) if min(areas) >= 0.0 else None
 
 
-def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> dict[str, Any]:
+def write(
+    out: Path, world_file: Path, robot: str, result: dict[str, Any], command: str = ''
+) -> dict[str, Any]:
     """Write map, graph, trajectory, picture, report and, with rerun, recording of a run in out/bag.
 
     Returns the report.
@@ -154,24 +151,24 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     world = World.from_patch(*read_world(world_file))
     start = next(iter(recording.true.values()))
     seen = robot_observable_cells(world, start, PRESETS[robot], recording.range_max_m)
-    report = _report(recording, seen, result)
-    patch = recording.maps[-1][1]
-    occupancy_maps.write_map(out / 'map', patch)
-    topology = recording.topology
-    regions = find_regions(patch)
-    graphs.write_geojson(out / 'topology.geojson', topology, membership_of(topology, regions))
-    estimated = np.array(list(recording.estimated.values()))
-    trajectories.write_tum(out / 'trajectory.tum', list(recording.estimated), list(estimated))
-    true = np.array(list(recording.true.values()))
-    report['world'] = world.name
+    report = _report(recording, seen, result) | {'world': world.name}
     title = exploration_title(report)
-    hidden = hidden_places(report)
-    summary_figure(out / 'summary.png', patch, topology, estimated, true, title, regions, hidden)
+    estimated = np.array(list(recording.estimated.values()))
+    true = np.array(list(recording.true.values()))
+    run = RunResult(
+        recording.maps[-1][1],
+        recording.topology,
+        title,
+        {'trajectory': (list(recording.estimated), list(estimated))},
+        estimated,
+        {'true': true, 'hidden': hidden_places(report)},
+    )
+    write_run(out, run)
     if rerun_sinks.is_installed():
         recording_from_bag(out / 'bag', out / 'recording.rrd')
     else:
         print(f'no recording.rrd: {rerun_sinks.ADVICE}', file=sys.stderr)
-    write_text(out / 'report.json', json.dumps(report, indent=2) + '\n')
+    write_report(out, title, report, command)
     return report
 
 

@@ -1,6 +1,5 @@
 """Results of a run of several robots on the live graph, from its bag."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,22 +9,18 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.regions.membership import membership_of
-from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation import recorded_run
 from thinmap_ros.evaluation.exploration_metrics import MILESTONES, exploration_title, first_time
 from thinmap_ros.evaluation.recorded_run import Recording
-from thinmap_ros.files import graphs, occupancy_maps, trajectories
-from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS, RobotConfig
 from thinmap_ros.sim.world import World
-from thinmap_ros.view.summary import summary_figure
+from thinmap_ros.view.run_folder import RunResult, write_report, write_run
 
 _TOPICS = {'/merged_map', '/merged_topology', '/join_status'}
 
@@ -76,7 +71,12 @@ class RobotRun:
 
 
 def write(
-    out: Path, world_file: Path, robot: str, result: dict[str, Any], map_poses: Sequence[Array]
+    out: Path,
+    world_file: Path,
+    robot: str,
+    result: dict[str, Any],
+    map_poses: Sequence[Array],
+    command: str = '',
 ) -> dict[str, Any]:
     """Write map, graph, trajectories, picture and report of a run of several robots in out/bag.
 
@@ -95,27 +95,13 @@ def write(
     first = robots[0].recording
     patch = first.maps[-1][1] if joint.patch is None else joint.patch
     topology = first.topology if joint.patch is None else joint.topology
-    occupancy_maps.write_map(out / 'map', patch)
-    regions = find_regions(patch)
-    graphs.write_geojson(out / 'topology.geojson', topology, membership_of(topology, regions))
     T_merged_world = _world_pose(robots, joint)
-    paths = {}
-    for each in robots:
-        estimated = each.recording.estimated
-        file = out / f'trajectory_{each.name}.tum'
-        trajectories.write_tum(file, list(estimated), list(estimated.values()))
-        paths[each.name] = se2.transform_points(T_merged_world, each.true[:, :2])
-    summary_figure(
-        out / 'summary.png',
-        patch,
-        topology,
-        np.empty((0, 3)),
-        None,
-        exploration_title(report),
-        regions,
-        robots=paths,
-    )
-    write_text(out / 'report.json', json.dumps(report, indent=2) + '\n')
+    title = exploration_title(report)
+    estimated = {f'trajectory_{each.name}': each.recording.estimated for each in robots}
+    poses = {name: (list(found), list(found.values())) for name, found in estimated.items()}
+    paths = {each.name: se2.transform_points(T_merged_world, each.true[:, :2]) for each in robots}
+    write_run(out, RunResult(patch, topology, title, poses, shown={'robots': paths}))
+    write_report(out, title, report, command)
     return report
 
 

@@ -22,7 +22,6 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation import recorded_run, recorded_team_run
-from thinmap_ros.evaluation.exploration_metrics import exploration_title
 from thinmap_ros.evaluation.processes import end_with_parent
 from thinmap_ros.evaluation.ros_domains import use_free_domain
 from thinmap_ros.files import package_data
@@ -258,11 +257,11 @@ def _work(arguments: argparse.Namespace) -> None:
     explore(arguments, world, starts)
     result = json.loads((arguments.out / 'result.json').read_text())
     run = (arguments.out, world, arguments.robot, result)
+    command = cli.command_line()
     if len(starts) == 1:
-        report = recorded_run.write(*run)
+        report = recorded_run.write(*run, command)
     else:
-        report = recorded_team_run.write(*run, map_poses(starts))
-    report_page.write(arguments.out, exploration_title(report), report, cli.command_line())
+        report = recorded_team_run.write(*run, map_poses(starts), command)
     print(
         f'{report["reason"]}: {100.0 * report["coverage"]:.1f} % seen, '
         f'{report["distance"]:.1f} m, {report["time"]:.1f} s, {report["collisions"]} collisions; '

@@ -1,7 +1,6 @@
 """Explores a simulated world without ROS, faster than real time."""
 
 import argparse
-import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,11 @@ import numpy as np
 from thinmap_ros.closed_loop import ClosedLoop, Options
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.regions.membership import membership_of
-from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_metrics import exploration_title, hidden_places
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
-from thinmap_ros.files import graphs, occupancy_maps, package_data, trajectories
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.other_robots import starts_side_by_side
@@ -29,9 +25,8 @@ from thinmap_ros.team.loop import TeamLoop
 from thinmap_ros.team.radio import Trouble
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser, add_out, out_folder
-from thinmap_ros.view import report_page
 from thinmap_ros.view.progress_bar import ProgressBar
-from thinmap_ros.view.summary import summary_figure
+from thinmap_ros.view.run_folder import RunResult, write_report, write_run
 
 MAX_ROBOTS = 10
 MAX_DELAY_S = 1000.0
@@ -43,52 +38,36 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
     """Write all files into a folder."""
     log = loop.log
     pipeline = loop.pipeline
-    patch = pipeline.grid.known_area()
-    topology = pipeline.topology.map
-    folder.mkdir(parents=True, exist_ok=True)
-    trajectories.write_tum(folder / 'trajectory.tum', log.stamps_ns, log.poses)
-    occupancy_maps.write_map(folder / 'map', patch)
-    regions = find_regions(patch)
-    graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
     title = exploration_title(report)
-    hidden = hidden_places(report)
-    poses = np.array(log.poses)
-    true_poses = np.array(log.true_poses)
-    summary_figure(
-        folder / 'summary.png',
-        patch,
-        topology,
-        poses,
-        true_poses,
+    run = RunResult(
+        pipeline.grid.known_area(),
+        pipeline.topology.map,
         title,
-        regions,
-        hidden,
-        apart=pipeline.localizer.apart_points(),
+        {'trajectory': (log.stamps_ns, log.poses)},
+        np.array(log.poses),
+        {
+            'true': np.array(log.true_poses),
+            'hidden': hidden_places(report),
+            'apart': pipeline.localizer.apart_points(),
+        },
     )
-    write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
-    report_page.write(folder, title, report, cli.command_line())
+    write_run(folder, run)
+    write_report(folder, title, report, cli.command_line())
 
 
 def write_team_outputs(loop: TeamLoop, report: dict[str, Any], folder: Path) -> None:
     """Write all files of several robots into a folder; a trajectory for each."""
-    patch = loop.maps.known_area()
-    topology = loop.maps.view(0)[0]
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = {}
-    for member in loop.members:
-        log = member.loop.log
-        trajectories.write_tum(folder / f'trajectory_{member.name}.tum', log.stamps_ns, log.poses)
-        paths[member.name] = np.array(log.true_poses)
-    occupancy_maps.write_map(folder / 'map', patch)
-    regions = find_regions(patch)
-    graphs.write_geojson(folder / 'topology.geojson', topology, membership_of(topology, regions))
     title = exploration_title(report)
-    nowhere = np.empty((0, 3))
-    summary_figure(
-        folder / 'summary.png', patch, topology, nowhere, None, title, regions, robots=paths
+    logs = {member.name: member.loop.log for member in loop.members}
+    run = RunResult(
+        loop.maps.known_area(),
+        loop.maps.view(0)[0],
+        title,
+        {f'trajectory_{name}': (log.stamps_ns, log.poses) for name, log in logs.items()},
+        shown={'robots': {name: np.array(log.true_poses) for name, log in logs.items()}},
     )
-    write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
-    report_page.write(folder, title, report, cli.command_line())
+    write_run(folder, run)
+    write_report(folder, title, report, cli.command_line())
 
 
 def _start(world: World, given: str | None) -> Array:

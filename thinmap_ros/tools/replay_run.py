@@ -19,7 +19,6 @@ from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import Replay, Watcher, replay, write_outputs
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.parameter_file import NodeParameters, read_parameter_file
-from thinmap_ros.view import report_page
 
 # Whose parameters replay takes from a file.
 _NODES = ('localizer', 'grid_mapper', 'topology_builder')
@@ -52,9 +51,7 @@ def replay_log(
     result.notes = [*parameters.notes, *result.notes]
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{path.name}: {len(result.poses)} scans'
-    report = write_outputs(result, out, title, seconds)
-    report_page.write(out, title, report, arguments.command)
-    return result, report
+    return result, write_outputs(result, out, title, seconds, arguments.command)
 
 
 def options_of(arguments: argparse.Namespace) -> dict[str, Any]:
