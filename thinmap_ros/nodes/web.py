@@ -20,10 +20,10 @@ from thinmap_msgs.msg import (
 )
 from thinmap_ros.core.config import SAFE_LOWER, Config, parameter
 from thinmap_ros.core.errors import counted
+from thinmap_ros.core.planning.give_way import MESSAGE_PERIOD_S, moved_on
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.steering.steering import Steering, TopSpeeds
-from thinmap_ros.nodes.steering.team_view import TeamView
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
@@ -31,6 +31,7 @@ from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.team.heard_robots import heard_robots
 from thinmap_ros.web import access, links, server
 from thinmap_ros.web.board import Board
 from thinmap_ros.web.pages import Pages
@@ -91,7 +92,7 @@ class WebNode(ThinmapNode):
         self._picture = Picture(Board())
         top = TopSpeeds(config.max_drive_speed_m_s, config.max_drive_turn_rad_s)
         self._steering = Steering(self, self._picture, (map_frame, self._laser.base_frame), top)
-        self._team = TeamView(self, self._picture)
+        self._team = heard_robots(self)
         parameters.reject_unknown(self)
         warm_up.topology_builder()  # a merged session is read and saved in this process
         self._pages = Pages(self._picture.board, access.Gate(self._tokens), self._steering)
@@ -148,7 +149,9 @@ class WebNode(ThinmapNode):
 
     def _tick(self) -> None:
         self._steering.tick()
-        self._team.tick()
+        if self._team is not None:
+            motions = self._team.motions()
+            self._picture.robots(moved_on(each, min(s, MESSAGE_PERIOD_S)) for each, s in motions)
         self._ticks = (self._ticks + 1) % _TICKS
         if not self._ticks:
             self._picture.tick()

@@ -8,8 +8,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.robots_in_scan import without_robots
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.team.heard_robots import HeardRobots, declare_silence
-from thinmap_ros.ros.team.membership import JoinedPlaces, declare_membership
+from thinmap_ros.ros.team.heard_robots import heard_robots
 
 
 @dataclass(frozen=True)
@@ -30,14 +29,8 @@ class TeamInScans:
 
     def __init__(self, node: ThinmapNode) -> None:
         """Declare the parameters."""
-        membership = declare_membership(node)
-        silence_s = declare_silence(node)
+        self._heard = heard_robots(node)
         self._cut_m = parameters.declare_config(node, RobotCutConfig).robot_cut_radius_m
-        self._heard: HeardRobots | None = None
-        if membership.team:
-            name = membership.team_name
-            places = JoinedPlaces(node, name)
-            self._heard = HeardRobots(node, places, name, silence_s)
 
     def without(self, scan: Scan, T_map_base: Array) -> Scan:
         """A scan made at a pose (3,) without the beams that end at another robot."""

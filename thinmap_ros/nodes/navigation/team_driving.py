@@ -11,8 +11,7 @@ from thinmap_ros.core.planning.navigator import Command, Navigator
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.team.heard_robots import HeardRobots, declare_silence
-from thinmap_ros.ros.team.membership import JoinedPlaces, declare_membership
+from thinmap_ros.ros.team.heard_robots import heard_robots
 from thinmap_ros.ros.team.received_tiles import TileReceiver
 
 
@@ -34,16 +33,11 @@ class TeamDriving:
 
     def __init__(self, node: ThinmapNode) -> None:
         """Declare the parameters."""
-        membership = declare_membership(node)
-        silence_s = declare_silence(node)
+        self._heard = heard_robots(node)
         self._distance_m = parameters.declare_config(node, GiveWayConfig).give_way_m
-        self._name = membership.team_name
-        self._heard: HeardRobots | None = None
         self._tiles: TileReceiver | None = None
-        if membership.team:
-            places = JoinedPlaces(node, self._name)
-            self._heard = HeardRobots(node, places, self._name, silence_s)
-            self._tiles = TileReceiver(node, places, self._name)
+        if self._heard is not None:
+            self._tiles = TileReceiver(node, self._heard.places, self._heard.name)
 
     def completed(self, own: GridPatch) -> GridPatch:
         """The map of this robot, and what others know where it is undecided."""
@@ -58,7 +52,7 @@ class TeamDriving:
         """
         if self._heard is None or command.v <= 0.0:
             return command
-        own = Motion(self._name, T_map_base, command.v, command.w)
+        own = Motion(self._heard.name, T_map_base, command.v, command.w)
         others = [each for heard in self._heard.motions() for each in as_heard(*heard)]
         controller = navigator.config.controller
         brakes_s = controller.max_speed_m_s / controller.max_acceleration_m_s2

@@ -11,15 +11,10 @@ from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.ros import parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
-from thinmap_ros.ros.team.membership import JoinedPlaces
+from thinmap_ros.ros.team.membership import JoinedPlaces, declare_membership
 from thinmap_ros.ros.team.team_messages import RobotClaim, claim_from_msg
 
 CLAIMS = '/team/claims'
-
-
-def declare_silence(node: ThinmapNode) -> float:
-    """Declare how long a robot may be silent, s."""
-    return parameters.declare_config(node, SilenceConfig).claim_timeout_s
 
 
 class HeardMotion(NamedTuple):
@@ -36,7 +31,10 @@ class _Heard:
 
 
 class HeardRobots:
-    """Newest claim of each other robot; those of robots that are not joined are only kept."""
+    """Newest claim of each other robot; those of robots that are not joined are only kept.
+
+    name: of this robot; places: where the maps of the others lie.
+    """
 
     def __init__(
         self,
@@ -46,13 +44,13 @@ class HeardRobots:
         max_age_s: float,
         heard: Callable[[RobotClaim], bool] = lambda claim: True,
     ) -> None:
-        """name: of this robot; heard: is called with each claim, and says whether to keep it.
+        """heard: is called with each claim, and says whether to keep it.
 
         max_age_s: a robot that was silent for longer is an obstacle as any other.
         """
         self._node = node
-        self._places = places
-        self._name = name
+        self.places = places
+        self.name = name
         self._max_age_s = max_age_s
         self._accepts = heard
         self._heard: dict[str, _Heard] = {}
@@ -63,7 +61,7 @@ class HeardRobots:
         now_ns = self._node.elapsed_time.now_ns()
         found = []
         for name, heard in self._heard.items():
-            T = self._places.poses.get(name)
+            T = self.places.poses.get(name)
             age_s = (now_ns - heard.received_ns) / SECOND_NS
             if T is not None and 0.0 <= age_s <= self._max_age_s:
                 found.append(HeardMotion(heard.claim.in_map(T).motion, age_s))
@@ -72,5 +70,15 @@ class HeardRobots:
     def _on_claim(self, message: TeamClaim) -> None:
         claim = claim_from_msg(message)
         name = claim.claim.robot
-        if self._accepts(claim) and name != self._name:
+        if self._accepts(claim) and name != self.name:
             self._heard[name] = _Heard(claim, self._node.elapsed_time.now_ns())
+
+
+def heard_robots(node: ThinmapNode) -> HeardRobots | None:
+    """The other robots of the node's team, None without a team; declares the parameters."""
+    membership = declare_membership(node)
+    silence_s = parameters.declare_config(node, SilenceConfig).claim_timeout_s
+    if not membership.team:
+        return None
+    name = membership.team_name
+    return HeardRobots(node, JoinedPlaces(node, name), name, silence_s)
