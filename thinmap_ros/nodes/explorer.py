@@ -187,7 +187,7 @@ class ExplorerNode(ThinmapNode):
                 'to start one'
             )
             return
-        self._output.clear_target()
+        self._output.target.clear()
         self._publish_progress()
 
     # Inputs.
@@ -217,7 +217,7 @@ class ExplorerNode(ThinmapNode):
         self._execute(action)
 
     def _on_drive_ended(self, success: bool, reason: str) -> None:
-        self._output.clear_target()
+        self._output.target.clear()
         self._execute(self._mission.drive_ended(success, reason))
 
     def _on_timer(self) -> None:
@@ -229,7 +229,7 @@ class ExplorerNode(ThinmapNode):
             status = self._output.status(self._mission)
             end_nodes = self._output.end_nodes_now(self._mission)
             self._goals.feedback(Explore.Feedback(status=status, end_nodes=end_nodes))
-            self._output.frontiers(self._mission)
+            self._output.lite.publish_frontiers(self._mission)
 
     def _end_if_cancelled(self) -> None:
         if self._goals.is_cancel_requested:
@@ -247,7 +247,7 @@ class ExplorerNode(ThinmapNode):
     def _execute(self, action: Action) -> None:
         """Carry out what the mission answers."""
         if isinstance(action, DriveTo):
-            self._output.target(action.goal)
+            self._output.target.publish(action.goal)
             self._driver.drive_to(action.goal)
         elif isinstance(action, Finish):
             self._finish(action)
@@ -255,7 +255,7 @@ class ExplorerNode(ThinmapNode):
 
     def _finish(self, end: Finish) -> None:
         self._driver.cancel()
-        self._output.clear_target()
+        self._output.target.clear()
         status = self._output.status(self._mission)
         self.get_logger().info(f'finished: {end.reason}')
         outcome = Outcome.SUCCEEDED if end.is_success else Outcome.ABORTED
@@ -271,7 +271,7 @@ class ExplorerNode(ThinmapNode):
         return Progress(self._mission, located, driver.goal, driver.remaining_m)
 
     def _publish_progress(self) -> None:
-        self._output.progress(self._mission, self._driver.is_yielding)
+        self._output.lite.publish_status(self._mission, self._driver.is_yielding)
 
     def _now_s(self) -> float:
         return self.elapsed_time.now_s()

@@ -1,13 +1,13 @@
 """What starts an exploration: always a goal of the action explore, also of the explorer itself."""
 
+import numpy as np
 from rclpy.action import ActionClient
 from rclpy.node import Node
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.mission import MissionGoal
-from thinmap_ros.nodes.exploration.mission_messages import mission_goal_from
+from thinmap_ros.core.exploration.mission import Budget, MissionGoal
 from thinmap_ros.ros.action_server import InvalidGoalError
 
 ACTION = 'explore'
@@ -48,7 +48,7 @@ class Starts:
         try:
             if self.stop_reason:
                 raise InputError(self.stop_reason)
-            return mission_goal_from(message)
+            return _mission_goal(message)
         except InputError as error:
             status = ExplorationStatus(
                 state=ExplorationStatus.FINISHED,
@@ -56,3 +56,10 @@ class Starts:
                 reason=str(error),
             )
             raise InvalidGoalError(Explore.Result(status=status)) from error
+
+
+def _mission_goal(message: Explore.Goal) -> MissionGoal:
+    """Goal of a mission. Raises InputError where a limit or a corner is no number, or too large."""
+    budget = Budget(message.time_limit_s, message.distance_limit_m, message.area_limit_m2)
+    area = np.array([[point.x, point.y] for point in message.area.points]).reshape(-1, 2)
+    return MissionGoal(budget, area, bool(message.return_home))
