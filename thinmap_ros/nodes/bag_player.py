@@ -24,7 +24,7 @@ from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
 from thinmap_ros.ros.lockstep import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep
 from thinmap_ros.ros.messages import message_class
-from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.services import offer
 
 _SCAN = 'sensor_msgs/msg/LaserScan'
 
@@ -126,8 +126,8 @@ class BagPlayerNode(Node):
         self._diagnostics = NodeDiagnostics(self)
         self._diagnostics.add_update_callback(self._publish_diagnostics)
         self.finished = False
-        self.create_service(SetBool, '~/pause', self._on_pause)
-        self.create_service(Trigger, '~/step', self._on_step)
+        offer(self.create_service, SetBool, '~/pause', self._on_pause)
+        offer(self.create_service, Trigger, '~/step', self._on_step)
         self.create_timer(_SECONDS.tick, self._tick, clock=STEADY)
 
     def close(self) -> None:
@@ -245,16 +245,11 @@ class BagPlayerNode(Node):
         for topic, count in self._sent.items():
             self._diagnostics.set_value(f'{topic}: sent', count)
 
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def _on_pause(self, request: SetBool.Request) -> str:
         self._paused = request.data
-        return fill_response(
-            response, lambda: f'{"paused" if self._paused else "playing"} at {self._where()}'
-        )
+        return f'{"paused" if self._paused else "playing"} at {self._where()}'
 
-    def _on_step(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return fill_response(response, self._step)
-
-    def _step(self) -> str:
+    def _on_step(self, _: Trigger.Request) -> str:
         if not self._paused:
             raise InputError('not paused: nothing to step')
         taken = self._playback.step()

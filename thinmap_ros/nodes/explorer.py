@@ -5,7 +5,6 @@ from dataclasses import replace
 from std_srvs.srv import Trigger
 
 from thinmap_msgs.action import Explore
-from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.exploration.live.mission_state import mission_state, resumed_mission
 from thinmap_ros.core.exploration.mission import (
     Action,
@@ -35,7 +34,8 @@ from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
-from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.services import offer
+from thinmap_ros.ros.session_services import offer_saving
 from thinmap_ros.ros.stop_topic import StopTopic
 
 _CHECK_PERIOD_S = 1.0
@@ -65,7 +65,7 @@ class ExplorerNode(ThinmapNode):
             self, frames.map_frame, self._strategies.is_default, self._progress
         )
         self._session = parameters.declare_session(self)
-        self._save_directory = SaveDirectory(self)
+        offer_saving(self, SaveDirectory(self), EXPLORATION, self._save)
         parameters.reject_unknown(self)
         warm_up.explorer()
         radius_m = self._strategies.config.robot_radius_m
@@ -80,8 +80,7 @@ class ExplorerNode(ThinmapNode):
             self, Explore, ACTION, self._start, self._on_preempted, self._starts.read
         )
         StopTopic(self, self._on_stop)
-        self.create_service(Trigger, '~/cancel', self._on_cancel)
-        self.create_active_service(SaveMap, 'save_exploration', self._on_save)
+        offer(self.create_service, Trigger, '~/cancel', self._on_cancel)
         self.create_active_timer(_CHECK_PERIOD_S, self._on_timer)
         self.enable_checkpoint(self._state, self._restore)
 
@@ -165,13 +164,10 @@ class ExplorerNode(ThinmapNode):
         if stop.reason:
             self._cancel(stop.reason)
 
-    def _on_cancel(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        def cancel() -> str:
-            was_due = self._starts.is_due
-            self._starts.is_due = False
-            return 'exploration ended' if self._cancel('cancelled') or was_due else 'none to end'
-
-        return fill_response(response, cancel)
+    def _on_cancel(self, _: Trigger.Request) -> str:
+        was_due = self._starts.is_due
+        self._starts.is_due = False
+        return 'exploration ended' if self._cancel('cancelled') or was_due else 'none to end'
 
     def _on_resume(self, is_wanted: bool) -> None:
         """Pause the exploration, or continue one that is paused."""
@@ -235,12 +231,8 @@ class ExplorerNode(ThinmapNode):
         if self._goals.is_cancel_requested:
             self._cancel('cancelled')
 
-    def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
-        def save() -> str:
-            path = self._save_directory.resolve_for_saving(request.path, EXPLORATION)
-            return self._strategies.save(path, self._mission.strategy, request.overwrite)
-
-        return fill_response(response, save)
+    def _save(self, path: str, overwrite: bool) -> str:
+        return self._strategies.save(path, self._mission.strategy, overwrite)
 
     # Outputs.
 

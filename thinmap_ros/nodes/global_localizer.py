@@ -41,6 +41,7 @@ from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
 from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.tf.odometry_source import OdometrySource
@@ -315,7 +316,7 @@ class GlobalLocalizerNode(ThinmapNode):
         self._odometry.subscribe()
         scan_topic = self._laser_transform.scan_topic
         subscribe_guarded(self, LaserScan, scan_topic, self._on_scan, qos.SENSOR)
-        self.create_active_service(LocalizeGlobally, 'localize_globally', self._on_request)
+        offer(self.create_active_service, LocalizeGlobally, 'localize_globally', self._on_request)
         self.create_active_timer(1.0, self._report_missing_inputs)
 
     def _create_driver(self) -> _SearchDriver:
@@ -361,14 +362,10 @@ class GlobalLocalizerNode(ThinmapNode):
             self.get_logger().info('the localizer is lost: searching the whole map')
             self._start(clear=True)
 
-    def _on_request(
-        self, request: LocalizeGlobally.Request, response: LocalizeGlobally.Response
-    ) -> LocalizeGlobally.Response:
+    def _on_request(self, request: LocalizeGlobally.Request) -> str:
         self._start(request.discard_hypotheses)
         missing = self._missing()
-        response.success = True
-        response.message = f'waits for {missing}' if missing else 'searching the whole map'
-        return response
+        return f'waits for {missing}' if missing else 'searching the whole map'
 
     def _start(self, clear: bool) -> None:
         self._is_requested = True

@@ -36,12 +36,11 @@ from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.diagnostics import ERROR
-from thinmap_ros.ros.exit_save import ExitSave
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import ReceivedScan, localized_scan_from_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
-from thinmap_ros.ros.session_client import SessionClient
+from thinmap_ros.ros.session_services import SessionClient, save_on_exit
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 
 _OTHER_MAP = (
@@ -109,7 +108,7 @@ class GridMapperNode(ThinmapNode):
         self._team = TeamInScans(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
-        ExitSave(self, self._save_directory, sessions.GRID, self._save_at_end)
+        save_on_exit(self, self._save_directory, sessions.GRID, self._save_at_end)
         parameters.reject_unknown(self)
         warm_up.grid_mapper()
         self._stamp = StateStamp()

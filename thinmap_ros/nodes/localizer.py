@@ -17,7 +17,6 @@ from thinmap_msgs.msg import (
     SlamStatus,
     TopologicalMap,
 )
-from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
@@ -53,12 +52,11 @@ from thinmap_ros.nodes.localization.recovery import Recovery, restored, saved_po
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN, new_map_id
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
-from thinmap_ros.ros.exit_save import ExitSave
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
-from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.session_services import offer_loading, offer_saving, save_on_exit
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.tf.map_broadcaster import MapBroadcaster
 from thinmap_ros.ros.tf.odometry_source import OdometrySource
@@ -197,7 +195,7 @@ class LocalizerNode(ThinmapNode):
         )
         self._given = GivenMap(self, self._config)
         self._save_directory = SaveDirectory(self)
-        ExitSave(self, self._save_directory, LOCALIZER, self._save_at_end)
+        save_on_exit(self, self._save_directory, LOCALIZER, self._save_at_end)
         parameters.reject_unknown(self, parameters_elsewhere(slam))
         warm_up.localizer()
         if slam != SCAN_MATCHING:
@@ -221,9 +219,8 @@ class LocalizerNode(ThinmapNode):
         )
         self._given.source.subscribe(self, self._on_new_map)
         self._given.create_interface(self._output.map_frame, poses)
-        self.create_active_service(SaveMap, 'save_localizer', self._on_save)
-        self.create_service(LoadMap, 'check_localizer', self._on_check)
-        self.create_service(LoadMap, 'load_localizer', self._on_load)
+        offer_saving(self, self._save_directory, LOCALIZER, self._save)
+        offer_loading(self, LOCALIZER, self._check, self._load)
 
     def _on_config(self, config: StartConfig) -> None:
         """Continue in the same map with other parameters."""
@@ -367,26 +364,16 @@ class LocalizerNode(ThinmapNode):
             # So was the robot, with all that made the map.
             self._localizer = self._given.create_localizer()
 
-    def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
-        def save() -> str:
-            path = self._save_directory.resolve_for_saving(request.path, LOCALIZER)
-            return f'saved {save_localizer(path, self._localizer, request.overwrite)}'
-
-        return fill_response(response, save)
+    def _save(self, path: str, overwrite: bool = False) -> str:
+        return f'saved {save_localizer(path, self._localizer, overwrite)}'
 
     def _save_at_end(self, path: str) -> str:
         if self._map_ids is None or self._recovery.last is None:
             return ''
-        return f'saved {save_localizer(path, self._localizer)}'
+        return self._save(path)
 
-    def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
-        return fill_response(response, lambda: self._load(request.path))
-
-    def _on_check(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
-        def check() -> str:
-            return 'no map of the localizer' if self._read(request.path) is None else 'a map'
-
-        return fill_response(response, check)
+    def _check(self, path: str) -> str:
+        return 'no map of the localizer' if self._read(path) is None else 'a map'
 
     def _read(self, path: str) -> AnyLocalizer | None:
         """Localizer in a saved map, at the present pose; None where there is no such map."""

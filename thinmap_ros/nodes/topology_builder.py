@@ -8,7 +8,6 @@ from rclpy.node import Node
 
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
-from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import counted
 from thinmap_ros.core.regions.tracker import FIELDS as REGION_FIELDS
@@ -25,11 +24,10 @@ from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN, FollowedMap, Origin
-from thinmap_ros.ros.exit_save import ExitSave
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import map_update_from_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
-from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.session_services import offer_loading, offer_saving, save_on_exit
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 _ID_RESERVE = 1000  # ids that a builder may have assigned after its last checkpoint
@@ -107,7 +105,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._output = _TopologyPublishers(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
-        ExitSave(self, self._save_directory, TOPOLOGY, self._save_at_end)
+        save_on_exit(self, self._save_directory, TOPOLOGY, self._save_at_end)
         self._route_graph = RouteGraphUpdates(
             self, self._output.frame_id, lambda: self._topology.map
         )
@@ -119,9 +117,8 @@ class TopologyBuilderNode(ThinmapNode):
         warm_up.topology_builder()
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(self, LocalGrid, 'local_grid', self._on_local_grid, qos.STREAM)
-        self.create_active_service(SaveMap, 'save_topology', self._on_save)
-        self.create_service(LoadMap, 'check_topology', self._on_check)
-        self.create_service(LoadMap, 'load_topology', self._on_load)
+        offer_saving(self, self._save_directory, TOPOLOGY, self._save_and_route)
+        offer_loading(self, TOPOLOGY, self._check, self._load)
         self.diagnostics.check_sole_publisher('topology')
         self._stamp = StateStamp()
         self._topology = Topology(self._config, _begin_in_thread)
@@ -211,14 +208,10 @@ class TopologyBuilderNode(ThinmapNode):
         if newest != self._newest_saved_id and self.checkpoint_now():
             self._newest_saved_id = newest
 
-    def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
-        def save() -> str:
-            path = self._save_directory.resolve_for_saving(request.path, TOPOLOGY)
-            saved = self._save(path, request.overwrite)
-            self._route_graph.graph_saved()
-            return saved
-
-        return fill_response(response, save)
+    def _save_and_route(self, path: str, overwrite: bool) -> str:
+        saved = self._save(path, overwrite)
+        self._route_graph.graph_saved()
+        return saved
 
     def _save(self, path: str, overwrite: bool = False) -> str:
         saved = TOPOLOGY.save(path, self._topology.builder, overwrite)
@@ -228,14 +221,8 @@ class TopologyBuilderNode(ThinmapNode):
     def _save_at_end(self, path: str) -> str:
         return self._save(path) if self._topology.map.nodes else ''
 
-    def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
-        return fill_response(response, lambda: self._load(request.path))
-
-    def _on_check(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
-        def check() -> str:
-            return f'graph of {len(self._read(request.path)[0].map.nodes)} nodes'
-
-        return fill_response(response, check)
+    def _check(self, path: str) -> str:
+        return f'graph of {len(self._read(path)[0].map.nodes)} nodes'
 
     def _read(self, path: str) -> tuple[TopologyBuilder, RegionTracker | None]:
         """Saved graph and regions; empty ones if the path is empty."""

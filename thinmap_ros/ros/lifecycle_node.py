@@ -19,7 +19,7 @@ from thinmap_ros.ros.clocks.time_jumps import STEADY, ElapsedTime, TimeJumps
 from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
 from thinmap_ros.ros.foreign.translation import translate
 from thinmap_ros.ros.private_rclpy import RCLError
-from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.sole_source import follow_one_clock
 
 _CHECKPOINT_PERIOD_S = 0.5
@@ -61,7 +61,7 @@ class ThinmapNode(LifecycleNode):
         self._end_callbacks: list[Callable[[], None]] = []
         self._failure_callbacks: list[Callable[[], None]] = []
         self.diagnostics.add_update_callback(self.handle_time_jump)
-        self.create_service(Trigger, '~/reset', self._on_reset)
+        offer(self.create_service, Trigger, '~/reset', self._on_reset)
         self._reject_invalid_transitions()
 
     def start(self) -> None:
@@ -82,7 +82,7 @@ class ThinmapNode(LifecycleNode):
 
     def create_pause_service(self) -> None:
         """Create ~/pause: while paused, the node ignores new scans."""
-        self.create_service(SetBool, '~/pause', self._on_pause)
+        offer(self.create_service, SetBool, '~/pause', self._on_pause)
 
     def create_active_timer(
         self, period_s: float, work: Callable[[], None], clock: Clock | None = None
@@ -268,16 +268,11 @@ class ThinmapNode(LifecycleNode):
 
     # Services.
 
-    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        def work() -> str:
-            self._reset()
-            return 'state reset'
+    def _on_reset(self, _: Trigger.Request) -> str:
+        self._reset()
+        return 'state reset'
 
-        return fill_response(response, work)
-
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def _on_pause(self, request: SetBool.Request) -> str:
         self.is_paused = request.data
         self.diagnostics.set_paused(self.is_paused)
-        return fill_response(
-            response, lambda: 'scans are ignored' if self.is_paused else 'scans are processed'
-        )
+        return 'scans are ignored' if self.is_paused else 'scans are processed'

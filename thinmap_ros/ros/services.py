@@ -1,4 +1,4 @@
-"""Services with the response `success` and `message`: filled in by a node, called by another."""
+"""Services with the response `success` and `message`: offered by a node, called by another."""
 
 import traceback
 from collections.abc import Callable
@@ -12,6 +12,14 @@ from thinmap_ros.core.errors import ThinmapError, one_line_reason
 from thinmap_ros.ros.clocks.time_jumps import STEADY
 
 _TIMEOUT_S = 10.0
+
+
+def offer(create: Callable[..., Any], kind: Any, name: str, work: Callable[[Any], str]) -> None:
+    """Offer a service whose response has what `work` returns for a request, or its error.
+
+    create: `create_service` of a node, or its `create_active_service`.
+    """
+    create(kind, name, lambda request, response: fill_response(response, lambda: work(request)))
 
 
 def fill_response(response: Any, work: Callable[[], str]) -> Any:

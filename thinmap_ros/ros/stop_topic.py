@@ -16,7 +16,7 @@ from thinmap_ros.ros.checkpoint import Checkpoint
 from thinmap_ros.ros.diagnostics import WARN, full_name
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.private_rclpy import GID_SIZE, subscribe_with_gid
-from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.services import offer
 
 TOPIC = 'stop'
 _RELEASE = 'stop/release'
@@ -111,7 +111,7 @@ class StopTopic:
         self._is_protective = False
         self._releases = node.create_publisher(String, _RELEASE, qos.STREAM)
         node.create_subscription(String, _RELEASE, self._on_release, qos.STREAM)
-        node.create_service(ReleaseStop, '~/release_stop', self._on_request)
+        offer(node.create_service, ReleaseStop, '~/release_stop', self._on_request)
         node.diagnostics.expect_topic(TOPIC)
         node.diagnostics.add_update_callback(self._refresh)
         node.diagnostics.add_check(WARN, self._gone_sources)
@@ -160,12 +160,8 @@ class StopTopic:
         if self._sources.release(message.data, self._alive()):
             self._changed()
 
-    def _on_request(
-        self, request: ReleaseStop.Request, response: ReleaseStop.Response
-    ) -> ReleaseStop.Response:
-        return fill_response(response, lambda: self._requested(request.source))
-
-    def _requested(self, name: str) -> str:
+    def _on_request(self, request: ReleaseStop.Request) -> str:
+        name = request.source
         released = self.release(name)
         if self._is_protective and name in ('', self._name):
             self._is_protective = False

@@ -18,7 +18,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.services import fill_response, offer
 
 _FREE = np.int8(0)
 _FORBIDDEN = np.int8(100)
@@ -55,8 +55,8 @@ class MapEditing:
         self._mask = node.create_publisher(OccupancyGrid, 'keepout_filter_mask', qos.LATCHED)
         self._info = node.create_publisher(CostmapFilterInfo, 'costmap_filter_info', qos.LATCHED)
         node.create_active_service(AddKeepOut, 'add_keep_out', self._on_add)
-        node.create_active_service(RemoveKeepOut, 'remove_keep_out', self._on_remove)
-        node.create_active_service(EraseArea, 'erase_area', self._on_erase)
+        offer(node.create_active_service, RemoveKeepOut, 'remove_keep_out', self._on_remove)
+        offer(node.create_active_service, EraseArea, 'erase_area', self._on_erase)
 
     def publish(self) -> None:
         """Publish the areas and their mask, if they have changed."""
@@ -116,30 +116,20 @@ class MapEditing:
 
         return fill_response(response, add)
 
-    def _on_remove(
-        self, request: RemoveKeepOut.Request, response: RemoveKeepOut.Response
-    ) -> RemoveKeepOut.Response:
-        def remove() -> str:
-            before = len(self._mapper.keep_out.areas)
-            self._replace(self._mapper.keep_out.without(request.id))
-            removed = before - len(self._mapper.keep_out.areas)
-            return f'{counted(removed, "keep-out area")} removed'
+    def _on_remove(self, request: RemoveKeepOut.Request) -> str:
+        before = len(self._mapper.keep_out.areas)
+        self._replace(self._mapper.keep_out.without(request.id))
+        removed = before - len(self._mapper.keep_out.areas)
+        return f'{counted(removed, "keep-out area")} removed'
 
-        return fill_response(response, remove)
-
-    def _on_erase(
-        self, request: EraseArea.Request, response: EraseArea.Response
-    ) -> EraseArea.Response:
-        def erase() -> str:
-            latest_ns = self._latest_ns()
-            if latest_ns is None:
-                raise InputError('no map yet: expected a scan that is mapped')
-            self._mapper.erase(decode.corners(request.corners), latest_ns)
-            self.is_edited = True
-            self._on_erased()
-            return 'the cells are unknown until the laser shows them again'
-
-        return fill_response(response, erase)
+    def _on_erase(self, request: EraseArea.Request) -> str:
+        latest_ns = self._latest_ns()
+        if latest_ns is None:
+            raise InputError('no map yet: expected a scan that is mapped')
+        self._mapper.erase(decode.corners(request.corners), latest_ns)
+        self.is_edited = True
+        self._on_erased()
+        return 'the cells are unknown until the laser shows them again'
 
 
 def mask_of(keep_out: KeepOut, frame: GridFrame) -> GridPatch:

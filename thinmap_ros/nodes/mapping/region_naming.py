@@ -13,7 +13,7 @@ from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.services import offer
 
 
 class RegionNaming:
@@ -24,7 +24,7 @@ class RegionNaming:
         self._regions = regions
         self._corrected_ns = 0
         self._of: RegionTracker | None = None  # whose names follow this correction
-        node.create_active_service(NameRegion, 'name_region', self._on_name)
+        offer(node.create_active_service, NameRegion, 'name_region', self._name)
 
     def follow(self, whole: WholeMap) -> None:
         """Move the names as a correction has moved the map."""
@@ -34,11 +34,6 @@ class RegionNaming:
             tracker.names.move(MapMotion(*whole.moved))
         self._of = tracker
         self._corrected_ns = whole.corrected_ns
-
-    def _on_name(
-        self, request: NameRegion.Request, response: NameRegion.Response
-    ) -> NameRegion.Response:
-        return fill_response(response, lambda: self._name(request))
 
     def _name(self, request: NameRegion.Request) -> str:
         tracker = self._regions.tracker

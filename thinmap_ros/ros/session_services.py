@@ -1,4 +1,7 @@
-"""A session saved and loaded across nodes: each node saves and loads its own part."""
+"""A session saved and loaded across nodes: each node saves and loads its own part when asked.
+
+It may save it at its end, too.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,14 +18,80 @@ from thinmap_ros.files.sessions import (
     LOCALIZER,
     TOPOLOGY,
     SessionPart,
+    require_own_files,
     saved_with,
     stem_of,
 )
-from thinmap_ros.ros.services import call
+from thinmap_ros.ros import parameters
+from thinmap_ros.ros.clocks.time_jumps import STEADY
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.save_directory import SaveDirectory
+from thinmap_ros.ros.services import call, offer
 
 Part = SessionPart[Any, Any]
 _SAVED: tuple[Part, ...] = (TOPOLOGY, LOCALIZER, EXPLORATION)
 _LOADED: tuple[Part, ...] = (TOPOLOGY, LOCALIZER)
+
+
+def offer_saving(
+    node: ThinmapNode, directory: SaveDirectory, part: Part, save: Callable[[str, bool], str]
+) -> None:
+    """Offer service save_PART; save: gets path and overwrite, returns what was saved."""
+
+    def work(request: SaveMap.Request) -> str:
+        return save(directory.resolve_for_saving(request.path, part), request.overwrite)
+
+    offer(node.create_active_service, SaveMap, f'save_{part.name}', work)
+
+
+def offer_loading(
+    node: ThinmapNode, part: Part, check: Callable[[str], str], load: Callable[[str], str]
+) -> None:
+    """Offer services check_PART and load_PART; check, load: get the path as it was given."""
+    create = node.create_service
+    offer(create, LoadMap, f'check_{part.name}', lambda request: check(request.path))
+    offer(create, LoadMap, f'load_{part.name}', lambda request: load(request.path))
+
+
+def save_on_exit(
+    node: ThinmapNode, directory: SaveDirectory, part: Part, save: Callable[[str], str]
+) -> None:
+    """Save a part of the session of `save_on_exit` when the node ends, and now and then before.
+
+    save: gets a path, returns what was saved, '' for nothing: a node without a map saves none.
+    Raises InputError where the parameter names no path below the directory, or a file that is not
+    of thinmap.
+    """
+    given = parameters.declare_parameter(
+        node,
+        'save_on_exit',
+        '',
+        'Path stem of the session that is saved when the node ends, below save_directory. '
+        'Empty: none. Give it to localizer, grid_mapper and topology_builder.',
+    )
+    period_s = parameters.declare_parameter(
+        node,
+        'autosave_period_s',
+        0.0,
+        'Time after which the session of save_on_exit is saved again (s). 0: only at the '
+        'end. Set it where the power may fail.',
+        low=0.0,
+    )
+    if not given:
+        return
+    path = directory.resolve(str(given))
+    require_own_files(path, part)
+
+    def save_now() -> None:
+        try:
+            if saved := save(path):
+                node.get_logger().info(saved)
+        except (ThinmapError, OSError) as error:
+            node.get_logger().error(f'save_on_exit: {error}')
+
+    node.add_end_callback(save_now)
+    if float(period_s) > 0.0:
+        node.create_timer(float(period_s), save_now, clock=STEADY)
 
 
 @dataclass(frozen=True)
