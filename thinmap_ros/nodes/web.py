@@ -23,7 +23,8 @@ from thinmap_ros.core.errors import counted
 from thinmap_ros.core.planning.give_way import MESSAGE_PERIOD_S, moved_on
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.kernels import warm_up
-from thinmap_ros.nodes.steering.steering import Steering, TopSpeeds
+from thinmap_ros.nodes.steering.steering import Steering
+from thinmap_ros.nodes.steering.teleoperation import TopSpeeds
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.decoding.map_updates import subscribe_to_map

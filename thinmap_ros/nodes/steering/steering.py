@@ -1,5 +1,6 @@
 """What pages ask for, done by the node."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.nodes.steering.node_queue import NodeQueue
 from thinmap_ros.nodes.steering.session_merge import SessionMerge
 from thinmap_ros.nodes.steering.tasks import RobotTasks
-from thinmap_ros.nodes.steering.teleoperation import Teleoperation
+from thinmap_ros.nodes.steering.teleoperation import Teleoperation, TopSpeeds
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.stop_topic import StopTopic
@@ -46,14 +47,6 @@ _ALWAYS = (
     'remove_keep_out',
     'erase',
 )
-
-
-class TopSpeeds:
-    """Velocity of a joystick that is pushed to its end: ahead m/s, turn rad/s."""
-
-    def __init__(self, ahead: float, turn: float) -> None:
-        self.ahead = ahead
-        self.turn = turn
 
 
 class Hold:
@@ -116,9 +109,8 @@ class Steering:
         self._node = node
         self._picture = picture
         self._map_frame, base_frame = frames
-        self._top = top
         self._held = Hold()
-        self._drive = Teleoperation(node, base_frame)
+        self._drive = Teleoperation(node, base_frame, top)
         self._tasks = RobotTasks(node, self._map_frame, self.tell, self._show_goal)
         self._publishers = {
             _RESUME: node.create_publisher(Bool, _RESUME, qos.STREAM),
@@ -135,6 +127,7 @@ class Steering:
             'erase': node.create_client(EraseArea, 'erase_area'),
         }
         self._merge = SessionMerge(node, picture.board, self.tell)
+        self._works = self._works_by_action()
         self._later = NodeQueue(node, self.tell).put
         self._news = 0
         self._show_held()
@@ -229,24 +222,53 @@ class Steering:
         if is_stopped and request.action not in _ALWAYS:
             return  # stopped since it was taken, and perhaps released
         request.require_recent()  # it may have waited for the node
-        getattr(self, f'_do_{request.action}')(**request.values)
+        self._works[request.action](**request.values)
 
-    def _do_goal(self, x: float, y: float, theta: float) -> None:
-        self._tasks.drive_to(np.array([x, y, theta]))
+    def _works_by_action(self) -> dict[str, Callable[..., None]]:
+        """What does each action of a page, with the values of the request."""
+        merge = self._merge
+        tasks = self._tasks
+        call = self._call
+        area_of = messages.polygon_msg
+        return {
+            'goal': lambda x, y, theta: tasks.drive_to(np.array([x, y, theta])),
+            'go_to_region': self._go_to_region,
+            'home': self._go_home,
+            'initial_pose': self._set_initial_pose,
+            'explore': tasks.explore,
+            'pause': self._pause,
+            'resume': self._resume,
+            'cancel': tasks.cancel_all,
+            'drive': self._drive.drive,
+            'save': lambda name: call('save', SaveMap.Request(path=name)),
+            'load': lambda name: call('load', LoadMap.Request(path=name)),
+            'name_region': lambda region, name: call(
+                'name', NameRegion.Request(id=region, name=name)
+            ),
+            'sessions': merge.list_sessions,
+            'merge': merge.begin,
+            'merge_save': merge.save,
+            'merge_drop': merge.drop,
+            'keep_out': lambda corners, is_wall: call(
+                'keep out', AddKeepOut.Request(corners=area_of(corners), is_wall=is_wall)
+            ),
+            'remove_keep_out': lambda area: call('remove', RemoveKeepOut.Request(id=area)),
+            'erase': lambda corners: call('erase', EraseArea.Request(corners=area_of(corners))),
+        }
 
-    def _do_go_to_region(self, region: int) -> None:
+    def _go_to_region(self, region: int) -> None:
         centre = self._picture.centres.get(region)
         if centre is None:
             raise InputError(f'region {region}: expected one of the map')
         self._tasks.drive_to(np.array([*centre, 0.0]))
 
-    def _do_home(self) -> None:
+    def _go_home(self) -> None:
         start = self._picture.path.start
         if start is None:
             raise InputError('home: no pose of the robot yet')
         self._tasks.drive_to(np.array([*start, 0.0]))
 
-    def _do_initial_pose(self, x: float, y: float, theta: float) -> None:
+    def _set_initial_pose(self, x: float, y: float, theta: float) -> None:
         now_ns = int(self._node.get_clock().now().nanoseconds)
         pose = np.array([x, y, theta])
         self._publishers['initialpose'].publish(
@@ -254,54 +276,14 @@ class Steering:
         )
         self.tell(f'initial pose {x:.2f}, {y:.2f}')
 
-    def _do_explore(self, area: list[tuple[float, float]], return_home: bool) -> None:
-        self._tasks.explore(area, return_home)
-
-    def _do_pause(self) -> None:
+    def _pause(self) -> None:
         self._publishers[_RESUME].publish(Bool(data=False))
         self.tell('exploration paused')
 
-    def _do_resume(self) -> None:
+    def _resume(self) -> None:
         self._tasks.require_paused()
         self._publishers[_RESUME].publish(Bool(data=True))
         self.tell('exploration continues')
-
-    def _do_cancel(self) -> None:
-        self._tasks.cancel_all()
-
-    def _do_drive(self, ahead: float, left: float) -> None:
-        self._drive.drive(ahead * self._top.ahead, left * self._top.turn)
-
-    def _do_save(self, name: str) -> None:
-        self._call('save', SaveMap.Request(path=name))
-
-    def _do_load(self, name: str) -> None:
-        self._call('load', LoadMap.Request(path=name))
-
-    def _do_name_region(self, region: int, name: str) -> None:
-        self._call('name', NameRegion.Request(id=region, name=name))
-
-    def _do_sessions(self) -> None:
-        self._merge.list_sessions()
-
-    def _do_merge(self, first: str, second: str) -> None:
-        self._merge.begin(first, second)
-
-    def _do_merge_save(self, name: str) -> None:
-        self._merge.save(name)
-
-    def _do_merge_drop(self) -> None:
-        self._merge.drop()
-
-    def _do_keep_out(self, corners: list[tuple[float, float]], is_wall: bool) -> None:
-        request = AddKeepOut.Request(corners=messages.polygon_msg(corners), is_wall=is_wall)
-        self._call('keep out', request)
-
-    def _do_remove_keep_out(self, area: int) -> None:
-        self._call('remove', RemoveKeepOut.Request(id=area))
-
-    def _do_erase(self, corners: list[tuple[float, float]]) -> None:
-        self._call('erase', EraseArea.Request(corners=messages.polygon_msg(corners)))
 
     def _call(self, name: str, request: Any) -> None:
         client: Client = self._clients[name]

@@ -2,6 +2,7 @@
 
 from threading import Lock
 from time import monotonic
+from typing import NamedTuple
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -12,6 +13,13 @@ from thinmap_ros.ros.velocity.watchdog import CommandTimeout, CommandWatchdog
 _TIMEOUT_S = 0.2
 # After the last command the publisher stays as long as a stop may need to be received.
 _LINGER_S = 2.0
+
+
+class TopSpeeds(NamedTuple):
+    """Velocity of a joystick that is pushed to its end: ahead m/s, turn rad/s."""
+
+    ahead: float
+    turn: float
 
 
 class HoldTimeout(CommandTimeout):
@@ -33,7 +41,8 @@ class Teleoperation:
     reported by the navigator.
     """
 
-    def __init__(self, node: ThinmapNode, base_frame: str) -> None:
+    def __init__(self, node: ThinmapNode, base_frame: str, top: TopSpeeds) -> None:
+        self._top = top
         self._output = CommandPublisher(node, base_frame, declare_stamped(node))
         self._lock = Lock()
         self._sent_s = 0.0
@@ -56,10 +65,10 @@ class Teleoperation:
             self.halt()
             self._holder = None
 
-    def drive(self, v: float, w: float) -> None:
-        """Publish a velocity, m/s and rad/s; it holds for 0.3 s."""
+    def drive(self, ahead: float, left: float) -> None:
+        """Publish a velocity, as shares of the top speeds; it holds for 0.3 s."""
         self._output.open()
-        self._watchdog.send(v, w)
+        self._watchdog.send(ahead * self._top.ahead, left * self._top.turn)
 
     def halt(self) -> None:
         """Stop the robot, if somebody drives; from any thread."""
