@@ -59,7 +59,7 @@ _STOPS = round(1.0 / CONTROL_PERIOD_S)
 class _NavigatorPublishers:
     """Publishes velocity commands and the planned path.
 
-    base: whether the robot moves as commanded.
+    velocity: what is commanded; base: whether the robot moves as commanded.
     """
 
     def __init__(self, node: ThinmapNode, map_frame: str, base_frame: str, base: BaseWatch) -> None:
@@ -68,18 +68,14 @@ class _NavigatorPublishers:
         self._subscribers = 0
         self._stops = 0
         self._clock = node.get_clock()
-        self._velocity = VelocityPublisher(node, base_frame, declare_stamped(node))
+        self.velocity = VelocityPublisher(node, base_frame, declare_stamped(node))
         self._plan = node.create_publisher(Path, 'plan', qos.LATCHED)
         self._published_path: Array | None = None
         self.is_moving = False  # by the last command
         self._stop_topic: StopTopic | None = None
 
-    @property
-    def is_interrupted(self) -> bool:
-        return self._velocity.is_interrupted
-
     def command(self, v: float, w: float) -> None:
-        self._velocity.publish(v, w)
+        self.velocity.publish(v, w)
         self.base.add_sent(v, w)
         self.is_moving = v != 0.0 or w != 0.0
 
@@ -101,12 +97,6 @@ class _NavigatorPublishers:
         """Begin a protective stop, which lasts until it is released."""
         assert self._stop_topic is not None
         self._stop_topic.hold()
-
-    def hold(self, is_held: bool) -> None:
-        self._velocity.hold(is_held)
-
-    def stop(self) -> None:
-        self._velocity.stop()
 
     def plan(self, path: Array | None) -> None:
         """Publish a path (K, 2), unless it is the one that was published last."""
@@ -210,7 +200,7 @@ class NavigatorNode(ThinmapNode):
 
     def close(self) -> None:
         """Stop the robot: the last thing the node does."""
-        self._output.stop()
+        self._output.velocity.stop()
         super().close()
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
@@ -254,7 +244,7 @@ class NavigatorNode(ThinmapNode):
         if self._tasks.stop_reason and not stop.reason:
             self._output.base.release()
         self._tasks.stop_reason = stop.reason
-        self._output.hold(bool(stop.reason))
+        self._output.velocity.hold(bool(stop.reason))
         if stop.reason:
             self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, stop.reason)
         else:
@@ -290,7 +280,7 @@ class NavigatorNode(ThinmapNode):
         if fault := self._output.base.fault:
             self._end(Outcome.ABORTED, ErrorCode.UNKNOWN, fault)
             return
-        if self._output.is_interrupted:
+        if self._output.velocity.is_interrupted:
             self._navigator.reset_velocity()
         command = self._command()
         if command is None:

@@ -70,20 +70,9 @@ class _TopologyPublishers:
 
     def __init__(self, node: Node) -> None:
         self.frame_id = parameters.declare_map_frame(node)
-        self._local = _GraphPublisher(node, 'local_topology', self.frame_id)
-        self._global = _GraphPublisher(node, 'topology', self.frame_id)
+        self.local = _GraphPublisher(node, 'local_topology', self.frame_id)
+        self.map = _GraphPublisher(node, 'topology', self.frame_id)
         self.followed = FollowedMap()
-
-    @property
-    def has_published(self) -> bool:
-        return self._global.has_published
-
-    def publish_map(self, topology: TopologicalMap, stamp_ns: int, again: bool) -> bool:
-        return self._global.publish(topology, stamp_ns, self.followed.id, again)
-
-    def publish_local_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
-        # A subscriber may wait for the result of each scan (lockstep).
-        self._local.publish(topology, stamp_ns, again=self._local.has_subscribers)
 
 
 class TopologyBuilderNode(ThinmapNode):
@@ -157,7 +146,7 @@ class TopologyBuilderNode(ThinmapNode):
             self.get_logger().info(f'loaded {self._session}: {counts}')
         else:
             self._regions.reset()
-        if self._session or self._output.has_published:
+        if self._session or self._output.map.has_published:
             self._publish(self.get_clock().now().nanoseconds)
 
     def _is_of_this_map(self, message: ProbabilityGrid) -> bool:
@@ -179,10 +168,12 @@ class TopologyBuilderNode(ThinmapNode):
         with self.diagnostics.time_step('graph update'):
             changed = self._topology.step(update)
         # The first one is published even if it is empty: others wait for the graph of the map.
-        if changed is not None or not self._output.has_published:
+        if changed is not None or not self._output.map.has_published:
             self._publish(stamp_ns, again=False)
-        # The local map comes last: a subscriber that receives it has all results of this scan.
-        self._output.publish_local_map(self._topology.builder.local_map(), stamp_ns)
+        # The local map comes last: a subscriber that receives it has all results of this scan. It
+        # may wait for the result of each scan (lockstep).
+        local = self._output.local
+        local.publish(self._topology.builder.local_map(), stamp_ns, again=local.has_subscribers)
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
         if not self._is_of_this_map(message):
@@ -198,7 +189,8 @@ class TopologyBuilderNode(ThinmapNode):
 
     def _publish(self, stamp_ns: int, again: bool = True) -> None:
         self._checkpoint_new_ids()
-        if self._output.publish_map(self._topology.map, stamp_ns, again):
+        map_id = self._output.followed.id
+        if self._output.map.publish(self._topology.map, stamp_ns, map_id, again):
             self._route_graph.graph_changed()
             self._regions.graph_changed()
 
