@@ -65,11 +65,6 @@ class MapSource:
     def _is_topic(self) -> bool:
         return not self._is_mapping and self.name == 'topic map'
 
-    @property
-    def is_from_file(self) -> bool:
-        """Whether the map is the one of a file in mode localization."""
-        return not self._is_mapping and not self._session and not self._is_topic
-
     def create_localizer(self, config: StartConfig) -> AnyLocalizer:
         """A localizer at the configured pose, delocalized if in a given map."""
         if self.patch is not None and isinstance(config, LocalizerConfig):
