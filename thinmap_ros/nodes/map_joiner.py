@@ -11,7 +11,6 @@ from thinmap_ros.core.slam.joining.team_map import WORLD, RobotMap, Search, Team
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.joining.joint_map import JointMap
 from thinmap_ros.nodes.joining.robot_maps import RobotMaps
-from thinmap_ros.nodes.joining.saved_maps import SavedMaps
 from thinmap_ros.nodes.joining.settings import (
     MapJoinerConfig,
     declare_initial_poses,
@@ -24,7 +23,7 @@ from thinmap_ros.ros import messages, node_main, parameters
 from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.services import offer
 
 _POLL_S = 0.1
 _MERGE = 'merge'
@@ -37,8 +36,7 @@ class MapJoinerNode(ThinmapNode):
 
     ROBOT/keyframes and ROBOT/keyframe_poses in, where they are: with them the joint map bends.
     Also merged_regions and join_status out. Services join_maps, which gives the place of a map in
-    another one, and separate_maps, which undoes all joins of a map; map_merging/add_submap, with a
-    saved map, and map_merging/merge_submaps. Only joined maps are published.
+    another one, and separate_maps, which undoes all joins of a map. Only joined maps are published.
     Places are searched for in a thread, a pair of maps at a time.
     """
 
@@ -47,7 +45,6 @@ class MapJoinerNode(ThinmapNode):
         warn_of_confidence(self)
         self._config = parameters.declare_config(self, MapJoinerConfig)
         self._initial = declare_initial_poses(self)
-        SavedMaps(self, self._on_saved_map, self._merge_now)
         parameters.reject_unknown(self)
         warm_up.map_joiner()
         config = self._config
@@ -56,8 +53,8 @@ class MapJoinerNode(ThinmapNode):
         self._worker = Worker(_SHARE)
         self._turns = Turns()
         self.reset_state()
-        self.create_active_service(JoinMaps, 'join_maps', self._on_join)
-        self.create_active_service(SeparateMaps, 'separate_maps', self._on_separate)
+        offer(self.create_active_service, JoinMaps, 'join_maps', self._on_join)
+        offer(self.create_active_service, SeparateMaps, 'separate_maps', self._on_separate)
         discovery_s = 1.0 / config.discovery_rate
         self.create_active_timer(discovery_s, self._robots.discover, clock=STEADY)
         self.create_active_timer(_POLL_S, self._work, clock=STEADY)
@@ -71,7 +68,7 @@ class MapJoinerNode(ThinmapNode):
         self._is_merge_due = False
         self._next_merge_s = 0.0  # time of the machine
         self._next_search_s = 0.0
-        for name in self._robots.patches | self._robots.saved:
+        for name in self._robots.patches:
             self._on_map(name)
 
     def _on_map(self, name: str) -> None:
@@ -89,23 +86,6 @@ class MapJoinerNode(ThinmapNode):
         self.get_logger().warning(f'{name} has begun another map: its place is searched for')
         self._team.begin_again(name)
         self._places_changed()
-
-    def _on_saved_map(self, name: str, saved: RobotMap) -> None:
-        """A map of a file is to be joined, instead of an earlier one of that name."""
-        if name in self._robots.names:
-            raise InputError(f'{quoted(name)} is the map of a robot: expected another file name')
-        self._robots.saved[name] = saved
-        self._team.begin_again(name)
-        self._on_map(name)
-
-    def _merge_now(self) -> str:
-        """Merge the maps that are joined; returns which these are."""
-        places = self._team.places()
-        if not places:
-            raise InputError('no map has a place in another one: expected two or more that have')
-        self._is_merge_due = True
-        self._next_merge_s = 0.0
-        return f'{", ".join(sorted(places))}: merged'
 
     def _give_initial_pose(self, name: str) -> None:
         pose = self._initial.get(name)
@@ -201,34 +181,26 @@ class MapJoinerNode(ThinmapNode):
                 'joins, or the maps as they are now, contradict it'
             )
 
-    def _on_join(self, request: JoinMaps.Request, response: JoinMaps.Response) -> JoinMaps.Response:
-        def work() -> str:
-            first = request.first
-            second = request.second
-            for name in (first, second):
-                self._require_map(name, is_world_allowed=name == first)
-            if first == second:
-                raise InputError(f'second = {quoted(second)}: expected another map than first')
-            T = messages.pose_from_msg(request.pose)
-            if not se2.is_bounded_pose(T):
-                raise InputError(f'pose {T.tolist()}: expected finite numbers')
-            self._report_dropped(self._team.give(first, second, T))
-            self._places_changed()
-            return f'{second} is joined with {first}'
+    def _on_join(self, request: JoinMaps.Request) -> str:
+        first = request.first
+        second = request.second
+        for name in (first, second):
+            self._require_map(name, is_world_allowed=name == first)
+        if first == second:
+            raise InputError(f'second = {quoted(second)}: expected another map than first')
+        T = messages.pose_from_msg(request.pose)
+        if not se2.is_bounded_pose(T):
+            raise InputError(f'pose {T.tolist()}: expected finite numbers')
+        self._report_dropped(self._team.give(first, second, T))
+        self._places_changed()
+        return f'{second} is joined with {first}'
 
-        return fill_response(response, work)
-
-    def _on_separate(
-        self, request: SeparateMaps.Request, response: SeparateMaps.Response
-    ) -> SeparateMaps.Response:
-        def work() -> str:
-            self._require_map(request.name)
-            self._team.separate(request.name)
-            self._joint.begin_ids_again()
-            self._places_changed()
-            return f'{request.name} is separated until join_maps joins it'
-
-        return fill_response(response, work)
+    def _on_separate(self, request: SeparateMaps.Request) -> str:
+        self._require_map(request.name)
+        self._team.separate(request.name)
+        self._joint.begin_ids_again()
+        self._places_changed()
+        return f'{request.name} is separated until join_maps joins it'
 
     def _require_map(self, name: str, is_world_allowed: bool = False) -> None:
         """Raise InputError unless there is a map of that name."""

@@ -7,11 +7,10 @@ from support.driven_pieces import driven_piece, true_transform
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import JoinStatus, Keyframe, KeyframePoses, RegionArray, TopologicalMap
-from thinmap_msgs.srv import AddSubmap, JoinMaps, MergeMaps, SeparateMaps
+from thinmap_msgs.srv import JoinMaps, SeparateMaps
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, SentEdge
 from thinmap_ros.core.topology.flat import topology_from_msg
-from thinmap_ros.files.occupancy_maps import write_map
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -174,40 +173,6 @@ def test_the_joint_map_bends_by_keyframes_that_were_sent_before(graph, robots):
     graph.until(lambda: robots.has_transform('/robot2'), 'the transform')
     graph.until(lambda: maps, 'the joint map')
     assert 'keyframe: ' in graph.log('map_joiner')
-
-
-def test_a_saved_map_is_added_and_merged_by_the_services_of_slam_toolbox(graph, robots, tmp_path):
-    maps = graph.heard('merged_map', OccupancyGrid, qos.LATCHED)
-    robots.publish('/robot1', 1, 1)
-    write_map(tmp_path / 'house', driven_piece(1, 2).piece.patch)
-    write_map(tmp_path / 'robot1', driven_piece(1, 2).piece.patch)
-    graph.start('map_joiner', **QUICK)
-    graph.until(lambda: robots.status and robots.status[-1].maps, 'the map of the robot')
-
-    def add(filename):
-        request = AddSubmap.Request(filename=filename)
-        return graph.call(AddSubmap, 'map_merging/add_submap', request)
-
-    def merge():
-        return graph.call(MergeMaps, 'map_merging/merge_submaps', MergeMaps.Request())
-
-    early = merge()
-    assert not early.success and 'expected two or more' in early.message
-    missing = add('nowhere')
-    assert not missing.success and 'nowhere' in missing.message
-    outside = add('../elsewhere')
-    assert not outside.success and 'expected a file below' in outside.message
-    taken = add('robot1')
-    assert not taken.success and 'the map of a robot' in taken.message
-    done = add('house')
-    assert done.success, done.message
-    robots.until_joined('/robot1', '/house')
-    assert_true(se2.between(robots.place('/robot1'), robots.place('/house')))
-    graph.until(lambda: maps, 'the joint map')
-    count = len(maps)
-    done = merge()
-    assert done.success and done.message == '/house, /robot1: merged'
-    graph.until(lambda: len(maps) > count, 'the joint map again')
 
 
 def test_a_parameter_file_of_map_merge_starts_it_unchanged(graph, robots, tmp_path):

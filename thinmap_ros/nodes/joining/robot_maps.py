@@ -27,8 +27,7 @@ _TYPE = 'nav_msgs/msg/OccupancyGrid'
 class RobotMaps:
     """Subscribes to map, topology and keyframes of each robot, by its namespace.
 
-    patches, graphs: the newest ones; a robot without topological map has no graph. saved: maps of
-    files, by names of their own.
+    patches, graphs: the newest ones; a robot without topological map has no graph.
     """
 
     def __init__(
@@ -44,7 +43,6 @@ class RobotMaps:
         """
         self.patches: dict[str, GridPatch] = {}
         self.graphs: dict[str, TopologicalMap] = {}
-        self.saved: dict[str, RobotMap] = {}
         self.names: set[str] = set()
         self._node = node
         self._config = config
@@ -55,9 +53,7 @@ class RobotMaps:
         self._own = node.resolve_topic_name(config.merged_map_topic)
 
     def map_of(self, name: str) -> RobotMap:
-        """The newest map of a robot, or a saved one."""
-        if name in self.saved:
-            return self.saved[name]
+        """The newest map of a robot."""
         return RobotMap(self.patches[name], self.graphs.get(name), self._keyframes_of(name))
 
     def _keyframes_of(self, name: str) -> RobotKeyframes | None:
