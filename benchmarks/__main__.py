@@ -25,8 +25,9 @@ from benchmarks.speed import (
     thinning,
     topology_update,
 )
+from benchmarks.time_and_memory import machine
 from benchmarks.worlds import WORLDS
-from thinmap_ros.evaluation.machine import machine, write_provenance
+from thinmap_ros.evaluation.machine import write_provenance
 from thinmap_ros.evaluation.outcome import Row, show
 
 _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+from benchmarks.graphs.graph_metrics import completeness, drivable_share
+from benchmarks.time_and_memory import best_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.evaluation.graph_metrics import completeness, drivable_share
-from thinmap_ros.evaluation.machine import best_seconds
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.files.occupancy_maps import read_map
 

@@ -8,14 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from benchmarks.worlds import Floor, groups
-from thinmap_ros.baselines.voronoi import build_voronoi, voronoi_lines
-from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.topology.builder import TopologyConfig, build
-from thinmap_ros.core.topology.free_space import select_free_space
-from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
-from thinmap_ros.core.topology.thinning import thin
-from thinmap_ros.evaluation.graph_metrics import (
+from benchmarks.graphs.graph_metrics import (
     Mask,
     completeness,
     drivable_share,
@@ -23,7 +16,14 @@ from thinmap_ros.evaluation.graph_metrics import (
     loop_count,
     sight_share,
 )
-from thinmap_ros.evaluation.machine import median_seconds
+from benchmarks.time_and_memory import median_seconds
+from benchmarks.worlds import Floor, groups
+from thinmap_ros.baselines.voronoi import build_voronoi, voronoi_lines
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.free_space import select_free_space
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+from thinmap_ros.core.topology.thinning import thin
 from thinmap_ros.evaluation.outcome import Row, at_least
 from thinmap_ros.files.occupancy_maps import read_map
 

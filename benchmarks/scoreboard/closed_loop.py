@@ -10,6 +10,7 @@ from benchmarks.scoreboard.cases import DriveCase, LoopCase, flat
 from benchmarks.scoreboard.measure import config_of, play
 from benchmarks.scoreboard.played import Numbers, PlayedPipeline, rehearse, simulated_numbers
 from benchmarks.scoreboard.recordings import RecordedSimulation, Recording, read_recording
+from benchmarks.time_and_memory import forget_peak, peak_mb
 from benchmarks.worlds import floors
 from thinmap_ros.closed_loop import (
     SCANS_PER_GRAPH,
@@ -23,7 +24,6 @@ from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells

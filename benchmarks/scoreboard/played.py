@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.time_and_memory import CpuTimedPipeline, resident_mb
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.machine import CpuTimedPipeline, resident_mb
 from thinmap_ros.evaluation.trajectory_errors import aligned_rms
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.pipeline import PipelineConfig, PipelineResult

@@ -11,6 +11,7 @@ import numpy as np
 from benchmarks.kidnapped.cases import ROWS, Setting
 from benchmarks.kidnapped.summary import summary
 from benchmarks.kidnapped.trials import shifted_map
+from benchmarks.time_and_memory import median_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.likelihood import Judge
@@ -18,7 +19,6 @@ from thinmap_ros.core.places.observation import observe
 from thinmap_ros.core.places.observation_model import NodeModel, random_pose
 from thinmap_ros.core.places.place_database import Places
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
-from thinmap_ros.evaluation.machine import median_seconds
 from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.sim.drives import random_drive
 

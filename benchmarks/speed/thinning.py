@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.morphology import skeletonize
 
+from benchmarks.time_and_memory import best_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.core.topology.thinning import thin
-from thinmap_ros.evaluation.machine import best_seconds
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 
 Mask = NDArray[np.bool_]

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.drive import Drive, final_map, tour
+from benchmarks.graphs.graph_metrics import agreement, drivable_share, loop_count
 from benchmarks.worlds import floors
-from thinmap_ros.evaluation.graph_metrics import agreement, drivable_share, loop_count
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 
 _QUICK = ('dungeon/d114',)

@@ -5,6 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from benchmarks.graphs.graph_metrics import (
+    drivable_share,
+    hole_count,
+    loop_count,
+    sight_share,
+)
 from thinmap_ros.baselines.voronoi import build_voronoi, voronoi_lines
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -12,12 +18,6 @@ from thinmap_ros.core.topology.builder import TopologyConfig, build, build_along
 from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.core.topology.thinning import thin
-from thinmap_ros.evaluation.graph_metrics import (
-    drivable_share,
-    hole_count,
-    loop_count,
-    sight_share,
-)
 
 CONFIG = TopologyConfig()
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.graphs.graph_metrics import drivable_share
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.builder import TopologyConfig, build_along
@@ -13,7 +14,6 @@ from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.routes import lines
 from thinmap_ros.core.topology.routes.editing import EditedGraph, is_drivable
 from thinmap_ros.core.topology.routes.route_graph import route_graph
-from thinmap_ros.evaluation.graph_metrics import drivable_share
 
 CONFIG = TopologyConfig(max_unknown_gap_m=0.0)
 
