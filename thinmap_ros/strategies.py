@@ -22,7 +22,6 @@ _BASELINES = {
     'visit_all_end_nodes': 'VisitAllEndNodes',
     'explore_lite': 'ExploreLite',
     'information_gain': 'InformationGain',
-    'distance_advantage': 'DistanceAdvantage',
     'bounded_tour': 'BoundedTour',
 }
 NAMES = (DEFAULT, _PAPER, *_BASELINES)

@@ -8,7 +8,6 @@ import pytest
 
 from thinmap_ros.baselines.exploration import (
     BoundedTour,
-    DistanceAdvantage,
     ExploreLite,
     FrontierExplorer,
     InformationGain,
@@ -103,16 +102,6 @@ def test_explore_lite_and_information_gain_go_for_more_where_it_is_not_much_fart
     assert (values > 0.0).all()
 
 
-def test_the_advantage_of_a_frontier_grows_with_the_return_path() -> None:
-    strategy = DistanceAdvantage()
-    frontiers = after_a_look(strategy, corridor(), POSE)
-    ways = np.array([frontier.path_length_m for frontier in frontiers])
-    costs = strategy.costs(frontiers, POSE)
-    assert (costs < ways).all()
-    nearest_end = int(ways.argmin())
-    assert costs.argmin() == nearest_end
-
-
 def test_a_failed_target_is_deferred_and_reported_at_the_end() -> None:
     strategy = NearestFrontier()
     pose = POSE
@@ -158,7 +147,7 @@ def test_an_edge_is_followed_to_its_end_though_another_end_comes_nearer() -> Non
     assert goes_to(1.2, 1.2) == 14.0
 
 
-@pytest.mark.parametrize('kind', [ExploreLite, InformationGain, DistanceAdvantage, BoundedTour])
+@pytest.mark.parametrize('kind', [ExploreLite, InformationGain, BoundedTour])
 def test_targets_without_progress_are_given_up_also_by_a_robot_that_oscillates(
     kind: type[FrontierExplorer],
 ) -> None:

@@ -14,10 +14,9 @@ import yaml
 from PIL import Image
 
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.files.graphs import read_geojson
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.worlds import read_starts, read_tour, read_world
-from thinmap_ros.files.yaml import load_yaml, parse_yaml
+from thinmap_ros.files.yaml import parse_yaml
 
 WORLD = {'resolution': 0.1, 'wall_thickness': 0.2, 'start': [1, 1, 0], 'walls': [[[0, 0], [4, 0]]]}
 MAP = {'image': 'm.png', 'resolution': 0.05, 'origin': [0, 0, 0]}
@@ -78,10 +77,9 @@ def test_yaml_bombs(tmp_path: Path, name: str, read: object) -> None:
     assert time.process_time() - begun < 10.0
 
 
-def test_what_yaml_is_for_is_read(tmp_path: Path) -> None:
-    path = tmp_path / 'a.yaml'
-    path.write_text('a: [1, 2.5, 0x1f, .inf, yes, null, 2001-02-03, text]\nb:\n  c: {d: "<<"}\n')
-    assert load_yaml(path) == yaml.safe_load(path.read_text())
+def test_what_yaml_is_for_is_read() -> None:
+    text = 'a: [1, 2.5, 0x1f, .inf, yes, null, 2001-02-03, text]\nb:\n  c: {d: "<<"}\n'
+    assert parse_yaml(text) == yaml.safe_load(text)
     assert parse_yaml('') is None
 
 
@@ -114,38 +112,6 @@ def test_keys_of_several_kinds_in_a_world(tmp_path: Path) -> None:
     path.write_text(yaml.safe_dump(WORLD) + '1: 2\nzz: 3\n')
     with pytest.raises(InputError, match='key 1: expected a name'):
         read_world(path)
-
-
-@pytest.mark.parametrize('digits', [101, 400, 5000, 1_000_000])
-@pytest.mark.parametrize(
-    'place',
-    [
-        '"id": {}',
-        '"id": 1, "metadata": {{"class": "end", "clearance": {}}}',
-        '"id": -{}',
-        '"id": 1e{}',
-    ],
-)
-def test_numbers_of_many_digits_in_geojson(tmp_path: Path, place: str, digits: int) -> None:
-    path = tmp_path / 'g.geojson'
-    for coordinates in ('1, 2', f'1, {digits * "9"}'):
-        path.write_text(
-            f'{{"features": [{{"geometry": {{"type": "Point", "coordinates": [{coordinates}]}},'
-            f'"properties": {{{place.format(digits * "9")}}}}}]}}'
-        )
-        with pytest.raises(InputError) as error:
-            read_geojson(path)
-        assert len(str(error.value)) <= LONGEST and '\n' not in str(error.value)
-
-
-def test_a_kind_of_a_million_letters_in_geojson(tmp_path: Path) -> None:
-    path = tmp_path / 'g.geojson'
-    node = {'geometry': {'type': 'Point', 'coordinates': [0, 0]}}
-    node['properties'] = {'id': 1, 'metadata': {'class': 1_000_000 * 'k', 'clearance': 1}}
-    path.write_text(json.dumps({'features': [node]}))
-    with pytest.raises(InputError) as error:
-        read_geojson(path)
-    assert len(str(error.value)) <= LONGEST
 
 
 @pytest.mark.parametrize(

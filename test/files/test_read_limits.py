@@ -13,6 +13,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
 
 import lz4.frame
@@ -38,7 +39,7 @@ from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.mcap_reader import Damage, intact_records
-from thinmap_ros.logs.mcap_records import DamagedError, decompress, records_of
+from thinmap_ros.logs.mcap_records import DamagedError, Section, decompress, plain_records
 from thinmap_ros.logs.storage import own_typestore, typestore_of
 from thinmap_ros.tools.carmen_to_bag import convert
 
@@ -161,8 +162,9 @@ def schema_record(number: int) -> bytes:
 
 
 def test_definitions_without_end_are_refused(tmp_path: Path) -> None:
+    data = b''.join(schema_record(number % 2**16) for number in range(2**16 + 2))
     with pytest.raises(DamagedError, match='schemas and channels'):
-        records_of(b''.join(schema_record(number % 2**16) for number in range(2**16 + 2)))
+        plain_records(Section(BytesIO(data), len(data)))
     builder = RecordBuilder()
     Header('ros2', 'test').write(builder)
     for number in range(70):

@@ -1,4 +1,4 @@
-"""Damaged files of all kinds: logs, maps, worlds, graphs, trajectories."""
+"""Damaged files of all kinds: logs, maps, worlds, trajectories."""
 
 import gzip
 import io
@@ -12,7 +12,6 @@ from PIL import Image
 from fuzz.cases import NUMBERS, Source, chosen, damaged_bytes, damaged_text, finite, nothing, tried
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
-from thinmap_ros.files.graphs import read_geojson, write_geojson
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.trajectories import read_tum, write_tum
 from thinmap_ros.files.worlds import read_tour, read_world
@@ -190,11 +189,6 @@ def small_graph() -> TopologicalMap:
     return TopologicalMap(nodes, [Edge(4, 1, 2, path, 1.1, 0.3), Edge(5, 2, 2, ring, 3.6, 0.2)])
 
 
-def graph_text(folder: Path) -> str:
-    write_geojson(folder / 'g.geojson', small_graph())
-    return (folder / 'g.geojson').read_text()
-
-
 def sound_graph(graph: TopologicalMap) -> None:
     """Raise AssertionError unless a graph is valid."""
     for node in graph.nodes.values():
@@ -202,13 +196,6 @@ def sound_graph(graph: TopologicalMap) -> None:
     for edge in graph.edges.values():
         finite(edge.path, [edge.length_m, edge.clearance_m])
         assert {edge.a, edge.b} <= graph.nodes.keys()
-
-
-def read_any_graph(shared: str, rng: np.random.Generator, folder: Path) -> None:
-    path = write(rng, folder / 'g.geojson', shared)
-    graph = tried(lambda: read_geojson(path))
-    if graph is not None:
-        sound_graph(graph)
 
 
 def read_trajectory(shared: None, rng: np.random.Generator, folder: Path) -> None:
@@ -225,6 +212,5 @@ SOURCES = (
     Source('carmen', nothing, read_carmen),
     Source('map', nothing, read_any_map),
     Source('world', world_texts, read_any_world),
-    Source('geojson', graph_text, read_any_graph),
     Source('trajectory', nothing, read_trajectory),
 )

@@ -225,7 +225,7 @@ def test_ctrl_c_ends_it_with_a_summary(tmp_path: Path) -> None:
         'PYTHONPATH': ':'.join([*map(str, places), os.environ.get('PYTHONPATH', '')])
     }
     process = subprocess.Popen(
-        [sys.executable, '-m', 'fuzz', '--only', 'geojson', '--out', str(tmp_path)],
+        [sys.executable, '-m', 'fuzz', '--only', 'trajectory', '--out', str(tmp_path)],
         stdout=subprocess.PIPE,
         text=True,
         env=environment,

@@ -250,24 +250,6 @@ class InformationGain(ImpatientExplorer):
         )
 
 
-class DistanceAdvantage(ImpatientExplorer):
-    """The frontier with the largest distance advantage: near the robot, far from other frontiers.
-
-    Cost: path length from the robot minus the mean path length from the other frontiers, from which
-    the robot would have to return later.
-    """
-
-    def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Negative advantage."""
-        lengths = np.array([f.path_length_m for f in frontiers])
-        places = np.array([f.viewpoint for f in frontiers])
-        if len(frontiers) < 2:
-            return lengths
-        between = np.array([self.finder.path_lengths_from(place, places) for place in places])
-        between = np.where(np.isfinite(between), between, 0.0)
-        return np.asarray(lengths - between.sum(axis=0) / (len(frontiers) - 1))
-
-
 class BoundedTour(ImpatientExplorer):
     """The frontier with which the shortest open path through the nearest ones begins.
 

@@ -66,8 +66,8 @@ class Scan:
     message contradict its beams; odometry_silence_s: by how much the odometry was silent for longer
     than usual since the previous scan; None: unknown. Use `Scan.create` to make one.
 
-    Each range is one of `hit`, `distant_hit`, `no_return`, `below_range_min`, or invalid (`valid`
-    is False).
+    Each range is one of `hit`, a hit beyond the usable range, `no_return`, `below_range_min`, or
+    invalid (`valid` is False).
     Source: REP 117, with range_max as a finite value for "no return", which many drivers publish.
     """
 
@@ -173,11 +173,6 @@ class Scan:
     def hit(self) -> NDArray[np.bool_]:
         """Beams that hit an obstacle within the usable range, (N,)."""
         return self.returned & (self.ranges_m < self.max_range_m)
-
-    @cached_property
-    def distant_hit(self) -> NDArray[np.bool_]:
-        """Beams that hit an obstacle beyond the usable range: free up to there, (N,)."""
-        return self.returned & (self.ranges_m >= self.max_range_m)
 
     @cached_property
     def without_return(self) -> NDArray[np.bool_]:

@@ -25,14 +25,12 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-from thinmap_ros.core import validation
-from thinmap_ros.core.errors import InputError, one_line_reason, quoted, require_type
+from thinmap_ros.core.errors import InputError, require_type
 from thinmap_ros.core.regions.membership import Membership
 from thinmap_ros.core.regions.region_map import Region
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
-from thinmap_ros.files.atomic import atomic_write, read_text, write_text
-from thinmap_ros.files.limits import FILES
+from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.files.paths import path_of
 
 Writer = Callable[[Path, TopologicalMap, Membership | None], None]
@@ -49,7 +47,6 @@ _GRAPHML_TYPES = {
     'region_kind': 'string',
     'door': 'boolean',
 }
-_BAD_FEATURE = (KeyError, TypeError, ValueError, InputError)
 _ARRIVED_M = 0.3  # distance at which topological_navigation counts a node as reached
 _UPRIGHT = {'w': 1.0, 'x': 0.0, 'y': 0.0, 'z': 0.0}
 _SIDES = 8  # of the polygon around a node in which the robot counts as arrived
@@ -310,54 +307,6 @@ def _tmap2_node(
     }
 
 
-def read_geojson(path: Path) -> TopologicalMap:
-    """Read a topological map that `write_geojson` wrote, of at most 256 MiB, without its regions.
-
-    Raises InputError naming the file and the feature.
-    """
-    expected = 'expected a GeoJSON collection of features'
-    text = read_text(path, FILES.graph_bytes)
-    try:
-        features = json.loads(text, parse_int=_integer)['features']
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f'{path}: {one_line_reason(error)}: {expected}') from error
-    if not isinstance(features, list):
-        raise InputError(f'{path}: features: {quoted(features)}: {expected}')
-    topology = TopologicalMap()
-    lines: list[tuple[int, dict[str, Any]]] = []
-    ids: set[int] = set()
-    for i, feature in enumerate(features):
-        try:
-            kind = feature['geometry']['type']
-            if kind == _REGION:
-                continue
-            _add_id(ids, feature)
-            if kind == 'Point':
-                topology.put_node(_node(feature))
-            else:
-                lines.append((i, feature))
-        except _BAD_FEATURE as error:
-            reason = one_line_reason(error)
-            expected = 'expected a node (point with id, class) or an edge'
-            raise InputError(f'{path}: features[{i}]: {reason}: {expected}') from error
-    for i, feature in lines:
-        try:
-            if feature['properties']['id'] == feature['properties']['metadata']['edge']:
-                topology.put_edge(_edge(feature))
-        except _BAD_FEATURE as error:
-            reason = one_line_reason(error)
-            expected = 'expected an edge (line with ids, length)'
-            raise InputError(f'{path}: features[{i}]: {reason}: {expected}') from error
-    return topology
-
-
-def _integer(digits: str) -> int:
-    """Parse an integer of a JSON text; no valid number has hundreds of digits."""
-    if len(digits) > FILES.digits:
-        raise ValueError(f'a number of {len(digits)} digits: expected at most {FILES.digits}')
-    return int(digits)
-
-
 def _node_feature(node: Node, frame_id: str, regions: Membership | None) -> dict[str, Any]:
     metadata = {'class': node.kind.name.lower(), 'clearance': round(float(node.clearance_m), 3)}
     metadata |= _node_region(node, regions)
@@ -431,54 +380,6 @@ def _edge_region(edge: Edge, regions: Membership | None) -> dict[str, Any]:
 def _rounded(points: Array) -> list[list[float]]:
     """Points (N, 2), rounded to a tenth of a millimetre."""
     return [[round(float(x), 4), round(float(y), 4)] for x, y in points]
-
-
-def _number(value: Any) -> float:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not abs(value) <= validation.MAX_COORDINATE_M:
-        raise ValueError(f'{quoted(value)} is no finite number of m')
-    return float(value)
-
-
-def _id(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _MAX_ID:
-        raise ValueError(f'id {quoted(value)} is no integer from 1 to {_MAX_ID}')
-    return value
-
-
-def _add_id(ids: set[int], feature: dict[str, Any]) -> None:
-    """Raise ValueError where another feature has the id; also the two directions of an edge."""
-    number = _id(feature['properties']['id'])
-    if number in ids:
-        raise ValueError(f'id {number}: expected an id that no other feature has')
-    ids.add(number)
-
-
-def _length(metadata: dict[str, Any], name: str) -> float:
-    value = _number(metadata[name])
-    if value < 0.0:
-        raise ValueError(f'{name}: {value}: expected no negative number of m')
-    return value
-
-
-def _node(feature: dict[str, Any]) -> Node:
-    properties = feature['properties']
-    (x, y) = feature['geometry']['coordinates']
-    metadata = properties['metadata']
-    kind = NodeKind[str(metadata['class']).upper()]
-    return Node(_id(properties['id']), kind, _number(x), _number(y), _length(metadata, 'clearance'))
-
-
-def _edge(feature: dict[str, Any]) -> Edge:
-    properties = feature['properties']
-    (line,) = feature['geometry']['coordinates']
-    path = np.array([[_number(x), _number(y)] for x, y in line])
-    if len(path) < 2:
-        raise ValueError(f'a line of {len(path)} points')
-    metadata = properties['metadata']
-    ends = (_id(properties['startid']), _id(properties['endid']))
-    measures = (_length(metadata, 'length'), _length(metadata, 'clearance'))
-    return Edge(_id(properties['id']), *ends, path, *measures)
 
 
 _WRITERS: dict[str, Writer] = {

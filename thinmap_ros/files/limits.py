@@ -14,7 +14,6 @@ class FileLimits:
     yaml_bytes: int = 4 << 20
     yaml_nodes: int = 100_000  # values, lists and mappings
     yaml_levels: int = 20
-    graph_bytes: int = 256 << 20
     npz_bytes: int = 512 << 20  # decompressed
     npz_arrays: int = 64
     image_pixels: int = 1 << 26  # each needs up to 40 bytes while a graph is built

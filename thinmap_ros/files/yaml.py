@@ -33,19 +33,11 @@ _TRUE = ('y', 'yes', 'true', 'on')
 _FALSE = ('n', 'no', 'false', 'off')
 
 
-def load_yaml(path: Path) -> object:
-    """Read a YAML file: mappings, lists, texts, numbers, booleans, dates or nothing.
-
-    Raises InputError with the file name if it is no YAML, or exceeds the limits.
-    """
-    try:
-        return parse_yaml(read_text(path, FILES.yaml_bytes))
-    except _YamlError as error:
-        raise InputError(f'{path}: {error}') from error
-
-
 def parse_yaml(text: str) -> object:
-    """Parse a YAML text, as `load_yaml`. Raises InputError as it does."""
+    """Parse a YAML text: mappings, lists, texts, numbers, booleans, dates or nothing.
+
+    Raises InputError, without a file name, if it is no YAML, or exceeds the limits.
+    """
     return _parse(text, _BoundedLoader)
 
 

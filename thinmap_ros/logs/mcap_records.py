@@ -171,20 +171,15 @@ def _lz4_pieces(data: Section) -> Iterator[bytes]:
             return
 
 
-def records_of(data: bytes, whole: bool = True) -> Records:
-    """Consecutive records in `data`, up to its end or to bytes that are no record.
-
-    The message before such bytes is omitted, too: most likely its length is wrong. In truncated
-    data (not `whole`) an incomplete last record is expected. Raises DamagedError if there are too
-    many definitions.
-    """
-    return plain_records(Section(BytesIO(data), len(data)), whole)
-
-
 def plain_records(
     content: Section, whole: bool = True, wanted: frozenset[int] | None = None
 ) -> Records:
-    """Consecutive records outside of chunks, as `records_of`; wanted: as in `chunk_records`."""
+    """Consecutive records outside of chunks, up to the end or to bytes that are no record.
+
+    The message before such bytes is omitted, too: most likely its length is wrong. In truncated
+    data (not `whole`) an incomplete last record is expected. wanted: as in `chunk_records`. Raises
+    DamagedError if there are too many definitions.
+    """
     found = _Found(wanted)
     for piece in _plain_pieces(content):
         found.feed(piece)

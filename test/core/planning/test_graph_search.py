@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thinmap_ros.core.planning.graph_search import (
-    access,
     path_lengths_to_nodes,
     path_points,
     shortest_path,
@@ -92,7 +91,7 @@ def test_costs_from_a_point_reach_what_is_joined():
 def test_a_loop_is_left_by_the_shorter_side():
     ring = [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1), (0, 0)]
     topology = TopologicalMap([node(1, 0, 0)], [edge(2, 1, 1, ring)])
-    assert access(topology, 1.0, 1.0).to_node_m == pytest.approx({1: 2.0})
+    assert path_lengths_to_nodes(topology, 1.0, 1.0) == pytest.approx({1: 2.0})
 
 
 def test_a_map_without_edges_and_an_empty_one():

@@ -165,7 +165,6 @@ class GlobalLocalization:
         self._T_step: Array | None = None
         self._T_look: Array | None = None
         self._way_m = 0.0
-        self._independent = 0.0  # updates
         self._since_search = math.inf
         self._searches = 0  # that were complete, since there were not too many places to keep
         self._overview = 0.0  # updates in which all places that explain them have been known
@@ -231,7 +230,6 @@ class GlobalLocalization:
         seen = observe(scan, self.places.frame.resolution, self.config)
         self._advance(T_odom_base)
         self._since_search += novelty
-        self._independent += novelty
         every = 1.0 if self._searches < _FIRST_SEARCHES or self._explains_badly() else _LATER_EVERY
         if self._since_search >= every and not self.is_sure:
             self._search(judge, seen, T_odom_base)

@@ -36,11 +36,6 @@ class Observation:
     nodes: Array
     node_kinds: NDArray[np.int64]
 
-    @property
-    def shows_walls(self) -> bool:
-        """Whether any beam met something."""
-        return bool(self.met.any())
-
 
 def observe(scan: Scan, resolution_m: float, config: GlobalLocalizationConfig) -> Observation:
     """Observation of a scan; the nodes are those of a grid with the map's resolution."""

@@ -24,20 +24,6 @@ class Route:
     cost_m: float
 
 
-@dataclass(frozen=True)
-class GraphAccess:
-    """Where a point connects to the graph: the nearest edge and index into its path, or a node.
-
-    approach_m: straight distance from the point to the graph; to_node_m: distance from the point,
-    by this connection, to each node.
-    """
-
-    edge_id: int | None
-    index: int
-    approach_m: float
-    to_node_m: dict[int, float]
-
-
 def shortest_path(topology: TopologicalMap, start_id: int, goal_id: int) -> Route | None:
     """Shortest route between two nodes, by A*; None if no edges connect them.
 
@@ -94,30 +80,9 @@ def shortest_route(
     return _route(last_id, reached_by, best_m) if last_id else None
 
 
-def access(topology: TopologicalMap, x: float, y: float) -> GraphAccess | None:
-    """How a point (m, map frame) connects to the graph; None if the map is empty."""
-    found = topology.nearest_edge_point(x, y)
-    node = topology.nearest_node(x, y)
-    if node is None:
-        return None
-    to_node = ((node.x - x) ** 2 + (node.y - y) ** 2) ** 0.5
-    if found is None or to_node < found[2] - 1e-9:
-        return GraphAccess(None, 0, to_node, {node.id: to_node})
-    edge_id, index, approach = found
-    edge = topology.edges[edge_id]
-    along = _along(edge)
-    ends: dict[int, float] = {}
-    for node_id, length in ((edge.a, along[index]), (edge.b, along[-1] - along[index])):
-        ends[node_id] = min(ends.get(node_id, np.inf), approach + float(length))
-    return GraphAccess(edge_id, index, approach, ends)
-
-
 def path_lengths_to_nodes(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:
     """Length of the shortest path from a point (m, map frame) to every reachable node, m."""
-    start = access(topology, x, y)
-    if start is None:
-        return {}
-    costs = dict(start.to_node_m)
+    costs = _lengths_to_next_nodes(topology, x, y)
     open_nodes = [(cost, node_id) for node_id, cost in costs.items()]
     heapq.heapify(open_nodes)
     closed: set[int] = set()
@@ -132,6 +97,27 @@ def path_lengths_to_nodes(topology: TopologicalMap, x: float, y: float) -> dict[
                 costs[other] = cost + edge.length_m
                 heapq.heappush(open_nodes, (costs[other], other))
     return costs
+
+
+def _lengths_to_next_nodes(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:
+    """Length to each node of the edge that is nearest to a point, or to a node that is nearer, m.
+
+    Empty if the map is.
+    """
+    found = topology.nearest_edge_point(x, y)
+    node = topology.nearest_node(x, y)
+    if node is None:
+        return {}
+    to_node = ((node.x - x) ** 2 + (node.y - y) ** 2) ** 0.5
+    if found is None or to_node < found[2] - 1e-9:
+        return {node.id: to_node}
+    edge_id, index, approach = found
+    edge = topology.edges[edge_id]
+    along = _along(edge)
+    ends: dict[int, float] = {}
+    for node_id, length in ((edge.a, along[index]), (edge.b, along[-1] - along[index])):
+        ends[node_id] = min(ends.get(node_id, np.inf), approach + float(length))
+    return ends
 
 
 def path_points(topology: TopologicalMap, route: Route) -> Array:
