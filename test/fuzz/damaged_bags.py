@@ -16,7 +16,8 @@ from mcap.writer import CompressionType, Writer
 from thinmap_ros.core.errors import counted
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+from thinmap_ros.logs.carmen import CarmenLog
+from thinmap_ros.logs.laser_options import LaserOptions
 from thinmap_ros.tools import bag_repair, cli
 from thinmap_ros.tools.carmen_to_bag import convert
 

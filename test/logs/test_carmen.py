@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.stamps import LATEST_S
 from thinmap_ros.logs import carmen
-from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+from thinmap_ros.logs.carmen import CarmenLog
+from thinmap_ros.logs.laser_options import LaserOptions
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
 
 FLASER = 'FLASER 3 1.00 2.50 81.83 9 9 9 0.5 -0.25 1.5 976052857.337530 host 0.1\n'

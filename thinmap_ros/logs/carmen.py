@@ -21,7 +21,6 @@ from typing import IO
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
@@ -29,6 +28,7 @@ from thinmap_ros.core.stamps import LATEST_S, SECOND_NS
 from thinmap_ros.files.limits import LOGS
 from thinmap_ros.files.regular_files import open_regular_file
 from thinmap_ros.logs.formats import is_mcap, refuse_foreign
+from thinmap_ros.logs.laser_options import LaserOptions
 from thinmap_ros.logs.log import (
     Event,
     OdometryEvent,
@@ -44,29 +44,6 @@ _TOO_LONG = (
     f'expected at most {LOGS.lines} lines, and {LOGS.file_ratio} times the bytes of a gzip file: '
     'only the lines before are read'
 )
-
-
-@dataclass(frozen=True)
-class LaserOptions(Config):
-    """Properties of the laser that FLASER lines do not contain.
-
-    ROBOTLASER1 lines contain them; an offset given here takes precedence.
-    """
-
-    start_angle_deg: float = parameter(
-        -90.0, 'bearing of the first beam, degrees', low=-360.0, high=360.0
-    )
-    step_deg: float = parameter(
-        0.0,
-        'angle between beams, degrees; 0: 1 for 180 beams, else 180 over the intervals',
-        low=-10.0,
-        high=10.0,
-    )
-    offset_m: float = parameter(0.0, 'laser ahead of the robot centre, m', low=-5.0, high=5.0)
-    range_min_m: float = parameter(0.02, 'nearest valid range, m', low=0.0, high=10.0)
-    range_max_m: float = parameter(
-        80.0, 'ranges from here on are "no return", m', low=0.1, high=1000.0
-    )
 
 
 @dataclass

@@ -10,7 +10,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs import readers
-from thinmap_ros.logs.carmen import LaserOptions
+from thinmap_ros.logs.laser_options import LaserOptions
 from thinmap_ros.logs.log import Log
 
 
