@@ -23,7 +23,7 @@ from tf2_msgs.msg import TFMessage
 
 from benchmarks.faults.stream_faults import StreamFaults
 from thinmap_msgs.msg import TopologicalMap
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import messages, node_main, qos
 
 # No fault of the clock leads to a stamp below zero.

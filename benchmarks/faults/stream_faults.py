@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.ros import messages
 
 _BLIND = {'laser_nan': np.nan, 'laser_zero': 0.0, 'laser_inf': np.inf}

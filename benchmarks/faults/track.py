@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 
 _SPAN_NS = 60 * SECOND_NS
 _SPEED_NS = SECOND_NS // 2

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import inverse
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, inverse
 from thinmap_ros.core.slam.graph.keyframe_graph import KeyframeGraph
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Keyframes, Step
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge

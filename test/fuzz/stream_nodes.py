@@ -21,8 +21,8 @@ from fuzz.cases import Source, chosen, finite, nothing, tried
 from fuzz.strange_messages import numbers
 from fuzz.streams import START_NS, STEP_NS, Stream
 from thinmap_ros.core.odometry import OdometryIncrements
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.grid_mapper import GridMapperNode
 from thinmap_ros.nodes.localizer import LocalizerNode

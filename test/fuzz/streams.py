@@ -19,8 +19,7 @@ from fuzz.cases import chosen
 from thinmap_msgs.msg import LocalGrid, LocalizedScan, ProbabilityGrid, SlamStatus
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.ros import messages
 
 STEP_NS = 50_000_000

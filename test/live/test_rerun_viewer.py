@@ -6,7 +6,7 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 from support.hidden_library import hide
 
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.view import rerun_sinks
 

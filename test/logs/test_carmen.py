@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.stamps import LATEST_S
+from thinmap_ros.core.se2 import LATEST_S
 from thinmap_ros.logs import carmen
 from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.laser_options import LaserOptions

@@ -8,7 +8,7 @@ from support.driven_pieces import world_of
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.sim.drives import random_drive, random_start
 
 PERIOD_NS = SECOND_NS // 5

@@ -12,7 +12,7 @@ from support.bag_maker import ODOMETRY, SCAN, TF, Maker, write
 from support.carmen_log import box_ranges, carmen_lines
 from support.forks import forked
 
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.logs.bag_writer import BagWriter
 
 SCANS = 60

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, Field
-from thinmap_ros.core.stamps import SECOND_NS
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, config_or_default, parameter
 from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 
 # With a smaller share of valid beams, the space in front of the laser is unobserved.
 MIN_VALID_BEAM_RATIO = 0.1

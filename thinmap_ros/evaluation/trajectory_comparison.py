@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.evaluation.trajectory_errors import between_paths, known_relation_errors
 from thinmap_ros.files.trajectories import read_tum
 

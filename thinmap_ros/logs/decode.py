@@ -13,8 +13,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.keep_out import KeepOut, KeepOutArea
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import LaserConfig, Scan
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 
 
 def time_ns(stamp: Any) -> int:

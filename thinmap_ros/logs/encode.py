@@ -6,8 +6,7 @@ import numpy as np
 
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.flat import flat_topology
 from thinmap_ros.core.topology.graph import TopologicalMap
 

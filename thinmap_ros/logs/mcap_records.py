@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Message, Schema
 from numpy.typing import NDArray
 
-from thinmap_ros.core.stamps import LATEST_NS
+from thinmap_ros.core.se2 import LATEST_NS
 from thinmap_ros.files.limits import LOGS, PIECE_BYTES
 
 MAGIC = b'\x89MCAP0\r\n'

@@ -14,8 +14,7 @@ from thinmap_ros.core.planning.navigator import (
     Navigator,
     NavigatorConfig,
 )
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.logs import decode

@@ -37,9 +37,8 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.scan import LaserConfig, Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.slam.covariance import UNKNOWN
-from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.flat import FIELDS, flat_topology
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.logs import decode

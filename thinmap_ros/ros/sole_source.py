@@ -12,7 +12,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros.diagnostics import WARN, NodeDiagnostics
 
 # After a time without a message of the followed publisher, the next one is followed: a driver that

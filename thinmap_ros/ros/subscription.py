@@ -25,7 +25,7 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import LocalizedScan, SlamStatus, TeamClaim
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

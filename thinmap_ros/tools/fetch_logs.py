@@ -11,7 +11,7 @@ import zlib
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, counted
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import OdometryEvent

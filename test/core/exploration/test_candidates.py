@@ -16,7 +16,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
 FRAME = GridFrame(0.0, 0.0, 0.1)

@@ -7,7 +7,7 @@ import pytest
 from support.slam_room import ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import rotated_covariance
+from thinmap_ros.core.se2 import rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import Anchor
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig

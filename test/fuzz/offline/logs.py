@@ -13,9 +13,9 @@ from support.ros1_bag import converted
 from fuzz.cases import Source, chosen, damaged_bytes, damaged_text, finite, nothing, tried
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.slam.localizers import default_config
-from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.start import StartConfig
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.log import (

@@ -7,7 +7,7 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
 from thinmap_ros.logs.order.clock_jumps import ClockJumpError, stamp_of
 from thinmap_ros.logs.order.stamp_order import by_stamp

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.logs.log import OdometryEvent, ScanEvent
 from thinmap_ros.logs.order.unused_scans import UnusedScans
 

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import BOUND_SIGMAS, rotation
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, rotation
 
 _ITERATIONS = 3
 

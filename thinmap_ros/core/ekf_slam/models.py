@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.covariances import rotation
-from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.se2 import Array, rotation, wrap
 
 
 @dataclass(frozen=True)

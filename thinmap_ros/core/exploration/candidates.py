@@ -24,8 +24,7 @@ from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode, un
 from thinmap_ros.core.exploration.unknown_space import depth_behind_m, hidden_area_m2
 from thinmap_ros.core.exploration.viewpoints import Cell, place_for, search_beside
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
 SETTLED = 0.999  # probability of an end node without a frontier

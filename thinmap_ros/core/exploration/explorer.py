@@ -48,8 +48,7 @@ from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import NO_PATH
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 _TURN_FROM_M = 0.3  # paths that are shorter begin with no turn

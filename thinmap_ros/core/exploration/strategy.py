@@ -12,8 +12,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.belief.model import MissingArea, missing_area
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 # Ids from here on are those of frontier candidates that no end node sees.

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.covariances import BOUND_SIGMAS
 from thinmap_ros.core.places.likelihood import LOG_ODDS_A_BEAM, SILENT_COUNTS
 from thinmap_ros.core.places.search import distinct_indices, moved
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array
 from thinmap_ros.jit import kernel
 
 # Shares of the beams that fall to either side at edges: by chance, and, as the cells of the map

@@ -7,13 +7,12 @@ import math
 
 import numpy as np
 
-from thinmap_ros.core.covariances import BOUND_SIGMAS
 from thinmap_ros.core.places import likelihood_kernels
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.observation import Observation
 from thinmap_ros.core.places.observation_model import NodeModel
 from thinmap_ros.core.places.place_database import NEAR_UNIT_M, Places
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array
 
 # A beam that one place explains and another does not: about 1 in log odds, but beams that miss come
 # in groups.

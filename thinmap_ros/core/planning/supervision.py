@@ -8,8 +8,7 @@ from typing import NamedTuple
 from thinmap_ros.core import se2
 from thinmap_ros.core.odometry import OdometryLimits
 from thinmap_ros.core.planning.navigator import SENSOR_DELAY_NS, NavigatorConfig
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 
 # Dead time of base and network together: with 0.8 s the simulated robot still follows its paths.
 _DEAD_TIME_S = 1.0

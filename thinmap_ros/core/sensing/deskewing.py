@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.jit import inlined, kernel
 
 # Largest relative difference between the stated and the measured time of a revolution.

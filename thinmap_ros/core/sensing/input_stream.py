@@ -3,7 +3,7 @@
 from collections import deque
 from statistics import median
 
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 
 _USUAL_INTERVALS = 5
 _GAP_INTERVALS = 3.0  # a longer silence is no low rate

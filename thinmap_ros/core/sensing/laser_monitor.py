@@ -7,10 +7,9 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import MIN_HITS, Scan, is_most_missed
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.sensing.dropouts import DropoutDetector
 from thinmap_ros.core.sensing.no_return_range import NoReturnRange
-from thinmap_ros.core.stamps import SECOND_NS
 
 FROZEN = 'the same ranges while the robot moves'
 NO_RETURNS = 'no returns from surfaces that it has just measured'

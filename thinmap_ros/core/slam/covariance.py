@@ -11,14 +11,14 @@ the calibration, and S the derivative of the pose by it.
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import (
+from thinmap_ros.core.se2 import (
+    Array,
     carried,
     inverse,
     propagated_covariance,
     rotated_covariance,
     rotation,
 )
-from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 
 CHI2 = 11.34  # 99 % of three degrees of freedom

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import carried, rotation
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, carried, rotation
 from thinmap_ros.core.slam.graph.rows import Rows
 from thinmap_ros.jit import kernel
 

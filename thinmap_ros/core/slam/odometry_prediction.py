@@ -5,11 +5,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import rotated_covariance, rotation
 from thinmap_ros.core.ekf_slam.models import odometry_variances
 from thinmap_ros.core.odometry import OdometryIncrement, OdometryIncrements
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, rotated_covariance, rotation
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 from thinmap_ros.core.slam.motion_model import MotionConfig, MotionModel, MotionPrediction
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration

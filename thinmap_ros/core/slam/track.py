@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import propagated_covariance, rotated_covariance
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.covariance import PoseUncertainty
 from thinmap_ros.core.slam.map_evidence import MapEvidence
 from thinmap_ros.core.slam.odometry_prediction import Prediction

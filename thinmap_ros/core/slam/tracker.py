@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import BOUND_SIGMAS, rotated_covariance, rotation
 from thinmap_ros.core.ekf_slam.models import odometry_slip
 from thinmap_ros.core.scan import Scan, few_beams_reason
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, rotated_covariance, rotation
 from thinmap_ros.core.slam.graph.keyframes import Anchor
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.map_evidence import INLIERS_PER_CONTRADICTION, MapEvidence

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import CLOCK_JUMP_NS, SECOND_NS
+from thinmap_ros.core.se2 import CLOCK_JUMP_NS, SECOND_NS, Array
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
 
 # Odometry continues where it moves at most so many steps as before: two samples may be lost.

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.stamps import CLOCK_JUMP_NS
+from thinmap_ros.core.se2 import CLOCK_JUMP_NS
 from thinmap_ros.logs.log import Event, OdometryEvent
 from thinmap_ros.logs.order.clock_jumps import ClockJumpError, stamp_of
 

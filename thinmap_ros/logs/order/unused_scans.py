@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.logs.log import Event, OdometryEvent
 
 _UNITS = (('s', 1.0), ('h', 3600.0), ('days', 86400.0), ('years', 365.25 * 86400.0))

@@ -9,8 +9,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.foreign_maps import scan_in_map
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.laser_transform import LaserTransform

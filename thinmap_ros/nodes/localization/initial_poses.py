@@ -6,9 +6,8 @@ from typing import Any
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import rotated_covariance
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, rotated_covariance
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded

@@ -11,8 +11,7 @@ from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.nodes.navigation.map_input import MapInput
 from thinmap_ros.ros import messages, parameters
 from thinmap_ros.ros.action_server import InvalidGoalError

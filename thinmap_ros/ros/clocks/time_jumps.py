@@ -5,7 +5,7 @@ from time import monotonic_ns
 from rclpy.clock import Clock, ClockType, JumpThreshold, ROSClock, TimeJump
 from rclpy.duration import Duration
 
-from thinmap_ros.core.stamps import CLOCK_JUMP_NS
+from thinmap_ros.core.se2 import CLOCK_JUMP_NS
 
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """Clock of the machine, which nobody sets: for timers."""

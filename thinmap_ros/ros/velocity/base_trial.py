@@ -10,7 +10,7 @@ from rclpy.node import Node
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.diagnostics import publisher_names
 from thinmap_ros.ros.robot_check import Finding

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from thinmap_ros.core.exploration.team.claims import Claim, Claims
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS
 
 
 def claim(robot, second, remaining_m=5.0, place=(1.0, 2.0)):

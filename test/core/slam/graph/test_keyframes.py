@@ -8,7 +8,7 @@ import pytest
 from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import inverse, propagated_covariance, rotated_covariance
+from thinmap_ros.core.se2 import inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph import keyframes as module
 from thinmap_ros.core.slam.graph.edge_table import EdgeTable
 from thinmap_ros.core.slam.graph.heading_table import heading_row

@@ -7,7 +7,7 @@ import pytest
 from support.slam_room import ROOM, corridor_ring, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import inverse, propagated_covariance, rotated_covariance
+from thinmap_ros.core.se2 import inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph import keyframe_graph
 from thinmap_ros.core.slam.graph import loop_closure as module
 from thinmap_ros.core.slam.graph.consistency import largest_consistent

@@ -8,9 +8,9 @@ import pytest
 from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import inverse
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import inverse
 from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph import packed_scans, saved_keyframes
 from thinmap_ros.core.slam.graph.keyframes import Keyframe

@@ -7,7 +7,7 @@ import pytest
 from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import inverse
+from thinmap_ros.core.se2 import inverse
 from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph.edge_table import EdgeTable
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Step

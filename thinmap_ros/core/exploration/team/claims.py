@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.stamps import SECOND_NS
+from thinmap_ros.core.se2 import SECOND_NS, Array
 
 Place = tuple[float, float]
 SAME_PLACE_M = 0.5  # a claimed place that moves less is the same one

@@ -14,13 +14,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import inverse
 from thinmap_ros.core.places.recognition.drift import SAME_M, SAME_RAD, agree, are_same
 from thinmap_ros.core.places.recognition.evidence import Evidence, ViewJudge
 from thinmap_ros.core.places.recognition.landmarks import Landmarks
 from thinmap_ros.core.places.recognition.piece import MapPiece
 from thinmap_ros.core.places.recognition.views import SPACING_M, WINDOW_M, View
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, inverse
 
 # Of one view. Neighbouring views are not independent, and the model may be wrong: with twice as
 # much a foreign pair of maps was joined, with half as much a real building was not.

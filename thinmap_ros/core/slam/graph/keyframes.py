@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.covariances import (
+from thinmap_ros.core.grid.spatial_hash import SpatialHash
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import (
+    Array,
     carried,
     inverse,
     propagated_covariance,
     rotated_covariance,
     rotation,
 )
-from thinmap_ros.core.grid.spatial_hash import SpatialHash
-from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.edge_table import EdgeTable
 from thinmap_ros.core.slam.graph.heading_table import HeadingTable
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, EdgeArrays, Systematic

@@ -13,16 +13,16 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.covariances import (
+from thinmap_ros.core.estimate import Correction
+from thinmap_ros.core.places.recognition.decision import JOIN_ODDS
+from thinmap_ros.core.se2 import (
+    Array,
     carried,
     inverse,
     propagated_covariance,
     rotated_covariance,
     rotation,
 )
-from thinmap_ros.core.estimate import Correction
-from thinmap_ros.core.places.recognition.decision import JOIN_ODDS
-from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import CHI2
 from thinmap_ros.core.slam.graph.consistency import largest_consistent
 from thinmap_ros.core.slam.graph.keyframe_graph import KeyframeGraph

@@ -3,8 +3,7 @@
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import inverse
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, inverse
 from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Edge

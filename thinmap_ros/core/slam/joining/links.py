@@ -6,11 +6,10 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import inverse, rotated_covariance
 from thinmap_ros.core.places.recognition.drift import DRIFT
 from thinmap_ros.core.places.recognition.recognition import Hypothesis
 from thinmap_ros.core.places.recognition.views import View
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, inverse, rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, view_difference_m
 from thinmap_ros.core.slam.graph.loop_closure import EDGE_NOISE, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge

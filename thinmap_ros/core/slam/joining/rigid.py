@@ -5,8 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import inverse, propagated_covariance, rotated_covariance
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
 from thinmap_ros.core.slam.joining.links import Prior, match_keyframes
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece

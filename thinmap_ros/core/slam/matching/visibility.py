@@ -6,10 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.covariances import BOUND_SIGMAS
 from thinmap_ros.core.grid.tiles import NO_TILE
 from thinmap_ros.core.scan import Scan, is_most_missed
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array
 from thinmap_ros.core.slam.matching.local_map import (
     MIN_HIT_RATIO,
     TILE_MASK,
