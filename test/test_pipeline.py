@@ -7,7 +7,7 @@ import pytest
 from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.pipeline import Pipeline
 
 HERE = se2.pose(2.0, 2.0, 0.0)

@@ -10,7 +10,6 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter, part
 from thinmap_ros.core.errors import ConfigError, quoted
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.live.drives import Drives
 from thinmap_ros.core.exploration.mission import Odometer
 from thinmap_ros.core.exploration.observations import Observation
@@ -21,6 +20,7 @@ from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import ObservableCells
 from thinmap_ros.sim.laser import LaserScannerConfig

@@ -9,7 +9,6 @@ from benchmarks.places.make import explored
 from benchmarks.worlds import Floor
 from thinmap_ros.closed_loop import ClosedLoop
 from thinmap_ros.core import se2
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
@@ -20,6 +19,7 @@ from thinmap_ros.core.slam.joining.keyframe_sender import KeyframeSender
 from thinmap_ros.core.slam.joining.robot_keyframes import ReceivedKeyframes, RobotKeyframes
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.surface import surface_points
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.builder import build
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap

@@ -24,12 +24,12 @@ from thinmap_msgs.msg import (
     TeamClaim,
     TopologicalMap,
 )
-from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.exploration.team.team import MAX_SETTLED
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.joined_maps import JoinedMaps
 from thinmap_ros.core.grid.map_tiles import TileSender
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.stage import Destination
 from thinmap_ros.core.topology.flat import FIELDS, topology_from_msg
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
@@ -368,7 +368,7 @@ def check_grid(message):
 def check_localized_scan(message):
     found = localized_scan_from_msg(message)
     assert np.isfinite(found.scan.points_base()).all() and np.isfinite(found.T_map_base).all()
-    assert found.corrected_ns >= 0 and found.placement in Placement
+    assert found.corrected_ns >= 0 and found.placement in Destination
 
 
 def check_local_grid(message):

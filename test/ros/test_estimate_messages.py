@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.ros import messages
 
 

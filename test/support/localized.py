@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from thinmap_msgs.msg import LocalGrid, SlamStatus
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.localized_scan import localized_scan_msg
 

@@ -10,12 +10,12 @@ from thinmap_ros.baselines.exploration import NearestFrontier
 from thinmap_ros.closed_loop import ClosedLoop
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.strategy import Strategy
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.pipeline import Pipeline
 
 

@@ -17,14 +17,12 @@ from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ThinmapError
-from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.stage import Trajectory
-from thinmap_ros.core.start import LOCALIZATION, MAPPING
+from thinmap_ros.core.stage import LOCALIZATION, MAPPING, Destination, Trajectory
 from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.mapping.map_editing import MapEditing
@@ -219,7 +217,7 @@ class GridMapperNode(ThinmapNode):
         stamp_ns = localized.scan.stamp_ns
         if self._stamp.is_restarted_by(stamp_ns):
             self.reset_state()
-        placement = localized.placement if self._settings.mapping else Placement.NOWHERE
+        placement = localized.placement if self._settings.mapping else Destination.NOWHERE
         with self.diagnostics.time_step('map update'):
             scan = self._team.without(localized.scan, localized.T_map_base)
             update = self._mapper.step(

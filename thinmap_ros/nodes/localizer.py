@@ -21,7 +21,6 @@ from thinmap_ros.core import snapshot
 from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
@@ -36,7 +35,7 @@ from thinmap_ros.core.slam.localizers import (
     parameters_elsewhere,
 )
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.start import SCAN_MATCHING, StartConfig
+from thinmap_ros.core.stage import SCAN_MATCHING, Correction, Estimate, StartConfig
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.files.sessions import LOCALIZER, save_localizer

@@ -8,10 +8,9 @@ from geometry_msgs.msg import PoseWithCovariance
 from thinmap_msgs.msg import LocalGrid, SlamStatus
 from thinmap_msgs.msg import LocalizedScan as LocalizedScanMsg
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.core.estimate import Estimate, Placement
 from thinmap_ros.core.grid.mapper import MapUpdate
 from thinmap_ros.core.scan import LaserConfig, Scan
-from thinmap_ros.core.stage import LocalizedScan
+from thinmap_ros.core.stage import Destination, Estimate, LocalizedScan
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import messages
 
@@ -72,13 +71,13 @@ def localized_scan_from_msg(message: LocalizedScanMsg) -> ReceivedScan:
     )
 
 
-def _placement(status: SlamStatus) -> Placement:
+def _placement(status: SlamStatus) -> Destination:
     """Where the scan belongs: nowhere if the robot is lost, or the laser shows nothing."""
     if status.state == SlamStatus.MAPPING_APART:
-        return Placement.APART
+        return Destination.APART
     if status.state != SlamStatus.TRACKING:
-        return Placement.NOWHERE
-    return Placement.OPEN if status.is_contradicted else Placement.MAP
+        return Destination.NOWHERE
+    return Destination.OPEN if status.is_contradicted else Destination.MAP
 
 
 def map_update_from_msg(message: LocalGrid) -> MapUpdate:

@@ -30,7 +30,6 @@ from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M
 from thinmap_ros.core.grid.mapper import WholeMap
 from thinmap_ros.core.grid.patch import GridPatch
@@ -39,6 +38,7 @@ from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.slam.covariance import UNKNOWN
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.flat import FIELDS, flat_topology
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.logs import decode

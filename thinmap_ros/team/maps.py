@@ -6,12 +6,12 @@ from typing import Protocol
 import numpy as np
 
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, ground_truth_poses
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap
 

@@ -6,7 +6,6 @@ from functools import reduce
 import numpy as np
 
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.team.team import Team
 from thinmap_ros.core.grid.map_tiles import (
@@ -19,6 +18,7 @@ from thinmap_ros.core.grid.map_tiles import (
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.team.radio import Radio, Trouble

@@ -13,11 +13,10 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, ThinmapError
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.start import StartConfig
+from thinmap_ros.core.stage import Estimate, StartConfig
 from thinmap_ros.evaluation.batch import jobs_of, run_batch
 from thinmap_ros.evaluation.parallel_jobs import add_run_options
 from thinmap_ros.files.atomic import atomic_write

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from support.slam_room import corridor_ring, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid import rerendering
 from thinmap_ros.core.grid.correctable import MAX_OPEN, CorrectableGrid
 from thinmap_ros.core.grid.occupancy import (
@@ -25,6 +24,7 @@ from thinmap_ros.core.grid.patch import UNKNOWN
 from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.scan import LaserConfig, Scan
+from thinmap_ros.core.stage import Destination
 
 WALLS = corridor_ring()
 CORNERS = np.array([[1.2, 1.2], [38.8, 1.2], [38.8, 18.8], [1.2, 18.8], [1.2, 1.2]])
@@ -393,13 +393,13 @@ def occupied_after(placements, correct_at=None):
             stamps = np.array([SCANS[i].stamp_ns for i in numbers], dtype=np.int64)
             grid.apply_correction(stamps, TRUE[numbers], SCANS[number].stamp_ns)
         # Where the place is unknown, so is the pose.
-        at = TRUE[number] + (100.0 if placement is Placement.APART else 0.0)
+        at = TRUE[number] + (100.0 if placement is Destination.APART else 0.0)
         grid.update(SCANS[number], at, placement)
     grid.finish()
     return grid.shown.known_area().occupied.sum(), grid
 
 
-MAP, OPEN, APART, NOWHERE = Placement
+MAP, OPEN, APART, NOWHERE = Destination
 
 
 def test_scans_whose_placement_is_open_wait_until_it_is_decided():

@@ -6,7 +6,6 @@ from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.edits import MAX_ERASURES, Erasures, MapEdits, split_edits
 from thinmap_ros.core.grid.keep_out import KeepOut
@@ -14,7 +13,7 @@ from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import UNKNOWN
 from thinmap_ros.core.grid.polygon import touched_cells
-from thinmap_ros.core.stage import LocalizedScan, Trajectory
+from thinmap_ros.core.stage import Destination, LocalizedScan, Trajectory
 
 POSES = [se2.pose(2.0 + 0.3 * k, 2.0, 0.0) for k in range(8)]
 SCANS = [scan_in(ROOM, T, None, k + 1) for k, T in enumerate(POSES)]
@@ -35,7 +34,7 @@ def part_of(grid):
 
 def add(mapper, numbers, shift=(0.0, 0.0, 0.0), trajectory=None):
     for k in numbers:
-        mapper.step(LocalizedScan(SCANS[k], POSES[k] + shift, Placement.MAP, trajectory))
+        mapper.step(LocalizedScan(SCANS[k], POSES[k] + shift, Destination.MAP, trajectory))
         trajectory = None
 
 

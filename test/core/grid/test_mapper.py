@@ -6,17 +6,16 @@ from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyConfig
-from thinmap_ros.core.stage import LocalizedScan, Trajectory
+from thinmap_ros.core.stage import Destination, LocalizedScan, Trajectory
 
 POSES = [se2.pose(2.0 + 0.3 * k, 2.0, 0.0) for k in range(8)]
 
 
 def localized(k, T_map_base, trajectory=None):
     scan = scan_in(ROOM, POSES[k], None, k + 1)
-    return LocalizedScan(scan, T_map_base, Placement.MAP, trajectory)
+    return LocalizedScan(scan, T_map_base, Destination.MAP, trajectory)
 
 
 def corrected(mapper):

@@ -10,7 +10,6 @@ from support.slam_room import BLIND, ROOM, drive, drive_round_the_block, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
@@ -19,6 +18,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.matching.local_map import MIN_HIT_RATIO, LocalMapConfig
+from thinmap_ros.core.stage import Destination
 from thinmap_ros.sim.drives import DriveConfig
 from thinmap_ros.sim.drives import drive as drive_along
 from thinmap_ros.sim.laser import LaserScannerConfig
@@ -523,7 +523,7 @@ def test_a_carried_robot_sees_through_walls_where_its_scans_fit_the_map_that_gro
     apart = [estimate.is_mapping_apart for _, estimate in carried]
     assert any(apart[:60])
     assert all(apart[60:])
-    mapped = [row for row in carried if row[1].placement is Placement.MAP]
+    mapped = [row for row in carried if row[1].placement is Destination.MAP]
     assert not any(np.hypot(*(e.T_map_base - truth)[:2]) > 0.5 for truth, e in mapped)
 
 
@@ -552,7 +552,7 @@ def test_what_is_mapped_apart_is_not_saved_and_the_pose_of_a_user_leaves_it():
     back = on(localizer, 10, truth, carried[-1][2], rng)
     assert not any(estimate.is_mapping_apart for _, estimate, _ in back)
     assert worst(back) < 0.1
-    assert all(estimate.placement is Placement.MAP for _, estimate, _ in back[-5:])
+    assert all(estimate.placement is Destination.MAP for _, estimate, _ in back[-5:])
 
 
 def test_a_robot_that_was_lost_in_a_crowd_joins_its_map_again():
@@ -578,7 +578,7 @@ def test_a_loaded_map_in_which_the_robot_is_elsewhere_stays_as_it_is(whole_drive
     second = Localizer.from_state(state, LocalizerConfig(**AT_START))
     estimates = [estimate for _, estimate in driven_elsewhere(second, (4.1, 7.0, 1.5))]
     assert all(estimate.is_mapping_apart for estimate in estimates[60:])
-    assert not any(estimate.placement is Placement.MAP for estimate in estimates)
+    assert not any(estimate.placement is Destination.MAP for estimate in estimates)
     after = second.state()
     for name, array in state.items():
         np.testing.assert_array_equal(after[name], array)
@@ -797,7 +797,7 @@ def test_a_guessed_start_pose_is_confirmed_by_the_way_alone(guess, is_right):
         estimate = localizer.step(scan, odom)
         off_m = np.hypot(*(estimate.T_map_base - truth)[:2])
         assert estimate.is_lost or (off_m < 0.1 and k > 100)
-        assert estimate.placement is not Placement.MAP or off_m < 0.1
+        assert estimate.placement is not Destination.MAP or off_m < 0.1
     assert estimate.is_lost != is_right
 
 

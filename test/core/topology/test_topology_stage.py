@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.mapper import MapUpdate, WholeMap
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.stage import LocalizedScan
+from thinmap_ros.core.stage import Destination, LocalizedScan
 from thinmap_ros.core.topology.layers.stack import Layers
 from thinmap_ros.core.topology.topology import Finished, Topology
 
@@ -54,7 +53,7 @@ def wall(x=3.0):
 
 def update(patch, corrected_ns, stamp_ns=10, is_rerendering=False, T_map_base=POSES[-1]):
     scan = Scan.create(stamp_ns, np.full(181, 2.0), -math.pi / 2, math.pi / 180, 0.05, 8.0)
-    localized = LocalizedScan(scan, T_map_base, Placement.MAP)
+    localized = LocalizedScan(scan, T_map_base, Destination.MAP)
     return MapUpdate(localized, patch, corrected_ns, is_rerendering)
 
 

@@ -16,7 +16,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.slam.localizers import default_config
-from thinmap_ros.core.start import StartConfig
+from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.log import (
     Event,

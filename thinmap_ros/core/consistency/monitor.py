@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from thinmap_ros.core import se2
 from thinmap_ros.core.consistency.mount_error import MountError, MountErrorEstimator
 from thinmap_ros.core.consistency.turn_comparison import TurnComparison
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stage import Estimate
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,10 @@ from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.features import LineFeature
 from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
 from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odometry_variances
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.odometry import OdometryAnchor, OdometryIncrement, OdometryIncrements
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.start import EKF_FULL, EKF_TI, StartConfig, slam_parameter
+from thinmap_ros.core.stage import EKF_FULL, EKF_TI, Estimate, StartConfig, slam_parameter
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 _START = np.diag(np.square([1e-4, 1e-4, 1e-4]))  # of the initial pose, which defines the map frame

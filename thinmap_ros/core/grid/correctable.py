@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Placement
 from thinmap_ros.core.grid.edits import Erasures
 from thinmap_ros.core.grid.erasing import erase
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
@@ -17,6 +16,7 @@ from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.scan_history import CorrectedPoses, PoseHistory
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stage import Destination
 
 MAX_OPEN = 1000  # scans that wait, the latest; 10 MB of a robot that stands at a start pose
 
@@ -95,7 +95,7 @@ class CorrectableGrid:
         return True
 
     def update(
-        self, scan: Scan | None, T_map_base: Array, placement: Placement = Placement.MAP
+        self, scan: Scan | None, T_map_base: Array, placement: Destination = Destination.MAP
     ) -> CorrectedPoses | None:
         """Continue the re-rendering, then add a scan made at a robot pose (3,).
 
@@ -105,24 +105,24 @@ class CorrectableGrid:
         """
         self._T_map_base = T_map_base
         if scan is None:
-            placement = Placement.NOWHERE
-        if placement is Placement.MAP:
+            placement = Destination.NOWHERE
+        if placement is Destination.MAP:
             self._end_apart()
         moved = self._render_slice()
         if scan is not None:
             self._place(scan, T_map_base, placement)
         return moved
 
-    def _place(self, scan: Scan, T_map_base: Array, placement: Placement) -> None:
-        if placement is Placement.MAP:
+    def _place(self, scan: Scan, T_map_base: Array, placement: Destination) -> None:
+        if placement is Destination.MAP:
             self._set_drops_out(scan.drops_out)
             for earlier, T_earlier in self._open:
                 self._add_scan(earlier, T_earlier)
             self._open.clear()
             self._add_scan(scan, T_map_base)
-        elif placement is Placement.OPEN:
+        elif placement is Destination.OPEN:
             self._open.append((scan, T_map_base))
-        elif placement is Placement.APART:
+        elif placement is Destination.APART:
             self._open.clear()
             self._store_apart(scan, T_map_base)
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.ekf_slam.features import LineFeature
 from thinmap_ros.core.ekf_slam.models import odometry_variances
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
@@ -30,6 +29,7 @@ from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupi
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.slam.tracker import Tracked, Tracker
 from thinmap_ros.core.snapshot import State
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 

@@ -10,7 +10,7 @@ from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MatchingConfig
 from thinmap_ros.core.slam.motion_model import MotionConfig
-from thinmap_ros.core.start import SCAN_MATCHING, StartConfig
+from thinmap_ros.core.stage import SCAN_MATCHING, StartConfig
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.active_map import ActiveMap
@@ -23,6 +22,7 @@ from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS
 from thinmap_ros.core.slam.tracker import Surroundings, Tracker
 from thinmap_ros.core.slam.wall_compass import Reference
 from thinmap_ros.core.snapshot import State
+from thinmap_ros.core.stage import Correction
 
 # A scan is added to the local map after so much motion: nearer ones show the same walls again.
 _UPDATE_M = 0.2

@@ -8,7 +8,7 @@ from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.start import StartConfig
+from thinmap_ros.core.stage import StartConfig
 
 AnyLocalizer = Localizer | EkfLocalizer
 

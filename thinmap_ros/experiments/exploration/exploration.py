@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table

@@ -10,7 +10,7 @@ from std_srvs.srv import Empty
 
 from thinmap_msgs.srv import LocalizeGlobally
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded

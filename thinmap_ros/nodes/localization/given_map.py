@@ -4,10 +4,9 @@ from dataclasses import replace
 
 from thinmap_msgs.msg import SlamStatus
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizers import AnyLocalizer
-from thinmap_ros.core.start import StartConfig
+from thinmap_ros.core.stage import Estimate, StartConfig
 from thinmap_ros.nodes.localization.amcl_interface import AmclInterface
 from thinmap_ros.nodes.localization.config import GIVEN_COVARIANCE, LocalizationConfig
 from thinmap_ros.nodes.localization.initial_poses import InitialPoses

@@ -12,7 +12,7 @@ from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import MAX_COUNT, Field, State
-from thinmap_ros.core.start import StartConfig
+from thinmap_ros.core.stage import StartConfig
 
 _STAMPS = 'keyframe_stamps_ns'
 _CALIBRATION = 'calibration'

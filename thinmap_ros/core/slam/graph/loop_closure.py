@@ -13,7 +13,6 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.places.recognition.decision import JOIN_ODDS
 from thinmap_ros.core.se2 import (
     Array,
@@ -41,6 +40,7 @@ from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.stage import Correction
 
 _RECENT = 8  # recent candidates among which consistent ones are searched
 # Covariance (3, 3) that an edge between two visits has beside that of its match: of 5 cm and
