@@ -7,7 +7,7 @@ from time import perf_counter
 
 from thinmap_ros.core.config import Config, config_or_default, parameter, part
 from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
-from thinmap_ros.core.errors import require_type
+from thinmap_ros.core.errors import pose_of, require_type
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.scan import LaserConfig, Scan
@@ -18,7 +18,6 @@ from thinmap_ros.core.stage import Estimate, LocalizedScan, StartConfig, Traject
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.topology import Topology
-from thinmap_ros.core.validation import pose_of
 
 
 @dataclass(frozen=True)

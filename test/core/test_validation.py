@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.validation import angle_warning, quoted_name, require_angles
+from thinmap_ros.core.errors import InputError, angle_warning, quoted_name, require_angles
 
 DEGREE = math.radians(1.0)
 

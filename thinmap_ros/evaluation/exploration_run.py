@@ -9,10 +9,9 @@ import numpy as np
 
 from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
 from thinmap_ros.core.config import config_or_default
-from thinmap_ros.core.errors import require_type
+from thinmap_ros.core.errors import pose_of, require_type
 from thinmap_ros.core.exploration.strategy import Decision
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.validation import pose_of
 from thinmap_ros.evaluation.exploration_metrics import (
     EndNodeCensus,
     TargetLog,

@@ -9,7 +9,7 @@ from typing import Any
 from rosbags.interfaces import Nodetype, Qos
 from rosbags.typesys.store import Typestore
 
-from thinmap_ros.core import validation
+from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.core.se2 import Array
@@ -135,9 +135,9 @@ class Bag:
             )
         except Exception as error:  # the deserializer raises many types
             reason = ' '.join(str(error).split())[:120] or type(error).__name__
-            where = f'{self.path}: {validation.quoted_name(message.topic)}'
+            where = f'{self.path}: {errors.quoted_name(message.topic)}'
             raise InputError(
-                f'{where}: no {validation.quoted_name(message.type_name)}: {reason}'
+                f'{where}: no {errors.quoted_name(message.type_name)}: {reason}'
             ) from error
 
     def fields(self, topic: str) -> dict[str, str]:
@@ -253,7 +253,7 @@ class BagLog:
             if used[name] == 0:
                 first = f': {self.skipped.first}' if self.skipped.first else odometry.missing
                 raise InputError(
-                    f'{self.path}: {validation.quoted_name(name)}: no usable message{first}'
+                    f'{self.path}: {errors.quoted_name(name)}: no usable message{first}'
                 )
 
     def _of_message(
@@ -267,7 +267,7 @@ class BagLog:
                 return
             scan = decode.scan(decoded, decode.stamp_ns(decoded), laser=self.laser)
         except InputError as error:
-            where = f'{self.path}: {validation.quoted_name(message.topic)}: '
+            where = f'{self.path}: {errors.quoted_name(message.topic)}: '
             self.skipped.add(where + str(error).removeprefix(where))
             return
         yield from odometry.at_scan(scan.stamp_ns)
@@ -298,13 +298,13 @@ class BagLog:
             return found[0]
         usual = _USUAL_TOPICS[type_name]
         if not wanted and usual in found:
-            others = validation.quoted_names([topic for topic in found if topic != usual])
+            others = errors.quoted_names([topic for topic in found if topic != usual])
             self.skipped.note(f'{what} of {usual}, as the nodes subscribe to it; not of {others}')
             return usual
         if not found or wanted:
-            has = validation.quoted_names(
+            has = errors.quoted_names(
                 [f'{topic} ({name})' for topic, name in sorted(bag.topics.items())]
             )
             raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {has}')
-        names = validation.quoted_names(found)
+        names = errors.quoted_names(found)
         raise InputError(f'{self.path}: {what} on several topics: choose one of {names}')

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2, validation
+from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.keep_out import KeepOut, KeepOutArea
@@ -53,7 +53,7 @@ def checked_pose(message: Any) -> Array:
 
     Raises InputError where it is beyond 1000 km or no rotation.
     """
-    validation.require_bounded('position', (message.position.x, message.position.y))
+    errors.require_bounded('position', (message.position.x, message.position.y))
     require_rotation(message.orientation)
     return pose(message)
 
@@ -67,9 +67,9 @@ def scan(
     InputError as `Scan.create`, and where it has no beams, too many, or impossible angles.
     """
     count = len(message.ranges)
-    if not 0 < count <= validation.MAX_BEAMS:
-        raise InputError(f'{count} beams: expected 1 to {validation.MAX_BEAMS}')
-    validation.require_angles(message.angle_min, message.angle_increment, count)
+    if not 0 < count <= errors.MAX_BEAMS:
+        raise InputError(f'{count} beams: expected 1 to {errors.MAX_BEAMS}')
+    errors.require_angles(message.angle_min, message.angle_increment, count)
     with np.errstate(invalid='ignore'):  # NaN is kept, whatever its bits
         made = Scan.create(
             ns,
@@ -83,7 +83,7 @@ def scan(
             message.time_increment,
             message.scan_time,
         )
-    warning = validation.angle_warning(
+    warning = errors.angle_warning(
         message.angle_min, message.angle_max, message.angle_increment, count
     )
     return replace(made, warning=warning)
@@ -111,14 +111,14 @@ def map_update(message: Any) -> tuple[int, int, NDArray[np.int8]]:
             f'with {len(message.data)} values: expected a value for each cell'
         )
     cells = np.frombuffer(message.data, dtype=np.int8).reshape(message.height, message.width)
-    validation.require_occupancy(cells)
+    errors.require_occupancy(cells)
     return int(message.y), int(message.x), cells
 
 
 def outline(region: Any) -> Array:
     """Outline (K, 2) of a thinmap_msgs/Region. Raises InputError where it is not finite."""
     points = corners(region.outline)
-    validation.require_bounded(f'region {region.id}', points.ravel().tolist())
+    errors.require_bounded(f'region {region.id}', points.ravel().tolist())
     return points
 
 

@@ -5,11 +5,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from thinmap_ros.core.config import config_or_default
-from thinmap_ros.core.errors import InputError, quoted
+from thinmap_ros.core.errors import InputError, pose_of, quoted
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.core.validation import pose_of
 from thinmap_ros.files.paths import path_of
 from thinmap_ros.logs.laser_options import LaserOptions
 from thinmap_ros.logs.log import Event, Log, OdometryEvent

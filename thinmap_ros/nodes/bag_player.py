@@ -13,7 +13,7 @@ from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock as ClockMsg
 from std_srvs.srv import SetBool, Trigger
 
-from thinmap_ros.core import validation
+from thinmap_ros.core import errors
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError, InputError, counted
 from thinmap_ros.logs.bag import Bag
@@ -145,7 +145,7 @@ class BagPlayerNode(Node):
     def _chosen(self) -> list[str]:
         asked = {topic.strip() for topic in self._config.topics.split(',') if topic.strip()}
         if unknown := asked - set(self._bag.topics):
-            has = validation.quoted_names(sorted(self._bag.topics))
+            has = errors.quoted_names(sorted(self._bag.topics))
             raise InputError(f'{self._config.bag}: no topic {sorted(unknown)[0]}; it has {has}')
         # A recorded clock would contradict the player's own.
         return sorted((asked or set(self._bag.topics)) - {'/clock'})
@@ -165,8 +165,8 @@ class BagPlayerNode(Node):
         except (InputError, NameValidationException) as error:
             reason = ' '.join(str(error).split())[:200]
             if self._config.topics:
-                raise InputError(f'{validation.quoted_name(topic)}: {reason}') from error
-            self.get_logger().warning(f'{validation.quoted_name(topic)} is not played: {reason}')
+                raise InputError(f'{errors.quoted_name(topic)}: {reason}') from error
+            self.get_logger().warning(f'{errors.quoted_name(topic)} is not played: {reason}')
 
     def _require_same_fields(self, topic: str, installed: dict[str, str]) -> None:
         recorded = self._bag.fields(topic)

@@ -10,7 +10,7 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, Region, RegionArray, TopologicalMap
-from thinmap_ros.core import validation
+from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError, one_line
 from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.topology.flat import topology_from_msg
@@ -98,7 +98,7 @@ def regions(message: RegionArray) -> MarkerArray:
     doors = _marker(message.header, 'doors', Marker.SPHERE_LIST, _DOOR.size_m, palette.ESTIMATE)
     for door in message.doors:
         place = (door.position.x, door.position.y)
-        validation.require_bounded(f'door {door.region_a}-{door.region_b}', place)
+        errors.require_bounded(f'door {door.region_a}-{door.region_b}', place)
         doors.points.append(_point(*place, _DOOR.z_m))
     return _shown([outlines, doors, *names])
 
@@ -106,7 +106,7 @@ def regions(message: RegionArray) -> MarkerArray:
 def _region_name(header: Header, region: Region) -> Marker:
     """Name of a region, or its kind and id, as text at its centre."""
     place = (region.center.x, region.center.y)
-    validation.require_bounded(f'region {region.id}', place)
+    errors.require_bounded(f'region {region.id}', place)
     text = _marker(header, 'region_names', Marker.TEXT_VIEW_FACING, _TEXT.size_m, _TEXT_COLOUR)
     text.id = region.id % 2**31
     text.text = one_line(region.name) or f'{_KINDS[region.kind].name.lower()} {region.id}'
@@ -121,8 +121,8 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
     """
     markers: list[Marker] = []
     for node in message.end_nodes:
-        validation.require_bounded(f'end node {node.node_id}', (node.position.x, node.position.y))
-        validation.require_bounded(
+        errors.require_bounded(f'end node {node.node_id}', (node.position.x, node.position.y))
+        errors.require_bounded(
             f'probability of end node {node.node_id}', (node.position_probability,), 1.0
         )
         ball = _marker(
@@ -153,9 +153,7 @@ def line_features(message: LineFeatureArray) -> MarkerArray:
     lines = _marker(message.header, 'lines', Marker.LINE_LIST, _LINE.size_m, palette.ESTIMATE)
     for feature in message.features:
         ends = (feature.start, feature.end)
-        validation.require_bounded(
-            f'line {feature.id}', [c for end in ends for c in (end.x, end.y)]
-        )
+        errors.require_bounded(f'line {feature.id}', [c for end in ends for c in (end.x, end.y)])
         lines.points += [_point(end.x, end.y, _LINE.z_m) for end in ends]
         lines.colors += 2 * [_colour(palette.ESTIMATE if feature.in_local_area else _REMOTE)]
     return _shown([lines])

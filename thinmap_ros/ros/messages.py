@@ -28,7 +28,7 @@ from std_msgs.msg import Header
 
 from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
-from thinmap_ros.core import se2, validation
+from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M
 from thinmap_ros.core.grid.mapper import WholeMap
@@ -54,14 +54,12 @@ def message_class(type_name: str) -> Any:
     """
     parts = _TYPE_NAME.fullmatch(type_name)
     if parts is None:
-        raise InputError(
-            f'message type {validation.quoted_name(type_name)}: expected PACKAGE/msg/NAME'
-        )
+        raise InputError(f'message type {errors.quoted_name(type_name)}: expected PACKAGE/msg/NAME')
     try:
         return getattr(import_module(f'{parts[1]}.msg'), parts[2])
     except (ImportError, AttributeError) as error:
         raise InputError(
-            f'message type {validation.quoted_name(type_name)}: not installed here'
+            f'message type {errors.quoted_name(type_name)}: not installed here'
         ) from error
 
 
@@ -178,7 +176,7 @@ def covariance_from_msg(message: PoseWithCovarianceStamped) -> Array:
     """
     full = np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     part = full[np.ix_((0, 1, 5), (0, 1, 5))]
-    validation.require_bounded('covariance', part.ravel().tolist())
+    errors.require_bounded('covariance', part.ravel().tolist())
     part = (part + part.T) / 2.0
     if np.linalg.eigvalsh(part).min() < -1e-9:
         raise InputError(f'covariance {part.tolist()}: expected no negative eigenvalue')
@@ -341,7 +339,7 @@ def grid_from_msg(message: OccupancyGrid | ProbabilityGrid) -> GridPatch:
         )
     origin = pose_from_msg(info.origin)
     cells = np.frombuffer(message.data, dtype=np.int8).reshape(info.height, info.width)
-    validation.require_occupancy(cells)
+    errors.require_occupancy(cells)
     return aligned_patch(origin, resolution, cells)
 
 

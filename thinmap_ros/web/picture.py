@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.core import validation
+from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError, one_line
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.give_way import Motion
@@ -124,9 +124,9 @@ class Picture:
         shown = []
         for node in message.end_nodes:
             place = (node.position.x, node.position.y)
-            validation.require_bounded(f'end node {node.node_id}', place)
+            errors.require_bounded(f'end node {node.node_id}', place)
             probability = float(node.position_probability)
-            validation.require_bounded(f'probability of {node.node_id}', (probability,), 1.0)
+            errors.require_bounded(f'probability of {node.node_id}', (probability,), 1.0)
             x, y = (round(number, 2) for number in place)
             shown.append([node.node_id, x, y, round(probability, 2), bool(node.is_target)])
         self.board.put('end_nodes', shown)
@@ -136,7 +136,7 @@ class Picture:
         points = np.array(
             [[p.pose.position.x, p.pose.position.y] for p in message.poses], dtype=np.float64
         ).reshape(-1, 2)
-        validation.require_bounded('plan', points.ravel().tolist())
+        errors.require_bounded('plan', points.ravel().tolist())
         step = -(-len(points) // _MAX_PATH_POINTS) or 1
         points = np.vstack([points[:-1:step], points[-1:]])
         self.board.put('plan', np.round(points, 2).ravel().tolist())
@@ -145,7 +145,7 @@ class Picture:
         """Show a thinmap_msgs/SlamStatus."""
         inliers = float(message.inlier_ratio)
         step_ms = float(message.step_time_ms)
-        validation.require_bounded('inlier_ratio, step_time_ms', (inliers, step_ms))
+        errors.require_bounded('inlier_ratio, step_time_ms', (inliers, step_ms))
         shown = words.slam_words(message)
         self.board.put('slam', {**shown, 'inliers': round(inliers, 3), 'step_ms': round(step_ms)})
 
@@ -172,7 +172,7 @@ def _region(region: Any) -> dict[str, Any]:
     if region.kind not in _KINDS:
         raise InputError(f'region {region.id}: kind {region.kind}: expected 0 to 2')
     center = (region.center.x, region.center.y)
-    validation.require_bounded(f'region {region.id}', (*center, region.area_m2))
+    errors.require_bounded(f'region {region.id}', (*center, region.area_m2))
     kind = _KINDS[region.kind]
     return {
         'id': int(region.id),

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thinmap_ros.core import validation
+from thinmap_ros.core import errors
 from thinmap_ros.core.exploration.live.drives import Drives
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, FinishCode, Strategy
@@ -82,7 +82,7 @@ class MissionGoal:
     def __post_init__(self) -> None:
         limits = (self.budget.time_s, self.budget.distance_m, self.budget.area_m2)
         corners = self.area.reshape(-1).tolist()
-        validation.require_bounded('goal: limit or corner of the area', [*limits, *corners])
+        errors.require_bounded('goal: limit or corner of the area', [*limits, *corners])
 
     def masked(self, patch: GridPatch) -> GridPatch:
         """Map in which all outside the area is wall."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thinmap_ros.core import se2, validation
+from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import Bounds, GridPatch
@@ -63,7 +63,7 @@ class KeepOut:
     def __init__(self, areas: Sequence[KeepOutArea] = (), next_id: int = 1) -> None:
         """Raises InputError where there are too many, or an id occurs twice."""
         require_count(len(areas))
-        validation.require_unique('keep-out areas', [area.id for area in areas])
+        errors.require_unique('keep-out areas', [area.id for area in areas])
         self.areas = tuple(areas)
         self.next_id = max([next_id, *(area.id + 1 for area in areas)])
         self._laid = _Laid()
@@ -207,7 +207,7 @@ def require_corners(
     if not least <= len(corners) <= MAX_CORNERS:
         found = counted(len(corners), 'corner')
         raise InputError(f'{what} of {found}: expected {least} to {MAX_CORNERS}')
-    validation.require_bounded(f'corner of a {what}', corners.ravel().tolist())
+    errors.require_bounded(f'corner of a {what}', corners.ravel().tolist())
     outline_m = float(np.hypot(*(corners - np.roll(corners, 1, axis=0)).T).sum())
     if outline_m > max_outline_m:
         expected = f'expected at most {max_outline_m:g} m'

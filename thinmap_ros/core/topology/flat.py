@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import validation
+from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
@@ -126,9 +126,9 @@ def _check_nodes(flat: Flat) -> None:
     for i in _first(~np.isin(kinds, list(_KINDS))):
         raise InputError(f'node {ids[i]}: kind {kinds[i]}: expected one of {list(_KINDS)}')
     for i in _first(_is_unbounded(places)):
-        validation.require_bounded(f'node {ids[i]}', places[i].tolist())
+        errors.require_bounded(f'node {ids[i]}', places[i].tolist())
     for i in _first(_is_no_length(clearances)):
-        validation.require_lengths(f'node {ids[i]}: clearance', clearances[[i]].tolist())
+        errors.require_lengths(f'node {ids[i]}: clearance', clearances[[i]].tolist())
 
 
 def _check_edges(flat: Flat) -> None:
@@ -143,7 +143,7 @@ def _check_edges(flat: Flat) -> None:
     _check_paths(ids, flat['edge_first'].astype(np.int64), flat[_POINTS])
     lengths = np.column_stack([flat['edge_length_m'], flat['edge_clearance_m']])
     for i in _first(np.any(_is_no_length(lengths), axis=1)):
-        validation.require_lengths(f'edge {ids[i]}: length, clearance', lengths[i].tolist())
+        errors.require_lengths(f'edge {ids[i]}: length, clearance', lengths[i].tolist())
 
 
 def _check_paths(ids: list[int], begins: NDArray[np.int64], points: NDArray[np.float32]) -> None:
@@ -160,7 +160,7 @@ def _check_paths(ids: list[int], begins: NDArray[np.int64], points: NDArray[np.f
         )
     for i in _first(_is_unbounded(points)):
         edge = int(np.searchsorted(begins, i, side='right')) - 1
-        validation.require_bounded(f'edge {ids[edge]}', points[i].tolist())
+        errors.require_bounded(f'edge {ids[edge]}', points[i].tolist())
 
 
 def _checked_ids(what: str, numbers: NDArray[np.uint64]) -> list[int]:
@@ -168,18 +168,18 @@ def _checked_ids(what: str, numbers: NDArray[np.uint64]) -> list[int]:
     ids: list[int] = numbers.tolist()
     for i in _first((numbers < 1) | (numbers > _MAX_ID)):
         raise InputError(f'{what} id {ids[i]}: expected 1 to {_MAX_ID}')
-    validation.require_unique(f'{what}s', ids)
+    errors.require_unique(f'{what}s', ids)
     return ids
 
 
 def _is_unbounded(places: NDArray[Any]) -> Mask:
     """For each place (K, 2) whether it is not finite or too far away."""
-    is_far: Mask = np.any(~(np.abs(places) <= validation.MAX_COORDINATE_M), axis=1)
+    is_far: Mask = np.any(~(np.abs(places) <= errors.MAX_COORDINATE_M), axis=1)
     return is_far
 
 
 def _is_no_length(lengths: NDArray[Any]) -> Mask:
-    return ~((lengths >= 0.0) & (lengths <= validation.MAX_COORDINATE_M))
+    return ~((lengths >= 0.0) & (lengths <= errors.MAX_COORDINATE_M))
 
 
 def _first(bad: Mask) -> list[int]:

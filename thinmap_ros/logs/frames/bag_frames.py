@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from thinmap_ros.core import validation
+from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs.frames.laser_mount import Mount, StaticTransforms
@@ -140,8 +140,8 @@ class BagFrames:
         except InputError as error:
             raise InputError(f'{self._bag.path}: /tf_static: {error}') from error
         if mount is None:
-            known = validation.quoted_names(static.frames)
-            where = f'from "{validation.quoted_name(frame)}" to "{self.base_frame}"'
+            known = errors.quoted_names(static.frames)
+            where = f'from "{errors.quoted_name(frame)}" to "{self.base_frame}"'
             raise InputError(
                 f'{self._bag.path}: /tf_static has no transform {where}, nor has /tf (they have '
                 f'{known}): give --base-frame, or --laser-pose'
@@ -153,7 +153,7 @@ class BagFrames:
         """Note that later transforms place a frame elsewhere on the robot."""
         change = static.change(frame, self.base_frame)
         if change:
-            name = validation.quoted_name(frame)
+            name = errors.quoted_name(frame)
             self._skipped.note(f'static transform of {what} {name} {change}: the first one is used')
 
     def _note_of_odometry(self, note: str) -> None:
@@ -162,7 +162,7 @@ class BagFrames:
     def _assume_base(self, frame: str) -> None:
         if frame == self.base_frame:
             return
-        name = validation.quoted_name(frame)
+        name = errors.quoted_name(frame)
         self._skipped.note(
             f'no transform names "{self.base_frame}": the frame of the robot is "{name}", as that '
             'of the odometry (--base-frame)'

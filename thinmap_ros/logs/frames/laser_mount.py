@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.core import se2, validation
+from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -142,7 +142,7 @@ class StaticTransforms:
         """
         moved = message.transform.translation
         translation = np.array([moved.x, moved.y, moved.z], dtype=np.float64)
-        validation.require_bounded(
+        errors.require_bounded(
             f'transform to {quoted(message.child_frame_id)}', translation.tolist()
         )
         placement = _Placement(rotation_matrix(message.transform.rotation), translation)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.core import se2, validation
+from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.odometry import OdometryBuffer
 from thinmap_ros.core.se2 import Array
@@ -149,7 +149,7 @@ class TransformBuffer:
 def _planar_pose(transform: Any) -> Array:
     moved = transform.transform.translation
     name = f'transform to {quoted(transform.child_frame_id)}'
-    validation.require_bounded(name, (moved.x, moved.y, moved.z))
+    errors.require_bounded(name, (moved.x, moved.y, moved.z))
     rotation = rotation_matrix(transform.transform.rotation)
     return se2.pose(moved.x, moved.y, math.atan2(rotation[1, 0], rotation[0, 0]))
 

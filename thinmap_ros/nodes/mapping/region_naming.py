@@ -3,7 +3,7 @@
 import numpy as np
 
 from thinmap_msgs.srv import NameRegion
-from thinmap_ros.core import validation
+from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.mapper import WholeMap
 from thinmap_ros.core.grid.motion import MapMotion
@@ -56,7 +56,7 @@ def _anchor(regions: RegionMap, request: NameRegion.Request) -> tuple[int, Array
             raise InputError(f'region {request.id}: expected the id of a region of the map')
         return request.id, np.array([region.x, region.y])
     place = (request.point.x, request.point.y)
-    validation.require_bounded('point', place)
+    errors.require_bounded('point', place)
     number = int(regions.ids_at(np.array([place]))[0])
     if not number:
         raise InputError(f'point {place[0]:g}, {place[1]:g}: expected a point in a region')

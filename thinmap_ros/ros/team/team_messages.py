@@ -10,7 +10,7 @@ from std_msgs.msg import Header
 
 from thinmap_msgs.msg import MapTiles, TeamClaim, TileRequest
 from thinmap_msgs.msg import SettledPlace as SettledPlaceMsg
-from thinmap_ros.core import se2, validation
+from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.exploration.team.claims import Claim, Place, SettledPlace
 from thinmap_ros.core.exploration.team.team import MAX_SETTLED
@@ -107,10 +107,10 @@ def claim_from_msg(message: TeamClaim) -> RobotClaim:
     places = [(place.x, place.y) for place in message.settled]
     points = [(message.goal.x, message.goal.y), (message.frontier.x, message.frontier.y)]
     numbers = np.ravel([*places, *points]).tolist()
-    validation.require_bounded(f'claim of robot {quoted(name)}: place', numbers)
-    validation.require_bounded(f'claim of robot {quoted(name)}: path', [message.remaining_m])
+    errors.require_bounded(f'claim of robot {quoted(name)}: place', numbers)
+    errors.require_bounded(f'claim of robot {quoted(name)}: path', [message.remaining_m])
     speeds = [message.v, message.w]
-    validation.require_bounded(f'claim of robot {quoted(name)}: speed', speeds, _MAX_SPEED)
+    errors.require_bounded(f'claim of robot {quoted(name)}: speed', speeds, _MAX_SPEED)
     if message.state not in list(RobotState):
         raise InputError(
             f'claim of robot {quoted(name)}: state {message.state}: expected 0 to {max(RobotState)}'

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import MAX_BEAMS, InputError
 from thinmap_ros.core.scan import MAX_MOUNT_OFFSET_M, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import Field, Fields, State
-from thinmap_ros.core.validation import MAX_BEAMS
 
 # Of all scans together: 16,000 scans of 1,000 beams need about 1 GB once they are keyframes.
 MAX_BEAMS_IN_ALL = 1 << 24

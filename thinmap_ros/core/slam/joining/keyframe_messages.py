@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.errors import InputError, one_line_reason
+from thinmap_ros.core.errors import MAX_BEAMS, InputError, one_line_reason
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph import packed_scans
 from thinmap_ros.core.slam.graph.saved_keyframes import MAX_EDGES, MAX_KEYFRAMES
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, State
-from thinmap_ros.core.validation import MAX_BEAMS
 
 _WHAT = 'keyframe'
 _ROUNDING = 1e-5  # relative error of an information matrix in 32 bit
