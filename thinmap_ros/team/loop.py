@@ -13,7 +13,7 @@ from thinmap_ros.core.exploration.team.claims import Claim
 from thinmap_ros.core.planning.give_way import NEAR_ROBOT_M, Motion, must_stop
 from thinmap_ros.core.planning.navigator import Command
 from thinmap_ros.core.se2 import SECOND_NS, Array
-from thinmap_ros.core.sensing.robots_in_scan import without_robots
+from thinmap_ros.core.sensing.beams import without_robots
 from thinmap_ros.sim.coverage import ObservableCells
 from thinmap_ros.sim.simulation import STEP_NS, SensorReadings
 from thinmap_ros.team.maps import TeamMaps

@@ -7,7 +7,7 @@ import pytest
 from support.slam_room import ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.sensing.dropouts import DropoutDetector
+from thinmap_ros.core.sensing.beams import DropoutDetector
 
 START = se2.pose(2.0, 2.0, 0.0)
 PERIOD_NS = 200_000_000

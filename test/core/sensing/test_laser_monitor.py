@@ -8,7 +8,7 @@ from support.slam_room import ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.sensing.laser_monitor import FROZEN, NO_RETURNS, LaserMonitor
+from thinmap_ros.core.sensing.beams import FROZEN, NO_RETURNS, LaserMonitor
 
 START = se2.pose(2.0, 2.0, 0.0)
 PERIOD_NS = 200_000_000

@@ -7,7 +7,7 @@ import pytest
 from support.slam_room import RANGE_MAX_M, ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.sensing.no_return_range import NoReturnRange
+from thinmap_ros.core.sensing.beams import NoReturnRange
 
 START = se2.pose(2.0, 2.0, 0.0)
 POSES = list(drive(200, np.random.default_rng(1), START))

@@ -7,7 +7,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.sensing.robots_in_scan import without_robots
+from thinmap_ros.core.sensing.beams import without_robots
 
 POSE = se2.pose(2.0, 3.0, 0.5 * math.pi)
 

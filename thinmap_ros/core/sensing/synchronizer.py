@@ -6,8 +6,8 @@ from dataclasses import replace
 from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, OdometryBuffer
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.sensing.beams import LaserMonitor
 from thinmap_ros.core.sensing.deskewing import SweepTiming, deskewed
-from thinmap_ros.core.sensing.laser_monitor import LaserMonitor
 
 
 class ScanOdometrySynchronizer:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.sensing.robots_in_scan import without_robots
+from thinmap_ros.core.sensing.beams import without_robots
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.team.heard_robots import heard_robots

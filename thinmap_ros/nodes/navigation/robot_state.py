@@ -5,8 +5,8 @@ from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, OdometryBuffer
 from thinmap_ros.core.planning.navigator import SENSOR_DELAY_NS, SENSOR_TIMEOUT_NS
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.sensing.beams import LaserMonitor
 from thinmap_ros.core.sensing.input_stream import InputStream
-from thinmap_ros.core.sensing.laser_monitor import LaserMonitor
 from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
 
 # Without a new pose the last correction of the odometry holds for a while; without odometry, the

@@ -1,0 +1,369 @@
+"""What beams mean: scans that no laser measured, beams without return, beams at other robots."""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.scan import MIN_HITS, NO_RETURN_CLEAR_RANGE_M, Scan, is_most_missed
+from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.jit import kernel
+
+# Decides from the data whether a beam without return shows free space.
+#
+# A laser whose range ends in a hall has no return because nothing is in range. Cheap lasers also
+# drop returns of surfaces in range. The second kind contradicts itself: its beams without return
+# cross surfaces that it has just measured.
+
+_FAN_REACH = 0.8  # of the range: farther walls at a small angle may have gone out of range
+
+_APART_M = 0.1
+
+_APART_RAD = 0.1
+
+# Odometry drifts little over 4 m of path. Its turns are wrong by some percent: after half a radian,
+# by a beam.
+_VIEWS = 40
+
+_MAX_TURN_RAD = 0.5
+
+_SAME_SURFACE_M = 0.1
+
+_MIN_STEP_RAD = 1e-6
+
+# Measured over whole recordings: at most 0.017 with lasers of 3 to 80 m in rooms, halls and
+# outdoors; 0.05 with one that drops 5 % of its returns, 0.27 and 0.53 with cheap ones.
+_MAX_MISSED = 0.03
+
+# Measured: at most 0.06 in halls and outdoors, 0.15 and more with lasers that drop returns.
+_MAX_WRONG = 0.1
+
+
+class DropoutDetector:
+    """Decides for a laser whether its beams without return show free space.
+
+    Views are scans 0.1 m or 0.1 rad apart. In each, the beams are counted that point at a surface
+    of earlier views within the range that a beam without return clears, and those of them that have
+    no return. No return does not mean free if the laser misses more than 3 % of what it must hit,
+    and if that explains a tenth of its beams without return: in a hall most of them are right. A
+    laser is trusted at first, with the weight of one scan.
+    """
+
+    def __init__(self) -> None:
+        self.drops_out = False
+        self._views: deque[Array] = deque(maxlen=_VIEWS)
+        self._turns_rad: deque[float] = deque(maxlen=_VIEWS)  # before each view
+        self._last: Array | None = None
+        self._aimed = 0  # beams at surfaces
+        self._missed = 0  # of these, without return
+        self._unreturned = 0  # beams without return, whatever they point at
+
+    @property
+    def miss_ratio(self) -> float:
+        """Share of the beams to a known surface that have no return, so far."""
+        return self._missed / max(self._aimed, 1)
+
+    @property
+    def warning(self) -> str:
+        """Description of a laser that drops out; '' for any other."""
+        if not self.drops_out:
+            return ''
+        return (
+            f'{100.0 * self.miss_ratio:.0f} % of the beams to surfaces that the laser has measured '
+            'have no return: no return is taken as unknown, not as free'
+        )
+
+    def update(self, scan: Scan, T_odom_base: Array) -> bool:
+        """Add a scan made at an odometry pose (3,); returns whether the laser drops returns."""
+        if scan.is_blind or not self._is_apart(T_odom_base):
+            return self.drops_out
+        self._forget_turned(T_odom_base)
+        self._last = T_odom_base
+        aimed = self._aimed_beams(scan, T_odom_base)
+        missed = int(np.count_nonzero(aimed & scan.without_return))
+        self._aimed += int(np.count_nonzero(aimed & scan.hit)) + missed
+        self._missed += missed
+        self._unreturned += int(np.count_nonzero(scan.without_return))
+        self._views.append(se2.transform_points(T_odom_base, _surfaces(scan)))
+        # With a gap, so that the verdict on a laser near the limit does not alternate.
+        scale = 0.5 if self.drops_out else 1.0
+        most = scale * max(
+            _MAX_MISSED * (self._aimed + scan.ranges_m.size), _MAX_WRONG * self._unreturned
+        )
+        self.drops_out = self._missed > most
+        return self.drops_out
+
+    def _forget_turned(self, T_odom_base: Array) -> None:
+        """Forget the views from which the robot has turned too far since."""
+        turn_rad = 0.0 if self._last is None else abs(se2.wrap(T_odom_base[2] - self._last[2]))
+        self._turns_rad.append(float(turn_rad))
+        while self._views and sum(self._turns_rad) > _MAX_TURN_RAD:
+            self._views.popleft()
+            self._turns_rad.popleft()
+
+    def _is_apart(self, T_odom_base: Array) -> bool:
+        if self._last is None:
+            return True
+        moved = se2.between(self._last, T_odom_base)
+        return math.hypot(moved[0], moved[1]) > _APART_M or abs(float(moved[2])) > _APART_RAD
+
+    def _aimed_beams(self, scan: Scan, T_odom_base: Array) -> NDArray[np.bool_]:
+        """Which beams (N,) point at a surface of an earlier view."""
+        if not self._views:
+            return np.zeros(scan.ranges_m.size, dtype=np.bool_)
+        T_odom_laser = se2.compose(T_odom_base, scan.T_base_laser)
+        reach_m = _FAN_REACH * min(scan.range_max_m, scan.max_range_m, NO_RETURN_CLEAR_RANGE_M)
+        fan = (scan.angle_min_rad, scan.angle_increment_rad, reach_m)
+        points = np.vstack(self._views)
+        return _interior(_aimed(points, T_odom_laser, scan.ranges_m.size, fan))
+
+
+def _surfaces(scan: Scan) -> Array:
+    """Hits (N, 2), robot frame, with a neighbour at the same range: not the mixed pixels."""
+    ranges = np.where(scan.hit, scan.ranges_m, np.inf)
+    with np.errstate(invalid='ignore'):
+        near = np.abs(np.diff(ranges)) < _SAME_SURFACE_M
+    surfaces = (np.append(near, False) | np.append(False, near))[scan.hit]
+    return np.asarray(scan.points_base()[surfaces])
+
+
+def _interior(aimed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The beams (N,) whose neighbours point at a surface, too.
+
+    At its edge a small error of the odometry decides whether a beam meets it.
+    """
+    inside = np.zeros_like(aimed)
+    inside[1:-1] = aimed[:-2] & aimed[1:-1] & aimed[2:]
+    return inside
+
+
+@kernel
+def _aimed(
+    points: Array, laser: Array, count: int, fan: tuple[float, float, float]
+) -> NDArray[np.bool_]:
+    """Which beams (count,) point at one of some points (M, 2) in reach.
+
+    laser (3,): its pose in the frame of the points; fan: bearing of the first beam, angle between
+    beams, rad, and reach, m.
+    """
+    first, step, reach = fan
+    aimed = np.zeros(count, dtype=np.bool_)
+    for k in range(points.shape[0]):
+        dx = points[k, 0] - laser[0]
+        dy = points[k, 1] - laser[1]
+        if dx * dx + dy * dy >= reach * reach:
+            continue
+        ahead = (math.atan2(dy, dx) - laser[2] - first) * (1.0 if step > 0.0 else -1.0)
+        ahead -= 2.0 * math.pi * math.floor(ahead / (2.0 * math.pi))
+        beam = round(ahead / max(abs(step), _MIN_STEP_RAD))
+        if beam < count:
+            aimed[beam] = True
+    return aimed
+
+
+# Recognizes a finite range that a driver publishes for beams without return.
+
+# No surface gives exactly the same range to so many beams: ranges are noisy, and walls are oblique.
+_MIN_SHARE = 0.2
+
+# Real ranges may lie between that value and range_max.
+_MAX_BEYOND = 0.05
+
+
+class NoReturnRange:
+    """Largest range of a laser whose driver publishes a value below range_max for no return.
+
+    Drivers publish 2.99 m for a laser of 3 m, or the true range of a laser with a wrong range_max.
+    REP 117 takes such a value for a hit, and a wall appears all around the robot. At least a fifth
+    of the beams share it in a scan, and hardly any range is larger.
+    """
+
+    def __init__(self) -> None:
+        self._range_m: float | None = None
+
+    @property
+    def warning(self) -> str:
+        """Description of such a value; '' where a driver publishes none."""
+        if self._range_m is None:
+            return ''
+        return f'many beams of a scan share the range {self._range_m:.3f} m: taken as no return'
+
+    def applied(self, scan: Scan) -> Scan:
+        """The scan, in which the beams with that value have no return."""
+        if self._range_m is None or not self._is_largest(scan, self._range_m):
+            self._range_m = self._shared(scan)
+        return scan if self._range_m is None else replace(scan, range_max_m=self._range_m)
+
+    def _shared(self, scan: Scan) -> float | None:
+        """The shared range; None without one, and where all beams share it: that says nothing."""
+        ranges = scan.ranges_m[scan.returned]
+        if ranges.size < _MIN_SHARE * scan.ranges_m.size:
+            return None
+        values, counts = np.unique(ranges, return_counts=True)
+        most = int(np.argmax(counts))
+        shared_m = float(values[most])
+        is_shared = _MIN_SHARE * scan.ranges_m.size <= counts[most] < ranges.size
+        return shared_m if is_shared and self._is_largest(scan, shared_m) else None
+
+    def _is_largest(self, scan: Scan, range_m: float) -> bool:
+        beyond = np.count_nonzero(scan.ranges_m[scan.returned] > range_m)
+        return bool(beyond <= _MAX_BEYOND * scan.ranges_m.size)
+
+
+# Detects scans that a laser did not measure, by the scans before and the motion of the robot.
+
+FROZEN = 'the same ranges while the robot moves'
+
+NO_RETURNS = 'no returns from surfaces that it has just measured'
+
+_MOVED_REACH = 0.9  # of range_max: a farther surface may have gone out of range
+
+_CONFIRMED_NS = 2 * SECOND_NS
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Motion since a scan: path length (m) and rotation (rad); standing still adds nothing."""
+
+    path_m: float = 0.0
+    turn_rad: float = 0.0
+
+    def moved(self, increment: Array, seconds: float) -> '_Motion':
+        """Add an increment (3,); slower ones than a robot drives are drift of the odometry."""
+        path_m = math.hypot(increment[0], increment[1])
+        turn_rad = abs(float(increment[2]))
+        if path_m < 0.02 * seconds and turn_rad < 0.02 * seconds:
+            return self
+        return _Motion(self.path_m + path_m, self.turn_rad + turn_rad)
+
+    @property
+    def changes_ranges(self) -> bool:
+        """Whether the ranges of any laser must have changed."""
+        return self.path_m > 0.02 or self.turn_rad > 0.02
+
+
+class _FreezeDetector:
+    """Ranges of a real laser are noisy: equal ones, while the robot moves, are an old scan."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Scan, Array] | None = None
+        self._motion = _Motion()
+
+    def is_frozen(self, scan: Scan, T_odom_base: Array) -> bool:
+        """Whether the ranges are those of an earlier pose; T_odom_base (3,)."""
+        last = self._last
+        self._last = (scan, T_odom_base)
+        if last is None or not np.array_equal(last[0].ranges_m, scan.ranges_m, equal_nan=True):
+            self._motion = _Motion()
+            return False
+        seconds = (scan.stamp_ns - last[0].stamp_ns) / SECOND_NS
+        self._motion = self._motion.moved(se2.between(last[1], T_odom_base), seconds)
+        return self._motion.changes_ranges and int(np.count_nonzero(scan.hit)) >= MIN_HITS
+
+
+@dataclass(frozen=True, eq=False)
+class _Surfaces:
+    """End points (N, 2) of the hits of a scan, odometry frame, m."""
+
+    points: Array = field(default_factory=lambda: np.empty((0, 2)))
+
+    @staticmethod
+    def of(scan: Scan, T_odom_base: Array) -> '_Surfaces':
+        return _Surfaces(se2.transform_points(T_odom_base, scan.points_base()))
+
+    def are_missed(self, scan: Scan, T_odom_base: Array) -> bool:
+        """Whether a scan at an odometry pose (3,) has no return from most of them."""
+        T_odom_laser = se2.compose(T_odom_base, scan.T_base_laser)
+        local = se2.transform_points(se2.invert(T_odom_laser), self.points)
+        ranges = np.hypot(local[:, 0], local[:, 1])
+        near = ranges < _MOVED_REACH * scan.range_max_m
+        bearings = np.arctan2(local[near, 1], local[near, 0]) - scan.angle_min_rad
+        step = abs(scan.angle_increment_rad)
+        ahead = bearings if scan.angle_increment_rad > 0.0 else -bearings
+        # A single beam has no increment.
+        beams = np.rint(np.mod(ahead, 2.0 * math.pi) / max(step, _MIN_STEP_RAD))
+        beams = beams[beams < scan.ranges_m.size].astype(np.int64)
+        return is_most_missed(scan, int(np.count_nonzero(scan.without_return[beams])))
+
+
+class LaserMonitor:
+    """Replaces scans that the laser did not measure by blind ones, and recognizes dropouts.
+
+    A frozen driver repeats its ranges with new stamps. A laser that has failed may report no return
+    for its beams: walls do not vanish from one scan to the next. Such a scan is blind, until walls
+    are measured again, or scans agree with each other for some time (the robot was carried away).
+    The scans of a laser that often has no return from surfaces in range are marked (`drops_out`).
+    """
+
+    def __init__(self) -> None:
+        self._freeze = _FreezeDetector()
+        self._no_return = NoReturnRange()
+        self._dropouts = DropoutDetector()
+        self._trusted = _Surfaces()
+        self._previous = _Surfaces()
+        self._doubted_ns: int | None = None  # first scan of a series that agrees with itself only
+
+    @property
+    def warnings(self) -> dict[str, str]:
+        """What the laser or its driver do otherwise than REP 117, by kind."""
+        texts = {'no return': self._no_return.warning, 'dropouts': self._dropouts.warning}
+        return {kind: text for kind, text in texts.items() if text}
+
+    def checked(self, scan: Scan, T_odom_base: Array) -> Scan:
+        """The scan, or a blind one with the reason; T_odom_base (3,): pose, without jumps."""
+        scan = self._no_return.applied(scan)
+        if self._freeze.is_frozen(scan, T_odom_base):
+            return scan.blinded(FROZEN)
+        if scan.is_blind:
+            return scan
+        # Of a laser that drops out, a scan without returns is blind anyway.
+        if not self._dropouts.drops_out and self._has_failed(scan, T_odom_base):
+            return scan.blinded(NO_RETURNS)
+        drops_out = self._dropouts.update(scan, T_odom_base)
+        return replace(scan, drops_out=True) if drops_out else scan
+
+    def _has_failed(self, scan: Scan, T_odom_base: Array) -> bool:
+        surfaces = _Surfaces.of(scan, T_odom_base)
+        is_empty = len(surfaces.points) < MIN_HITS
+        contradicts = self._trusted.are_missed(scan, T_odom_base)
+        contradicts |= self._doubted_ns is not None and is_empty
+        if contradicts and self._doubted_ns is not None and not is_empty:
+            agrees = not self._previous.are_missed(scan, T_odom_base)
+            contradicts = not agrees or scan.stamp_ns - self._doubted_ns < _CONFIRMED_NS
+            self._doubted_ns = self._doubted_ns if agrees else scan.stamp_ns
+        elif contradicts:
+            self._doubted_ns = scan.stamp_ns
+        self._previous = surfaces
+        if not contradicts:
+            self._trusted = surfaces
+            self._doubted_ns = None
+        return contradicts
+
+
+# Other robots in a scan: beams that end at them are no evidence about the map.
+
+
+def without_robots(scan: Scan, T_map_base: Array, places: Array, radius_m: float) -> Scan:
+    """Scan made at a pose (3,) with the beams invalid that end within radius_m of places (M, 2), m.
+
+    The beams beside these are invalid as well: their ranges may be mixed with those
+    of walls behind.
+    """
+    hit = np.flatnonzero(scan.hit)
+    if not len(places) or not hit.size:
+        return scan
+    T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
+    angles = scan.angles_rad[hit] + T_map_laser[2]
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    ends = T_map_laser[:2] + scan.ranges_m[hit, None] * directions
+    away = np.hypot(*(ends[:, None] - places[None]).transpose(2, 0, 1))
+    cut = hit[(away < radius_m).any(axis=1)]
+    if not cut.size:
+        return scan
+    beams = np.concatenate([cut - 1, cut, cut + 1])
+    ranges = scan.ranges_m.copy()
+    ranges[beams[(beams >= 0) & (beams < ranges.size)]] = np.nan
+    return replace(scan, ranges_m=ranges)
