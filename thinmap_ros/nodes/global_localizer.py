@@ -29,8 +29,7 @@ from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.sensing.input_stream import InputStream
-from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
+from thinmap_ros.core.sensing.synchronizer import InputStream, ScanOdometrySynchronizer
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology

@@ -9,8 +9,7 @@ from support.slam_room import RANGE_MAX_M, ROOM, ranges_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import AT_END, LaserConfig, Scan
-from thinmap_ros.core.sensing.deskewing import SweepTiming, deskewed
-from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
+from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer, SweepTiming, deskewed
 from thinmap_ros.logs.frames.laser_mount import Mount
 
 SECOND = 1_000_000_000

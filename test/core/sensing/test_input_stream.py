@@ -2,7 +2,7 @@
 
 import pytest
 
-from thinmap_ros.core.sensing.input_stream import InputStream
+from thinmap_ros.core.sensing.synchronizer import InputStream
 
 S = 1_000_000_000
 PERIOD_NS = S // 10

@@ -13,7 +13,7 @@ from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.se2 import SECOND_NS, Array
-from thinmap_ros.core.sensing.input_stream import InputStream
+from thinmap_ros.core.sensing.synchronizer import InputStream
 from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology

@@ -8,7 +8,7 @@ from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import SECOND_NS
-from thinmap_ros.core.sensing.input_stream import InputStream
+from thinmap_ros.core.sensing.synchronizer import InputStream
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
 from thinmap_ros.ros.decoding.map_identity import UNKNOWN

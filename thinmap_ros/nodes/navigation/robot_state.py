@@ -6,7 +6,7 @@ from thinmap_ros.core.planning.navigator import SENSOR_DELAY_NS, SENSOR_TIMEOUT_
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.sensing.beams import LaserMonitor
-from thinmap_ros.core.sensing.input_stream import InputStream
+from thinmap_ros.core.sensing.synchronizer import InputStream
 from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
 
 # Without a new pose the last correction of the odometry holds for a while; without odometry, the
