@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 
 from thinmap_ros.core.config import Config, config_or_default, parameter, part
-from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.errors import pose_of, require_type
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class
 from thinmap_ros.core.stage import Estimate, LocalizedScan, StartConfig, Trajectory

@@ -9,7 +9,6 @@ from support.slam_room import ROOM, scan_in
 from fuzz.cases import Source, chosen, finite, nothing, tried
 from fuzz.files import small_graph, sound_graph, sound_patch
 from thinmap_ros.core import se2
-from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
@@ -19,6 +18,7 @@ from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
 from thinmap_ros.core.slam.localizers import default_config, localizer_class
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.builder import TopologyBuilder

@@ -18,13 +18,13 @@ from thinmap_msgs.msg import (
     TopologicalMap,
 )
 from thinmap_ros.core import snapshot
-from thinmap_ros.core.consistency.monitor import ConsistencyMonitor
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LIVE_PARAMETERS, LocalizerConfig

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.consistency.mount_error import MountErrorConfig, MountErrorEstimator
+from thinmap_ros.core.sensing.consistency import MountErrorConfig, MountErrorEstimator
 
 GIVEN = se2.pose(0.2, -0.1, 0.4)
 NOWHERE = np.zeros(3)

@@ -8,8 +8,8 @@ import pytest
 from support.slam_room import ROOM, corridor, drive, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.consistency.turn_comparison import TurnComparison
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.sensing.consistency import TurnComparison
 
 START = se2.pose(2.0, 2.0, 0.0)
 STEPS = 700

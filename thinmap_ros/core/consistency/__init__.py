@@ -1,1 +1,0 @@
-"""Contradictions between scans, odometry, and the pose of the laser on the robot."""

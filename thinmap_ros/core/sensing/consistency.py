@@ -1,0 +1,500 @@
+"""Checks the geometry of the laser by the motion of the robot: angles, turns, and its mount."""
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.scan import MIN_HITS, Scan
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, rotation
+from thinmap_ros.core.stage import Estimate
+
+# Estimates by how much the pose of the laser on the robot is wrong.
+#
+# A laser that is turned on the robot turns the motion that scan matching finds against that of the
+# odometry. A laser in another place moves while the robot turns in place. With a motion M by
+# odometry and the same motion F by scan matching, F = inverse(E) o M o E for the error E of the
+# mount. The translations are linear in the position of the laser and in cosine and sine of its yaw.
+# Source: Shiu and Ahmad, "Calibration of wrist-mounted robotic sensors by solving homogeneous
+# transform equations of the form AX = XB", 1989, in the plane.
+
+_ITERATIONS = 3
+
+
+@dataclass(frozen=True)
+class MountErrorConfig:
+    """Spans of motion, their noise, and the prior of the estimate.
+
+    A span of motion ends after span_m or span_rad, so long that the errors of its ends are small
+    beside it. windows: number of the last spans of either kind from which the error is estimated:
+    a slip is found by few, a small error by many; fewer show nothing. noise_m,
+    noise_share: of a span, and for each metre of it, besides the covariance of its ends;
+    min_information: for directions without information, as in a corridor; prior_sigmas: of the
+    yaw (rad), of the odometry's scale and of the position (m); outlier_sigmas: residual
+    with half the weight, for wheel slip.
+    """
+
+    span_m: float = 0.5
+    span_rad: float = 0.5
+    windows: tuple[int, int] = (5, 10)
+    noise_m: float = 0.01
+    noise_share: float = 0.02
+    min_information: float = 1e-2
+    prior_sigmas: tuple[float, ...] = (math.pi, 0.1, 0.2, 0.2)
+    outlier_sigmas: float = 2.4
+
+
+@dataclass(frozen=True, eq=False)
+class MountError:
+    """By how much the true pose of the laser on the robot differs from the given one.
+
+    yaw_rad, and offset_m (2,) in the robot frame, with their standard deviations; that of the
+    offset is in its least certain direction. yaw_support: ratio of the straight spans that ask for
+    this yaw, whose squared residual would be larger by a variance without it.
+    """
+
+    yaw_rad: float
+    yaw_sigma_rad: float
+    offset_m: Array
+    offset_sigma_m: float
+    yaw_support: float
+
+    @property
+    def least_yaw_rad(self) -> float:
+        """Least yaw error within three sigmas, if most spans ask for one; else at most 0.
+
+        In a corridor one wrong match can turn the estimate to the other direction.
+        """
+        least = abs(self.yaw_rad) - BOUND_SIGMAS * self.yaw_sigma_rad
+        return least if self.yaw_support > 0.5 else min(least, 0.0)
+
+    @property
+    def least_offset_m(self) -> float:
+        """Least offset within three sigmas; negative where none is certain."""
+        return math.hypot(*self.offset_m) - BOUND_SIGMAS * self.offset_sigma_m
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    """Poses (3,) of a scan, by matching and by odometry, and the covariance (3, 3) of the match."""
+
+    T_map_base: Array
+    T_odom_base: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Span:
+    """A span of motion as linear equations of [cos, sin, x, y]: H (2, 4), y (2,).
+
+    cos and sin of the yaw error, times the scale of the odometry; x, y: position of the laser. The
+    errors of the equations are independent, with variance 1.
+    """
+
+    H: Array
+    y: Array
+
+
+class MountErrorEstimator:
+    """Compares the motion by scan matching with that by odometry."""
+
+    def __init__(self, config: MountErrorConfig | None = None) -> None:
+        self._config = config or MountErrorConfig()
+        # Apart, so that turns do not displace what was learned in straight driving.
+        self._straight: deque[_Span] = deque(maxlen=max(self._config.windows))
+        self._turning: deque[_Span] = deque(maxlen=max(self._config.windows))
+        self._begin: _Pose | None = None
+        self._T_odom_last: Array = np.zeros(3)
+        self._path_m = self._turn_rad = 0.0
+
+    def reset_span(self) -> None:
+        """Discard the current span: a pose is unknown, or is not due to matching."""
+        self._begin = None
+
+    def add(
+        self, T_map_base: Array, information: Array, T_odom_base: Array, T_base_laser: Array
+    ) -> bool:
+        """Add a matched pose (3,) with the information (3, 3) of its scan; whether a span ended.
+
+        T_odom_base (3,): odometry at the scan; T_base_laser (3,): pose of the laser as given.
+        """
+        config = self._config
+        if self._begin is not None:
+            moved = se2.between(self._T_odom_last, T_odom_base)
+            self._path_m += math.hypot(moved[0], moved[1])
+            self._turn_rad += float(moved[2])
+        self._T_odom_last = T_odom_base
+        is_long = self._path_m >= config.span_m
+        if self._begin is not None and not is_long and abs(self._turn_rad) < config.span_rad:
+            return False
+        floor = config.min_information * np.eye(3)
+        covariance: Array = np.linalg.inv(information + floor).astype(np.float64)
+        end = _Pose(T_map_base, T_odom_base, covariance)
+        begin = self._begin
+        if begin is not None:
+            span = self._span(begin, end, T_base_laser)
+            if span is not None:
+                (self._straight if is_long else self._turning).append(span)
+        self._begin = end
+        self._path_m = self._turn_rad = 0.0
+        return begin is not None
+
+    def estimates(self, T_base_laser: Array) -> list[MountError]:
+        """Estimated errors of the pose T_base_laser (3,), by each window with enough motion."""
+        found = []
+        for count in self._config.windows:
+            straight = _newest(self._straight, count)
+            turning = _newest(self._turning, count)
+            if straight or turning:
+                found.append(_estimate(straight, turning, T_base_laser, self._config))
+        return found
+
+    def _span(self, begin: _Pose, end: _Pose, T_base_laser: Array) -> _Span | None:
+        """Equations of the motion between two poses; None where no mount explains its length.
+
+        Then the wheels have slipped, or a match is wrong.
+        """
+        config = self._config
+        F = se2.between(begin.T_map_base, end.T_map_base)
+        M = se2.between(begin.T_odom_base, end.T_odom_base)
+        # The chord of an arc is rotated by half the turn that the odometry lacks.
+        unexplained = float(se2.wrap(float(F[2] - M[2])))
+        along, aside = (rotation(0.5 * unexplained)[:2, :2] @ M[:2]).tolist()
+        length = math.hypot(along, aside)
+        lever = rotation(float(F[2]))[:2, :2] - np.eye(2)
+        # By a coarse integration of the odometry its direction is wrong by up to half the turn.
+        turn_variance = float(begin.covariance[2, 2]) + 0.25 * (float(F[2]) ** 2 + unexplained**2)
+        noise = config.noise_m**2 + length**2 * (config.noise_share**2 + turn_variance)
+        R = rotation(-float(begin.T_map_base[2]))[:2, :2]
+        ends = R @ (begin.covariance + end.covariance)[:2, :2] @ R.T
+        covariance = ends + noise * np.eye(2)
+        _, scale, place, _ = config.prior_sigmas
+        possible = config.noise_m**2 + float(np.linalg.eigvalsh(ends)[-1])
+        swing = math.hypot(*lever[0].tolist())
+        possible += (scale * length) ** 2 + (swing * place) ** 2
+        # A laser may point anywhere: then it swings to the other side.
+        opposite = 2.0 * swing * math.hypot(T_base_laser[0], T_base_laser[1])
+        if abs(math.hypot(F[0], F[1]) - length) > BOUND_SIGMAS * math.sqrt(possible) + opposite:
+            return None
+        H = np.column_stack([[along, aside], [aside, -along], lever])
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        return _Span(whitening @ H, whitening @ (F[:2] + lever @ T_base_laser[:2]))
+
+
+def _newest(spans: deque[_Span], count: int) -> list[_Span]:
+    """The newest spans; none if there are fewer."""
+    return list(spans)[-count:] if len(spans) >= count else []
+
+
+def _estimate(
+    straight: list[_Span], turning: list[_Span], T_base_laser: Array, config: MountErrorConfig
+) -> MountError:
+    """Estimated error of the pose T_base_laser (3,) of a laser by some spans."""
+    spans = [*straight, *turning]
+    H = np.concatenate([span.H for span in spans])
+    y = np.concatenate([span.y for span in spans])
+    x, information = _solve(H, y, T_base_laser[:2], config)
+    covariance = np.linalg.inv(information)
+    largest = float(np.linalg.eigvalsh(covariance[2:, 2:])[-1])
+    yaw = float(se2.wrap(float(x[0])))
+    support = _support(straight, x, T_base_laser[:2])
+    return MountError(yaw, math.sqrt(float(covariance[0, 0])), x[2:], math.sqrt(largest), support)
+
+
+def _support(straight: list[_Span], x: Array, place: Array) -> float:
+    """Ratio of straight spans for which a solution (4,) fits better than one without yaw."""
+    if not straight:
+        return 0.0
+    without = np.concatenate([[x[1], 0.0], place + x[2:]])
+    R = rotation(-float(x[0]))[:2, :2]
+    found = np.concatenate([x[1] * R[0], R @ without[2:]])
+    gains = [
+        np.square(span.y - span.H @ without).sum() - np.square(span.y - span.H @ found).sum()
+        for span in straight
+    ]
+    return float(np.mean(np.array(gains) > 1.0))
+
+
+def _solve(H: Array, y: Array, place: Array, config: MountErrorConfig) -> tuple[Array, Array]:
+    """Yaw error, scale of the odometry and offset of the laser (4,), and information (4, 4).
+
+    place (2,): position of the laser as given. Gauss-Newton with Cauchy weights. Residuals beyond
+    the modelled noise lower the information. The scale has a prior: along a corridor the odometry
+    alone measures the length of a motion.
+    """
+    mean = np.array([0.0, 1.0, 0.0, 0.0])
+    prior = np.diag(np.array(config.prior_sigmas) ** -2.0)
+    x = np.array([_first_yaw(H, y, place, config), *mean[1:].tolist()])
+    for _ in range(_ITERATIONS):
+        R = rotation(-float(x[0]))[:2, :2]
+        turned = R @ (place + x[2:])
+        direction = x[1] * R[0]  # cos and sin of the yaw error, times the scale
+        residuals = y - H @ np.concatenate([direction, turned])
+        weights = 1.0 / (1.0 + np.square(residuals / config.outlier_sigmas))
+        by_yaw = np.array([-direction[1], direction[0], turned[1], -turned[0]])
+        J = np.column_stack([H @ by_yaw, H[:, :2] @ R[0], H[:, 2:] @ R])
+        information = prior + (J.T * weights) @ J
+        x = x + np.linalg.solve(information, (J.T * weights) @ residuals + prior @ (mean - x))
+    squared = float(weights @ np.square(residuals))
+    return x, information / max(1.0, squared / max(float(weights.sum()) - 3.0, 1.0))
+
+
+def _first_yaw(H: Array, y: Array, place: Array, config: MountErrorConfig) -> float:
+    """The yaw of none, of one span, or of all together that has the lowest cost.
+
+    A span with a jump of the pose would draw the solution of all together anywhere.
+    """
+    blocks = H[:, :2].reshape(-1, 2, 2)
+    transposed = blocks.transpose(0, 2, 1)
+    # A span without translation has no direction.
+    squares = transposed @ blocks + 1e-6 * np.eye(2)
+    own = np.linalg.solve(squares, transposed @ y.reshape(-1, 2, 1))[..., 0]
+    linear = np.linalg.solve(H.T @ H + np.eye(4), H.T @ y)
+    yaws = np.arctan2([0.0, linear[1], *own[:, 1]], [1.0, linear[0], *own[:, 0]])
+    c = np.cos(yaws)
+    s = np.sin(yaws)
+    x = np.stack([c, s, c * place[0] + s * place[1], c * place[1] - s * place[0]])
+    cost = np.log1p(np.square((y[:, None] - H @ x) / config.outlier_sigmas)).sum(axis=0)
+    return float(yaws[int(cost.argmin())])
+
+
+# Compares the turns of scans with those of the odometry, to find a mirrored laser.
+#
+# A driver whose angle increment has the wrong sign exchanges left and right. The map is a perfect
+# mirror image then, and nothing within the scans contradicts it. Only the scans turn against the
+# odometry. The turn between two near scans is that with which most of their ranges agree. The
+# odometry's translation is applied to it, its turn is not.
+
+
+@dataclass(frozen=True)
+class TurnComparisonConfig:
+    """Scans that are compared, and how.
+
+    Two scans are compared with from min_turn_rad to max_turn_rad of odometry between them, within
+    max_path_m: a right angle more would be ambiguous in a square room. step_rad: between turns that
+    are tried, up to max_ratio times that of the odometry to either side; max_points: of a scan;
+    tolerance_m: difference of ranges with half the score; min_share: of the points that have to
+    be in view of both scans; min_lead: lead of the best turn over those in the other direction,
+    without which it means nothing; ratio_sigma: standard deviation of the ratio of two turns, 0.10
+    to 0.44 on the recordings of seven robots.
+    """
+
+    min_turn_rad: float = 0.15
+    max_turn_rad: float = 0.5
+    max_path_m: float = 0.5
+    step_rad: float = 0.025
+    max_ratio: float = 1.5
+    max_points: int = 120
+    tolerance_m: float = 0.1
+    min_share: float = 0.3
+    min_lead: float = 0.05
+    ratio_sigma: float = 0.5
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Sums of turns that were compared, rad.
+
+    odometry: without signs; scans: positive in the direction of the odometry, negative against it.
+    squares: sum of the squared turns of the odometry; products: of both; fourth: sum of the fourth
+    powers of the odometry's.
+    """
+
+    odometry: float = 0.0
+    scans: float = 0.0
+    squares: float = 0.0
+    products: float = 0.0
+    fourth: float = 0.0
+
+    def added(self, odometry: float, scans: float) -> 'Turns':
+        """The sums with two more turns."""
+        return Turns(
+            self.odometry + abs(odometry),
+            self.scans + math.copysign(1.0, odometry) * scans,
+            self.squares + odometry**2,
+            self.products + odometry * scans,
+            self.fourth + odometry**4,
+        )
+
+    def are_opposed(self, ratio_sigma: float) -> bool:
+        """Whether the scans turn against the odometry, by three sigmas.
+
+        Their ratio is nearer to -1, of a mirrored laser, than to 0, of unrelated turns.
+        """
+        if self.squares == 0.0:
+            return False
+        sigma = ratio_sigma * math.sqrt(self.fourth) / self.squares
+        return self.products / self.squares + 3.0 * sigma < -0.5
+
+
+class TurnComparison:
+    """Sums up the turns of scans, found without odometry, and those of the odometry."""
+
+    def __init__(self, config: TurnComparisonConfig | None = None) -> None:
+        self._config = config or TurnComparisonConfig()
+        self.turns = Turns()
+        self._reference: tuple[Scan, Array] | None = None
+
+    @property
+    def are_opposed(self) -> bool:
+        """Whether the scans turn against the odometry."""
+        return self.turns.are_opposed(self._config.ratio_sigma)
+
+    def add(self, scan: Scan, T_odom_base: Array) -> None:
+        """Add a scan with the odometry pose (3,) at its stamp."""
+        if np.count_nonzero(scan.hit) < MIN_HITS:
+            self._reference = None
+            return
+        if self._reference is None:
+            self._reference = (scan, T_odom_base)
+            return
+        reference, T_odom_reference = self._reference
+        moved = se2.between(T_odom_reference, T_odom_base)
+        turn = float(moved[2])
+        is_near = math.hypot(moved[0], moved[1]) <= self._config.max_path_m
+        if is_near and abs(turn) < self._config.min_turn_rad:
+            return
+        self._reference = (scan, T_odom_base)
+        if is_near and abs(turn) <= self._config.max_turn_rad:
+            found = self._turn(reference, scan, moved)
+            if found is not None:
+                self.turns = self.turns.added(turn, found)
+
+    def _turn(self, reference: Scan, scan: Scan, moved: Array) -> float | None:
+        """Turn (rad) from a reference to a scan; None if one in the other direction fits as well.
+
+        moved (3,): motion by odometry in between, robot frame.
+        """
+        config = self._config
+        count = math.ceil(config.max_ratio * abs(float(moved[2])) / config.step_rad)
+        turns = config.step_rad * np.arange(-count, count + 1, dtype=np.float64)
+        points = reference.points_base()
+        points = points[:: -(-len(points) // config.max_points)] - moved[:2]
+        score = _agreement(points, turns, scan, config)
+        best = int(score.argmax())
+        opposite = score[:count] if best > count else score[count + 1 :]
+        if best == count or score[best] - opposite.max() < config.min_lead:
+            return None
+        return float(turns[best])
+
+
+def _agreement(points: Array, turns: Array, scan: Scan, config: TurnComparisonConfig) -> Array:
+    """Agreement (K,), 0 to 1, of points (N, 2) with the ranges of a scan for some turns (K,).
+
+    points: in the robot frame of the scan but for its turn; 0 where too few are in view.
+    """
+    c = np.cos(turns)[:, None]
+    s = np.sin(turns)[:, None]
+    x = c * points[:, 0] + s * points[:, 1] - scan.T_base_laser[0]
+    y = c * points[:, 1] - s * points[:, 0] - scan.T_base_laser[1]
+    bearings = np.arctan2(y, x) - scan.T_base_laser[2] - scan.angle_min_rad
+    step = scan.angle_increment_rad
+    ahead = np.mod(math.copysign(1.0, step) * bearings, 2.0 * math.pi)
+    beams: NDArray[np.int64] = np.rint(ahead / max(abs(step), 1e-6)).astype(np.int64)
+    is_seen = beams < scan.ranges_m.size
+    beams[~is_seen] = 0
+    is_seen &= scan.hit[beams]
+    off = np.where(is_seen, scan.ranges_m[beams] - np.hypot(x, y), 0.0)
+    fits = is_seen / (1.0 + np.square(off / config.tolerance_m))
+    seen = np.count_nonzero(is_seen, axis=1)
+    return np.where(
+        seen >= config.min_share * len(points), fits.sum(axis=1) / np.maximum(seen, 1), 0.0
+    )
+
+
+@dataclass(frozen=True)
+class MountLimits:
+    """Errors of the laser's pose on the robot that are reported, and at which the robot stops."""
+
+    warn_yaw_rad: float = math.radians(5.0)
+    stop_yaw_rad: float = math.radians(20.0)
+    warn_offset_m: float = 0.1
+
+
+_LIMITS = MountLimits()
+
+
+class ConsistencyMonitor:
+    """Checks each scan with its estimate; warns of contradictions between laser and odometry.
+
+    warnings: those that hold now, by kind; reported: the last text of each kind so far.
+    """
+
+    def __init__(self) -> None:
+        self.warnings: dict[str, str] = {}
+        self.reported: dict[str, str] = {}
+        self._turns = TurnComparison()
+        self._mount_errors = MountErrorEstimator()
+        self._by_window: list[MountError] = []
+
+    def checked(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> Estimate:
+        """The estimate of a scan with odometry pose (3,), with `mount_fault` where there is one.
+
+        A pose that no match has set, or that a loop closure has moved, says nothing of the mount,
+        and neither does an odometry that has jumped.
+        """
+        if se2.is_finite(T_odom_base):
+            self._turns.add(scan, T_odom_base)
+            self._add_to_mount(scan, T_odom_base, estimate)
+        self.warnings = dict(self._found(scan))
+        self.reported |= self.warnings
+        return replace(estimate, mount_fault=self._fault)
+
+    def _add_to_mount(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> None:
+        information = estimate.scan_information
+        is_moved = estimate.correction is not None or estimate.odometry_discontinuity
+        if information is None or is_moved:
+            self._mount_errors.reset_span()
+            return
+        T_base_laser = scan.T_base_laser
+        if self._mount_errors.add(estimate.T_map_base, information, T_odom_base, T_base_laser):
+            self._by_window = self._mount_errors.estimates(T_base_laser)
+
+    def _found(self, scan: Scan) -> Iterator[tuple[str, str]]:
+        """Kind and text of each warning."""
+        if scan.warning:
+            yield 'angles', scan.warning
+        if self._turns.are_opposed:
+            turns = self._turns.turns
+            yield (
+                'turns',
+                f'scans turn against the odometry: by {turns.scans:.1f} rad where the odometry '
+                f'turned by {turns.odometry:.1f} rad: laser upside down or clockwise, or the yaw '
+                'of the odometry inverted?',
+            )
+        turned = self._most_turned
+        if turned is not None and turned.least_yaw_rad > _LIMITS.warn_yaw_rad:
+            yield 'yaw', _yaw_text(turned)
+        moved = max(self._by_window, key=lambda error: error.least_offset_m, default=None)
+        if moved is not None and moved.least_offset_m > _LIMITS.warn_offset_m:
+            x, y = moved.offset_m.tolist()
+            yield (
+                'offset',
+                f'laser displaced by {x:.2f}, {y:.2f} m (sigma {moved.offset_sigma_m:.2f} m) from '
+                'its given pose on the robot: by turns in scans and in odometry',
+            )
+
+    @property
+    def _most_turned(self) -> MountError | None:
+        """The estimate that is most certain of an error of the yaw."""
+        return max(self._by_window, key=lambda error: error.least_yaw_rad, default=None)
+
+    @property
+    def _fault(self) -> str:
+        """Why the robot must not drive with this laser; '' for no reason."""
+        turned = self._most_turned
+        is_wrong = turned is not None and turned.least_yaw_rad > _LIMITS.stop_yaw_rad
+        return _yaw_text(turned) if turned is not None and is_wrong else ''
+
+
+def _yaw_text(error: MountError) -> str:
+    yaw = math.degrees(error.yaw_rad)
+    sigma = math.degrees(error.yaw_sigma_rad)
+    return (
+        f'laser turned by {yaw:.0f} deg (sigma {sigma:.1f} deg) from its given pose on the robot: '
+        'by the direction of motion in scans and in odometry'
+    )
