@@ -15,9 +15,8 @@ from scipy.optimize import linear_sum_assignment
 
 from benchmarks.scoreboard.drives import samples
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.regions.tracker import RegionTracker

@@ -14,9 +14,8 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
     from thinmap_ros.core.errors import ConfigError, InputError, ThinmapError
     from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
-    from thinmap_ros.core.grid.frame import GridFrame
     from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-    from thinmap_ros.core.grid.patch import GridPatch
+    from thinmap_ros.core.grid.patch import GridFrame, GridPatch
     from thinmap_ros.core.places.config import GlobalLocalizationConfig
     from thinmap_ros.core.places.global_localizer import GlobalLocalization as GlobalLocalizer
     from thinmap_ros.core.planning.graph_search import shortest_path
@@ -99,7 +98,7 @@ _PLACES = {
     'paired_scans': 'logs.reading.paired_scans',
     # maps
     'GridPatch': 'core.grid.patch.GridPatch',
-    'GridFrame': 'core.grid.frame.GridFrame',
+    'GridFrame': 'core.grid.patch.GridFrame',
     'OccupancyConfig': 'core.grid.occupancy.OccupancyConfig',
     'OccupancyGrid': 'core.grid.occupancy.OccupancyGrid',
     'read_map': 'files.occupancy_maps.read_map',

@@ -10,8 +10,7 @@ from benchmarks.exploration.cases import load_case
 from thinmap_ros.closed_loop import Options, make_loop, no_progress
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.strategy import Decision
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import kernel
 from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.worlds import floors
 from thinmap_ros.baselines.voronoi import build_voronoi
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.places.global_localizer import GlobalLocalization, Hypothesis, Result, State
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.builder import TopologyConfig, build

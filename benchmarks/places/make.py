@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.places.recorded import RecordedPiece
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, Mishap, no_progress
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan

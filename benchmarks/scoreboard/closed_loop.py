@@ -19,8 +19,8 @@ from thinmap_ros.closed_loop import (
     no_progress,
 )
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.se2 import Array

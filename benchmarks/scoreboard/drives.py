@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.sim.buildings import Building, generate_building

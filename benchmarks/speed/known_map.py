@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.speed.node_process import TrafficListener, processor_s, start, stop, use_own_domain
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.evaluation.outcome import Row, at_most

@@ -17,8 +17,7 @@ from thinmap_ros.baselines.exploration import (
 )
 from thinmap_ros.baselines.frontier_map import Frontier
 from thinmap_ros.closed_loop import Options
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.evaluation.exploration_run import explore

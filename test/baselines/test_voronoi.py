@@ -12,8 +12,7 @@ from benchmarks.graphs.graph_metrics import (
     sight_share,
 )
 from thinmap_ros.baselines.voronoi import build_voronoi, voronoi_lines
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology.builder import TopologyConfig, build, build_along
 from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap

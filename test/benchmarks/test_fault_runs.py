@@ -20,8 +20,7 @@ from benchmarks.faults.processes import Processes
 from benchmarks.faults.stream_faults import StreamFaults
 from benchmarks.faults.track import Located, Track
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import messages

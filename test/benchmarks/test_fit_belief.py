@@ -20,8 +20,7 @@ from benchmarks.exploration.fit_belief import (
 )
 from benchmarks.exploration.observed_candidates import COLUMNS, Case, hidden_areas
 from thinmap_ros.core.exploration.belief.fitted import FITTED
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.sim.coverage import ObservableCells
 
 

@@ -8,8 +8,7 @@ from PIL import Image
 
 from benchmarks.graphs.map_sizes import graph_in_bytes, grid_as_png, grid_in_bytes
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 

@@ -13,8 +13,7 @@ import yaml
 from support.node_list import ROOT, node_class
 
 from thinmap_ros.core.errors import ConfigError
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.files.occupancy_maps import write_map
 from thinmap_ros.ros.foreign.tables import PACKAGES
 

@@ -10,8 +10,7 @@ from support import bag_maker
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.evaluation import recorded_team_run
 from thinmap_ros.files import occupancy_maps, package_data
 from thinmap_ros.files.worlds import read_world

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.regions.membership import Membership, membership_of
 from thinmap_ros.core.regions.region_map import Door, Region, RegionKind, RegionMap
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap

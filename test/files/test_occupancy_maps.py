@@ -14,8 +14,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.files.occupancy_maps import read_map, write_map
 from thinmap_ros.files.yaml import number_of, parse_yaml
 

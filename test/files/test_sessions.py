@@ -10,10 +10,9 @@ import pytest
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.edits import MapEdits
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, pose
 from thinmap_ros.core.slam.localizer import Localizer

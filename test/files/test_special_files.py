@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.files import occupancy_maps, sessions, trajectories, worlds, yaml
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_directory import bag_files

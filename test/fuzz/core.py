@@ -10,9 +10,8 @@ from fuzz.cases import Source, chosen, finite, nothing, tried
 from fuzz.files import small_graph, sound_graph, sound_patch
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.explorer import Explorer
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig

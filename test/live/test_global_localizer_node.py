@@ -11,8 +11,7 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.msg import LocalizationStatus, TopologicalMap
 from thinmap_msgs.srv import LocalizeGlobally
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap as TopologicalGraph

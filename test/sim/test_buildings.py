@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.sim.buildings import BuildingConfig, generate_building
 from thinmap_ros.sim.floor_plan import FloorPlanConfig, Kind, generate_floor_plan
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig

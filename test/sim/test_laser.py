@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World

@@ -7,7 +7,7 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.other_robots import simulations_in, starts_in, starts_side_by_side
 from thinmap_ros.sim.robot import PRESETS

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.sim.robot import PRESETS, DifferentialDriveRobot, RobotConfig, after_arc
 from thinmap_ros.sim.world import World
 

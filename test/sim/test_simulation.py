@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation

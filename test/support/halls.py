@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.ros import messages
 
 START = '2.0,2.0,0.9'

@@ -9,7 +9,7 @@ import pytest
 
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
 from thinmap_ros.sim.world import World

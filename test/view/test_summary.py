@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.topology.builder import TopologyConfig, build

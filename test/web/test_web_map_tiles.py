@@ -7,8 +7,7 @@ import zlib
 import numpy as np
 import pytest
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.web.board import Board
 from thinmap_ros.web.map_tiles import MapTiles
 

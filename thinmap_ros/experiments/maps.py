@@ -4,9 +4,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.experiments.drives import world_of
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.sim.surfaces import inside_of

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.grid.frame import MIN_RESOLUTION_M, GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import MIN_RESOLUTION_M, GridFrame, GridPatch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, pose
 from thinmap_ros.files.limits import FILES
 from thinmap_ros.files.occupancy_maps import read_map

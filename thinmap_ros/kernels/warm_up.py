@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -202,7 +201,7 @@ def explorer() -> None:
     """Warm up the choice of an end node, in a partly unknown room, and what other maps need."""
     from thinmap_ros.core.exploration.explorer import Explorer
     from thinmap_ros.core.exploration.viewpoints import search_beside
-    from thinmap_ros.core.grid.foreign_maps import scan_in_map
+    from thinmap_ros.core.grid.patch import scan_in_map
     from thinmap_ros.core.grid.raytrace import line_is_clear
     from thinmap_ros.core.planning.grid_search import path_lengths_from
 

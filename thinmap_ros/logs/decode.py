@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.keep_out import KeepOut, KeepOutArea
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.floor_plan import (
     FloorPart,

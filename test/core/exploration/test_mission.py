@@ -18,8 +18,7 @@ from thinmap_ros.core.exploration.mission import (
 )
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import pose
 from thinmap_ros.core.topology.graph import TopologicalMap

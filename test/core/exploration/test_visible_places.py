@@ -7,7 +7,7 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.visibility import field_of_view, visible_places
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.scan import Scan
 
 FRAME = GridFrame(0.0, 0.0, 0.1)

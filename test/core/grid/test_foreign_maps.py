@@ -5,9 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from thinmap_ros.core.grid.foreign_maps import occupancy_from_costs, scan_in_map
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch, occupancy_from_costs, scan_in_map
 from thinmap_ros.core.se2 import pose
 
 

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.keep_out import (
     MAX_AREAS,
     MAX_CORNERS,
@@ -14,7 +13,7 @@ from thinmap_ros.core.grid.keep_out import (
     KeepOutArea,
     moved_corners,
 )
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.polygon import inside, touched_cells
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, find_path
 from thinmap_ros.core.se2 import compose, invert, pose, transform_points

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from reference_grid import PlainGrid
 
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import (
     P_MAX,
     P_MIN,
@@ -16,7 +15,7 @@ from thinmap_ros.core.grid.occupancy import (
     OccupancyGrid,
     log_odds,
 )
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.scan import Scan

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch, bounds_of
+from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch, bounds_of
 
 
 def patch_of(rows, cols, value=0, origin=(0.0, 0.0)):

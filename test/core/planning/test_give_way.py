@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.give_way import Motion, as_heard, moved_on, must_stop
 from thinmap_ros.core.planning.navigator import Navigator
 

@@ -9,8 +9,7 @@ from scipy import ndimage
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.frontiers import _clusters
 from thinmap_ros.core.exploration.visibility import field_of_view, visible_places
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.grid_search import downsample_mask
 from thinmap_ros.core.planning.obstacle_points import _arc, _clear_steps, _points_around

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from support.ride import Ride
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.long_path import route_band
 from thinmap_ros.core.planning.traversability import path_collides
 from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path, plan

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, find_path, plan
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning import short_path
 from thinmap_ros.core.planning.short_path import plan_short_path
 from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, plan

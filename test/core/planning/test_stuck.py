@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.navigator import Navigator
 from thinmap_ros.core.planning.stuck import StuckDetector, StuckPlaces
 from thinmap_ros.core.se2 import pose

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.graphs.doors import oblique_door, pass_door
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.traversability import nearest_true, path_collides
 from thinmap_ros.core.planning.wavefront import (
     WavefrontConfig,

@@ -5,8 +5,7 @@ import pytest
 from core.regions.floors import CELL_M, office, patch_of
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.regions.tracker import RegionTracker
 
 CORRIDOR = (7.0, 3.2)

@@ -5,8 +5,7 @@ import pytest
 from support.slam_room import ROOM, ranges_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.localizer import Localizer

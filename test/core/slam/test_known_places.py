@@ -5,8 +5,7 @@ import pytest
 from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizers import config_with, localizer_class
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.layers.deletion_times import update_skeleton
 from thinmap_ros.core.topology.layers.free_space import FreeSpace

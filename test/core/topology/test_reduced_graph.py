@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.graphs.graph_metrics import drivable_share
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology.builder import TopologyConfig, build_along
 from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap

@@ -20,8 +20,7 @@ from thinmap_msgs.msg import (
     TopologicalMap,
 )
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.grid.rotated import overlaid
 from thinmap_ros.core.scan import Scan

@@ -28,8 +28,7 @@ from thinmap_msgs.msg import (
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.exploration.mission import MissionState
 from thinmap_ros.core.exploration.strategy import FinishCode
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import pose

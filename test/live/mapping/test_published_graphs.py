@@ -6,8 +6,7 @@ from support.doctor import Doctor
 from support.localized import local_grid
 
 from thinmap_msgs.msg import LocalGrid, TopologicalMap
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import messages, qos
 

@@ -9,8 +9,7 @@ from rclpy.action import ActionClient
 from support.peers.still_robot import StillRobot
 
 from thinmap_msgs.msg import TopologicalMap
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.ros import messages, qos
 

@@ -8,8 +8,7 @@ from support.localized import local_grid
 
 from thinmap_ros.core.exploration.mission import MissionGoal
 from thinmap_ros.core.exploration.strategy import FinishCode
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.nodes.explorer import ExplorerNode
 from thinmap_ros.ros.diagnostics import WARN
 

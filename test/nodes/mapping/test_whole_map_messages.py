@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.mapper import WholeMap
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.ros import messages
 

@@ -6,8 +6,7 @@ from rclpy.clock import ROSClock
 from rclpy.time import Time
 from support.localized import local_grid
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.nodes.navigation.map_input import MapInput, MapTimeoutConfig
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.clocks.time_jumps import ElapsedTime

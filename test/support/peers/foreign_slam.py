@@ -18,8 +18,7 @@ from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid import occupancy
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.ros import messages, qos
 
 RESOLUTION_M = 0.05

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.exploration.frontiers import NOTHING, FrontierMap
 from thinmap_ros.core.exploration.viewpoints import SQUARE
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.planning.grid_search import (
     distance_field_from,
     downsample_mask,

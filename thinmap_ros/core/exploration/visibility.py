@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.grid.patch import Bounds
+from thinmap_ros.core.grid.patch import Bounds, GridFrame
 from thinmap_ros.core.grid.polygon import Mask, touched_cells
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.scan import Scan

@@ -10,8 +10,7 @@ import numpy as np
 
 from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import InputError, counted
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import Bounds, GridPatch
+from thinmap_ros.core.grid.patch import Bounds, GridFrame, GridPatch
 from thinmap_ros.core.grid.polygon import Mask, inside, touched_cells, with_walls
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_ID

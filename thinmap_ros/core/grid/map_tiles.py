@@ -14,8 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import (
+    FREE_AT_MOST,
+    OCCUPIED_AT_LEAST,
+    UNKNOWN,
+    GridFrame,
+    GridPatch,
+)
 from thinmap_ros.core.grid.tiles import MAX_CELLS
 from thinmap_ros.core.se2 import Array
 

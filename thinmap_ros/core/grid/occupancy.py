@@ -11,8 +11,14 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import Config, config_or_default, parameter
 from thinmap_ros.core.errors import InputError, quoted, require_type
-from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, Bounds, GridPatch
+from thinmap_ros.core.grid.patch import (
+    MAX_RESOLUTION_M,
+    MIN_RESOLUTION_M,
+    UNKNOWN,
+    Bounds,
+    GridFrame,
+    GridPatch,
+)
 from thinmap_ros.core.grid.raytrace import fill_segment
 from thinmap_ros.core.grid.rendered_map import RenderedMap
 from thinmap_ros.core.grid.tiles import MAX_TILE_INDEX, TILE, TileStore

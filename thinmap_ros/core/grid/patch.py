@@ -1,5 +1,6 @@
 """A rectangle of map cells with its place in the world."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,16 +8,82 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError, quoted, require_type
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.grid.raytrace import cast_rays
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
+
+# Transform between world points and the cells of a grid.
+
+MIN_RESOLUTION_M = 0.001
+
+MAX_RESOLUTION_M = 10.0
+
+
+@dataclass(frozen=True)
+class GridFrame:
+    """A lattice of square cells: world point <-> cell (row, col).
+
+    origin_x, origin_y: lower left corner of cell (0, 0), m; resolution: edge of a cell, m. Row 0
+    has the lowest y, as in nav_msgs/OccupancyGrid. Raises InputError if the origin is beyond
+    MAX_COORDINATE_M, or the resolution is not between MIN_RESOLUTION_M and MAX_RESOLUTION_M.
+    """
+
+    origin_x: float
+    origin_y: float
+    resolution: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not isinstance(value, float | int | np.number):
+                raise InputError(f'{name} = {quoted(value)}: expected a number')
+        if not (abs(self.origin_x) <= MAX_COORDINATE_M and abs(self.origin_y) <= MAX_COORDINATE_M):
+            raise InputError(
+                f'map with its origin at {self.origin_x:g}, {self.origin_y:g} m: expected numbers '
+                f'from {-MAX_COORDINATE_M:g} to {MAX_COORDINATE_M:g}'
+            )
+        if not MIN_RESOLUTION_M <= self.resolution <= MAX_RESOLUTION_M:
+            raise InputError(
+                f'map of cells of {self.resolution:g} m: expected {MIN_RESOLUTION_M:g} to '
+                f'{MAX_RESOLUTION_M:g} m'
+            )
+
+    def in_cells(self, points: Array) -> Array:
+        """Points (N, 2), as x and y in cells from the corner of cell (0, 0)."""
+        return np.asarray((points - (self.origin_x, self.origin_y)) / self.resolution)
+
+    def cells_of(self, points: Array) -> NDArray[np.int64]:
+        """Cells (N, 2) as (row, col) that hold the points (N, 2)."""
+        return np.floor(self.in_cells(np.atleast_2d(points))[:, ::-1]).astype(np.int64)
+
+    def centres_of(self, cells: NDArray[np.int64]) -> Array:
+        """World points (N, 2) at the centres of the cells (N, 2) given as (row, col)."""
+        centres = np.empty(cells.shape)
+        centres[:, 0] = (cells[:, 1] + 0.5) * self.resolution + self.origin_x
+        centres[:, 1] = (cells[:, 0] + 0.5) * self.resolution + self.origin_y
+        return centres
+
+    def with_origin_at(self, rows: int, cols: int) -> 'GridFrame':
+        """The same lattice with cell (rows, cols) as its new cell (0, 0)."""
+        x = self.origin_x + cols * self.resolution
+        y = self.origin_y + rows * self.resolution
+        return GridFrame(x, y, self.resolution)
+
+    def as_array(self) -> Array:
+        """Origin x, origin y and resolution, (3,), m."""
+        return np.array([self.origin_x, self.origin_y, self.resolution])
+
 
 UNKNOWN = -1
+
 # First row, first column, end row, end column.
 Bounds = tuple[int, int, int, int]
+
 # Rows before, columns before, rows after, columns after.
 Margins = tuple[int, int, int, int]
+
 # map_server's thresholds, in percent.
 FREE_AT_MOST = 25
+
 OCCUPIED_AT_LEAST = 65
 
 
@@ -162,3 +229,36 @@ def bounds_of(chosen: NDArray[np.bool_]) -> Bounds | None:
 def union(a: Bounds, b: Bounds) -> Bounds:
     """Bounds of all cells in one of two rectangles."""
     return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
+
+
+# Maps of any publisher: costs as occupancy, and what a robot would see in them.
+
+_LETHAL = 100
+
+_BEAMS = 360
+
+_RANGE_MIN_M = 0.01
+
+
+def occupancy_from_costs(patch: GridPatch) -> GridPatch:
+    """Occupancy of a costmap, in which costs below lethal only keep the robot at a distance.
+
+    The radius of the robot is a parameter of the exploration: inflated cells are free space.
+    """
+    cells = np.where(patch.cells < 0, UNKNOWN, np.where(patch.cells >= _LETHAL, _LETHAL, 0))
+    return GridPatch(patch.frame, cells.astype(np.int8))
+
+
+def scan_in_map(patch: GridPatch, T_map_base: Array, range_m: float, stamp_ns: int) -> Scan:
+    """Scan all round that the known free space of a map shows from a pose (3,).
+
+    Stands for the scans of a robot that publishes none. range_m: the farthest that is seen.
+    """
+    resolution = patch.frame.resolution
+    x = (float(T_map_base[0]) - patch.frame.origin_x) / resolution
+    y = (float(T_map_base[1]) - patch.frame.origin_y) / resolution
+    step = 2.0 * math.pi / _BEAMS
+    angles = float(T_map_base[2]) - math.pi + step * np.arange(_BEAMS, dtype=np.float64)
+    opaque = (~patch.free).astype(np.uint8)
+    ranges = resolution * cast_rays(opaque, x, y, angles, range_m / resolution)
+    return Scan.create(stamp_ns, ranges, -math.pi, step, _RANGE_MIN_M, range_m)

@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, Bounds, GridPatch, bounds_of, union
+from thinmap_ros.core.grid.patch import UNKNOWN, Bounds, GridFrame, GridPatch, bounds_of, union
 from thinmap_ros.core.grid.tiles import TileStore
 
 _BAND_ROWS = 256  # rendered at once: a large map needs little more memory than its cells

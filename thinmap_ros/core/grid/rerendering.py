@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.erasing import add_scan_outside
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.motion import MapMotion
-from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.tiles import MAX_CELLS
 from thinmap_ros.core.se2 import Array
 

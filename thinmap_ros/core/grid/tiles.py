@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import MIN_RESOLUTION_M
+from thinmap_ros.core.grid.patch import MIN_RESOLUTION_M
 from thinmap_ros.core.se2 import MAX_COORDINATE_M
 
 TILE = 64  # cells along the edge of a tile

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.distance import distance_cells
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup, line_is_clear
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.se2 import Array

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.components import reachable
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, Bounds, GridPatch
+from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, Bounds, GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.free_space import column_distance, standing_room
 from thinmap_ros.jit import kernel

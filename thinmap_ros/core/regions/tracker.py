@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.regions import names as region_names
 from thinmap_ros.core.regions.config import RegionConfig
 from thinmap_ros.core.regions.names import RegionNames

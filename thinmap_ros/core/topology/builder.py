@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import config_or_default
 from thinmap_ros.core.errors import InputError, quoted, require_type
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.motion import MapMotion
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology import topology_state
 from thinmap_ros.core.topology.config import TopologyConfig

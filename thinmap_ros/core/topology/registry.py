@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corners_between, with_middles

@@ -8,8 +8,13 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import (
+    MAX_RESOLUTION_M,
+    MIN_RESOLUTION_M,
+    UNKNOWN,
+    GridFrame,
+    GridPatch,
+)
 from thinmap_ros.core.grid.tiles import MAX_CELLS, MAX_TILE_INDEX, TILE
 from thinmap_ros.core.snapshot import MAX_CELL_INDEX, MAX_COORDINATE_M, MAX_ID, Field
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap

@@ -6,8 +6,7 @@ from functools import cached_property
 from sensor_msgs.msg import LaserScan
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.foreign_maps import scan_in_map
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridPatch, scan_in_map
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings

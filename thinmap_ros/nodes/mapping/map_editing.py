@@ -11,10 +11,9 @@ from thinmap_msgs.msg import KeepOut as KeepOutMsg
 from thinmap_msgs.msg import KeepOutArea as KeepOutAreaMsg
 from thinmap_msgs.srv import AddKeepOut, EraseArea, RemoveKeepOut
 from thinmap_ros.core.errors import InputError, counted
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.mapper import Mapper
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

@@ -7,8 +7,7 @@ import pytest
 from support.driven_pieces import driven_piece
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.places.recognition.views import LATTICE_M
 from thinmap_ros.core.places.recognition.wall_field import WallField
 

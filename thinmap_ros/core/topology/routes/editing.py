@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.free_space import column_distance, squared_clearance
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap

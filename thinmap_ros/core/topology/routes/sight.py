@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Node, TopologicalMap
