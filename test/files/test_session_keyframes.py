@@ -10,7 +10,7 @@ from support.slam_room import drive_round_the_block
 
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfLocalizer
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.correction import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

@@ -11,7 +11,7 @@ import numpy as np
 from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
-from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.correction import CorrectableGrid
 from thinmap_ros.core.grid.edits import Erasures, MapEdits
 from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid

@@ -14,7 +14,7 @@ from thinmap_msgs.msg import LocalGrid, LocalizedScan, ProbabilityGrid
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid import occupancy
-from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.correction import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.files import sessions
 from thinmap_ros.ros import messages, qos

@@ -17,7 +17,7 @@ from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ThinmapError
-from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.correction import CorrectableGrid
 from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from support.slam_room import corridor_ring, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid import rerendering
-from thinmap_ros.core.grid.correctable import MAX_OPEN, CorrectableGrid
+from thinmap_ros.core.grid import correction as rerendering
+from thinmap_ros.core.grid.correction import MAX_OPEN, CorrectableGrid, Rerendering, StoredScan
 from thinmap_ros.core.grid.occupancy import (
     P_MAX,
     P_MIN,
@@ -21,7 +21,6 @@ from thinmap_ros.core.grid.occupancy import (
     log_odds,
 )
 from thinmap_ros.core.grid.patch import UNKNOWN
-from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.stage import Destination

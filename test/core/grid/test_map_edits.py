@@ -6,7 +6,7 @@ from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.correction import CorrectableGrid
 from thinmap_ros.core.grid.edits import MAX_ERASURES, Erasures, MapEdits, split_edits
 from thinmap_ros.core.grid.keep_out import KeepOut
 from thinmap_ros.core.grid.mapper import Mapper

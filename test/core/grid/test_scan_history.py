@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.scan_history import PoseHistory
+from thinmap_ros.core.grid.correction import PoseHistory
 
 POSES = np.array([se2.pose(0.3 * k, 0.0, 0.0) for k in range(12)])
 

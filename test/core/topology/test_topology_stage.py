@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.correction import CorrectedPoses
 from thinmap_ros.core.grid.mapper import MapUpdate, WholeMap
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
-from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.stage import Destination, LocalizedScan
 from thinmap_ros.core.topology.layers.stack import Layers

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.correction import CorrectedPoses
 from thinmap_ros.core.grid.mapper import WholeMap
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.ros import messages
 
 PATCH = GridPatch(GridFrame(1.0, 2.0, 0.1), np.full((3, 4), 100, dtype=np.int8))

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.correction import CorrectableGrid, CorrectedPoses
 from thinmap_ros.core.grid.edits import MapEdits, split_edits
 from thinmap_ros.core.grid.keep_out import KeepOut, require_corners
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import LocalizedScan, Stage, Trajectory

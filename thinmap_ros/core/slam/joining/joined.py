@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.grid.correction import add_scan_outside
 from thinmap_ros.core.grid.edits import Erasure
-from thinmap_ros.core.grid.erasing import add_scan_outside
 from thinmap_ros.core.grid.motion import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.rotated import overlaid

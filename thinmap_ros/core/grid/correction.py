@@ -1,0 +1,682 @@
+"""A grid that is corrected: rendered again from stored scans, tiles near the robot first."""
+
+import math
+from array import array
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.edits import Erasures
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.patch import Bounds, GridFrame
+from thinmap_ros.core.grid.polygon import Mask, touched_cells
+from thinmap_ros.core.grid.tiles import TILE
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stage import Destination
+
+# Stored poses and scans, for re-rendering the grid after a loop closure.
+
+_MAX_PLACE = 1 << 26  # more places than lie within MAX_COORDINATE_M
+
+Kept = TypeVar('Kept')
+
+
+@dataclass(frozen=True)
+class HistoryConfig:
+    """Which scans are stored: those some distance or angle apart, the newest of each place."""
+
+    apart_m: float = 0.25
+    apart_rad: float = 0.25
+    place_m: float = 1.0  # edge of a place
+    directions: int = 8  # robot headings that are distinguished at each place
+    scans_per_place: int = 4  # and direction: about one visit
+
+
+class CorrectedPoses(NamedTuple):
+    """Poses (N, 3) of the stored scans before and after the corrections of a map."""
+
+    before: Array
+    after: Array
+
+
+class PoseHistory(Generic[Kept]):
+    """The pose of every scan, and stored data of some scans.
+
+    Of the scans that are 0.25 m or 0.25 rad apart, the newest four of each place and direction are
+    stored: their number grows with the area, not with time. A correction gives the poses of some
+    scans, by their stamps. Every other scan moves with the last of these before it, in the order in
+    which the scans were added: stamps of real robots step back now and then.
+    """
+
+    def __init__(self, config: HistoryConfig | None = None) -> None:
+        self._config = config or HistoryConfig()
+        self._stamps = array('q')
+        self._poses = array('d')
+        self._last_apart = -1
+        self._kept: dict[int, Kept] = {}  # by the index of the scan
+        self._at_place: dict[int, deque[int]] = {}
+        # All poses before the first correction that has not been accepted yet.
+        self._before: Array | None = None
+
+    def add_pose(self, stamp_ns: int, T_map_base: Array, kept: Kept) -> None:
+        """Add the pose (3,) of a scan; `kept` is stored if the scan is far enough from others."""
+        number = len(self._stamps)
+        self._stamps.append(stamp_ns)
+        self._poses.extend(T_map_base.tolist())
+        if self._last_apart >= 0:
+            last = np.array(self._poses[3 * self._last_apart : 3 * self._last_apart + 3])
+            moved = se2.between(last, T_map_base)
+            is_near = math.hypot(moved[0], moved[1]) < self._config.apart_m
+            if is_near and abs(float(moved[2])) < self._config.apart_rad:
+                return
+        self._last_apart = number
+        self._kept[number] = kept
+        at_place = self._at_place.setdefault(
+            int(_places_of(T_map_base[None], self._config)[0]), deque()
+        )
+        at_place.append(number)
+        while len(at_place) > self._config.scans_per_place:
+            del self._kept[at_place.popleft()]
+
+    def last_pose(self) -> Array | None:
+        """Pose (3,) of the newest scan; None before the first."""
+        return np.array(self._poses[-3:]) if self._poses else None
+
+    def extend(self, other: 'PoseHistory[Kept]') -> None:
+        """Add the scans of another history, at their present poses."""
+        first = len(self._stamps)
+        self._stamps.extend(other._stamps)
+        self._poses.extend(other._poses)
+        self._last_apart = first + other._last_apart
+        self._kept |= {first + number: kept for number, kept in other._kept.items()}
+        self._sort_by_place()
+
+    def kept(self) -> list[Kept]:
+        """The stored data, in the order in which it was added."""
+        return list(self._kept.values())
+
+    def kept_poses(self) -> Array:
+        """Current poses (N, 3) of the stored scans."""
+        return self._all_poses()[self._kept_numbers()]
+
+    def apply_correction(self, stamps_ns: NDArray[np.int64], poses: Array, since_ns: int) -> None:
+        """Correct all poses: the scans of these stamps (M,) were made at poses (M, 3).
+
+        since_ns: stamp of the first scan whose pose is already correct, whether it was added yet or
+        not. Unknown stamps are ignored.
+        """
+        stamps = np.array(self._stamps, dtype=np.int64)
+        right_already = np.flatnonzero(stamps == since_ns)
+        count = int(right_already[0]) if right_already.size else len(stamps)
+        numbers, named = _numbers_of(stamps_ns, stamps[:count])
+        if numbers.size == 0:
+            return
+        before = self._all_poses()[:count]
+        if self._before is None:
+            self._before = before
+        anchors = np.maximum(np.searchsorted(numbers, np.arange(count), side='right') - 1, 0)
+        after = _moved_along(before, before[numbers][anchors], poses[named][anchors])
+        np.frombuffer(self._poses)[: 3 * count] = after.ravel()
+        self._sort_by_place()
+
+    def _sort_by_place(self) -> None:
+        """Sort the stored scans by place.
+
+        Places that have too many scans now lose the oldest ones when more arrive.
+        """
+        kept = self._kept_numbers()
+        self._at_place = {}
+        places = _places_of(self._all_poses()[kept], self._config)
+        for number, place in zip(kept.tolist(), places.tolist(), strict=True):
+            self._at_place.setdefault(place, deque()).append(number)
+
+    def accept_corrections(self) -> CorrectedPoses:
+        """Poses of the stored scans before and after the corrections since the last call.
+
+        For scans added after the first of these corrections, the pose before is the one that they
+        would have without it.
+        """
+        after = self._all_poses()
+        before = after
+        if self._before is not None and len(self._before):
+            corrected = len(self._before)
+            last = corrected - 1
+            later = _moved_along(after[corrected:], after[last][None], self._before[last][None])
+            before = np.vstack([self._before, later])
+        self._before = None
+        kept = self._kept_numbers()
+        return CorrectedPoses(before[kept], after[kept])
+
+    def _kept_numbers(self) -> NDArray[np.int64]:
+        return np.array(list(self._kept), dtype=np.int64)
+
+    def _all_poses(self) -> Array:
+        return np.array(self._poses).reshape(-1, 3)
+
+
+def _places_of(poses: Array, config: HistoryConfig) -> NDArray[np.int64]:
+    """Number (N,) of the place and direction of each pose (N, 3)."""
+    turn = np.floor(poses[:, 2] % (2.0 * math.pi) / (2.0 * math.pi) * config.directions)
+    x, y = np.floor(poses[:, :2] / config.place_m).astype(np.int64).T
+    places: NDArray[np.int64] = (x * _MAX_PLACE + y) * config.directions + turn.astype(np.int64)
+    return places
+
+
+def _numbers_of(
+    wanted: NDArray[np.int64], stamps: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of the wanted stamps (M,) among all (N,), ascending, and their positions in wanted.
+
+    Of equal stamps the last is found. Unknown stamps are left out.
+    """
+    order = np.argsort(stamps, kind='stable')
+    at = np.searchsorted(stamps[order], wanted, side='right') - 1
+    named = np.flatnonzero(at >= 0)
+    numbers = order[at[named]]
+    found = stamps[numbers] == wanted[named]
+    ascending = np.argsort(numbers[found], kind='stable')
+    return numbers[found][ascending], named[found][ascending]
+
+
+def _moved_along(poses: Array, before: Array, after: Array) -> Array:
+    """Poses (N, 3), each moved rigidly with another from `before` to `after`, (N, 3) or (1, 3)."""
+    turn = after[:, 2] - before[:, 2]
+    c = np.cos(turn)
+    s = np.sin(turn)
+    dx, dy = (poses - before)[:, :2].T
+    x = after[:, 0] + c * dx - s * dy
+    y = after[:, 1] + s * dx + c * dy
+    return np.column_stack([x, y, se2.wrap(poses[:, 2] + turn)])
+
+
+# Erasing a part of a grid, so that scans from before do not draw it again.
+
+_MARGIN_CELLS = 2  # by which the cells of a scan may lie beyond the ends of its beams
+
+
+def erase(grid: OccupancyGrid, corners: Array) -> None:
+    """Set the cells of a grid that a polygon (M, 2), m, touches to unknown."""
+    tiles = grid.tiles()
+    if not len(tiles):
+        return
+    low = tiles.min(axis=0) * TILE
+    high = (tiles.max(axis=0) + 1) * TILE
+    cells = grid.frame.cells_of(corners)
+    row, col = np.maximum(cells.min(axis=0), low).tolist()
+    end_row, end_col = np.minimum(cells.max(axis=0) + 1, high).tolist()
+    if row >= end_row or col >= end_col:
+        return
+    bounds = (row, col, end_row, end_col)
+    odds = grid.odds(bounds)
+    odds[_erased(grid.frame, bounds, [corners])] = 0
+    grid.set_odds(bounds, odds)
+
+
+def add_scan_outside(
+    grid: OccupancyGrid, scan: Scan, T_map_base: Array, polygons: Sequence[Array]
+) -> None:
+    """Add a scan made at a pose (3,), but for what it shows of some polygons (M, 2), m.
+
+    Raises InputError as `OccupancyGrid.add_scan`.
+    """
+    bounds = _reach(grid, scan, T_map_base)
+    near = [corners for corners in polygons if _touches(grid.frame.cells_of(corners), bounds)]
+    if not near:
+        grid.add_scan(scan, T_map_base)
+        return
+    cells = _erased(grid.frame, bounds, near)
+    before = grid.odds(bounds)
+    grid.add_scan(scan, T_map_base)
+    grid.set_odds(bounds, np.where(cells, before, grid.odds(bounds)))
+
+
+def _erased(frame: GridFrame, bounds: Bounds, polygons: Sequence[Array]) -> Mask:
+    """Cells within bounds that one of some polygons (M, 2), m, touches."""
+    row, col, end_row, end_col = bounds
+    shape = (end_row - row, end_col - col)
+    at = frame.with_origin_at(row, col)
+    cells = np.zeros(shape, dtype=np.bool_)
+    for corners in polygons:
+        cells |= touched_cells(corners, at, shape)
+    return cells
+
+
+def _touches(cells: NDArray[np.int64], bounds: Bounds) -> bool:
+    """Whether the rectangle of some cells (M, 2) and another have a cell in common."""
+    low = cells.min(axis=0)
+    high = cells.max(axis=0)
+    return bool(
+        low[0] < bounds[2] and bounds[0] <= high[0] and low[1] < bounds[3] and bounds[1] <= high[1]
+    )
+
+
+def _reach(grid: OccupancyGrid, scan: Scan, T_map_base: Array) -> Bounds:
+    """Rectangle of all cells of a grid that a scan made at a pose (3,) can change."""
+    T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
+    row, col = grid.frame.cells_of(T_map_laser[None, :2])[0].tolist()
+    reach_m = min(scan.max_range_m, scan.range_max_m + grid.config.surface_thickness_m)
+    cells = math.ceil(reach_m / grid.frame.resolution) + _MARGIN_CELLS
+    return row - cells, col - cells, row + cells + 1, col + cells + 1
+
+
+# Re-renders a grid in slices after a correction, tiles near the robot first.
+
+# Work of a slice, in tiles that scans may touch: 2 to 15 ms on a desktop processor.
+_TILES_PER_SLICE = 512
+
+# At least two scans, whatever they touch: while one scan arrives, two are rendered.
+_SCANS_PER_SLICE = 2
+
+_LAST_RING = 1 << 30
+
+_Cells = NDArray[np.int64]
+
+
+class StoredScan(NamedTuple):
+    """A scan, and the bounding rectangle of its beams.
+
+    extent (4,): lowest x and y, highest x and y, robot frame, m. erasures: how many parts of the
+    map had been erased when it was made.
+    """
+
+    scan: Scan
+    extent: Array
+    erasures: int = 0
+
+    @staticmethod
+    def of(scan: Scan, config: OccupancyConfig, erasures: int = 0) -> 'StoredScan':
+        """Store a scan, with the extent that a grid of this configuration renders.
+
+        Or would render if beams without return showed free space.
+        """
+        usable = scan.max_range_m
+        ranges = np.where(scan.returned, scan.ranges_m, 0.0)
+        reach = np.minimum(ranges + config.surface_thickness_m, usable)
+        without_return = min(config.no_return_clear_range_m, scan.range_max_m, usable)
+        reach = np.where(scan.without_return, without_return, reach)
+        bearings = scan.angles_rad + scan.T_base_laser[2]
+        x = np.append(reach * np.cos(bearings), 0.0) + scan.T_base_laser[0]
+        y = np.append(reach * np.sin(bearings), 0.0) + scan.T_base_laser[1]
+        return StoredScan(scan, np.array([x.min(), y.min(), x.max(), y.max()]), erasures)
+
+
+class _Task(NamedTuple):
+    """A scan to be rendered.
+
+    ring: of the nearest tile that it may touch; tiles: how many tiles it may touch.
+    """
+
+    ring: int
+    tiles: int
+    stored: StoredScan
+    T_map_base: Array
+
+
+class _Queue:
+    """The scans to be rendered: first those before the correction, then those since.
+
+    The former are stored in arrays: thousands of small objects would trigger the garbage collector.
+    """
+
+    def __init__(
+        self, scans: Sequence[StoredScan], poses: Array, rings: _Cells, tile_counts: _Cells
+    ) -> None:
+        """Start with scans at poses (N, 3); nearest ring (N,) and number of tiles (N,) of each."""
+        order = np.argsort(rings, kind='stable')
+        self._scans = [scans[k] for k in order.tolist()]
+        self._poses = poses[order]
+        self._rings = rings[order]
+        self._tiles = tile_counts[order]
+        self._next = 0
+        self._since: deque[_Task] = deque()
+
+    def __len__(self) -> int:
+        return len(self._scans) - self._next + len(self._since)
+
+    def append(self, stored: StoredScan, T_map_base: Array, tiles: int) -> None:
+        """Add a scan that was made since the correction."""
+        self._since.append(_Task(_LAST_RING, tiles, stored, T_map_base))
+
+    @property
+    def first(self) -> _Task:
+        """The next scan."""
+        k = self._next
+        if k == len(self._scans):
+            return self._since[0]
+        return _Task(int(self._rings[k]), int(self._tiles[k]), self._scans[k], self._poses[k])
+
+    def pop(self) -> _Task:
+        """Remove and return the next scan."""
+        task = self.first
+        if self._next == len(self._scans):
+            self._since.popleft()
+        else:
+            self._next += 1
+        return task
+
+
+class Rerendering:
+    """Renders all stored scans at their corrected poses, in slices.
+
+    Tiles form square rings around the tile of the robot. Scans are sorted by the nearest ring that
+    they may touch, and within a ring by time. A ring is complete as soon as the next scan does not
+    touch it, and the tiles near the robot are rendered in the order of their scans.
+    Scans that arrive meanwhile are rendered last. Until then, they are added to the completed tiles
+    that are shown. At the end, `grid` equals a rendering of all scans at once.
+    """
+
+    def __init__(
+        self,
+        like: OccupancyGrid,
+        kept: Sequence[StoredScan],
+        poses: Array,
+        T_map_base: Array,
+        drops_out: bool = False,
+        erased: Sequence[Array] = (),
+    ) -> None:
+        """Start with the stored scans at their poses (N, 3).
+
+        like: a grid with the same cells and configuration; T_map_base (3,): pose of the robot;
+        drops_out: of the laser, as is known now, for all scans; those that have it, keep it;
+        erased: polygons (M, 2), m, of which only scans since show anything.
+        """
+        self._drops_out = drops_out
+        self._erased = erased
+        self.grid = OccupancyGrid(like.config, like.frame)
+        self._added = OccupancyGrid(like.config, like.frame)  # scans that arrived meanwhile
+        self._robot_tile = like.frame.cells_of(T_map_base[None, :2])[0] // TILE
+        self._complete_rings = 0
+        boxes = _tile_boxes([each.extent for each in kept], poses, like.frame)
+        rings = self._rings(boxes[:, 0], boxes[:, 1])
+        counts = np.prod(boxes[:, 1] - boxes[:, 0] + 1, axis=1)
+        self._queue = _Queue(kept, poses, rings, counts)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all scans are rendered."""
+        return len(self._queue) == 0
+
+    def add_scan(self, kept: StoredScan, T_map_base: Array) -> None:
+        """Add a scan that arrived meanwhile, made at a pose (3,) that is already correct."""
+        with suppress(InputError):  # it is shown when all is complete
+            self._added.add_scan(kept.scan, T_map_base)
+        box = _tile_boxes([kept.extent], T_map_base[None], self.grid.frame)[0]
+        tiles = int(np.prod(box[1] - box[0] + 1))
+        self._queue.append(kept, T_map_base, tiles)
+
+    def render_slice(self, shown: OccupancyGrid) -> list[str]:
+        """Render some scans, and update the shown grid, unless `grid` is complete now.
+
+        Returns why scans were left out whose corrected poses would make the map too large.
+        """
+        scans = 0
+        tiles = 0
+        refusals: list[str] = []
+        while self._queue:
+            tiles += self._queue.first.tiles
+            if scans >= _SCANS_PER_SLICE and tiles > _TILES_PER_SLICE:
+                break
+            task = self._queue.pop()
+            try:
+                scan = task.stored.scan
+                scan = replace(scan, drops_out=self._drops_out or scan.drops_out)
+                erased = self._erased[task.stored.erasures :]
+                add_scan_outside(self.grid, scan, task.T_map_base, erased)
+            except InputError as error:
+                refusals.append(str(error))
+            scans += 1
+        if self._queue:
+            self._show_complete_rings(shown)
+        return refusals
+
+    def _show_complete_rings(self, shown: OccupancyGrid) -> None:
+        complete = self._queue.first.ring
+        if complete <= self._complete_rings:
+            return
+        places = np.unique(np.vstack([shown.tiles(), self.grid.tiles()]), axis=0)
+        rings = self._rings(places, places)
+        completed = places[(rings >= self._complete_rings) & (rings < complete)]
+        with suppress(InputError):  # old and new rendering are too far apart for one map
+            shown.set_tiles(completed, self.grid, self._added)
+        self._complete_rings = complete
+
+    def _rings(self, low: _Cells, high: _Cells) -> _Cells:
+        """Nearest ring (N,) of each box of tiles from low (N, 2) to high (N, 2), inclusive."""
+        beyond = np.maximum(low - self._robot_tile, self._robot_tile - high)
+        rings: _Cells = np.maximum(beyond.max(axis=1), 0)
+        return rings
+
+
+def _tile_boxes(extents: Sequence[Array], poses: Array, frame: GridFrame) -> _Cells:
+    """First and last tile (N, 2, 2), each (row, col), that scans at poses (N, 3) may touch."""
+    corners = np.array(extents).reshape(-1, 4)[:, [[0, 1], [0, 3], [2, 1], [2, 3]]]
+    c = np.cos(poses[:, 2])[:, None]
+    s = np.sin(poses[:, 2])[:, None]
+    x = poses[:, None, 0] + c * corners[..., 0] - s * corners[..., 1]
+    y = poses[:, None, 1] + s * corners[..., 0] + c * corners[..., 1]
+    rows = (y - frame.origin_y) / frame.resolution
+    cols = (x - frame.origin_x) / frame.resolution
+    low = np.column_stack([rows.min(axis=1), cols.min(axis=1)]) - _MARGIN_CELLS
+    high = np.column_stack([rows.max(axis=1), cols.max(axis=1)]) + _MARGIN_CELLS
+    return np.floor(np.stack([low, high], axis=1) / TILE).astype(np.int64)
+
+
+# Occupancy grid that is corrected after loop closures, and once a laser proves to drop out.
+
+MAX_OPEN = 1000  # scans that wait, the latest; 10 MB of a robot that stands at a start pose
+
+
+class CorrectableGrid:
+    """A grid that is re-rendered from stored scans after a correction, one slice per scan.
+
+    So it is when the beams without return of a laser turn out to show no free space (`drops_out`).
+    `shown` is the published map. It is always complete: each tile shows the old rendering until its
+    new one is complete. `corrected_ns` is the stamp of the newest correction that has been
+    applied to the whole map.
+    Scans whose placement is open wait: they are added once a scan belongs in the map, and dropped
+    if the robot was lost. Those of a robot that maps apart are stored and not shown. They join the
+    map if a correction comes before the robot is in the map again; otherwise they are dropped.
+    `erasures` are the parts of the map of which only later scans show anything, whenever it is
+    rendered again; a correction moves them.
+    The stored scans take 10 kB per metre of new ground, at most 30 kB per square metre.
+    """
+
+    def __init__(
+        self,
+        grid: OccupancyGrid,
+        keeps_scans: bool = True,
+        corrected_ns: int = 0,
+        scans: Sequence[tuple[Scan, Array]] = (),
+        erasures: Erasures | None = None,
+    ) -> None:
+        """Start with a grid. If keeps_scans is False, it is never corrected.
+
+        scans: with poses (3,), from which a grid that is not empty can be rendered. It is shown as
+        it is until the first correction. erasures: of the grid, among its scans by their stamps.
+        """
+        self.shown = grid
+        self.corrected_ns = corrected_ns
+        self.erasures = erasures or Erasures()
+        self._drops_out = False
+        self._refusals: list[str] = []
+        history: PoseHistory[StoredScan] = PoseHistory()
+        for scan, T_scan in scans:
+            count = self.erasures.count_before(scan.stamp_ns)
+            history.add_pose(scan.stamp_ns, T_scan, StoredScan.of(scan, grid.config, count))
+        self._history = history if keeps_scans else None
+        # With the poses (3,) at which they were made.
+        self._open: deque[tuple[Scan, Array]] = deque(maxlen=MAX_OPEN)
+        self._apart: PoseHistory[StoredScan] | None = None
+        self._is_joined = False  # whether a correction has come since the last scan that is apart
+        self._pending_ns: int | None = None
+        self._rerendering: Rerendering | None = None
+        self._T_map_base = np.zeros(3)  # pose of the robot
+
+    @property
+    def is_rerendering(self) -> bool:
+        """Whether a correction has not yet been applied to the whole grid."""
+        return self._pending_ns is not None
+
+    def apply_correction(self, stamps_ns: NDArray[np.int64], poses: Array, since_ns: int) -> bool:
+        """Apply a correction: the scans of these stamps (M,) were made at poses (M, 3).
+
+        since_ns: stamp of the first scan whose pose is already correct. A re-rendering in progress
+        starts again with the newer poses. Returns False, and changes nothing, if the scans of the
+        grid are not stored.
+        """
+        if self._history is None:
+            self.corrected_ns = since_ns
+            return False
+        before = self._history.last_pose()
+        places = self._history.kept_poses()
+        self._history.apply_correction(stamps_ns, poses, since_ns)
+        self.erasures.move(places, self._history.kept_poses())
+        self._move_open(before, self._history.last_pose())
+        if self._apart is not None:
+            self._apart.apply_correction(stamps_ns, poses, since_ns)
+            self._is_joined = True
+        self._pending_ns = since_ns
+        self._rerendering = None
+        return True
+
+    def update(
+        self, scan: Scan | None, T_map_base: Array, placement: Destination = Destination.MAP
+    ) -> CorrectedPoses | None:
+        """Continue the re-rendering, then add a scan made at a robot pose (3,).
+
+        scan: None where there is none that belongs anywhere. Returns the corrected poses when a
+        re-rendering is complete, without that of this scan. Scans that `OccupancyGrid.add_scan`
+        refuses are left out: `take_refusals`.
+        """
+        self._T_map_base = T_map_base
+        if scan is None:
+            placement = Destination.NOWHERE
+        if placement is Destination.MAP:
+            self._end_apart()
+        moved = self._render_slice()
+        if scan is not None:
+            self._place(scan, T_map_base, placement)
+        return moved
+
+    def _place(self, scan: Scan, T_map_base: Array, placement: Destination) -> None:
+        if placement is Destination.MAP:
+            self._set_drops_out(scan.drops_out)
+            for earlier, T_earlier in self._open:
+                self._add_scan(earlier, T_earlier)
+            self._open.clear()
+            self._add_scan(scan, T_map_base)
+        elif placement is Destination.OPEN:
+            self._open.append((scan, T_map_base))
+        elif placement is Destination.APART:
+            self._open.clear()
+            self._store_apart(scan, T_map_base)
+
+    def erase(self, corners: Array, stamp_ns: int) -> None:
+        """Set a polygon (M, 2), m, to unknown until later scans show it.
+
+        Only where no re-rendering is in progress. stamp_ns: of the newest scan. Raises InputError
+        where too many parts are erased.
+        """
+        self.erasures.add(corners, stamp_ns)
+        erase(self.shown, corners)
+
+    def take_refusals(self) -> list[str]:
+        """Why scans were left out since the last call, a reason for each."""
+        refusals = self._refusals
+        self._refusals = []
+        return refusals
+
+    def finish(self) -> CorrectedPoses | None:
+        """Complete a re-rendering in progress, and return the corrected poses."""
+        moved = None
+        while self.is_rerendering:
+            moved = self._render_slice()
+        return moved
+
+    def _store_apart(self, scan: Scan, T_map_base: Array) -> None:
+        if self._history is None:
+            return
+        if self._apart is None:
+            self._apart = PoseHistory()
+        self._is_joined = False
+        kept = self._stored(scan)
+        self._apart.add_pose(scan.stamp_ns, T_map_base, kept)
+
+    def _end_apart(self) -> None:
+        """Add the scans that are apart to the map if they were joined, and drop them otherwise."""
+        if self._history is not None and self._apart is not None and self._is_joined:
+            self._history.extend(self._apart)
+            self._render_again()
+        self._apart = None
+
+    def _set_drops_out(self, drops_out: bool) -> None:
+        """Render the stored scans again if what their beams without return say has changed."""
+        if drops_out == self._drops_out:
+            return
+        self._drops_out = drops_out
+        if self._history is not None:
+            self._render_again()
+
+    def _render_again(self) -> None:
+        """Begin to render all stored scans."""
+        self._rerendering = None
+        if self._pending_ns is None:
+            self._pending_ns = self.corrected_ns
+
+    def _move_open(self, before: Array | None, after: Array | None) -> None:
+        """Move the waiting scans along with the scan before them, from one pose (3,) to another."""
+        if before is not None and after is not None:
+            T = se2.compose(after, se2.invert(before))
+            moved = [(scan, se2.compose(T, T_scan)) for scan, T_scan in self._open]
+            self._open = deque(moved, maxlen=MAX_OPEN)
+
+    def _add_scan(self, scan: Scan, T_map_base: Array) -> None:
+        try:
+            self.shown.add_scan(scan, T_map_base)
+        except InputError as error:
+            self._refusals.append(str(error))
+            return
+        if self._history is None:
+            return
+        kept = self._stored(scan)
+        self._history.add_pose(scan.stamp_ns, T_map_base, kept)
+        if self._rerendering is not None:
+            self._rerendering.add_scan(kept, T_map_base)
+
+    def _stored(self, scan: Scan) -> StoredScan:
+        """The scan of a laser of which it is found out later whether it drops out."""
+        scan = replace(scan, drops_out=False)
+        return StoredScan.of(scan, self.shown.config, len(self.erasures))
+
+    def _render_slice(self) -> CorrectedPoses | None:
+        if self._history is None or self._pending_ns is None:
+            return None
+        if self._rerendering is None:
+            kept = self._history.kept()
+            poses = self._history.kept_poses()
+            self._rerendering = Rerendering(
+                self.shown,
+                kept,
+                poses,
+                self._T_map_base,
+                self._drops_out,
+                [item.corners for item in self.erasures.items],
+            )
+            # The step that closes a loop is already long: rendering starts with the next one.
+            return None
+        self._refusals += self._rerendering.render_slice(self.shown)
+        if not self._rerendering.is_complete:
+            return None
+        self.shown = self._rerendering.grid
+        self.corrected_ns = self._pending_ns
+        self._pending_ns = None
+        self._rerendering = None
+        return self._history.accept_corrections()
