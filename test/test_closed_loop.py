@@ -7,8 +7,7 @@ import numpy as np
 
 from thinmap_ros.closed_loop import Options, make_loop
 from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
-from thinmap_ros.core.grid.keep_out import KeepOut
-from thinmap_ros.core.grid.polygon import inside
+from thinmap_ros.core.grid.edits import KeepOut, inside
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.coverage import observable_cells

@@ -8,8 +8,7 @@ from support.driven_pieces import driven_piece, true_transform
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.edits import Erasures, MapEdits
-from thinmap_ros.core.grid.keep_out import KeepOut, KeepOutArea
+from thinmap_ros.core.grid.edits import Erasures, KeepOut, KeepOutArea, MapEdits
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes

@@ -12,8 +12,7 @@ from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.correction import CorrectableGrid
-from thinmap_ros.core.grid.edits import Erasures, MapEdits
-from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.edits import Erasures, KeepOut, MapEdits
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer import Localizer

@@ -22,8 +22,7 @@ from support.hidden_library import hide
 from support.team_talk import ME, TeamTalk
 from support.web_client import WebClient
 
-from thinmap_ros.core.grid.edits import MapEdits
-from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.edits import KeepOut, MapEdits
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files.sessions import TOPOLOGY, load_edits, load_grid, load_topology, save_grid

@@ -12,8 +12,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from thinmap_ros.core.grid.edits import MapEdits
-from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.edits import KeepOut, MapEdits
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.files.occupancy_maps import read_map

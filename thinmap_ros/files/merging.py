@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, ThinmapError, quoted
-from thinmap_ros.core.grid.edits import MapEdits
-from thinmap_ros.core.grid.keep_out import KeepOut, require_count
+from thinmap_ros.core.grid.edits import KeepOut, MapEdits, require_count
 from thinmap_ros.core.grid.motion import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.recognition.decision import JOIN_ODDS, recognize

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.keep_out import KeepOut, KeepOutArea
+from thinmap_ros.core.grid.edits import KeepOut, KeepOutArea
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array

@@ -18,7 +18,7 @@ from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.grid.correction import CorrectableGrid
-from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.edits import KeepOut
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig
 from thinmap_ros.core.snapshot import State

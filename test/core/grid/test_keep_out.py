@@ -6,15 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.keep_out import (
+from thinmap_ros.core.grid.edits import (
     MAX_AREAS,
     MAX_CORNERS,
     KeepOut,
     KeepOutArea,
+    inside,
     moved_corners,
+    touched_cells,
 )
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.grid.polygon import inside, touched_cells
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, find_path
 from thinmap_ros.core.se2 import compose, invert, pose, transform_points
 

@@ -7,12 +7,17 @@ from support.slam_room import ROOM, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.correction import CorrectableGrid
-from thinmap_ros.core.grid.edits import MAX_ERASURES, Erasures, MapEdits, split_edits
-from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.edits import (
+    MAX_ERASURES,
+    Erasures,
+    KeepOut,
+    MapEdits,
+    split_edits,
+    touched_cells,
+)
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import UNKNOWN
-from thinmap_ros.core.grid.polygon import touched_cells
 from thinmap_ros.core.stage import Destination, LocalizedScan, Trajectory
 
 POSES = [se2.pose(2.0 + 0.3 * k, 2.0, 0.0) for k in range(8)]

@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from thinmap_ros.core.grid.edits import inside, masked_outside
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.grid.polygon import inside, masked_outside
 
 SQUARE = np.array([[1.0, 1.0], [3.0, 1.0], [3.0, 3.0], [1.0, 3.0]])
 ARROW = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [2.0, 1.0], [0.0, 4.0]])

@@ -13,8 +13,8 @@ from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import KeepOut
 from thinmap_msgs.srv import AddKeepOut, EraseArea, LoadMap, RemoveKeepOut, SaveMap
 from thinmap_ros.core.exploration.strategy import FinishCode
+from thinmap_ros.core.grid.edits import inside
 from thinmap_ros.core.grid.patch import UNKNOWN
-from thinmap_ros.core.grid.polygon import inside
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import messages, qos
 

@@ -14,8 +14,8 @@ from thinmap_ros.core import errors
 from thinmap_ros.core.exploration.live.drives import Drives
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, FinishCode, Strategy
+from thinmap_ros.core.grid.edits import masked_outside
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.grid.polygon import masked_outside
 from thinmap_ros.core.se2 import Array
 
 _MIN_STEP_M = 0.02

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.edits import Erasures
+from thinmap_ros.core.grid.edits import Erasures, Mask, touched_cells
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import Bounds, GridFrame
-from thinmap_ros.core.grid.polygon import Mask, touched_cells
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

@@ -6,8 +6,7 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.correction import CorrectableGrid, CorrectedPoses
-from thinmap_ros.core.grid.edits import MapEdits, split_edits
-from thinmap_ros.core.grid.keep_out import KeepOut, require_corners
+from thinmap_ros.core.grid.edits import KeepOut, MapEdits, require_corners, split_edits
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array

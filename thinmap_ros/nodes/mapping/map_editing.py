@@ -11,7 +11,7 @@ from thinmap_msgs.msg import KeepOut as KeepOutMsg
 from thinmap_msgs.msg import KeepOutArea as KeepOutAreaMsg
 from thinmap_msgs.srv import AddKeepOut, EraseArea, RemoveKeepOut
 from thinmap_ros.core.errors import InputError, counted
-from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.edits import KeepOut
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.logs import decode

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.grid.keep_out import KeepOut
+from thinmap_ros.core.grid.edits import KeepOut
 from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import SECOND_NS
