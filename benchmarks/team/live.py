@@ -32,7 +32,7 @@ from benchmarks.worlds import WORLDS, floors
 from thinmap_msgs.msg import ExplorationStatus, JoinStatus, MapTiles, TeamClaim, TileRequest
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.map_receiver import MapReceiver
+from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.ros_domains import use_free_domain
 from thinmap_ros.files import package_data

@@ -25,9 +25,8 @@ from thinmap_msgs.msg import (
     TopologicalMap,
 )
 from thinmap_ros.core.exploration.team.team import MAX_SETTLED
-from thinmap_ros.core.grid.joined_maps import JoinedMaps
-from thinmap_ros.core.grid.map_tiles import TileSender
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.grid.shared import JoinedMaps, TileSender
 from thinmap_ros.core.stage import Destination
 from thinmap_ros.core.topology.flat import FIELDS, topology_from_msg
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind

@@ -8,14 +8,14 @@ import numpy as np
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.team.team import Team
-from thinmap_ros.core.grid.map_tiles import (
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.shared import (
     ReceivedTiles,
     TileMessage,
     TileSender,
     changed_part,
     completed,
 )
-from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stage import Estimate

@@ -9,7 +9,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.map_receiver import MapReceiver
+from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

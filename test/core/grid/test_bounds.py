@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.odometry import OdometryBuffer
 from thinmap_ros.core.scan import Scan

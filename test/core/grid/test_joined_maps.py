@@ -7,9 +7,8 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.joined_maps import JoinedMaps
-from thinmap_ros.core.grid.map_tiles import TileMessage, TileSender
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.grid.shared import JoinedMaps, TileMessage, TileSender
 
 FRAME = GridFrame(0.0, 0.0, 0.1)
 QUARTER = se2.pose(5.0, 1.0, math.pi / 2)

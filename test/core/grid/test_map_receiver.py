@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.grid.shared import MapReceiver
 
 
 def patch(x, y, value, size=4, resolution=0.1):

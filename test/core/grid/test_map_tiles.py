@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.map_tiles import ReceivedTiles, TileMessage, TileSender, changed_part
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.grid.shared import ReceivedTiles, TileMessage, TileSender, changed_part
 
 LATTICE = GridFrame(0.0, 0.0, 0.1)
 VALUES = np.array([-1, 3, 100, 40], dtype=np.int8)

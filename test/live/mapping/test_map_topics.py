@@ -11,8 +11,8 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 from support.office_mapping import Mapping
 
-from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import UNKNOWN
+from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_updates import received_map, received_update
 

@@ -13,8 +13,8 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.team.claims import Claim, SettledPlace
 from thinmap_ros.core.exploration.team.team import MAX_SETTLED
-from thinmap_ros.core.grid.map_tiles import TileSender
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.grid.shared import TileSender
 from thinmap_ros.core.planning.give_way import Motion
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.team.team_messages import (

@@ -11,9 +11,9 @@ import numpy as np
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.correction import CorrectedPoses
-from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.mapper import MapUpdate, WholeMap
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import Stage
 from thinmap_ros.core.topology.builder import TopologyBuilder

@@ -7,8 +7,8 @@ from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid
 
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch, occupancy_from_costs
+from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.logs import decode
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages, qos

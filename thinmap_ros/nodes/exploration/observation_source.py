@@ -11,7 +11,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.mission import InputWatchdog
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.grid.edits import KeepOut
-from thinmap_ros.core.grid.map_receiver import MapReceiver
+from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.sensing.synchronizer import InputStream
 from thinmap_ros.core.topology.builder import TopologyConfig

@@ -1,8 +1,8 @@
 """The tiles of a robot's own map, for the other robots of its team."""
 
 from thinmap_msgs.msg import MapTiles, TileRequest
-from thinmap_ros.core.grid.map_tiles import TileSender
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.shared import TileSender
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import new_map_id
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

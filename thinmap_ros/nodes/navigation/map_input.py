@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.edits import KeepOut
-from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.sensing.synchronizer import InputStream
 from thinmap_ros.ros import messages, qos

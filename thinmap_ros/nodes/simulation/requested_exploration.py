@@ -15,8 +15,8 @@ from rclpy.task import Future
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.map_receiver import MapReceiver
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.nodes.exploration.goal_result import GoalResult
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_updates import received_map, received_update, updates_topic

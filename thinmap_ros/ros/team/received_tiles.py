@@ -2,8 +2,8 @@
 
 from thinmap_msgs.msg import MapTiles, TileRequest
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.joined_maps import JoinedMaps
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.shared import JoinedMaps
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

@@ -1,18 +1,17 @@
-"""Tiles of a map that have changed: what robots send each other of their maps.
-
-A tile has 16 x 16 cells of 2 bits: unknown, free, occupied, or in between. A message holds the
-tiles that have changed between two versions of the sender's map, compressed. A receiver that has
-missed one notices by its versions, and asks for all that has changed since the last that it has.
-The lattices of both maps must be the same.
-"""
+"""Maps of others: copies of published maps, and tiles that robots send each other."""
 
 import struct
 import zlib
+from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.grid.patch import (
     FREE_AT_MOST,
@@ -21,8 +20,16 @@ from thinmap_ros.core.grid.patch import (
     GridFrame,
     GridPatch,
 )
+from thinmap_ros.core.grid.rotated import overlaid
 from thinmap_ros.core.grid.tiles import MAX_CELLS
 from thinmap_ros.core.se2 import Array
+
+# Tiles of a map that have changed: what robots send each other of their maps.
+#
+# A tile has 16 x 16 cells of 2 bits: unknown, free, occupied, or in between. A message holds the
+# tiles that have changed between two versions of the sender's map, compressed. A receiver that has
+# missed one notices by its versions, and asks for all that has changed since the last that it has.
+# The lattices of both maps must be the same.
 
 
 def _table() -> NDArray[np.uint8]:
@@ -36,18 +43,29 @@ def _table() -> NDArray[np.uint8]:
 
 
 EDGE = 16
+
 _PACKED_BYTES = EDGE * EDGE // 4
+
 # Percent: after some four beams, of which most agree. docs/theory/exploration.md has the ablation.
 _SURELY_FREE = 10
+
 _SURELY_OCCUPIED = 90
+
 _MAX_TILES = 1 << 16
+
 _HEADER = struct.Struct('<IIIddd')
+
 _SHIFTS = np.array([0, 2, 4, 6], dtype=np.uint8)
+
 # In the order of their bits.
 _CELLS = np.array([UNKNOWN, 0, 100, 50], dtype=np.int8)
+
 _TABLE = _table()
+
 _UNKNOWN_TILE = bytes(_PACKED_BYTES)
+
 Key = tuple[int, int]
+
 """Row and column of a tile, in tiles from the origin of its frame."""
 
 
@@ -264,3 +282,220 @@ def _unpacked(packed: bytes) -> NDArray[np.int8]:
     bits = np.frombuffer(packed, dtype=np.uint8)[:, None] >> _SHIFTS & 3
     cells: NDArray[np.int8] = _CELLS[bits].reshape(EDGE, EDGE)
     return cells
+
+
+# Maps of other robots, received as tiles, laid into a robot's own map where that is undecided.
+
+
+class _JoinedMap:
+    """The map of another robot on its own lattice, and on that of this robot.
+
+    session: of the versions of its tiles. T (3,): place of the map in that of this robot, None
+    where it is unknown; laid: the map there.
+    """
+
+    def __init__(self, session: int, message: TileMessage) -> None:
+        self.session = session
+        self.received = ReceivedTiles(message.frame)
+        self.T: Array | None = None
+        self.laid: GridPatch | None = None
+
+    def is_moved_by(self, T: Array | None) -> bool:
+        """Whether a cell of the map is another one of this robot's map at another place."""
+        patch = self.received.known_area()
+        if T is None or self.T is None or patch is None:
+            return T is not self.T
+        corners = _corners(patch)
+        moved = se2.transform_points(T, corners) - se2.transform_points(self.T, corners)
+        return bool(np.hypot(*moved.T).max() > patch.frame.resolution)
+
+    def lay(self, base: GridPatch) -> GridPatch | None:
+        """The map on the lattice of a base; None: its place, or all of it, is unknown."""
+        patch = self.received.known_area()
+        if self.laid is None and self.T is not None and patch is not None:
+            self.laid = overlaid(base, patch, self.T)
+        return self.laid
+
+
+class JoinedMaps:
+    """Cells of other robots, in the map of this one as soon as the place of their maps is known.
+
+    is_moved: whether more of the joined map may have changed than `take_changes` says, since
+    somebody set this to False.
+    """
+
+    def __init__(self) -> None:
+        self.is_moved = False
+        self._maps: dict[str, _JoinedMap] = {}
+        self._places: dict[str, Array] = {}
+        self._changes: list[Array] = []
+        self._base: GridPatch | None = None
+        self._others: GridPatch | None = None
+        self._last: tuple[GridPatch, GridPatch] | None = None
+
+    def add(self, robot: str, session: int, message: TileMessage) -> int | None:
+        """Add tiles of a robot; returns the version after which some are missing; None: none.
+
+        Tiles of another session are of another map, which takes the place of the last one. Raises
+        InputError as `ReceivedTiles.add`.
+        """
+        joined = self._maps.get(robot)
+        if joined is None or joined.session != session:
+            joined = self._begin(robot, session, message)
+        box = joined.received.add(robot, message)
+        known = joined.received.version_of(robot)
+        if box is not None:
+            self._changed(joined, box)
+        return known if known < message.version else None
+
+    def place(self, places: dict[str, Array]) -> None:
+        """Set the places T (3,) of the maps of all joined robots in the map of this one, by name.
+
+        The maps of all others are left out.
+        """
+        self._places = places
+        for robot, joined in self._maps.items():
+            T = places.get(robot)
+            if joined.is_moved_by(T):
+                joined.T = T
+                self._drop(joined)
+
+    def completed(self, own: GridPatch) -> GridPatch:
+        """The map of this robot, and what others know where it is undecided.
+
+        Raises InputError where the map would be too large.
+        """
+        if self._base is None or not self._base.is_aligned_with(own):
+            self._base = GridPatch(own.frame, np.full((1, 1), UNKNOWN, dtype=np.int8))
+            for joined in self._maps.values():
+                self._drop(joined)
+        if self._others is None:
+            laid = [joined.lay(self._base) for joined in self._maps.values()]
+            known = [patch for patch in laid if patch is not None]
+            if not known:
+                return own
+            self._others = reduce(completed, known)
+            self._last = None
+        if self._last is None or self._last[0] is not own:
+            self._last = (own, completed(own, self._others))
+        return self._last[1]
+
+    def take_changes(self) -> list[Array]:
+        """Parts (2, 2), m, of this robot's map that others have changed since the last call."""
+        changes = self._changes
+        self._changes = []
+        return changes
+
+    def _begin(self, robot: str, session: int, message: TileMessage) -> _JoinedMap:
+        joined = _JoinedMap(session, message)
+        joined.T = self._places.get(robot)
+        self._maps[robot] = joined
+        self._drop(joined)
+        return joined
+
+    def _changed(self, joined: _JoinedMap, box: Array) -> None:
+        """Tiles in a box (2, 2) of the map of a robot are new."""
+        joined.laid = None
+        self._others = None
+        if joined.T is not None:
+            corners = se2.transform_points(joined.T, _corners_of(box))
+            self._changes.append(np.array([corners.min(axis=0), corners.max(axis=0)]))
+
+    def _drop(self, joined: _JoinedMap) -> None:
+        joined.laid = None
+        self._others = None
+        self._last = None
+        self.is_moved = True
+
+
+def _corners(patch: GridPatch) -> Array:
+    """Corners (4, 2), m, of a map."""
+    frame = patch.frame
+    low = np.array([frame.origin_x, frame.origin_y])
+    size = np.array(patch.shape[::-1]) * frame.resolution
+    return _corners_of(np.array([low, low + size]))
+
+
+def _corners_of(box: Array) -> Array:
+    """Corners (4, 2) of a box (2, 2)."""
+    return np.array([[x, y] for x in box[:, 0] for y in box[:, 1]])
+
+
+# Local copy of the map of another node, assembled from what it publishes.
+
+# Updates that may be received before the whole map that they follow: those of some seconds.
+_MAX_KEPT_UPDATES = 50
+
+
+class _Update(NamedTuple):
+    """Cells from a row and a column of the map on."""
+
+    stamp_ns: int
+    row: int
+    col: int
+    cells: NDArray[np.int8]
+
+
+class MapReceiver:
+    """The newest whole map, with newer updates and windows in it.
+
+    The lattice of all patches must be the same. Whole maps and updates have a topic each, and those
+    of one topic may overtake the others: an update is made where it is newer than the whole map, by
+    its stamp, also once that comes. Stamps of 0 are unknown: what comes last is the newest.
+    """
+
+    def __init__(self) -> None:
+        self.patch: GridPatch | None = None
+        self._stamp_ns = 0
+        self._updates: deque[_Update] = deque(maxlen=_MAX_KEPT_UPDATES)
+
+    def replace(self, whole: GridPatch, stamp_ns: int = 0) -> None:
+        """Replace the copy by a whole map."""
+        # A stamp from before: time was set back, and updates from then do not follow this map.
+        has_begun_anew = stamp_ns < self._stamp_ns
+        kept = () if has_begun_anew else tuple(self._updates)
+        self._updates.clear()
+        self._stamp_ns = stamp_ns
+        self.patch = whole
+        for update in kept:
+            if update.stamp_ns > stamp_ns:
+                with suppress(InputError):
+                    self.update(*update)
+
+    def update(self, stamp_ns: int, row: int, col: int, cells: NDArray[np.int8]) -> bool:
+        """Replace cells (H, W) of the map; returns whether they are newer than the map.
+
+        Raises InputError where they do not lie inside the map: the next whole map has them.
+        """
+        self._updates.append(_Update(stamp_ns, row, col, cells))
+        is_known = 0 < stamp_ns <= self._stamp_ns
+        if self.patch is None or is_known:
+            return False
+        self.patch = self.patch.with_part(row, col, cells)
+        return True
+
+    def paste(self, window: GridPatch) -> GridPatch:
+        """Paste a window into the copy, enlarging it if necessary; returns the result.
+
+        Raises InputError if the window is not aligned with the cells of the map, or far from it.
+        """
+        if self.patch is None:
+            self.patch = window
+            return window
+        margins = self.patch.overhang_of(window)
+        rows, cols = window.shape
+        if max(margins[0], margins[2]) > 2 * rows or max(margins[1], margins[3]) > 2 * cols:
+            raise InputError(
+                f'map window at {window.frame}: expected it on or beside the map '
+                f'at {self.patch.frame}'
+            )
+        rows_in_all = self.patch.shape[0] + margins[0] + margins[2]
+        cols_in_all = self.patch.shape[1] + margins[1] + margins[3]
+        if rows_in_all * cols_in_all > MAX_CELLS:
+            raise InputError(
+                f'map window at {window.frame}: a map of {rows_in_all} x {cols_in_all} cells: '
+                f'expected {MAX_CELLS} at most'
+            )
+        whole = self.patch.padded(margins) if any(margins) else self.patch
+        self.patch = whole.with_part(*whole.offset_of(window), window.cells)
+        return self.patch
