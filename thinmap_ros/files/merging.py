@@ -6,7 +6,7 @@ from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, ThinmapError, quoted
 from thinmap_ros.core.grid.edits import KeepOut, MapEdits, require_count
-from thinmap_ros.core.grid.motion import MapMotion
+from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.recognition.decision import JOIN_ODDS, recognize
 from thinmap_ros.core.regions.tracker import RegionTracker

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted, require_type
+from thinmap_ros.core.grid.moved import aligned_patch
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
-from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.files.images import CellRule, ImageCells, read_cells

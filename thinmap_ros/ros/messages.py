@@ -32,8 +32,8 @@ from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.correction import CorrectedPoses
 from thinmap_ros.core.grid.mapper import WholeMap
+from thinmap_ros.core.grid.moved import aligned_patch
 from thinmap_ros.core.grid.patch import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridPatch
-from thinmap_ros.core.grid.rotated import aligned_patch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.slam.covariance import UNKNOWN

@@ -3,9 +3,8 @@
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.motion import MapMotion
+from thinmap_ros.core.grid.moved import MapMotion, overlaid, overlaid_bent
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
-from thinmap_ros.core.grid.rotated import overlaid, overlaid_bent
 
 
 def corridor():

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.moved import overlaid
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
-from thinmap_ros.core.grid.rotated import overlaid
 
 
 def room(rows, cols, cell_m=0.1, origin=(0.0, 0.0)):

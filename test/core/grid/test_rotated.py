@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.rotated import aligned_patch
+from thinmap_ros.core.grid.moved import aligned_patch
 
 RESOLUTION_M = 0.05
 

@@ -5,7 +5,7 @@ import pytest
 from core.regions.floors import office, patch_of
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.motion import MapMotion
+from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.regions import names as region_names
 from thinmap_ros.core.regions.names import MAX_LENGTH, RegionNames, checked_name
 from thinmap_ros.core.regions.region_map import RegionMap

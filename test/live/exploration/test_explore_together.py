@@ -20,9 +20,9 @@ from thinmap_msgs.msg import (
     TopologicalMap,
 )
 from thinmap_ros.core import se2
+from thinmap_ros.core.grid.moved import overlaid
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
-from thinmap_ros.core.grid.rotated import overlaid
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.ros import messages, qos

@@ -11,8 +11,8 @@ from support.peers.still_robot import PERIOD_S, StillRobot
 from support.team_talk import ME, T_ME_OTHER, TeamTalk
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.grid.moved import overlaid
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
-from thinmap_ros.core.grid.rotated import overlaid
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live

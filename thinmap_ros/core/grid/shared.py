@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, one_line_reason
+from thinmap_ros.core.grid.moved import overlaid
 from thinmap_ros.core.grid.patch import (
     FREE_AT_MOST,
     OCCUPIED_AT_LEAST,
@@ -20,7 +21,6 @@ from thinmap_ros.core.grid.patch import (
     GridFrame,
     GridPatch,
 )
-from thinmap_ros.core.grid.rotated import overlaid
 from thinmap_ros.core.grid.tiles import MAX_CELLS
 from thinmap_ros.core.se2 import Array
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.grid.motion import MapMotion
+from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import Field

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import config_or_default
 from thinmap_ros.core.errors import InputError, quoted, require_type
-from thinmap_ros.core.grid.motion import MapMotion
+from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology import topology_state

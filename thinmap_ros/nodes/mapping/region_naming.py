@@ -6,7 +6,7 @@ from thinmap_msgs.srv import NameRegion
 from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.mapper import WholeMap
-from thinmap_ros.core.grid.motion import MapMotion
+from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.regions.names import checked_name
 from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.regions.tracker import RegionTracker

@@ -7,9 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from thinmap_ros.core.grid.motion import MapMotion
+from thinmap_ros.core.grid.moved import MapMotion, overlaid_bent
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
-from thinmap_ros.core.grid.rotated import overlaid_bent
 from thinmap_ros.core.places.recognition.decision import JOIN_ODDS, recognize
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
