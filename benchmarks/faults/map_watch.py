@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from benchmarks.faults.track import Track
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.distance import distance_cells
+from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.world import World

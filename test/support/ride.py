@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.distance import distance_cells
+from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig

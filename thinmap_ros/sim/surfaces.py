@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.grid.components import reachable
+from thinmap_ros.core.grid.fields import reachable
 from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.world import World

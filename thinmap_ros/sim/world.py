@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError, quoted, require_type
-from thinmap_ros.core.grid.distance import distance_cells
+from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.moving_obstacles import MovingObstacles

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from thinmap_ros.core.grid.spatial_hash import SpatialHash
+from thinmap_ros.core.grid.fields import SpatialHash
 
 
 def test_all_that_is_near_is_found_and_little_else():

@@ -7,7 +7,7 @@ import pytest
 from support.small_floor import CELL_M, OFFICE, START, drive, floor, map_of
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.distance import distance_cells
+from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.places import likelihood_kernels
 from thinmap_ros.core.places.config import GlobalLocalizationConfig

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.components import label, reachable
+from thinmap_ros.core.grid.fields import label, reachable
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import (
     column_distance,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.distance import distance_cells
+from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup, line_is_clear
 from thinmap_ros.core.places.config import GlobalLocalizationConfig

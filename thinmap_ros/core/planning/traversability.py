@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.grid.components import reachable
+from thinmap_ros.core.grid.fields import reachable
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, Bounds, GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.free_space import column_distance, standing_room

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from thinmap_ros.core.grid import components
-from thinmap_ros.core.grid.distance import distance_cells
+from thinmap_ros.core.grid import fields
+from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.regions.config import RegionConfig
 
@@ -56,7 +56,7 @@ def _furniture(patch: GridPatch, longest: float) -> Mask:
 
     A thin piece is one of a wall between two doors, unless it is no longer than a table's leg.
     """
-    numbers, sizes = components.label(~patch.free)
+    numbers, sizes = fields.label(~patch.free)
     small = np.zeros(len(sizes), dtype=np.bool_)
     for number, box in enumerate(ndimage.find_objects(numbers), 1):
         extent = _extent(box)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.components import label, reachable
+from thinmap_ros.core.grid.fields import label, reachable
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.jit import kernel

@@ -7,7 +7,7 @@ from enum import IntEnum
 import numpy as np
 
 from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.core.grid.spatial_hash import SpatialHash
+from thinmap_ros.core.grid.fields import SpatialHash
 from thinmap_ros.core.se2 import Array
 
 # Nodes are listed by squares, in which one is looked for up to so far away.

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.grid.distance import distance_cells
+from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.recognition import field_kernels
 from thinmap_ros.core.places.recognition.field_kernels import FAR, FREE, UNKNOWN, WALL, FieldArrays

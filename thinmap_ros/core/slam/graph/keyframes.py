@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.grid.spatial_hash import SpatialHash
+from thinmap_ros.core.grid.fields import SpatialHash
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import (
     Array,

@@ -1,0 +1,241 @@
+"""Fields over cells: distances and connected components; and points near a point."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.jit import kernel
+
+# Connected components of a mask, with 8-connectivity.
+#
+# Runs of true cells are joined row by row, with a union-find structure.
+
+Cells = NDArray[np.int64]
+
+Mask = NDArray[np.bool_]
+
+
+def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
+    """Label the 8-connected components of a mask (H, W).
+
+    Returns the component number of each true cell (0 elsewhere), (H, W), and the number of cells of
+    each component. Components are numbered in the order of their first cells, row by row.
+    """
+    numbers: NDArray[np.int32]
+    numbers, sizes = _label(np.ascontiguousarray(cells))
+    return numbers, sizes
+
+
+def reachable(cells: Mask, seeds: Cells) -> Mask:
+    """True cells (H, W) in the same 8-connected component as one of the seeds (N, 2)."""
+    found: Mask = _reachable(np.ascontiguousarray(cells), np.ascontiguousarray(seeds))
+    return found
+
+
+@kernel
+def _runs(cells: Mask) -> tuple[Cells, Cells, Cells, int]:
+    """Runs (R, 3) of true cells as (row, first column, end), row by row, and their components.
+
+    Also: index of the first run of each row, (H + 1,); component number of each run, from 1,
+    (R,); number of components.
+    """
+    rows, cols = cells.shape
+    runs = np.empty((rows * (cols // 2 + 1), 3), dtype=np.int64)
+    first = np.zeros(rows + 1, dtype=np.int64)
+    count = 0
+    for row in range(rows):
+        first[row] = count
+        was = False
+        line = cells[row]
+        for col in range(cols):
+            if line[col] == was:
+                continue
+            if was:
+                runs[count - 1, 2] = col
+            else:
+                runs[count, 0] = row
+                runs[count, 1] = col
+                runs[count, 2] = cols
+                count += 1
+            was = not was
+    first[rows] = count
+    owner = np.arange(count)
+    for row in range(1, rows):
+        above = first[row - 1]
+        for k in range(first[row], first[row + 1]):
+            while above < first[row] and runs[above, 2] < runs[k, 1]:
+                above += 1
+            other = above
+            while other < first[row] and runs[other, 1] <= runs[k, 2]:
+                a = _root(owner, k)
+                b = _root(owner, other)
+                owner[max(a, b)] = min(a, b)
+                other += 1
+    parts = np.empty(count, dtype=np.int64)
+    number = 0
+    for k in range(count):
+        root = _root(owner, k)
+        if root == k:
+            number += 1
+            parts[k] = number
+        else:
+            parts[k] = parts[root]
+    return runs[:count], first, parts, number
+
+
+@kernel
+def _root(owner: Cells, k: int) -> int:
+    """Root of a run in the union-find structure, with path compression."""
+    while owner[k] != k:
+        owner[k] = owner[owner[k]]
+        k = owner[k]
+    return k
+
+
+@kernel
+def _label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
+    runs, _, parts, count = _runs(cells)
+    numbers = np.zeros(cells.shape, dtype=np.int32)
+    sizes = np.zeros(count + 1, dtype=np.int64)
+    for k in range(parts.size):
+        row = numbers[runs[k, 0]]
+        for col in range(runs[k, 1], runs[k, 2]):
+            row[col] = parts[k]
+        sizes[parts[k]] += runs[k, 2] - runs[k, 1]
+    return numbers, sizes
+
+
+@kernel
+def _reachable(cells: Mask, seeds: Cells) -> Mask:
+    runs, first, parts, count = _runs(cells)
+    reached = np.zeros(count + 1, dtype=np.bool_)
+    for i in range(seeds.shape[0]):
+        for k in range(first[seeds[i, 0]], first[seeds[i, 0] + 1]):
+            if runs[k, 1] <= seeds[i, 1] < runs[k, 2]:
+                reached[parts[k]] = True
+                break
+    found = np.zeros(cells.shape, dtype=np.bool_)
+    for k in range(parts.size):
+        if reached[parts[k]]:
+            row = found[runs[k, 0]]
+            for col in range(runs[k, 1], runs[k, 2]):
+                row[col] = True
+    return found
+
+
+# Exact Euclidean distance of each cell to the nearest cell of a set.
+
+FAR = 1.0e6  # squared distance in cells if the set is empty
+
+
+def distance_cells(marked: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Distance, in cells between centres, from each cell (H, W) to the nearest marked one.
+
+    1000 if no cell is marked.
+
+    Source: Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012: the
+    lower envelope of parabolas, along columns and then along rows.
+    """
+    return np.asarray(_distance(np.ascontiguousarray(marked)))
+
+
+@kernel
+def _distance(marked: NDArray[np.bool_]) -> NDArray[np.float64]:
+    rows, cols = marked.shape
+    squared = np.full((rows, cols), FAR)
+    # Along columns, two sweeps count the steps from marked cells.
+    for col in range(cols):
+        steps = 1.0e3
+        for row in range(rows):
+            steps = 0.0 if marked[row, col] else min(steps + 1.0, 1.0e3)
+            squared[row, col] = steps * steps
+        steps = 1.0e3
+        for row in range(rows - 1, -1, -1):
+            steps = 0.0 if marked[row, col] else min(steps + 1.0, 1.0e3)
+            squared[row, col] = min(squared[row, col], steps * steps)
+    vertex = np.empty(cols, dtype=np.int64)
+    border = np.empty(cols + 1)
+    heights = np.empty(cols)
+    for row in range(rows):
+        heights[:] = squared[row]
+        last = 0
+        vertex[0] = 0
+        border[0] = -np.inf
+        border[1] = np.inf
+        for col in range(1, cols):
+            while True:
+                other = vertex[last]
+                meet = (heights[col] + col * col - heights[other] - other * other) / (
+                    2.0 * (col - other)
+                )
+                if meet > border[last]:
+                    break
+                last -= 1
+            last += 1
+            vertex[last] = col
+            border[last] = meet
+            border[last + 1] = np.inf
+        last = 0
+        for col in range(cols):
+            while border[last + 1] < col:
+                last += 1
+            step = col - vertex[last]
+            squared[row, col] = np.sqrt(min(step * step + heights[vertex[last]], FAR))
+    return squared
+
+
+# Spatial hash: finds the points near a point, by number.
+
+
+class SpatialHash:
+    """Numbers by square of the plane.
+
+    The time of a query does not depend on the number of points elsewhere.
+    """
+
+    def __init__(self, edge_m: float) -> None:
+        self._edge_m = edge_m
+        self._numbers: dict[tuple[int, int], set[int]] = {}
+        self._bucket_of: dict[int, tuple[int, int]] = {}
+
+    def insert(self, number: int, x: float, y: float) -> None:
+        """Add a number at a point, or move it there, m.
+
+        A point that is not finite removes the number.
+        """
+        if not (math.isfinite(x) and math.isfinite(y)):
+            self.remove(number)
+            return
+        bucket = (math.floor(x / self._edge_m), math.floor(y / self._edge_m))
+        if self._bucket_of.get(number) != bucket:
+            self.remove(number)
+            self._bucket_of[number] = bucket
+            self._numbers.setdefault(bucket, set()).add(number)
+
+    def remove(self, number: int) -> None:
+        """Remove a number, if present."""
+        bucket = self._bucket_of.pop(number, None)
+        if bucket is not None:
+            self._numbers[bucket].discard(number)
+            if not self._numbers[bucket]:
+                del self._numbers[bucket]
+
+    def query_radius(self, x: float, y: float, reach_m: float) -> list[int]:
+        """All numbers within reach_m of a point, m, sorted.
+
+        Some more distant ones may be among them.
+        """
+        if not (math.isfinite(x) and math.isfinite(y)):
+            return []
+        low_col, high_col = (
+            math.floor((x + reach) / self._edge_m) for reach in (-reach_m, reach_m)
+        )
+        low_row, high_row = (
+            math.floor((y + reach) / self._edge_m) for reach in (-reach_m, reach_m)
+        )
+        found: list[int] = []
+        for col in range(low_col, high_col + 1):
+            for row in range(low_row, high_row + 1):
+                found.extend(self._numbers.get((col, row), ()))
+        return sorted(found)
