@@ -22,9 +22,7 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.core.scan import LaserConfig, Scan
     from thinmap_ros.core.slam.localizer_config import LocalizerConfig
     from thinmap_ros.core.topology.builder import build as build_topology
-    from thinmap_ros.core.topology.config import TopologyConfig
-    from thinmap_ros.core.topology.flat import topology_from_msg
-    from thinmap_ros.core.topology.graph import TopologicalMap
+    from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig, topology_from_msg
     from thinmap_ros.core.topology.thinning import thin
     from thinmap_ros.evaluation.exploration_run import explore
     from thinmap_ros.files.graphs import write_graph
@@ -107,11 +105,11 @@ _PLACES = {
     'merge_maps': 'files.merging.merge_maps',
     # topological maps
     'TopologicalMap': 'core.topology.graph.TopologicalMap',
-    'TopologyConfig': 'core.topology.config.TopologyConfig',
+    'TopologyConfig': 'core.topology.graph.TopologyConfig',
     'build_topology': 'core.topology.builder.build',
     'shortest_path': 'core.planning.graph_search.shortest_path',
     'thin': 'core.topology.thinning.thin',
-    'topology_from_msg': 'core.topology.flat.topology_from_msg',
+    'topology_from_msg': 'core.topology.graph.topology_from_msg',
     'write_graph': 'files.graphs.write_graph',
     # localization in a finished map
     'GlobalLocalizer': 'core.places.global_localizer.GlobalLocalization',

@@ -21,8 +21,7 @@ from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.builder import build
-from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.sim.drives import random_drive
 
 _EACH_M = 10.0

@@ -15,8 +15,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.topology.flat import flat_topology, topology_from_msg
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, flat_topology, topology_from_msg
 
 _GRAPH = 'graph_'
 

@@ -28,8 +28,7 @@ from thinmap_ros.core.exploration.team.team import MAX_SETTLED
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.shared import JoinedMaps, TileSender
 from thinmap_ros.core.stage import Destination
-from thinmap_ros.core.topology.flat import FIELDS, topology_from_msg
-from thinmap_ros.core.topology.graph import Edge, Node, NodeKind
+from thinmap_ros.core.topology.graph import FIELDS, Edge, Node, NodeKind, topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.localized_scan import localized_scan_from_msg

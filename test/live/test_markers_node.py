@@ -9,7 +9,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from thinmap_msgs.msg import EndNode, EndNodeArray, LineFeature, LineFeatureArray, TopologicalMap
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.topology.flat import topology_from_msg
+from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.nodes import markers
 from thinmap_ros.ros import qos
 

@@ -12,8 +12,14 @@ from support.node_list import ROOT
 
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros import InputError, topology_from_msg
-from thinmap_ros.core.topology.flat import FIELDS, flat_topology
-from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.graph import (
+    FIELDS,
+    Edge,
+    Node,
+    NodeKind,
+    TopologicalMap,
+    flat_topology,
+)
 from thinmap_ros.files.package_data import message_definitions
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter

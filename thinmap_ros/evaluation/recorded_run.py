@@ -15,8 +15,7 @@ from thinmap_ros.core.exploration.belief.model import MissingArea
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.flat import topology_from_msg
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, topology_from_msg
 from thinmap_ros.evaluation.exploration_metrics import (
     EndNodeCensus,
     exploration_report,

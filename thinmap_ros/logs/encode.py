@@ -7,8 +7,7 @@ import numpy as np
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
-from thinmap_ros.core.topology.flat import flat_topology
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, flat_topology
 
 
 class BagObjects:

@@ -36,8 +36,8 @@ from thinmap_ros.core.slam.localizers import (
 )
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import SCAN_MATCHING, Correction, Estimate, StartConfig
-from thinmap_ros.core.topology.flat import topology_from_msg
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
+from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.files.sessions import LOCALIZER, save_localizer
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.logs.frames.bag_odometry import NONE

@@ -13,8 +13,7 @@ from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, Region, RegionArray
 from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError, one_line
 from thinmap_ros.core.regions.region_map import RegionKind
-from thinmap_ros.core.topology.flat import topology_from_msg
-from thinmap_ros.core.topology.graph import NodeKind
+from thinmap_ros.core.topology.graph import NodeKind, topology_from_msg
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

@@ -15,7 +15,7 @@ from thinmap_ros.core.planning.navigator import (
     NavigatorConfig,
 )
 from thinmap_ros.core.se2 import SECOND_NS, Array
-from thinmap_ros.core.topology.flat import topology_from_msg
+from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.frames.bag_odometry import NONE

@@ -38,8 +38,7 @@ from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.stage import Estimate
-from thinmap_ros.core.topology.flat import FIELDS, flat_topology
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import FIELDS, TopologicalMap, flat_topology
 from thinmap_ros.logs import decode
 
 # A bag or a publisher cannot name anything else to import.

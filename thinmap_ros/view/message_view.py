@@ -13,7 +13,7 @@ from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.flat import topology_from_msg
+from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag

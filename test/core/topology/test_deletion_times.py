@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.layers.deletion_times import update_skeleton
 from thinmap_ros.core.topology.layers.free_space import FreeSpace
 from thinmap_ros.core.topology.thinning import KEPT, deletion_times, thin

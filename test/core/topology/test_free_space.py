@@ -9,7 +9,6 @@ from scipy import ndimage
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.fields import label, reachable
-from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import (
     column_distance,
     known_free,
@@ -17,6 +16,7 @@ from thinmap_ros.core.topology.free_space import (
     squared_clearance,
     standing_room,
 )
+from thinmap_ros.core.topology.graph import TopologyConfig
 
 
 def random_mask(seed):

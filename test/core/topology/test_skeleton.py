@@ -9,9 +9,8 @@ from scipy import ndimage
 
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.topology.builder import build
-from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import select_free_space
-from thinmap_ros.core.topology.graph import NodeKind
+from thinmap_ros.core.topology.graph import NodeKind, TopologyConfig
 
 E = NodeKind.END
 B = NodeKind.BRANCH

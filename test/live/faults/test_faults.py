@@ -20,7 +20,7 @@ from support.slam_room import ROOM, scan_in
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros.core.topology.flat import topology_from_msg
+from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.files.snapshots import write_snapshot
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.sim.robot import after_arc

@@ -7,8 +7,7 @@ from support.peers.route_server import RouteServer
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros.core.topology.flat import topology_from_msg
-from thinmap_ros.core.topology.graph import NodeKind
+from thinmap_ros.core.topology.graph import NodeKind, topology_from_msg
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live

@@ -19,7 +19,7 @@ from thinmap_ros.core.planning.wavefront import (
     find_path,
 )
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.graph import TopologyConfig
 
 Cells = NDArray[np.int64]
 XY = tuple[float, float]

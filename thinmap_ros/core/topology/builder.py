@@ -15,9 +15,8 @@ from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology import topology_state
-from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import select_free_space
-from thinmap_ros.core.topology.graph import Edge, TopologicalMap
+from thinmap_ros.core.topology.graph import Edge, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.layers.lattice import Cells, Lattice
 from thinmap_ros.core.topology.layers.stack import Layers, Span
 from thinmap_ros.core.topology.registry import Changes, Registry

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.fields import label, reachable
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.jit import kernel
 
 Cells = NDArray[np.int64]

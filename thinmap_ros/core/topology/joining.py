@@ -4,8 +4,7 @@ from dataclasses import replace
 
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.builder import TopologyBuilder
-from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.registry import MATCH_RADIUS_M
 
 Ids = dict[int, int]

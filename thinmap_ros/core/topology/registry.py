@@ -9,9 +9,8 @@ import numpy as np
 
 from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corners_between, with_middles
-from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.layers.clearances import (
     box_of,
     least_between,

@@ -17,8 +17,7 @@ from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import Stage
 from thinmap_ros.core.topology.builder import TopologyBuilder
-from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 
 # Before every correction: the graph is rebuilt from the next whole map.
 _STALE_NS = -1

@@ -18,7 +18,7 @@ from thinmap_ros.core.slam.joining.links import match_keyframes, placed_keyframe
 from thinmap_ros.core.slam.joining.rigid import found, rigid_links, rigid_transform
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
 from thinmap_ros.core.topology.builder import TopologyBuilder, moved_map
-from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.joining import Ids, join_topologies
 
 _ORIGIN = np.zeros((1, 3))

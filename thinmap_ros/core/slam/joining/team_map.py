@@ -17,8 +17,7 @@ from thinmap_ros.core.slam.joining.rigid import refined
 from thinmap_ros.core.slam.joining.robot_keyframes import RobotKeyframes
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
 from thinmap_ros.core.topology.builder import TopologyBuilder, build, moved_map
-from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.joining import join_topologies
 
 WORLD = 'world'  # a map without cells, in whose frame a person gives the poses of others

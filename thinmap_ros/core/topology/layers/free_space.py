@@ -13,8 +13,8 @@ from thinmap_ros.core.grid.patch import (
 )
 from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_PERCENT
 from thinmap_ros.core.grid.tiles import TILE
-from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import column_distance, known_free
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.layers.deletion_times import skeleton_cells
 from thinmap_ros.core.topology.layers.lattice import (
     COLS,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.layers.free_space import borders_unknown, squared_clearance
 from thinmap_ros.core.topology.layers.lattice import Cells, col_of, hash_of, key_of, row_of
 from thinmap_ros.core.topology.layers.skeleton_graph import (

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.layers.deletion_times import update_skeleton
 from thinmap_ros.core.topology.layers.free_space import FreeSpace
 from thinmap_ros.core.topology.layers.lattice import Cells, Lattice, rows_and_cols

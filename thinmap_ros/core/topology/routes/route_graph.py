@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import known_free
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.routes.editing import EditedGraph
 from thinmap_ros.core.topology.routes.lines import give_edges, split_parallels
 from thinmap_ros.core.topology.routes.nodes import merge_nodes, show_places
