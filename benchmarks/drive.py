@@ -11,8 +11,8 @@ from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid, WindowCon
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, pose, wrap
-from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
-from thinmap_ros.core.topology.graph import Node, TopologicalMap
+from thinmap_ros.core.topology.graph import Node, TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import TopologyBuilder, build
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 

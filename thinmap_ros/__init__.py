@@ -21,9 +21,9 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.core.planning.graph_search import shortest_path
     from thinmap_ros.core.scan import LaserConfig, Scan
     from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-    from thinmap_ros.core.topology.builder import build as build_topology
     from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig, topology_from_msg
     from thinmap_ros.core.topology.thinning import thin
+    from thinmap_ros.core.topology.topology import build as build_topology
     from thinmap_ros.evaluation.exploration_run import explore
     from thinmap_ros.files.graphs import write_graph
     from thinmap_ros.files.merging import MergedMap, merge_maps
@@ -106,7 +106,7 @@ _PLACES = {
     # topological maps
     'TopologicalMap': 'core.topology.graph.TopologicalMap',
     'TopologyConfig': 'core.topology.graph.TopologyConfig',
-    'build_topology': 'core.topology.builder.build',
+    'build_topology': 'core.topology.topology.build',
     'shortest_path': 'core.planning.graph_search.shortest_path',
     'thin': 'core.topology.thinning.thin',
     'topology_from_msg': 'core.topology.graph.topology_from_msg',

@@ -15,9 +15,8 @@ from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class
 from thinmap_ros.core.stage import Estimate, LocalizedScan, StartConfig, Trajectory
-from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
-from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.core.topology.topology import Topology
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import Topology, TopologyBuilder
 
 
 @dataclass(frozen=True)

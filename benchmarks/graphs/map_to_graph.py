@@ -8,8 +8,8 @@ from benchmarks.graphs.graph_metrics import completeness, drivable_share
 from benchmarks.time_and_memory import best_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.baselines.voronoi import build_voronoi
-from thinmap_ros.core.topology.builder import TopologyConfig, build
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.files.occupancy_maps import read_map
 

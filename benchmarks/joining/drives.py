@@ -20,8 +20,8 @@ from thinmap_ros.core.slam.joining.robot_keyframes import ReceivedKeyframes, Rob
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.stage import Estimate
-from thinmap_ros.core.topology.builder import build
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.sim.drives import random_drive
 
 _EACH_M = 10.0

@@ -16,8 +16,8 @@ from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.places.global_localizer import GlobalLocalization, Hypothesis, Result, State
 from thinmap_ros.core.se2 import Array, wrap
-from thinmap_ros.core.topology.builder import TopologyConfig, build
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.maps import grid_of
 from thinmap_ros.files.worlds import read_world

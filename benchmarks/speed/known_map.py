@@ -20,7 +20,7 @@ from benchmarks.speed.node_process import TrafficListener, processor_s, start, s
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.regions.tracker import RegionTracker
-from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import write_map

@@ -13,8 +13,8 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.long_path import LONG_PATH_M, route_band
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells, find_path, plan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.builder import TopologyConfig, build
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.experiments.maps import patch_of_world
 from thinmap_ros.files.occupancy_maps import read_map

@@ -26,7 +26,7 @@ from fuzz.saved_states import (
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import OdometryAnchor
-from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files import sessions
 from thinmap_ros.files.npz import read_arrays
 from thinmap_ros.files.sessions import load_grid

@@ -15,8 +15,8 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, pose
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files.occupancy_maps import write_map
 from thinmap_ros.files.sessions import (
     EXPLORATION,

@@ -20,7 +20,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
 from thinmap_ros.core.slam.localizers import default_config, localizer_class
 from thinmap_ros.core.stage import Estimate
-from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.core.topology.topology import TopologyBuilder
 
 _PERIOD_NS = 200_000_000
 _STRANGE_RANGES = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-30, 1e30, 7.999, 8.0, 400.0)

@@ -16,8 +16,8 @@ from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.logs.laser_options import LaserOptions
 from thinmap_ros.view.message_view import MessageView
 from thinmap_ros.view.null_view import NullView

@@ -16,7 +16,7 @@ from thinmap_ros.core.grid.edits import Erasures, KeepOut, MapEdits
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.world import World

@@ -13,8 +13,9 @@ from thinmap_msgs.srv import LocalizeGlobally
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap as TopologicalGraph
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.files import occupancy_maps, package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, qos

@@ -17,8 +17,8 @@ from thinmap_msgs.msg import RegionArray, TopologicalMap
 from thinmap_msgs.srv import LoadMap, NameRegion, SaveMap
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.se2 import pose
-from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import topology_from_msg
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files import occupancy_maps, sessions
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig

@@ -24,7 +24,7 @@ from support.web_client import WebClient
 
 from thinmap_ros.core.grid.edits import KeepOut, MapEdits
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files.sessions import TOPOLOGY, load_edits, load_grid, load_topology, save_grid
 from thinmap_ros.ros import messages, qos
 

@@ -12,7 +12,8 @@ from thinmap_ros.core.places.recognition.piece import MapPiece
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.sim.buildings import BuildingConfig, generate_building
 from thinmap_ros.sim.drives import random_drive, random_start
 

@@ -4,7 +4,8 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 

@@ -13,7 +13,8 @@ from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.joined import JoinedMap, join
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
-from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import TopologyBuilder, build
 from thinmap_ros.files import sessions
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.occupancy_maps import Report, read_map, warn

@@ -25,7 +25,8 @@ from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import StartConfig
-from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.occupancy_maps import (
     Report,

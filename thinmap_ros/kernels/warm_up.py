@@ -180,7 +180,7 @@ def topology_builder() -> None:
     """Warm up thinning, the merging of local maps, and the regions."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
     from thinmap_ros.core.regions.segmentation import find_regions
-    from thinmap_ros.core.topology.builder import TopologyBuilder
+    from thinmap_ros.core.topology.topology import TopologyBuilder
 
     find_regions(_room())
     _graph(_room())
@@ -302,7 +302,8 @@ ALL = (
 
 def _graph(patch: GridPatch) -> 'TopologicalMap':
     """The graph of a map, after that of a closet: one node without edges."""
-    from thinmap_ros.core.topology.builder import TopologyConfig, build
+    from thinmap_ros.core.topology.graph import TopologyConfig
+    from thinmap_ros.core.topology.topology import build
 
     closet = GridPatch(GridFrame(0.0, 0.0, _REHEARSAL.cell_m), _walls(_REHEARSAL.closet_cells))
     build(closet, None, TopologyConfig())

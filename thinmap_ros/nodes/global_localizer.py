@@ -30,9 +30,9 @@ from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import InputStream, ScanOdometrySynchronizer
-from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
-from thinmap_ros.core.topology.graph import topology_from_msg
+from thinmap_ros.core.topology.graph import TopologyConfig, topology_from_msg
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.files import occupancy_maps
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos

@@ -13,9 +13,8 @@ from thinmap_ros.core.errors import counted
 from thinmap_ros.core.regions.tracker import FIELDS as REGION_FIELDS
 from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
-from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.core.topology.topology import Topology
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import Topology, TopologyBuilder
 from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.mapping.region_naming import RegionNaming

@@ -19,8 +19,8 @@ from thinmap_ros.core.grid.shared import (
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stage import Estimate
-from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.team.radio import Radio, Trouble
 
 TILE_PERIOD_S = 5.0

@@ -10,7 +10,7 @@ from typing import Any
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.slam.localizers import default_config
 from thinmap_ros.core.stage import StartConfig
-from thinmap_ros.core.topology.builder import TopologyConfig
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.evaluation.batch import REASON, Batch, FileJob, reported
 from thinmap_ros.evaluation.parallel_jobs import Report
 from thinmap_ros.files.atomic import read_text

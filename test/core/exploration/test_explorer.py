@@ -20,8 +20,8 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS

@@ -6,8 +6,8 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.long_path import route_band
 from thinmap_ros.core.planning.traversability import path_collides
 from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path, plan
-from thinmap_ros.core.topology.builder import TopologyConfig, build
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import build
 
 CONFIG = WavefrontConfig()
 START = (2.0, 1.5)

@@ -11,8 +11,8 @@ from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.outline import outline_of
 from thinmap_ros.core.regions.region_map import RegionKind, RegionMap
 from thinmap_ros.core.regions.segmentation import find_regions
-from thinmap_ros.core.topology.builder import TopologyConfig, build
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import build
 
 CORRIDOR = (7.0, 3.2)
 LEFT = (3.0, 7.0)

@@ -11,7 +11,8 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import config_with, localizer_class
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import build
 
 START = np.array([2.0, 2.0, 0.0])
 PERIOD_NS = 200_000_000

@@ -10,7 +10,8 @@ from drawings import patch_of, world
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
-from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import TopologyBuilder, build
 
 PAD = 200
 

@@ -7,9 +7,8 @@ import pytest
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import pose
-from thinmap_ros.core.topology.builder import TopologyConfig, build, build_again
-from thinmap_ros.core.topology.graph import NodeKind
-from thinmap_ros.core.topology.map_graph import MapGraph
+from thinmap_ros.core.topology.graph import NodeKind, TopologyConfig
+from thinmap_ros.core.topology.topology import MapGraph, build, build_again
 
 SECOND_NS = 1_000_000_000
 AT = pose(1.0, 3.0, 0.0)

@@ -7,12 +7,12 @@ import pytest
 
 from benchmarks.graphs.graph_metrics import drivable_share
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.topology.builder import TopologyConfig, build_along
 from thinmap_ros.core.topology.free_space import select_free_space
-from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.routes import lines
 from thinmap_ros.core.topology.routes.editing import EditedGraph, is_drivable
 from thinmap_ros.core.topology.routes.route_graph import route_graph
+from thinmap_ros.core.topology.topology import build_along
 
 CONFIG = TopologyConfig(max_unknown_gap_m=0.0)
 

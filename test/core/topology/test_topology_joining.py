@@ -3,10 +3,9 @@
 import numpy as np
 
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
-from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
-from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.core.topology.joining import join_topologies
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.registry import MATCH_RADIUS_M
+from thinmap_ros.core.topology.topology import TopologyBuilder, build, join_topologies
 
 FRAME = GridFrame(0.0, 0.0, 0.1)
 

@@ -24,7 +24,8 @@ from thinmap_ros.core.grid.moved import overlaid
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live

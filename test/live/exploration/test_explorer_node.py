@@ -32,7 +32,8 @@ from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import pose
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live

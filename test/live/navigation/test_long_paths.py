@@ -10,7 +10,8 @@ from support.peers.still_robot import StillRobot
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live

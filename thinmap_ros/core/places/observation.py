@@ -12,7 +12,8 @@ from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.place_database import DIRECTIONS, NODE_WINDOW_M, RANGE_UNIT_M
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import build
 
 # One scan alone has to make cells free and occupied.
 _P_FREE = 0.2

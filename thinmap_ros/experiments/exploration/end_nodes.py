@@ -8,8 +8,8 @@ import numpy as np
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
-from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.sim.surfaces import surfaces

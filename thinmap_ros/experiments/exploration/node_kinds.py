@@ -3,8 +3,8 @@
 import numpy as np
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.topology.builder import TopologyConfig, build
-from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.maps import CELL_M, patch_at_rest

@@ -4,9 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.free_space import select_free_space
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import thin
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.experiments.maps import patch_of_world

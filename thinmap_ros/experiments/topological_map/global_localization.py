@@ -8,7 +8,8 @@ import numpy as np
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.global_localizer import GlobalLocalization, Result, State
 from thinmap_ros.core.se2 import Array, wrap
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import SETUP, Source
 from thinmap_ros.experiments.maps import grid_of

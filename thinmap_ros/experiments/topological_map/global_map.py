@@ -7,8 +7,8 @@ from scipy.spatial import cKDTree
 
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid, WindowConfig
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
-from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import TopologyBuilder, build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.maps import grid_of

@@ -8,8 +8,8 @@ import numpy as np
 
 from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.topology.builder import TopologyConfig, build
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.maps import grid_of, patch_at_rest

@@ -14,10 +14,9 @@ from thinmap_ros.core.grid.edits import KeepOut
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.sensing.synchronizer import InputStream
-from thinmap_ros.core.topology.builder import TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
-from thinmap_ros.core.topology.graph import topology_from_msg
-from thinmap_ros.core.topology.map_graph import MapGraph
+from thinmap_ros.core.topology.graph import TopologyConfig, topology_from_msg
+from thinmap_ros.core.topology.topology import MapGraph
 from thinmap_ros.logs import decode
 from thinmap_ros.nodes.exploration.foreign_map import ForeignMap
 from thinmap_ros.nodes.exploration.publishers import PublisherCheck

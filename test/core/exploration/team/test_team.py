@@ -17,7 +17,7 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.navigator import NO_PATH
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS
-from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.core.topology.topology import TopologyBuilder
 
 MARGIN_M = 2.0
 

@@ -14,7 +14,8 @@ from thinmap_ros.core.places.recognition.evidence import ViewJudge
 from thinmap_ros.core.places.recognition.landmarks import landmarks_around
 from thinmap_ros.core.places.recognition.piece import MapPiece
 from thinmap_ros.core.places.recognition.recognition import Recognition
-from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import build
 
 BUILDINGS = range(1, 7)
 

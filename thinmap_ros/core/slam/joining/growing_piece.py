@@ -13,8 +13,8 @@ from thinmap_ros.core.places.recognition.landmarks import Landmarks, landmarks_a
 from thinmap_ros.core.places.recognition.piece import MapPiece
 from thinmap_ros.core.places.recognition.views import View, ViewBuilder
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
-from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.topology import TopologyBuilder
 
 # Coarser than the map: recognition compares pieces, and nobody sees them.
 _CELL_M = 0.1

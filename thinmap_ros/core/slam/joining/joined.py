@@ -17,9 +17,8 @@ from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
 from thinmap_ros.core.slam.joining.links import match_keyframes, placed_keyframes
 from thinmap_ros.core.slam.joining.rigid import found, rigid_links, rigid_transform
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
-from thinmap_ros.core.topology.builder import TopologyBuilder, moved_map
 from thinmap_ros.core.topology.graph import TopologyConfig
-from thinmap_ros.core.topology.joining import Ids, join_topologies
+from thinmap_ros.core.topology.topology import Ids, TopologyBuilder, join_topologies, moved_map
 
 _ORIGIN = np.zeros((1, 3))
 

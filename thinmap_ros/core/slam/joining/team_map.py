@@ -16,9 +16,8 @@ from thinmap_ros.core.slam.joining.map_links import MapLink, MapLinks
 from thinmap_ros.core.slam.joining.rigid import refined
 from thinmap_ros.core.slam.joining.robot_keyframes import RobotKeyframes
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
-from thinmap_ros.core.topology.builder import TopologyBuilder, build, moved_map
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
-from thinmap_ros.core.topology.joining import join_topologies
+from thinmap_ros.core.topology.topology import TopologyBuilder, build, join_topologies, moved_map
 
 WORLD = 'world'  # a map without cells, in whose frame a person gives the poses of others
 _FEWEST_MATCHES = LoopClosureConfig().min_consistent_matches
