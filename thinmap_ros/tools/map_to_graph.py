@@ -16,11 +16,7 @@ from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
-from thinmap_ros.core.topology.routes.route_graph import (
-    DETAIL_M,
-    MIN_NODE_SPACING_M,
-    route_graph,
-)
+from thinmap_ros.core.topology.routes import DETAIL_M, MIN_NODE_SPACING_M, route_graph
 from thinmap_ros.core.topology.topology import build_along
 from thinmap_ros.evaluation.batch import (
     REASON,

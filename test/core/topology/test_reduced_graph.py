@@ -7,11 +7,10 @@ import pytest
 
 from benchmarks.graphs.graph_metrics import drivable_share
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.topology import routes
 from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
-from thinmap_ros.core.topology.routes import lines
-from thinmap_ros.core.topology.routes.editing import EditedGraph, is_drivable
-from thinmap_ros.core.topology.routes.route_graph import route_graph
+from thinmap_ros.core.topology.routes import EditedGraph, is_drivable, route_graph
 from thinmap_ros.core.topology.topology import build_along
 
 CONFIG = TopologyConfig(max_unknown_gap_m=0.0)
@@ -154,7 +153,7 @@ def test_the_longer_of_two_parallel_edges_has_a_corner() -> None:
     bent = straight + np.column_stack([np.zeros(61), 2 * np.sin(np.linspace(0, math.pi, 61))])
     edges = [Edge(3, 1, 2, straight, 6.0, 1.0), Edge(4, 1, 2, bent, 7.5, 0.9)]
     graph = EditedGraph(TopologicalMap(nodes, edges), patch.frame, standing, patch.free)
-    lines.split_parallels(graph)
+    routes.split_parallels(graph)
     ends = {frozenset((edge.a, edge.b)) for edge in graph.map.edges.values()}
     assert len(ends) == len(graph.map.edges) == 3
     (corner,) = (node for node in graph.map.nodes.values() if node.id not in (1, 2))

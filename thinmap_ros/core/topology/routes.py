@@ -1,0 +1,652 @@
+"""The graph of a saved map, reduced for a route server."""
+
+import heapq
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.free_space import column_distance, known_free, squared_clearance
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
+from thinmap_ros.jit import inlined, kernel
+
+# A topological map that is edited: straight edges, and new nodes with their clearances.
+
+Mask = NDArray[np.bool_]
+
+_KINDS = (NodeKind.END, NodeKind.END, NodeKind.CORNER)  # by degree; else branch
+
+
+class EditedGraph:
+    """A map, and the cells on which its edges may run.
+
+    ends: ids of the nodes at which the map ended before it was edited.
+    """
+
+    def __init__(
+        self, topology: TopologicalMap, frame: GridFrame, standing: Mask, known: Mask
+    ) -> None:
+        """Edit a map: standing (H, W), traversable cells; known (H, W), cells that are free."""
+        self.map = topology
+        self.frame = frame
+        self.standing = standing
+        self.ends = {n.id for n in topology.nodes.values() if n.kind is NodeKind.END}
+        self._distance = column_distance(known)
+        self._next_id = 1 + max([0, *topology.nodes, *topology.edges])
+
+    def cell(self, node_id: int) -> tuple[int, int]:
+        """Row and column of a node."""
+        row, col = self.frame.cells_of(self.map.nodes[node_id].position)[0].tolist()
+        return row, col
+
+    def is_clear(self, a: tuple[int, int], b: tuple[int, int]) -> bool:
+        """Whether a robot can drive straight from the centre of a cell to that of another."""
+        return bool(is_drivable(self.standing, *a, *b))
+
+    def put_straight(self, edge_id: int, a: int, b: int) -> None:
+        """Put a straight edge between two nodes; id 0: a new one."""
+        start = self.map.nodes[a].position
+        end = self.map.nodes[b].position
+        steps = math.ceil(math.dist(start, end) / self.frame.resolution) + 1
+        self._put_edge(edge_id or self._new_id(), a, b, np.linspace(start, end, max(steps, 2)))
+
+    def put_node(self, xy: Array) -> int:
+        """Put a node at a point (2,), m; returns its id."""
+        clearance = float(self._clearances(xy[None])[0])
+        node = Node(self._new_id(), NodeKind.CORNER, float(xy[0]), float(xy[1]), clearance)
+        self.map.put_node(node)
+        return node.id
+
+    def split(self, edge: Edge, node_id: int) -> int:
+        """Replace an edge by two straight ones over a node; returns the id of the second one."""
+        self.map.drop_edge(edge.id)
+        self.put_straight(edge.id, edge.a, node_id)
+        self.put_straight(0, node_id, edge.b)
+        return self._next_id - 1
+
+    def with_kinds(self) -> TopologicalMap:
+        """The map, its nodes with the kinds that they have now."""
+        for node in list(self.map.nodes.values()):
+            degree = sum(1 + (edge.a == edge.b) for edge in self.map.edges_at(node.id))
+            kind = _KINDS[degree] if degree < len(_KINDS) else NodeKind.BRANCH
+            self.map.put_node(replace(node, kind=kind))
+        return self.map
+
+    def _put_edge(self, edge_id: int, a: int, b: int, path: Array) -> None:
+        length = float(np.hypot(*np.diff(path, axis=0).T).sum())
+        clearance = float(self._clearances(path).min())
+        self.map.put_edge(Edge(edge_id, a, b, path, length, clearance))
+
+    def _clearances(self, points: Array) -> Array:
+        squared = squared_clearance(self._distance, self.frame.cells_of(points))
+        return np.asarray(np.sqrt(squared) * self.frame.resolution)
+
+    def _new_id(self) -> int:
+        self._next_id += 1
+        return self._next_id - 1
+
+
+@kernel
+def is_drivable(standing: Mask, row: int, col: int, to_row: int, to_col: int) -> bool:
+    """Whether all cells on the straight line between the centres of two cells are traversable.
+
+    standing (H, W): traversable cells. As in the graph, a line over the corner of four cells needs
+    none of the two beside it.
+    """
+    rows = abs(to_row - row)
+    cols = abs(to_col - col)
+    up = 1 if to_row > row else -1
+    right = 1 if to_col > col else -1
+    i = 0
+    j = 0
+    while standing[row + up * i, col + right * j]:
+        if i == rows and j == cols:
+            return True
+        side = (1 + 2 * j) * rows - (1 + 2 * i) * cols
+        i += side >= 0
+        j += side <= 0
+    return False
+
+
+# Edges as a route server drives them: straight, one along a line, one at each node at least.
+
+_DIRECTIONS = 72
+
+
+def split_parallels(graph: EditedGraph) -> None:
+    """Lead the longer one of two edges between the same nodes over a corner node.
+
+    It stands where the edge is farthest from the line. An edge that no such corner clears goes:
+    both would be driven along the same line.
+    """
+    known: set[tuple[int, int]] = set()
+    edges = sorted(graph.map.edges.values(), key=lambda edge: (edge.length_m, edge.id))
+    for edge in edges:
+        ends = (min(edge.a, edge.b), max(edge.a, edge.b))
+        if ends in known or edge.a == edge.b:
+            _lead_over_corner(graph, edge)
+        known.add(ends)
+
+
+def _lead_over_corner(graph: EditedGraph, edge: Edge) -> None:
+    corner = edge.path[int(_off_line(edge.path).argmax())]
+    row, col = graph.frame.cells_of(corner)[0].tolist()
+    ends = {graph.cell(edge.a), graph.cell(edge.b)}
+    if len(ends) == 2 and all((row, col) != at and graph.is_clear((row, col), at) for at in ends):
+        graph.split(edge, graph.put_node(corner))
+    else:
+        graph.map.drop_edge(edge.id)
+
+
+def _off_line(path: Array) -> Array:
+    """Distance (K,) of the points of a path (K, 2) from the line through its ends."""
+    line = path[-1] - path[0]
+    off = path - path[0]
+    length = max(float(np.hypot(*line)), 1e-9)
+    return np.asarray(np.abs(off[:, 0] * line[1] - off[:, 1] * line[0]) / length)
+
+
+def give_edges(graph: EditedGraph) -> None:
+    """Lead an edge from each node without one to the farthest place on a straight line."""
+    for node in list(graph.map.nodes.values()):
+        if graph.map.edges_at(node.id):
+            continue
+        cell = graph.cell(node.id)
+        place = _farthest(graph.standing, *cell, _DIRECTIONS)
+        if place != cell:
+            other = graph.put_node(graph.frame.centres_of(np.array([place]))[0])
+            graph.put_straight(0, node.id, other)
+
+
+@kernel
+def _farthest(standing: NDArray[np.bool_], row: int, col: int, directions: int) -> tuple[int, int]:
+    """The traversable cell that is farthest from one on a straight line over such cells."""
+    best = (row, col)
+    best_away = 0.0
+    for k in range(directions):
+        angle = 2.0 * math.pi * k / directions
+        away = 0.0
+        at = (row, col)
+        to = at
+        while _is_true(standing, to[0], to[1]):
+            at = to
+            away += 0.5
+            to = (
+                int(math.floor(row + 0.5 + away * math.sin(angle))),
+                int(math.floor(col + 0.5 + away * math.cos(angle))),
+            )
+        if away > best_away and is_drivable(standing, row, col, at[0], at[1]):
+            best = at
+            best_away = away
+    return best
+
+
+@inlined
+def _is_true(mask: NDArray[np.bool_], row: int, col: int) -> bool:
+    """Whether a cell lies in a mask (H, W) and is true."""
+    return bool(0 <= row < mask.shape[0] and 0 <= col < mask.shape[1] and mask[row, col])
+
+
+# Branches into rays: space that a laser saw through glass, without walls around.
+
+_WALL = 2
+
+_UNKNOWN = 1
+
+_RAY_REACH_M = 3.0  # beyond, whatever ends a view is no part of the place
+
+
+def drop_rays(graph: EditedGraph, patch: GridPatch) -> None:
+    """Drop ends that see more of the unknown than of walls, back to the first node that does not.
+
+    A node without edges counts as an end, unless nothing else is left.
+    """
+    states = _UNKNOWN * patch.unknown.astype(np.uint8) + _WALL * patch.occupied.astype(np.uint8)
+    reach = _RAY_REACH_M / patch.frame.resolution
+    open_ids = [number for number in graph.map.nodes if len(graph.map.edges_at(number)) < 2]
+    while open_ids and len(graph.map.nodes) > 1:
+        number = open_ids.pop()
+        edges = graph.map.edges_at(number) if number in graph.map.nodes else []
+        if number not in graph.map.nodes or len(edges) > 1:
+            continue
+        walls, unknown = _view(states, *graph.cell(number), reach, _DIRECTIONS)
+        if unknown > walls:
+            open_ids += [edge.other(number) for edge in edges if edge.a != edge.b]
+            graph.map.drop_node(number)
+
+
+@kernel
+def _view(
+    states: NDArray[np.uint8], row: int, col: int, reach: float, directions: int
+) -> tuple[int, int]:
+    """Directions in which a view from a cell ends at a wall, and in the unknown, within a reach.
+
+    states (H, W): see the constants, 0 for free; cells outside are unknown; reach in cells.
+    """
+    walls = 0
+    unknown = 0
+    for k in range(directions):
+        angle = 2.0 * math.pi * k / directions
+        away = 0.0
+        while away < reach:
+            r = int(math.floor(row + 0.5 + away * math.sin(angle)))
+            c = int(math.floor(col + 0.5 + away * math.cos(angle)))
+            inside = 0 <= r < states.shape[0] and 0 <= c < states.shape[1]
+            state = states[r, c] if inside else _UNKNOWN
+            if state != 0:
+                walls += state == _WALL
+                unknown += state == _UNKNOWN
+                break
+            away += 0.5
+    return walls, unknown
+
+
+# Rings round small obstacles are opened: one path round is left, the wider one.
+
+Box = tuple[float, float, float, float]  # smallest x and y, largest x and y, m
+
+
+def open_rings(graph: EditedGraph, known: NDArray[np.bool_], detail_m: float) -> None:
+    """Drop the narrowest edge of each ring round an obstacle smaller than detail_m.
+
+    known (H, W): free cells; all others within a ring are the obstacle. The narrowest edges are
+    dropped first, so that obstacles with narrow gaps between them become one, and a large one has
+    paths round it.
+    """
+    boxes = {edge.id: _box(edge.path) for edge in graph.map.edges.values()}
+    order = sorted(graph.map.edges.values(), key=lambda e: (e.clearance_m, -e.length_m, e.id))
+    most = int(detail_m / graph.frame.resolution + 1e-6)
+    for edge in order:
+        ring = _ring(graph, edge, boxes, detail_m)
+        if ring is not None and _enclosed(known, graph.frame.cells_of(ring)) <= most:
+            graph.map.drop_edge(edge.id)
+
+
+def fits(box: Box, side_m: float) -> bool:
+    """Whether a box fits into a square of a side."""
+    return box[2] - box[0] <= side_m and box[3] - box[1] <= side_m
+
+
+def _ring(graph: EditedGraph, edge: Edge, boxes: dict[int, Box], detail_m: float) -> Array | None:
+    """Points (K, 2) of the shortest ring of an edge and others no narrower; None if it is large.
+
+    An obstacle touches the largest discs round the points of a ring: no ring round a small one has
+    a box larger than the obstacle by more than twice the largest clearance.
+    """
+    nodes = graph.map.nodes
+    room_m = max(nodes[edge.a].clearance_m, nodes[edge.b].clearance_m)
+    costs = {edge.b: 0.0}
+    boxed = {edge.b: (boxes[edge.id], room_m)}
+    came_by: dict[int, Edge] = {}
+    open_nodes = [(0.0, edge.b)]
+    while open_nodes:
+        cost, node_id = heapq.heappop(open_nodes)
+        if node_id == edge.a:
+            return _points(edge, came_by)
+        for other in graph.map.edges_at(node_id):
+            to = other.other(node_id)
+            reached = cost + other.length_m
+            if other.id == edge.id or other.clearance_m < edge.clearance_m:
+                continue
+            box = _joined(boxed[node_id][0], boxes[other.id])
+            room_m = max(boxed[node_id][1], nodes[to].clearance_m)
+            if reached < costs.get(to, math.inf) and fits(box, detail_m + 2.0 * room_m):
+                costs[to] = reached
+                boxed[to] = (box, room_m)
+                came_by[to] = other
+                heapq.heappush(open_nodes, (reached, to))
+    return None
+
+
+def _points(edge: Edge, came_by: dict[int, Edge]) -> Array:
+    """Points (K, 2) of an edge and of the edges by which its start was reached from its end."""
+    parts = [edge.path]
+    node_id = edge.a
+    while node_id != edge.b:
+        parts.insert(1, came_by[node_id].path_from(node_id)[::-1])
+        node_id = came_by[node_id].other(node_id)
+    return np.concatenate(parts)
+
+
+def _box(path: Array) -> Box:
+    """The box of a path (K, 2)."""
+    low = path.min(axis=0)
+    high = path.max(axis=0)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _joined(one: Box, other: Box) -> Box:
+    low_x = min(one[0], other[0])
+    low_y = min(one[1], other[1])
+    return low_x, low_y, max(one[2], other[2]), max(one[3], other[3])
+
+
+@kernel
+def _enclosed(known: NDArray[np.bool_], ring: NDArray[np.int64]) -> int:
+    """Rows or columns, whichever are more, of the cells within a ring (K, 2) that are not free."""
+    crossings = np.empty(len(ring))
+    low_row = known.shape[0]
+    high_row = -1
+    low_col = known.shape[1]
+    high_col = -1
+    for row in range(ring[:, 0].min(), ring[:, 0].max() + 1):
+        count = 0
+        for k in range(len(ring)):
+            a = ring[k - 1]
+            b = ring[k]
+            if (a[0] > row) != (b[0] > row):
+                crossings[count] = a[1] + (row - a[0]) * (b[1] - a[1]) / (b[0] - a[0])
+                count += 1
+        ordered = np.sort(crossings[:count])
+        for k in range(0, count - 1, 2):
+            for col in range(int(math.ceil(ordered[k])), int(ordered[k + 1]) + 1):
+                if not known[row, col]:
+                    low_row = min(low_row, row)
+                    high_row = max(high_row, row)
+                    low_col = min(low_col, col)
+                    high_col = max(high_col, col)
+    return int(max(high_row - low_row, high_col - low_col) + 1)
+
+
+# Which places see the node that is nearest to them.
+
+Cells = NDArray[np.int64]
+
+_LATTICE_M = 0.5  # between the places that should see a node
+
+_SIGHT_REACH_M = 10.0  # a node that is farther off is out of sight
+
+_MIN_GAIN = 3  # places that a node must show
+
+
+class Sight:
+    """Places on a lattice of traversable cells, the node nearest to each, and whether it is seen.
+
+    A route server starts at the node nearest to the robot, whatever walls are between.
+    """
+
+    def __init__(
+        self, frame: GridFrame, standing: Mask, known: Mask, nodes: Iterable[Node]
+    ) -> None:
+        """Begin with some nodes: standing (H, W), traversable cells; known (H, W), cells seen."""
+        step = max(round(_LATTICE_M / frame.resolution), 1)
+        self._frame = frame
+        self._known = known
+        self._cells = np.ascontiguousarray(np.argwhere(standing[::step, ::step]) * step)
+        self._xy = frame.centres_of(self._cells)
+        self._tree = cKDTree(self._xy)
+        self._away = np.full(len(self._cells), np.inf)
+        self._owner = np.zeros(len(self._cells), dtype=np.int64)
+        self._seen: Mask = np.zeros(len(self._cells), dtype=np.bool_)
+        self._places: dict[int, Cells] = {}
+        self._assign(list(nodes))
+
+    def drop(self, node: Node, graph: TopologicalMap) -> bool:
+        """Leave out a node of a graph, unless fewer places would see the node nearest to them."""
+        places = self._places[node.id]
+        others = self._candidates(node, graph)
+        xy = np.array([(other.x, other.y) for other in others])
+        away = np.hypot(*np.moveaxis(self._xy[places][:, None] - xy, 2, 0))
+        nearest = away.argmin(axis=1)
+        seen = np.zeros(len(places), dtype=np.bool_)
+        for k in np.unique(nearest):
+            seen[nearest == k] = self._sees(others[k], places[nearest == k])
+        if seen.sum() < self._seen[places].sum():
+            return False
+        self._seen[places] = seen
+        self._away[places] = away.min(axis=1)
+        for k in np.unique(nearest):
+            self._give(others[k].id, places[nearest == k])
+        del self._places[node.id]
+        return True
+
+    def add(self, node: Node) -> bool:
+        """Add a node, if so some more places see the node nearest to them."""
+        near = np.array(self._tree.query_ball_point(node.position, _SIGHT_REACH_M), dtype=np.int64)
+        away = np.hypot(*(self._xy[near] - node.position).T)
+        closer = away < self._away[near]
+        places = near[closer]
+        seen = self._sees(node, places)
+        if seen.sum() < self._seen[places].sum() + _MIN_GAIN:
+            return False
+        for owner in np.unique(self._owner[places]).tolist():
+            self._places[owner] = np.setdiff1d(self._places[owner], places)
+        self._seen[places] = seen
+        self._away[places] = away[closer]
+        self._give(node.id, places)
+        return True
+
+    def unseen(self) -> Cells:
+        """Indices of the places that do not see the node nearest to them."""
+        return np.flatnonzero(~self._seen)
+
+    def is_seen(self, place: int) -> bool:
+        """Whether a place sees the node nearest to it."""
+        return bool(self._seen[place])
+
+    def first_seeing(self, place: int, cells: Cells) -> int:
+        """Index of the first of some cells (N, 2) that a place sees; -1: none."""
+        row, col = self._cells[place].tolist()
+        return int(_first_clear(self._known, row, col, cells))
+
+    def position(self, place: int) -> Array:
+        """A place (2,), m."""
+        return np.asarray(self._xy[place])
+
+    def _assign(self, nodes: list[Node]) -> None:
+        """Find the nearest of the nodes for each place."""
+        self._places = {node.id: np.empty(0, dtype=np.int64) for node in nodes}
+        if not nodes or not len(self._cells):
+            return
+        found = cKDTree([(node.x, node.y) for node in nodes]).query(self._xy)
+        self._away = np.asarray(found[0])
+        nearest = np.asarray(found[1])
+        order = np.argsort(nearest, kind='stable')
+        first = np.searchsorted(nearest[order], np.arange(len(nodes) + 1))
+        for k, node in enumerate(nodes):
+            places = order[first[k] : first[k + 1]]
+            self._seen[places] = self._sees(node, places)
+            self._give(node.id, places)
+
+    def _give(self, node_id: int, places: Cells) -> None:
+        self._owner[places] = node_id
+        had = self._places.get(node_id, places[:0])
+        self._places[node_id] = np.concatenate((had, places))
+
+    def _candidates(self, node: Node, graph: TopologicalMap) -> list[Node]:
+        """Other nodes that may be nearest to one of the places of a node with a neighbour."""
+        around = [graph.nodes[i] for i in graph.neighbours(node.id) if i != node.id]
+        reach_m = float(self._away[self._places[node.id]].max(initial=0.0))
+        nearest_m = min(float(np.hypot(*(other.position - node.position))) for other in around)
+        found = graph.nodes_near(node.x, node.y, 2.0 * reach_m + nearest_m)
+        return [other for other in found if other.id != node.id]
+
+    def _sees(self, node: Node, places: Cells) -> Mask:
+        row, col = self._frame.cells_of(node.position)[0].tolist()
+        return np.asarray(_lines_clear(self._known, row, col, self._cells[places]))
+
+
+@kernel
+def _lines_clear(free: Mask, row: int, col: int, cells: Cells) -> Mask:
+    """Whether the straight lines from cells (N, 2) to one are clear, (N,)."""
+    found = np.zeros(len(cells), dtype=np.bool_)
+    for i in range(len(cells)):
+        found[i] = line_is_clear(free, cells[i, 0], cells[i, 1], row, col)
+    return found
+
+
+@kernel
+def _first_clear(free: Mask, row: int, col: int, cells: Cells) -> int:
+    """Index of the first of cells (N, 2) with a clear straight line to one; -1: none."""
+    for i in range(len(cells)):
+        if line_is_clear(free, cells[i, 0], cells[i, 1], row, col):
+            return i
+    return -1
+
+
+# Few nodes: one for several, and one more where places would not see the nearest.
+
+_NODE_REACH_M = 6.0  # of a place from an edge on which a node may show it
+
+_SPLIT_STEP_M = 0.25  # between the points on edges where nodes may be put
+
+
+def merge_nodes(graph: EditedGraph, sight: Sight, node_spacing_m: float, detail_m: float) -> None:
+    """Let nodes stand for others, as long as as many places see the node nearest to them.
+
+    A node goes, the one with the least clearance first, if a neighbour sees all of its other
+    neighbours and can have its edges: one nearer than node_spacing_m or the clearance of either,
+    any of two neighbours (a straight edge stays), or the only one where a ring was opened. Both
+    paths round an obstacle of detail_m or more stay.
+    """
+    order = sorted(graph.map.nodes.values(), key=lambda node: (-node.clearance_m, node.id))
+    open_ids = dict.fromkeys(node.id for node in order)
+    while open_ids:
+        number, _ = open_ids.popitem()
+        around = graph.map.neighbours(number)
+        heir = _heir(graph, number, node_spacing_m, detail_m)
+        if heir and sight.drop(graph.map.nodes[number], graph.map):
+            _move_edges(graph, number, heir)
+            open_ids |= dict.fromkeys(around)
+
+
+def _heir(graph: EditedGraph, number: int, node_spacing_m: float, detail_m: float) -> int:
+    """The nearest neighbour that can have the edges of a node; 0: none."""
+    node = graph.map.nodes[number]
+    around = [i for i in graph.map.neighbours(number) if i != number]
+    is_opened = len(around) == 1 and number not in graph.ends
+    is_chain = len(around) == 2 and len(graph.map.edges_at(number)) == 2
+    by_distance = sorted((math.dist(node.position, graph.map.nodes[i].position), i) for i in around)
+    for away_m, other in by_distance:
+        room_m = max(node_spacing_m, node.clearance_m, graph.map.nodes[other].clearance_m)
+        if not (is_opened or is_chain or away_m <= room_m):
+            continue
+        rest = [i for i in around if i != other]
+        seen = all(graph.is_clear(graph.cell(i), graph.cell(other)) for i in rest)
+        if seen and not _ends_ring(graph, number, other, detail_m):
+            return other
+    return 0
+
+
+def _ends_ring(graph: EditedGraph, number: int, heir: int, detail_m: float) -> bool:
+    """Whether two paths would become one that are farther apart than detail_m and their room."""
+    both = set(graph.map.neighbours(number)) & set(graph.map.neighbours(heir))
+    edges = [e for i in (number, heir) for e in graph.map.edges_at(i) if e.other(i) in both]
+    clearance_m = min((edge.clearance_m for edge in edges), default=0.0)
+    for other in both - {number, heir}:
+        corners = np.array([graph.map.nodes[i].position for i in (number, heir, other)])
+        low_x, low_y = corners.min(axis=0).tolist()
+        high_x, high_y = corners.max(axis=0).tolist()
+        if not fits((low_x, low_y, high_x, high_y), detail_m + 2.0 * clearance_m):
+            return True
+    return False
+
+
+def _move_edges(graph: EditedGraph, number: int, heir: int) -> None:
+    """Drop a node, and lead its edges to another one on straight lines."""
+    known = {heir, number, *graph.map.neighbours(heir)}
+    moved = {edge.other(number): edge.id for edge in graph.map.edges_at(number)}
+    graph.map.drop_node(number)
+    for other, edge_id in moved.items():
+        if other not in known:
+            graph.put_straight(edge_id, heir, other)
+
+
+class _EdgePoints:
+    """Points along straight edges, at which these can be split: cells (N, 2), edge of each."""
+
+    def __init__(self, graph: EditedGraph) -> None:
+        cells = [np.empty((0, 2), dtype=np.int64)]
+        owners = [np.empty(0, dtype=np.int64)]
+        for edge in graph.map.edges.values():
+            ends = np.array([graph.map.nodes[i].position for i in (edge.a, edge.b)])
+            count = int(math.dist(*ends) / _SPLIT_STEP_M)
+            inner = graph.frame.cells_of(np.linspace(ends[0], ends[1], count + 1)[1:-1])
+            cells.append(inner.reshape(-1, 2))
+            owners.append(np.full(len(inner), edge.id))
+        self.cells = np.concatenate(cells)
+        self.edges = np.concatenate(owners)
+        self._tree = cKDTree(graph.frame.centres_of(self.cells))
+
+    def near(self, xy: Array) -> Cells:
+        """Indices of the points within reach of a place (2,), m, the nearest first."""
+        found = np.array(self._tree.query_ball_point(xy, _NODE_REACH_M), dtype=np.int64)
+        away = np.hypot(*(self._tree.data[found] - xy).T)
+        return found[np.argsort(away, kind='stable')]
+
+    def split(self, point: int, second: int) -> None:
+        """The points behind one belong to another edge now, and it to none."""
+        behind = np.flatnonzero(self.edges == self.edges[point])
+        self.edges[behind[behind > point]] = second
+        self.edges[point] = 0
+
+
+def show_places(graph: EditedGraph, sight: Sight) -> None:
+    """Put nodes on edges from which places are in sight that do not see their nearest node."""
+    points = _EdgePoints(graph)
+    for place in sight.unseen().tolist():
+        if sight.is_seen(place) or not len(points.cells):
+            continue
+        near = points.near(sight.position(place))
+        first = sight.first_seeing(place, points.cells[near])
+        edge_id = int(points.edges[near[first]]) if first >= 0 else 0
+        if edge_id and _can_split(graph, graph.map.edges[edge_id], points.cells[near[first]]):
+            node_id = graph.put_node(graph.frame.centres_of(points.cells[near[first]][None])[0])
+            if sight.add(graph.map.nodes[node_id]):
+                points.split(int(near[first]), graph.split(graph.map.edges[edge_id], node_id))
+            else:
+                graph.map.drop_node(node_id)
+
+
+def _can_split(graph: EditedGraph, edge: Edge, cell: Cells) -> bool:
+    at = (int(cell[0]), int(cell[1]))
+    return all(graph.is_clear(at, graph.cell(i)) for i in (edge.a, edge.b))
+
+
+# The graph of a saved map, reduced for a route server.
+#
+# A robot that maps needs every node: each is an event of its exploration. A route server needs few
+# nodes, straight edges, and a node in sight of each place. The reduced graph has
+#
+# - no branch into rays that passed through glass;
+# - one path, the wider one, round an obstacle smaller than `detail_m`;
+# - one node for several that are nearer to each other than `node_spacing_m`, and none on a straight
+#   line;
+# - no two edges along one straight line, and no node without an edge.
+
+DETAIL_M = 1.2  # a small table; nodes are as far apart, unless another spacing is given
+
+MIN_NODE_SPACING_M = 0.05  # a cell of most maps
+
+
+def route_graph(
+    topology: TopologicalMap,
+    patch: GridPatch,
+    standing: NDArray[np.bool_],
+    config: TopologyConfig,
+    detail_m: float = DETAIL_M,
+    node_spacing_m: float | None = None,
+) -> TopologicalMap:
+    """The reduced graph of a map; the given one is not changed.
+
+    standing (H, W): cells of the patch that a robot can traverse. Each edge that is changed is a
+    straight line over such cells. detail_m: smaller obstacles are passed on one side only.
+    node_spacing_m: nodes nearer to each other than this, or than the clearance of one of them, are
+    one where places see it as well; None: detail_m.
+    """
+    known = known_free(patch, config)
+    graph = EditedGraph(topology.copy(), patch.frame, standing, known)
+    drop_rays(graph, patch)
+    open_rings(graph, known, detail_m)
+    sight = Sight(patch.frame, standing, known, graph.map.nodes.values())
+    merge_nodes(graph, sight, detail_m if node_spacing_m is None else node_spacing_m, detail_m)
+    show_places(graph, sight)
+    split_parallels(graph)
+    give_edges(graph)
+    return graph.with_kinds()

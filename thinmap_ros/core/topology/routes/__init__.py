@@ -1,1 +1,0 @@
-"""Route graphs: topological maps of saved maps, reduced to what a person would draw."""
