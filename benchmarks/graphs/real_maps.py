@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.routes import route_graph
+from thinmap_ros.core.topology.thinning import select_free_space
 from thinmap_ros.core.topology.topology import build_along
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.files.occupancy_maps import read_map, write_map

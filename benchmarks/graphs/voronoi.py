@@ -20,9 +20,8 @@ from benchmarks.time_and_memory import median_seconds
 from benchmarks.worlds import Floor, groups
 from thinmap_ros.baselines.voronoi import build_voronoi, voronoi_lines
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyConfig
-from thinmap_ros.core.topology.thinning import thin
+from thinmap_ros.core.topology.thinning import select_free_space, thin
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Row, at_least
 from thinmap_ros.files.occupancy_maps import read_map

@@ -13,9 +13,8 @@ from benchmarks.graphs.graph_metrics import (
 )
 from thinmap_ros.baselines.voronoi import build_voronoi, voronoi_lines
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyConfig
-from thinmap_ros.core.topology.thinning import thin
+from thinmap_ros.core.topology.thinning import select_free_space, thin
 from thinmap_ros.core.topology.topology import build, build_along
 
 CONFIG = TopologyConfig()

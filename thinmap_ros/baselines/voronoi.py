@@ -11,8 +11,8 @@ from scipy.spatial import Voronoi
 
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.free_space import known_free, select_free_space
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.thinning import known_free, select_free_space
 from thinmap_ros.core.topology.topology import build_along
 
 Mask = NDArray[np.bool_]

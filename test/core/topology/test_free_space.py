@@ -9,14 +9,14 @@ from scipy import ndimage
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.fields import label, reachable
-from thinmap_ros.core.topology.free_space import (
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.thinning import (
     column_distance,
     known_free,
     select_free_space,
     squared_clearance,
     standing_room,
 )
-from thinmap_ros.core.topology.graph import TopologyConfig
 
 
 def random_mask(seed):

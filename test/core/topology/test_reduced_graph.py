@@ -8,9 +8,9 @@ import pytest
 from benchmarks.graphs.graph_metrics import drivable_share
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology import routes
-from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.routes import EditedGraph, is_drivable, route_graph
+from thinmap_ros.core.topology.thinning import select_free_space
 from thinmap_ros.core.topology.topology import build_along
 
 CONFIG = TopologyConfig(max_unknown_gap_m=0.0)

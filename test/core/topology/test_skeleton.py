@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import NodeKind, TopologyConfig
+from thinmap_ros.core.topology.thinning import select_free_space
 from thinmap_ros.core.topology.topology import build
 
 E = NodeKind.END

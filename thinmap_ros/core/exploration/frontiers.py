@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import Bounds, GridFrame, GridPatch, union
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.free_space import known_free, true_cells
 from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.thinning import known_free, true_cells
 from thinmap_ros.jit import kernel
 
 Mask = NDArray[np.bool_]

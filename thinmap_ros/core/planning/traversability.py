@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.grid.fields import reachable
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, Bounds, GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.free_space import column_distance, standing_room
+from thinmap_ros.core.topology.thinning import column_distance, standing_room
 from thinmap_ros.jit import kernel
 
 Mask = NDArray[np.bool_]

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.free_space import column_distance, known_free, squared_clearance
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.thinning import column_distance, known_free, squared_clearance
 from thinmap_ros.jit import inlined, kernel
 
 # A topological map that is edited: straight edges, and new nodes with their clearances.

@@ -28,11 +28,11 @@ from thinmap_ros.core.grid.tiles import MAX_CELLS, MAX_TILE_INDEX, TILE
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_CELL_INDEX, MAX_COORDINATE_M, MAX_ID, Field, State
 from thinmap_ros.core.stage import Stage
-from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.layers.lattice import Cells, Lattice
 from thinmap_ros.core.topology.layers.stack import Layers, Span
 from thinmap_ros.core.topology.registry import MATCH_RADIUS_M, Changes, Registry
+from thinmap_ros.core.topology.thinning import select_free_space
 
 # Saved states of the topological map: cells of the grid, robot places, nodes and edges.
 

@@ -4,9 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import TopologyConfig
-from thinmap_ros.core.topology.thinning import thin
+from thinmap_ros.core.topology.thinning import select_free_space, thin
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.experiments.drives import Source, world_of

@@ -13,7 +13,6 @@ from thinmap_ros.core.grid.patch import (
 )
 from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_PERCENT
 from thinmap_ros.core.grid.tiles import TILE
-from thinmap_ros.core.topology.free_space import column_distance, known_free
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.layers.deletion_times import skeleton_cells
 from thinmap_ros.core.topology.layers.lattice import (
@@ -30,7 +29,7 @@ from thinmap_ros.core.topology.layers.lattice import (
     moved,
     row_of,
 )
-from thinmap_ros.core.topology.thinning import deletion_times
+from thinmap_ros.core.topology.thinning import column_distance, deletion_times, known_free
 from thinmap_ros.jit import inlined, kernel
 
 _MIN_FRONTIER_CELLS = 3
