@@ -11,11 +11,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.core.regions.config import RegionConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.stage import Estimate
+from thinmap_ros.core.topology.segmentation import RegionConfig
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.logs.log import Log
 from thinmap_ros.logs.order.unused_scans import UnusedScans

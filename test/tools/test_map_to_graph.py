@@ -14,7 +14,7 @@ from PIL import Image
 
 from thinmap_ros.core.grid.edits import KeepOut, MapEdits
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.regions.tracker import RegionTracker
+from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.sessions import EDITS, GRID, REGIONS
 from thinmap_ros.tools import map_to_graph

@@ -6,8 +6,8 @@ from PIL import Image
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.regions.region_map import RegionKind
-from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.segmentation import find_regions
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.view import palette
 from thinmap_ros.view.summary import scale_bar_m, shortened, shown_area, summary_figure

@@ -9,11 +9,11 @@ from thinmap_ros.core.grid.edits import KeepOut, MapEdits, require_count
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.recognition.decision import JOIN_ODDS, recognize
-from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.joined import JoinedMap, join
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
 from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import TopologyBuilder, build
 from thinmap_ros.files import sessions
 from thinmap_ros.files.atomic import atomic_write

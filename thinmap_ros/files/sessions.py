@@ -16,7 +16,6 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.edits import MapEdits
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
@@ -26,6 +25,7 @@ from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.occupancy_maps import (

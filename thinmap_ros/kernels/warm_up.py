@@ -179,7 +179,7 @@ def grid_mapper() -> None:
 def topology_builder() -> None:
     """Warm up thinning, the merging of local maps, and the regions."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
-    from thinmap_ros.core.regions.segmentation import find_regions
+    from thinmap_ros.core.topology.segmentation import find_regions
     from thinmap_ros.core.topology.topology import TopologyBuilder
 
     find_regions(_room())

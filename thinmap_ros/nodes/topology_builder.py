@@ -10,10 +10,10 @@ from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import counted
-from thinmap_ros.core.regions.tracker import FIELDS as REGION_FIELDS
-from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.segmentation import FIELDS as REGION_FIELDS
+from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import Topology, TopologyBuilder
 from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up

@@ -11,11 +11,10 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.regions.config import RegionConfig
 from thinmap_ros.core.regions.membership import membership_of
-from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.routes import DETAIL_M, MIN_NODE_SPACING_M, route_graph
+from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions
 from thinmap_ros.core.topology.thinning import select_free_space
 from thinmap_ros.core.topology.topology import build_along
 from thinmap_ros.evaluation.batch import (

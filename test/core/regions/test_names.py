@@ -9,7 +9,7 @@ from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.regions import names as region_names
 from thinmap_ros.core.regions.names import MAX_LENGTH, RegionNames, checked_name
 from thinmap_ros.core.regions.region_map import RegionMap
-from thinmap_ros.core.regions.tracker import RegionTracker
+from thinmap_ros.core.topology.segmentation import RegionTracker
 
 LEFT = np.array([3.0, 7.0])
 RIGHT = np.array([11.0, 7.0])

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from core.regions.floors import CELL_M, noisy, office, patch_of
 
-from thinmap_ros.core.regions.config import RegionConfig
 from thinmap_ros.core.regions.membership import membership_of
-from thinmap_ros.core.regions.outline import outline_of
 from thinmap_ros.core.regions.region_map import RegionKind, RegionMap
-from thinmap_ros.core.regions.segmentation import find_regions
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions, outline_of
 from thinmap_ros.core.topology.topology import build
 
 CORRIDOR = (7.0, 3.2)

@@ -6,7 +6,7 @@ from core.regions.floors import CELL_M, office, patch_of
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
-from thinmap_ros.core.regions.tracker import RegionTracker
+from thinmap_ros.core.topology.segmentation import RegionTracker
 
 CORRIDOR = (7.0, 3.2)
 LEFT = (3.0, 7.0)

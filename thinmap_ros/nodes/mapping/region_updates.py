@@ -10,11 +10,10 @@ import numpy as np
 from thinmap_msgs.msg import RegionArray
 from thinmap_ros.core.config import Config, parameter, part
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.regions.config import RegionConfig
 from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.regions.region_map import RegionMap
-from thinmap_ros.core.regions.tracker import RegionTracker
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.segmentation import RegionConfig, RegionTracker
 from thinmap_ros.kernels.memory import release_free_pages
 from thinmap_ros.nodes.mapping.region_messages import region_array_msg
 from thinmap_ros.ros import parameters, qos

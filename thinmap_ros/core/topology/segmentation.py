@@ -1,0 +1,714 @@
+"""Regions of a grid: flooded, described by kind, area, outline and doors; with ids that stay."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from thinmap_ros.core import snapshot
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid import fields
+from thinmap_ros.core.grid.fields import distance_cells
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.regions import names as region_names
+from thinmap_ros.core.regions.names import RegionNames
+from thinmap_ros.core.regions.region_map import Door, Region, RegionKind, RegionMap
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import MAX_COUNT, MAX_ID, Field
+from thinmap_ros.jit import inlined, kernel
+
+# Parameters of the regions of a map.
+
+
+@dataclass(frozen=True)
+class RegionConfig(Config):
+    """What separates two regions, and which kind a region is.
+
+    robot_radius_m: free space that the robot does not fit into belongs to no region.
+    neck_ratio: a passage separates two places if it is narrower than this share of both.
+    min_door_width_m: narrower passages are gaps along walls, and no doors.
+    max_door_depth_m: on both sides of a door it gets wider within this distance; else it is the
+    mouth of a narrow corridor.
+    max_furniture_m: compact obstacles apart from walls up to this length are furniture.
+    corridor_ratio: a corridor is at least so many times as long as wide.
+    """
+
+    robot_radius_m: float = 0.25
+    neck_ratio: float = 0.75
+    min_door_width_m: float = 0.5
+    max_door_depth_m: float = 2.0
+    max_furniture_m: float = 2.0
+    corridor_ratio: float = 4.0
+    max_door_width_m: float = parameter(
+        2.6,
+        'Widest passage that separates two regions (m). Raise it for gates, lower it if rooms are '
+        'divided where cupboards stand.',
+        low=0.5,
+        high=10.0,
+    )
+    max_corridor_width_m: float = parameter(
+        3.2,
+        'Largest width of a corridor (m); a region that is wider in most of its area is a room or '
+        'a hall. Raise it for hospitals and malls, lower it if long rooms count as corridors.',
+        low=0.5,
+        high=20.0,
+    )
+    min_hall_width_m: float = parameter(
+        9.0,
+        'Width from which a room is a hall (m). Raise it for a warehouse, lower it for a flat.',
+        low=1.0,
+        high=1000.0,
+    )
+
+
+# Basins of the clearance: a watershed by merge tree, cut where a passage is a neck.
+#
+# Cells are flooded from the roomiest one down. A cell beside one basin joins it; a cell beside two
+# is their saddle, the widest place of the narrowest path between them: they become one basin,
+# unless the saddle is a neck. So a path round a table, where basins meet again lower down, is no
+# door. Source: watershed after F. Meyer, "Topographic distance and watershed lines", 1994; compared
+# for maps by R. Bormann et al., "Room segmentation: survey, implementation, and analysis", ICRA
+# 2016.
+
+Labels = NDArray[np.int32]
+
+Cells = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Neck:
+    """When a saddle separates two basins.
+
+    ratio: clearance there relative to the smaller peak, at most. widest: largest clearance there,
+    m. least_cells: of the smaller basin.
+    """
+
+    ratio: float
+    widest: float
+    least_cells: int
+
+
+def flood(clearance: NDArray[np.float64], neck: Neck) -> tuple[Labels, Cells]:
+    """Basins of a clearance (H, W), m, 0 outside of the space.
+
+    Returns the basin of each cell, from 1, 0 outside, (H, W); and the saddles between basins,
+    widest first (N, 3): flat index of the cell, lower and higher basin.
+    """
+    flat = np.ascontiguousarray(clearance).ravel()
+    basin, parent, saddles = _flood(
+        flat, _from_widest(flat), clearance.shape[1], neck.ratio, neck.widest, neck.least_cells
+    )
+    number = np.zeros(len(parent) + 1, dtype=np.int32)  # the last: of cells outside
+    number[:-1] = 1 + np.unique(parent, return_inverse=True)[1]
+    pairs = np.sort(number[saddles[:, 1:]], axis=1)
+    apart = pairs[:, 0] != pairs[:, 1]
+    labels: Labels = number[basin].reshape(clearance.shape)
+    return labels, np.column_stack([saddles[apart, 0], pairs[apart]])
+
+
+def _from_widest(flat: NDArray[np.float64]) -> Cells:
+    """Indices of the cells inside, the roomiest first."""
+    inside = np.flatnonzero(flat > 0.0)
+    return inside[np.argsort(-flat[inside], kind='stable')]
+
+
+@inlined
+def _root(parent: Cells, k: int) -> int:
+    while parent[k] != k:
+        parent[k] = parent[parent[k]]
+        k = parent[k]
+    return k
+
+
+@kernel
+def _flood(
+    flat: NDArray[np.float64],
+    order: Cells,
+    cols: int,
+    ratio: float,
+    widest: float,
+    least_cells: int,
+) -> tuple[Labels, Cells, Cells]:
+    """Basin of each cell (-1 outside), basin that each one was merged into, saddles (N, 3)."""
+    basin = np.full(flat.size, -1, dtype=np.int32)
+    parent = np.empty(order.size, dtype=np.int64)
+    peak = np.empty(order.size)
+    cells = np.zeros(order.size, dtype=np.int64)
+    saddles = np.empty((3 * order.size, 3), dtype=np.int64)
+    count = 0
+    basins = 0
+    for at in order:
+        best = -1  # basin beside this cell, of several merged ones their union
+        uphill = -1  # basin of the neighbour with the largest clearance
+        highest = 0.0
+        col = at % cols
+        for step in range(9):
+            to_col = col + step % 3 - 1
+            other_cell = at + (step // 3 - 1) * cols + step % 3 - 1
+            outside = not (0 <= to_col < cols and 0 <= other_cell < flat.size)
+            if outside or basin[other_cell] < 0:
+                continue
+            if flat[other_cell] > highest:
+                highest = flat[other_cell]
+                uphill = basin[other_cell]
+            other = _root(parent, basin[other_cell])
+            if best < 0 or best == other:
+                best = other
+                continue
+            low = min(peak[best], peak[other])
+            is_narrow = flat[at] < ratio * low and flat[at] <= widest
+            if is_narrow and min(cells[best], cells[other]) >= least_cells:
+                saddles[count] = (at, best, other)
+                count += 1
+                continue
+            parent[other] = best
+            peak[best] = max(peak[best], peak[other])
+            cells[best] += cells[other]
+        if best < 0:
+            uphill = basins
+            parent[uphill] = uphill
+            peak[uphill] = flat[at]
+            basins += 1
+        # Up the steepest path, so that a boundary runs through its saddle.
+        own = _root(parent, uphill)
+        basin[at] = own
+        cells[own] += 1
+    for k in range(basins):
+        parent[k] = _root(parent, k)
+    return basin, parent[:basins].copy(), saddles[:count].copy()
+
+
+# Passages between basins of the clearance: which of them are doors, and which join corridors.
+
+Clearance = NDArray[np.float64]
+
+Mask = NDArray[np.bool_]
+
+_JAMB_M = 0.6  # on each side of a passage, over which a straight wall is no jamb
+
+_FACE_M = 0.15  # up to which a straight wall is rough
+
+
+@dataclass(frozen=True)
+class Passage:
+    """A passage between the basins a and b; cell: flat index of its widest saddle."""
+
+    cell: int
+    a: int
+    b: int
+    width_m: float
+
+
+def passages_at(
+    saddles: NDArray[np.int64], basins: Labels, clearance: Clearance, min_width_m: float
+) -> list[Passage]:
+    """One passage for each stretch of saddles (N, 3) between the same two basins, widest first."""
+    is_saddle = np.zeros(basins.shape, dtype=np.bool_)
+    is_saddle.ravel()[saddles[:, 0]] = True
+    around = np.ones((3, 3), dtype=np.bool_)
+    stretches = ndimage.label(ndimage.binary_dilation(is_saddle, around), around)[0].ravel()
+    widths_m = 2.0 * clearance.ravel()[saddles[:, 0]]
+    found: dict[tuple[int, int, int], Passage] = {}
+    for (cell, a, b), width_m in zip(saddles.tolist(), widths_m.tolist(), strict=True):
+        if width_m >= min_width_m:
+            found.setdefault((int(stretches[cell]), a, b), Passage(cell, a, b, width_m))
+    return list(found.values())
+
+
+def mean_widths_m(basins: Labels, clearance: Clearance) -> NDArray[np.float64]:
+    """Mean width of each basin as of a strip, by number from 0 (unused) on, m.
+
+    Across a strip the mean clearance is a quarter of the width. At a crossing it is more in a few
+    cells only, so that the largest one would call corridors that meet wide.
+    """
+    sums = np.bincount(basins.ravel(), clearance.ravel())
+    return 4.0 * sums / np.maximum(np.bincount(basins.ravel()), 1)
+
+
+def gets_wider(
+    passage: Passage, basins: Labels, clearance: Clearance, reach: int, ratio: float
+) -> bool:
+    """Whether both basins are wider than a passage, by a ratio, within so many cells of it."""
+    row, col = divmod(passage.cell, basins.shape[1])
+    rows = slice(max(row - reach, 0), row + reach + 1)
+    cols = slice(max(col - reach, 0), col + reach + 1)
+    return all(
+        ratio * float(clearance[rows, cols][basins[rows, cols] == basin].max(initial=0.0))
+        > 0.5 * passage.width_m
+        for basin in (passage.a, passage.b)
+    )
+
+
+def has_flat_jamb(passage: Passage, space: Mask, resolution_m: float) -> bool:
+    """Whether the wall at one end of a passage goes straight on to both sides of it.
+
+    So it does opposite an open door's leaf or a cupboard in a corridor; a door has a wall that ends
+    at both of its jambs.
+    """
+    at = np.array(divmod(passage.cell, space.shape[1]))
+    half = 0.5 * passage.width_m / resolution_m
+    reach = math.ceil(half + _JAMB_M / resolution_m) + 1
+    low = (at - reach).clip(0)
+    high = at + reach + 1
+    walls = np.argwhere(~space[low[0] : high[0], low[1] : high[1]]) + low - at
+    if not len(walls):
+        return False
+    away = np.hypot(*walls.T)
+    across = walls[away.argmin()] / away.min()
+    beside = walls @ across
+    along = walls @ np.array([-across[1], across[0]])
+    deepest = half + _FACE_M / resolution_m
+    for side in (1.0, -1.0):
+        is_face = (side * beside > 0.5 * half) & (side * beside <= deepest)
+        if _covers(along[is_face], _JAMB_M / resolution_m):
+            return True
+    return False
+
+
+def _covers(marks: NDArray[np.float64], reach: float) -> bool:
+    """Whether marks leave no gap of two cells between -reach and reach."""
+    inside = np.sort(marks[np.abs(marks) <= reach])
+    return bool((np.diff(np.concatenate(([-reach], inside, [reach]))) <= 2.0).all())
+
+
+def joined(
+    basins: Labels,
+    passages: list[Passage],
+    is_door: list[bool],
+    free: Mask,
+    least_cells: int,
+) -> tuple[Labels, list[Passage]]:
+    """Basins joined where a passage between them is no door: regions (H, W) from 1, and doors.
+
+    A region of fewer than least_cells free cells joins a neighbour, through its widest door.
+    """
+    number = np.arange(1 + int(basins.max(initial=0)))
+    cells = np.bincount(basins[free], minlength=len(number))
+
+    def join(passage: Passage) -> None:
+        low = number[passage.a]
+        high = number[passage.b]
+        if low != high:
+            cells[high] += cells[low]
+            number[number == low] = high
+
+    for passage, separates in zip(passages, is_door, strict=True):
+        if not separates:
+            join(passage)
+    for passage in passages:
+        if min(cells[number[passage.a]], cells[number[passage.b]]) < least_cells:
+            join(passage)
+    region = np.unique(number, return_inverse=True)[1].astype(np.int32)
+    doors = [
+        Passage(passage.cell, int(region[passage.a]), int(region[passage.b]), passage.width_m)
+        for passage in passages
+        if region[passage.a] != region[passage.b]
+    ]
+    return region[basins], doors
+
+
+# The free space of a map as rooms have it: without furniture, specks and hollow walls.
+
+# Least area of furniture in relation to its squared length: a square has a half, a wall 0.15 m
+# thick and 1 m long 0.13.
+_COMPACT = 0.15
+
+_LEG = 0.2  # length up to which any shape is furniture, as a share of the largest
+
+
+def room_space(patch: GridPatch, config: RegionConfig) -> Mask:
+    """Cells (H, W) that the robot's disc covers where it fits, with furniture taken for free.
+
+    Pillars and tables would make rings of narrow passages, and no two rooms. A free slit in which
+    the robot does not fit, as between the two faces of a wall, would join what the wall separates.
+    """
+    radius = config.robot_radius_m / patch.frame.resolution
+    free = patch.free | _furniture(patch, config.max_furniture_m / patch.frame.resolution)
+    standing = _clearance_cells(free) > radius
+    return np.asarray(distance_cells(standing) < radius)
+
+
+def clearance_m(space: Mask, resolution_m: float) -> NDArray[np.float64]:
+    """Distance of each cell (H, W) to the nearest cell outside a space, m; the rim is outside."""
+    return _clearance_cells(space) * resolution_m
+
+
+def wide_cells(clearance: NDArray[np.float64], width_m: float, resolution_m: float) -> Mask:
+    """Cells (H, W) of a space that a disc of a diameter covers where it fits, by clearances, m.
+
+    Niches leave them as they are, where they lower the mean clearance of a room.
+    """
+    fits = clearance > 0.5 * width_m
+    if not fits.any():
+        return fits
+    return np.asarray(distance_cells(fits) * resolution_m < 0.5 * width_m) & (clearance > 0.0)
+
+
+def _clearance_cells(space: Mask) -> NDArray[np.float64]:
+    return distance_cells(np.pad(~space, 1, constant_values=True))[1:-1, 1:-1]
+
+
+def _furniture(patch: GridPatch, longest: float) -> Mask:
+    """Obstacles and unknown specks (H, W) apart from walls, no longer than so many cells.
+
+    A thin piece is one of a wall between two doors, unless it is no longer than a table's leg.
+    """
+    numbers, sizes = fields.label(~patch.free)
+    small = np.zeros(len(sizes), dtype=np.bool_)
+    for number, box in enumerate(ndimage.find_objects(numbers), 1):
+        extent = _extent(box)
+        is_compact = sizes[number] >= _COMPACT * extent**2 or extent <= _LEG * longest
+        small[number] = extent <= longest and is_compact and not _at_rim(box, patch.shape)
+    return np.asarray(small[numbers])
+
+
+def _extent(box: Any) -> float:
+    """Diagonal of a box of slices, cells."""
+    return math.hypot(*(side.stop - side.start for side in box))
+
+
+def _at_rim(box: Any, shape: tuple[int, int]) -> bool:
+    """Whether a box of slices touches the rim of an array."""
+    return any(s.start == 0 or s.stop == n for s, n in zip(box, shape, strict=True))
+
+
+# Outer boundary of a set of cells as a polygon.
+
+
+def outline_of(cells: Mask, frame: GridFrame) -> Array:
+    """Outer boundary (K, 2) of the largest edge-connected part of cells (H, W), m, map frame.
+
+    Counterclockwise and not closed, with a point at each corner; (0, 2) of no cells.
+    """
+    parts, count = ndimage.label(cells)
+    if not count:
+        return np.empty((0, 2))
+    largest = 1 + int(np.bincount(parts.ravel())[1:].argmax())
+    corners = _boundary(np.pad(parts == largest, 1)) - 1.0  # (column, row) of lower left corners
+    return corners * frame.resolution + (frame.origin_x, frame.origin_y)
+
+
+@kernel
+def _boundary(cells: Mask) -> NDArray[np.float64]:
+    """Corners (K, 2), as (column, row), of the outer boundary of a connected part with a clear rim.
+
+    The cells lie on the left. Where two cells meet at a corner only, it stays with its own.
+    """
+    cols = cells.shape[1]
+    first = 0
+    while not cells[first // cols, first % cols]:
+        first += 1
+    row = first // cols
+    col = first % cols
+    corners = np.empty((4 * cells.size, 2))
+    count = 0
+    heading = 0  # east, north, west, south
+    previous = 0
+    while count == 0 or row != first // cols or col != first % cols:
+        if not cells[_ahead(row, col, heading)]:
+            heading = (heading + 1) % 4
+        elif cells[_ahead(row, col, (heading + 3) % 4)]:
+            heading = (heading + 3) % 4
+        if count == 0 or heading != previous:
+            corners[count] = (col, row)
+            count += 1
+        previous = heading
+        row += (heading == 1) - (heading == 3)
+        col += (heading == 0) - (heading == 2)
+    return corners[:count].copy()
+
+
+@inlined
+def _ahead(row: int, col: int, heading: int) -> tuple[int, int]:
+    """The cell ahead of a corner on the left of a heading; that on the right is the next one's."""
+    return row - (heading >= 2), col - (heading in (1, 2))
+
+
+# Area of a basin above its saddle, as a share of the least area of a region: more and small rooms
+# join the corridor, less and noise divides regions.
+_SEED = 1 / 3
+
+# Free cells this near to a region lie within its outline: regions end before the walls, m.
+_MIN_AREA_M2 = 3.0  # a smaller part is a niche of the one behind its widest passage
+
+_WALL_MARGIN_M = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """Cells of a grid by region, not yet described.
+
+    labels (H, W): region of each cell from 1, 0 for none; clearance (H, W), m.
+    """
+
+    patch: GridPatch
+    labels: Labels
+    clearance: NDArray[np.float64]
+    passages: list[Passage]
+
+
+def find_regions(patch: GridPatch, config: RegionConfig | None = None) -> RegionMap:
+    """Rooms, corridors and halls of a grid, with ids from 1."""
+    config = config or RegionConfig()
+    segmentation = segment(patch, config)
+    return describe(segmentation, np.arange(1 + int(segmentation.labels.max(initial=0))), config)
+
+
+def segment(patch: GridPatch, config: RegionConfig) -> Segmentation:
+    """Divide the free space of a grid at its necks."""
+    resolution = patch.frame.resolution
+    space = room_space(patch, config)
+    clearance = clearance_m(space, resolution)
+    least_cells = int(_MIN_AREA_M2 / resolution**2)
+    seed_cells = max(1, int(_SEED * least_cells))
+    neck = Neck(config.neck_ratio, 0.5 * config.max_door_width_m, seed_cells)
+    basins, saddles = flood(clearance, neck)
+    passages = passages_at(saddles, basins, clearance, config.min_door_width_m)
+    reach = math.ceil(config.max_door_depth_m / resolution)
+    widths_m = mean_widths_m(basins, clearance)
+    is_door = [
+        max(widths_m[p.a], widths_m[p.b]) > config.max_corridor_width_m
+        or (
+            gets_wider(p, basins, clearance, reach, config.neck_ratio)
+            and not has_flat_jamb(p, space, resolution)
+        )
+        for p in passages
+    ]
+    labels, doors = joined(basins, passages, is_door, patch.free, least_cells)
+    labels[np.bincount(labels[patch.free], minlength=labels.max() + 1)[labels] < least_cells] = 0
+    return Segmentation(patch, labels, clearance, doors)
+
+
+def describe(segmentation: Segmentation, ids: NDArray[np.int64], config: RegionConfig) -> RegionMap:
+    """Kinds, areas, outlines and doors of regions; ids (R + 1,): id by number, ids[0] unused."""
+    found = segmentation
+    cell_m2 = found.patch.frame.resolution**2
+    free = np.where(found.patch.free, found.labels, 0)
+    areas = np.bincount(free.ravel(), minlength=len(ids)) * cell_m2
+    wide = wide_cells(found.clearance, config.max_corridor_width_m, found.patch.frame.resolution)
+    regions = {}
+    for number, box in enumerate(ndimage.find_objects(found.labels), 1):
+        if box is None:
+            continue
+        own = found.labels[box] == number
+        clearance = np.where(own, found.clearance[box], 0.0)
+        kind = _kind(clearance, wide[box], float(own.sum()) * cell_m2, config)
+        low = (box[0].start, box[1].start)
+        x, y = _centre(clearance * found.patch.free[box], low, found.patch)
+        regions[int(ids[number])] = Region(
+            int(ids[number]), kind, x, y, float(areas[number]), _outline(found, number, box)
+        )
+    labels = np.asarray(ids, dtype=np.int32)[found.labels]
+    return RegionMap(found.patch.frame, labels, regions, _doors(found, ids))
+
+
+def _outline(found: Segmentation, number: int, box: tuple[slice, ...]) -> Array:
+    """Outline (K, 2) of a region and of the free cells between it and its walls, m, map frame."""
+    margin = round(_WALL_MARGIN_M / found.patch.frame.resolution)
+    low = (max(box[0].start - margin, 0), max(box[1].start - margin, 0))
+    wider = (slice(low[0], box[0].stop + margin), slice(low[1], box[1].stop + margin))
+    labels = found.labels[wider]
+    own = labels == number
+    if margin:
+        beside = own | (found.patch.free[wider] & (labels == 0))
+        square = np.ones((3, 3), dtype=np.bool_)
+        own = ndimage.binary_dilation(own, square, iterations=margin, mask=beside)
+    return outline_of(own, found.patch.frame.with_origin_at(*low))
+
+
+def _kind(
+    clearance: NDArray[np.float64], wide: Mask, area_m2: float, config: RegionConfig
+) -> RegionKind:
+    """Kind of a region by its clearances, m, 0 outside, and where it is wider than a corridor."""
+    inside = clearance > 0.0
+    width_m = 4.0 * float(clearance[inside].mean())  # as in mean_widths_m
+    is_long = area_m2 >= config.corridor_ratio * width_m**2
+    if is_long and float(wide[inside].mean()) <= 0.5:
+        return RegionKind.CORRIDOR
+    is_wide = 2.0 * float(clearance.max()) >= config.min_hall_width_m
+    return RegionKind.HALL if is_wide else RegionKind.ROOM
+
+
+def _centre(
+    clearance: NDArray[np.float64], low: tuple[int, int], patch: GridPatch
+) -> tuple[float, float]:
+    """Centre of the cell with the largest clearance in a part of a grid that begins at low."""
+    cell = np.unravel_index(int(clearance.argmax()), clearance.shape)
+    x, y = patch.frame.centres_of(np.array([cell], dtype=np.int64) + low)[0]
+    return float(x), float(y)
+
+
+def _doors(found: Segmentation, ids: NDArray[np.int64]) -> tuple[Door, ...]:
+    """The passages that are left between regions, as doors."""
+    doors = []
+    for passage in found.passages:
+        place = np.array([divmod(passage.cell, found.labels.shape[1])], dtype=np.int64)
+        x, y = found.patch.frame.centres_of(place)[0]
+        ends = (int(ids[passage.a]), int(ids[passage.b]))
+        doors.append(Door(*ends, float(x), float(y), passage.width_m))
+    return tuple(doors)
+
+
+# Regions of a growing map with ids that stay.
+
+_UPDATES = 5  # after which a cell forgets its earlier id
+
+_STRIDE_M = 0.4  # between the cells that a state keeps
+
+_OWN_FIELDS = {
+    'region_frame': Field(np.float64, (3,), -snapshot.MAX_COORDINATE_M, snapshot.MAX_COORDINATE_M),
+    'region_labels': Field(np.int32, ('r', 'c'), 0, MAX_ID),
+    'next_region_id': Field(np.int64, (), 1, MAX_COUNT),
+}
+
+FIELDS = {**_OWN_FIELDS, **region_names.FIELDS}
+
+
+class _Memory:
+    """Ids of the cells (H, W) of a grid: remembered, and at the last update.
+
+    changed: since how many updates they differ.
+    """
+
+    def __init__(
+        self,
+        frame: GridFrame,
+        labels: Labels,
+        last: Labels | None = None,
+        changed: NDArray[np.int16] | None = None,
+    ) -> None:
+        self.frame = frame
+        self.labels = labels
+        self.last = labels if last is None else last
+        self._changed = np.zeros(labels.shape, dtype=np.int16) if changed is None else changed
+
+    def resampled(self, patch: GridPatch) -> '_Memory':
+        """The same memory on the cells of a patch."""
+        frame = patch.frame
+        ratio = frame.resolution / self.frame.resolution
+        low_row = (frame.origin_y - self.frame.origin_y) / self.frame.resolution
+        low_col = (frame.origin_x - self.frame.origin_x) / self.frame.resolution
+        rows = np.floor(low_row + (np.arange(patch.shape[0]) + 0.5) * ratio).astype(np.int64)
+        cols = np.floor(low_col + (np.arange(patch.shape[1]) + 0.5) * ratio).astype(np.int64)
+        # A row and a column of zeros stand for all that is outside.
+        here = np.ix_(
+            np.where((rows >= 0) & (rows < self.labels.shape[0]), rows, -1),
+            np.where((cols >= 0) & (cols < self.labels.shape[1]), cols, -1),
+        )
+        arrays = (self.labels, self.last, self._changed)
+        return _Memory(frame, *(np.pad(array, ((0, 1), (0, 1)))[here] for array in arrays))
+
+    def updated(self, labels: Labels) -> '_Memory':
+        """The memory after an update with the ids (H, W); cells in no region keep theirs."""
+        changed = np.where((labels == self.labels) | (labels == 0), 0, self._changed + 1)
+        is_new = (labels > 0) & ((self.labels == 0) | (changed >= _UPDATES))
+        kept = np.where(is_new, labels, self.labels)
+        return _Memory(self.frame, kept, labels, np.where(is_new, 0, changed).astype(np.int16))
+
+
+class RegionTracker:
+    """Finds the regions of the present grid; a region keeps the id of the one that it continues.
+
+    An earlier region is continued by the one that overlaps it most; of several that claim the same
+    region, the one with the largest overlap. So the larger part keeps the id at a split, and the
+    larger region at a merge. No other region ever gets the id.
+    Each cell remembers its id until it has had another one for some updates. So a region that is
+    merged with another one for a moment, as a door closes, has its id again afterwards.
+
+    names: that people have given, which the regions here do not have yet.
+    """
+
+    def __init__(self, config: RegionConfig | None = None) -> None:
+        self.config = config or RegionConfig()
+        self.regions: RegionMap | None = None
+        self.names = RegionNames()
+        self._memory: _Memory | None = None
+        self._next_id = 1
+
+    def update(self, patch: GridPatch) -> RegionMap:
+        """Regions of a grid, which need not have the frame or size of the last one."""
+        found = segment(patch, self.config)
+        before = self._memory or _Memory(patch.frame, np.zeros(patch.shape, dtype=np.int32))
+        memory = before.resampled(patch)
+        self.regions = describe(found, self._ids(found.labels, memory), self.config)
+        self._memory = memory.updated(self.regions.labels)
+        return self.regions
+
+    def skip_ids(self, count: int) -> None:
+        """Never assign the next so many ids: they may be in use elsewhere."""
+        self._next_id += count
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Arrays by name, empty before the first update; `from_state` continues from them."""
+        memory = self._memory  # another thread may replace it by one of other cells
+        if memory is None:
+            return {}
+        frame = memory.frame
+        labels = np.where(memory.last > 0, memory.last, memory.labels)
+        stride = max(1, round(_STRIDE_M / frame.resolution))
+        coarse = GridFrame(frame.origin_x, frame.origin_y, stride * frame.resolution)
+        return {
+            'region_frame': coarse.as_array(),
+            'region_labels': labels[stride // 2 :: stride, stride // 2 :: stride],
+            'next_region_id': np.array(self._next_id),
+            **self.names.state(),
+        }
+
+    @staticmethod
+    def from_state(
+        state: Mapping[str, NDArray[Any]], config: RegionConfig | None = None
+    ) -> 'RegionTracker':
+        """Tracker that continues from the `state` of another one.
+
+        Its regions are known with the next grid. Raises InputError where it is no such state.
+        """
+        tracker = RegionTracker(config)
+        if not state:
+            return tracker
+        own = {name: array for name, array in state.items() if name not in region_names.FIELDS}
+        checked = snapshot.validate(own, _OWN_FIELDS, 'regions')
+        if len(own) < len(state):  # none where they were saved by an earlier version
+            named = {name: state[name] for name in state.keys() - own.keys()}
+            tracker.names = RegionNames.from_state(named)
+        labels = checked['region_labels']
+        tracker._next_id = int(checked['next_region_id'])
+        if labels.max(initial=0) >= tracker._next_id:
+            raise InputError(
+                f'saved regions: id {labels.max()}: expected ids below {tracker._next_id}'
+            )
+        tracker._memory = _Memory(GridFrame(*checked['region_frame'].tolist()), labels)
+        return tracker
+
+    def _ids(self, labels: Labels, memory: _Memory) -> NDArray[np.int64]:
+        """Ids (R + 1,) of the regions (H, W) of a grid, by number."""
+        ids = np.zeros(1 + int(labels.max(initial=0)), dtype=np.int64)
+        used = {0}
+        # What has been new since the last few updates is not remembered yet.
+        for number, earlier in [*_claims(labels, memory.labels), *_claims(labels, memory.last)]:
+            if ids[number] == 0 and earlier not in used:
+                ids[number] = earlier
+                used.add(earlier)
+        for number in np.flatnonzero(ids == 0)[1:].tolist():
+            ids[number] = self._next_id
+            self._next_id += 1
+        return ids
+
+
+def _claims(labels: Labels, before: Labels) -> Iterator[tuple[int, int]]:
+    """The region (H, W) that overlaps each earlier one (H, W) most, largest overlap first."""
+    both = (labels > 0) & (before > 0)
+    # A number of 64 bits for each pair: sorted in a tenth of the time.
+    pairs = (labels[both].astype(np.int64) << 32) + before[both]
+    values, cells = np.unique(pairs, return_counts=True)
+    claimed: set[int] = set()
+    for pair in values[np.argsort(-cells, kind='stable')].tolist():
+        number = pair >> 32
+        earlier = pair - (number << 32)
+        if earlier not in claimed:
+            claimed.add(earlier)
+            yield number, earlier
