@@ -17,9 +17,9 @@ from benchmarks.scoreboard.drives import samples
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.topology.regions import RegionMap
 from thinmap_ros.core.topology.segmentation import RegionTracker, find_regions
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.buildings import Building, Wing, generate_building

@@ -12,9 +12,15 @@ import yaml
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.core.regions.membership import Membership, membership_of
-from thinmap_ros.core.regions.region_map import Door, Region, RegionKind, RegionMap
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.regions import (
+    Door,
+    Membership,
+    Region,
+    RegionKind,
+    RegionMap,
+    membership_of,
+)
 from thinmap_ros.files.graphs import (
     SpeedLimit,
     write_geojson,

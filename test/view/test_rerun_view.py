@@ -11,9 +11,9 @@ import pytest
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, flat_topology
+from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.view import palette, rerun_blueprint, rerun_sinks
 from thinmap_ros.view.message_view import MessageView, recording_from_bag

@@ -5,8 +5,8 @@ import pytest
 from PIL import Image
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.core.topology.segmentation import find_regions
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.view import palette

@@ -26,10 +26,9 @@ import numpy as np
 import yaml
 
 from thinmap_ros.core.errors import InputError, require_type
-from thinmap_ros.core.regions.membership import Membership
-from thinmap_ros.core.regions.region_map import Region
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.regions import Membership, Region
 from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.files.paths import path_of
 

@@ -12,8 +12,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, Region, RegionArray, TopologicalMap
 from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError, one_line
-from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.topology.graph import NodeKind, topology_from_msg
+from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

@@ -11,8 +11,8 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.regions import membership_of
 from thinmap_ros.core.topology.routes import DETAIL_M, MIN_NODE_SPACING_M, route_graph
 from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions
 from thinmap_ros.core.topology.thinning import select_free_space

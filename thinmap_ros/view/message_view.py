@@ -10,10 +10,10 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.shared import MapReceiver
-from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import topology_from_msg
+from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag

@@ -1,7 +1,7 @@
 """Colours of figures and views: the colour-blind safe palette of Okabe and Ito."""
 
-from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.topology.graph import NodeKind
+from thinmap_ros.core.topology.regions import RegionKind
 
 NODES = {NodeKind.END: '#D55E00', NodeKind.BRANCH: '#0072B2', NodeKind.CORNER: '#E69F00'}
 EDGE = '#009E73'

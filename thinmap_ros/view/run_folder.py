@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.regions.membership import membership_of
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.regions import membership_of
 from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.regions.region_map import RegionKind, RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.regions import RegionKind, RegionMap
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.view import cell_blocks, palette
 from thinmap_ros.view.cell_blocks import DrawnCells

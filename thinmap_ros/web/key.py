@@ -1,7 +1,7 @@
 """Colours of the page with what they mean: those of summary.png."""
 
-from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.topology.graph import NodeKind
+from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.view import palette
 
 

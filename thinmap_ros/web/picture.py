@@ -9,10 +9,10 @@ from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError, one_line
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.give_way import Motion
-from thinmap_ros.core.regions.region_map import RegionKind
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs import decode
 from thinmap_ros.view import palette
 from thinmap_ros.view.apart_scans import ApartScans

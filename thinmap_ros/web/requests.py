@@ -9,8 +9,8 @@ from time import monotonic
 from typing import Any
 
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.regions.names import checked_name
 from thinmap_ros.core.se2 import MAX_COORDINATE_M
+from thinmap_ros.core.topology.regions import checked_name
 
 MAX_MESSAGE_BYTES = 16_384
 _MAX_CORNERS = 200

@@ -6,9 +6,8 @@ from core.regions.floors import office, patch_of
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.moved import MapMotion
-from thinmap_ros.core.regions import names as region_names
-from thinmap_ros.core.regions.names import MAX_LENGTH, RegionNames, checked_name
-from thinmap_ros.core.regions.region_map import RegionMap
+from thinmap_ros.core.topology import regions as region_names
+from thinmap_ros.core.topology.regions import MAX_LENGTH, RegionMap, RegionNames, checked_name
 from thinmap_ros.core.topology.segmentation import RegionTracker
 
 LEFT = np.array([3.0, 7.0])

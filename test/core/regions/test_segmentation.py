@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from core.regions.floors import CELL_M, noisy, office, patch_of
 
-from thinmap_ros.core.regions.membership import membership_of
-from thinmap_ros.core.regions.region_map import RegionKind, RegionMap
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.regions import RegionKind, RegionMap, membership_of
 from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions, outline_of
 from thinmap_ros.core.topology.topology import build
 

@@ -15,11 +15,10 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid import fields
 from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.regions import names as region_names
-from thinmap_ros.core.regions.names import RegionNames
-from thinmap_ros.core.regions.region_map import Door, Region, RegionKind, RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_COUNT, MAX_ID, Field
+from thinmap_ros.core.topology import regions as region_names
+from thinmap_ros.core.topology.regions import Door, Region, RegionKind, RegionMap, RegionNames
 from thinmap_ros.jit import inlined, kernel
 
 # Parameters of the regions of a map.

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.team_graph import Bend, TeamGraph
 from thinmap_ros.core.slam.joining.team_map import MergedMap, RobotMap, merged
+from thinmap_ros.core.topology.regions import RegionMap
 from thinmap_ros.core.topology.segmentation import RegionTracker
 
 

@@ -8,11 +8,10 @@ from rclpy.node import Node
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import JoinStatus, RegionArray, RobotMap, TopologicalMap
-from thinmap_ros.core.regions.membership import membership_of
-from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.team_map import MergedMap, Team
 from thinmap_ros.core.stage import MAX_ODDS
+from thinmap_ros.core.topology.regions import RegionMap, membership_of
 from thinmap_ros.nodes.mapping.region_messages import region_array_msg
 from thinmap_ros.ros import messages, qos
 

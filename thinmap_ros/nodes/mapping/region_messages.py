@@ -7,8 +7,7 @@ from geometry_msgs.msg import Point
 from thinmap_msgs.msg import Door as DoorMsg
 from thinmap_msgs.msg import Region as RegionMsg
 from thinmap_msgs.msg import RegionArray
-from thinmap_ros.core.regions.membership import Membership
-from thinmap_ros.core.regions.region_map import Door, Region
+from thinmap_ros.core.topology.regions import Door, Membership, Region
 from thinmap_ros.ros import messages
 
 

@@ -7,9 +7,8 @@ from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.mapper import WholeMap
 from thinmap_ros.core.grid.moved import MapMotion
-from thinmap_ros.core.regions.names import checked_name
-from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.regions import RegionMap, checked_name
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

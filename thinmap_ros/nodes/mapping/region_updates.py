@@ -10,9 +10,8 @@ import numpy as np
 from thinmap_msgs.msg import RegionArray
 from thinmap_ros.core.config import Config, parameter, part
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.regions.membership import membership_of
-from thinmap_ros.core.regions.region_map import RegionMap
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.regions import RegionMap, membership_of
 from thinmap_ros.core.topology.segmentation import RegionConfig, RegionTracker
 from thinmap_ros.kernels.memory import release_free_pages
 from thinmap_ros.nodes.mapping.region_messages import region_array_msg

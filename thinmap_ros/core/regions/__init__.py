@@ -1,1 +1,0 @@
-"""Rooms, corridors and halls of a map, and the doors between them."""
