@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.core.grid.patch import GridFrame, GridPatch
     from thinmap_ros.core.places.config import GlobalLocalizationConfig
     from thinmap_ros.core.places.global_localizer import GlobalLocalization as GlobalLocalizer
-    from thinmap_ros.core.planning.graph_search import shortest_path
+    from thinmap_ros.core.planning.paths import shortest_path
     from thinmap_ros.core.scan import LaserConfig, Scan
     from thinmap_ros.core.slam.localizer_config import LocalizerConfig
     from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig, topology_from_msg
@@ -107,7 +107,7 @@ _PLACES = {
     'TopologicalMap': 'core.topology.graph.TopologicalMap',
     'TopologyConfig': 'core.topology.graph.TopologyConfig',
     'build_topology': 'core.topology.topology.build',
-    'shortest_path': 'core.planning.graph_search.shortest_path',
+    'shortest_path': 'core.planning.paths.shortest_path',
     'thin': 'core.topology.thinning.thin',
     'topology_from_msg': 'core.topology.graph.topology_from_msg',
     'write_graph': 'files.graphs.write_graph',

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.worlds import floors
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.long_path import LONG_PATH_M, route_band
+from thinmap_ros.core.planning.paths import LONG_PATH_M, route_band
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells, find_path, plan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig

@@ -23,7 +23,7 @@ from thinmap_ros.core.exploration.strategy import (
 )
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
-from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
+from thinmap_ros.core.planning.paths import path_lengths_to_nodes
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap

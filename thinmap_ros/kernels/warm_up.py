@@ -220,8 +220,8 @@ def explorer() -> None:
 @cache
 def navigator() -> None:
     """Warm up planning and driving."""
-    from thinmap_ros.core.planning.long_path import route_band
     from thinmap_ros.core.planning.navigator import Navigator
+    from thinmap_ros.core.planning.paths import route_band
     from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path
 
     _sense()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thinmap_ros.core.planning.graph_search import (
+from thinmap_ros.core.planning.paths import (
     path_lengths_to_nodes,
     path_points,
     shortest_path,

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.planning import short_path
-from thinmap_ros.core.planning.short_path import plan_short_path
+from thinmap_ros.core.planning import paths
+from thinmap_ros.core.planning.paths import plan_short_path
 from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, plan
 
 CONFIG = WavefrontConfig()
@@ -35,13 +35,13 @@ def length_of(path):
 def window_sizes(monkeypatch):
     """Sizes of the maps in which paths are looked for, in the order of the searches."""
     sizes = []
-    find_path = short_path.find_path
+    find_path = paths.find_path
 
     def spy(patch, *arguments):
         sizes.append(patch.shape)
         return find_path(patch, *arguments)
 
-    monkeypatch.setattr(short_path, 'find_path', spy)
+    monkeypatch.setattr(paths, 'find_path', spy)
     return sizes
 
 

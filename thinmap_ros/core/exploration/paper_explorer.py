@@ -36,7 +36,7 @@ from thinmap_ros.core.exploration.strategy import (
 )
 from thinmap_ros.core.exploration.visibility import box_of_scan, visible_places
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
+from thinmap_ros.core.planning.paths import path_lengths_to_nodes
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap

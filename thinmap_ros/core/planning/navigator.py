@@ -10,7 +10,6 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import SAFE_HIGHER, SAFE_LOWER, Config, parameter, part
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.long_path import LONG_PATH_M, Band, route_band
 from thinmap_ros.core.planning.obstacle_points import ObstaclePoints
 from thinmap_ros.core.planning.path_follower import (
     PathFollower,
@@ -18,8 +17,8 @@ from thinmap_ros.core.planning.path_follower import (
     length_from,
     nearest_point,
 )
+from thinmap_ros.core.planning.paths import LONG_PATH_M, Band, plan_short_path, route_band
 from thinmap_ros.core.planning.recent_path import RecentPath
-from thinmap_ros.core.planning.short_path import plan_short_path
 from thinmap_ros.core.planning.stuck import StuckDetector, StuckPlaces
 from thinmap_ros.core.planning.traversability import path_collides
 from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path

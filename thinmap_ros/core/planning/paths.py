@@ -1,20 +1,15 @@
-"""Long paths: A* on the topological map finds the route, the wavefront the path along it.
+"""Paths in a map: in a window near by, along the topological map far away."""
 
-The wave spreads only in a band around the route. Its first and last part lead from the robot to
-the graph and from the graph to the goal: the cells there are found on the grid. Edges that the grid
-or scan points contradict are left out. Where the graph has no route, or no path along it is
-open, and for goals that are near, the wavefront plans alone.
-Source: topological map paper section 3.2.
-"""
-
+import heapq
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.errors import InputError, require_type
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.graph_search import path_points, shortest_route
 from thinmap_ros.core.planning.grid_search import distance_field_from
 from thinmap_ros.core.planning.traversability import nearest_true, path_collides
 from thinmap_ros.core.planning.wavefront import (
@@ -22,17 +17,281 @@ from thinmap_ros.core.planning.wavefront import (
     Obstacles,
     WavefrontConfig,
     cost_of_cells,
+    find_path,
 )
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import Edge, TopologicalMap, TopologyConfig
 from thinmap_ros.jit import kernel
 
-Mask = NDArray[np.bool_]
+# Short paths: planned in a window of the map, so that the cost does not grow with the map.
+#
+# The window holds start and goal with some room around. A path that leaves it is at least as long
+# as the way to the rim and on to the goal; a cheaper one in the window is the best of the whole
+# map. In all other cases the wavefront plans on the whole map.
+
+Cells = NDArray[np.int64]
+
 XY = tuple[float, float]
+
+Mask = NDArray[np.bool_]
+
+_GAP_M = TopologyConfig().max_unknown_gap_m
+
+_ROOM_M = 3.0  # around start and goal
+
+_ROOM_SHARE = 0.5  # of the distance between them, in addition
+
+_MAX_SHARE = 0.5  # of the map: a larger window saves nothing
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """Part of a map; row, col: its first cell; bound_m: least length of a path that leaves it."""
+
+    patch: GridPatch
+    row: int
+    col: int
+    bound_m: float
+
+    def cells(self, cells: Cells) -> Cells:
+        """Those of the map's cells (N, 2) that lie in the window, as its own cells (M, 2)."""
+        moved = cells - (self.row, self.col)
+        return moved[np.all((moved >= 0) & (moved < self.patch.shape), axis=1)]
+
+
+def plan_short_path(
+    patch: GridPatch,
+    start_xy: XY,
+    goal_xy: XY,
+    config: WavefrontConfig,
+    obstacles: Obstacles | None,
+    trail: Cells,
+) -> Array | None:
+    """Path (K, 2) from start to goal, m, map frame; None: no path.
+
+    obstacles: points that the map need not contain; trail: cells (N, 2) of the recent path.
+    """
+    window = _window(patch, start_xy, goal_xy, config, obstacles)
+    if window is not None:
+        inside = window.cells(trail)
+        found = find_path(window.patch, start_xy, goal_xy, config, obstacles, inside)
+        if found is not None and found.is_exact and found.cost_m <= window.bound_m:
+            return found.points
+    found = find_path(patch, start_xy, goal_xy, config, obstacles, trail)
+    return None if found is None else found.points
+
+
+def _window(
+    patch: GridPatch,
+    start_xy: XY,
+    goal_xy: XY,
+    config: WavefrontConfig,
+    obstacles: Obstacles | None,
+) -> _Window | None:
+    """Window around start and goal; None where it is no smaller than most of the map."""
+    resolution = patch.frame.resolution
+    ends = patch.frame.cells_of(np.array([start_xy, goal_xy]))
+    shape = np.array(patch.shape)
+    if np.any(ends < 0) or np.any(ends >= shape):
+        return None
+    rim = _rim_cells(resolution, config, obstacles)
+    room_m = _ROOM_M + _ROOM_SHARE * math.dist(start_xy, goal_xy)
+    room = rim + math.ceil(room_m / resolution)
+    low = np.maximum(ends.min(axis=0) - room, 0)
+    high = np.minimum(ends.max(axis=0) + room + 1, shape)
+    if np.prod(high - low) > _MAX_SHARE * np.prod(shape):
+        return None
+    row, col = (int(first) for first in low)
+    cells = np.ascontiguousarray(patch.cells[row : high[0], col : high[1]])
+    bound_m = _least_detour(ends, low + rim, high - 1 - rim, low > 0, high < shape) * resolution
+    return _Window(GridPatch(patch.frame.with_origin_at(row, col), cells), row, col, bound_m)
+
+
+def _least_detour(
+    ends: Cells, low: Cells, high: Cells, opens_below: Mask, opens_above: Mask
+) -> float:
+    """Least length, cells, of a path between two cells (2, 2) over the rim of a window.
+
+    low, high (2,): rows and columns of the rim; opens_below, opens_above (2,): whether the map
+    continues beyond it.
+    """
+    lengths = [math.inf]
+    for axis in (0, 1):
+        along = float(np.ptp(ends[:, 1 - axis]))
+        if opens_below[axis]:
+            lengths.append(math.hypot(along, float((ends[:, axis] - low[axis]).sum())))
+        if opens_above[axis]:
+            lengths.append(math.hypot(along, float((high[axis] - ends[:, axis]).sum())))
+    return min(lengths)
+
+
+def _rim_cells(resolution: float, config: WavefrontConfig, obstacles: Obstacles | None) -> int:
+    """Cells at the rim whose cost may differ from that in the map."""
+    reach_m = max(config.inflation_radius_m, config.robot_radius_m, START_ESCAPE_M)
+    if obstacles is not None:
+        reach_m = max(reach_m, obstacles.radius_m)
+    return math.ceil((reach_m + _GAP_M) / resolution) + 1
+
+
+# A* on the topological map, between any two points.
+#
+# Source: topological map paper section 3.2: the length of the edges is the cost of a path.
+
+
+@dataclass(frozen=True)
+class Route:
+    """A path along edges: the nodes in order, the edges between them, and its length in m."""
+
+    node_ids: tuple[int, ...]
+    edge_ids: tuple[int, ...]
+    cost_m: float
+
+
+def shortest_path(topology: TopologicalMap, start_id: int, goal_id: int) -> Route | None:
+    """Shortest route between two nodes, by A*; None if no edges connect them.
+
+    Raises InputError where the graph has no such node.
+    """
+    require_type('topology', topology, TopologicalMap)
+    for node_id in (start_id, goal_id):
+        require_type('node', node_id, int)
+        if node_id not in topology.nodes:
+            raise InputError(f'node {node_id}: expected a node of {topology!r}')
+    goal = topology.nodes[goal_id]
+    return shortest_route(topology, {start_id: 0.0}, {goal_id: 0.0}, (goal.x, goal.y))
+
+
+def shortest_route(
+    topology: TopologicalMap,
+    starts: Mapping[int, float],
+    goals: Mapping[int, float],
+    goal_xy: tuple[float, float],
+    avoided: Collection[int] = (),
+) -> Route | None:
+    """Shortest route from a point to another, by A*; None if no edges connect them.
+
+    starts, goals: length of the path from each node to the point at this end, m. avoided: ids of
+    edges that the route must not use.
+    The heuristic is the straight distance to the goal. It is admissible because no edge is shorter
+    than the distance between its nodes.
+    """
+    reached_by: dict[int, tuple[int, int]] = {}
+    costs = dict(starts)
+    open_nodes = [(cost + _away(topology, i, goal_xy), i) for i, cost in costs.items()]
+    heapq.heapify(open_nodes)
+    closed: set[int] = set()
+    last_id = 0
+    best_m = np.inf
+    while open_nodes:
+        at_least_m, node_id = heapq.heappop(open_nodes)
+        if at_least_m >= best_m:
+            break
+        if node_id in closed:
+            continue
+        closed.add(node_id)
+        total_m = costs[node_id] + goals.get(node_id, np.inf)
+        if total_m < best_m:
+            best_m = total_m
+            last_id = node_id
+        for edge in topology.edges_at(node_id):
+            other = edge.other(node_id)
+            cost = costs[node_id] + edge.length_m
+            if edge.id not in avoided and cost < costs.get(other, np.inf):
+                costs[other] = cost
+                reached_by[other] = (node_id, edge.id)
+                heapq.heappush(open_nodes, (cost + _away(topology, other, goal_xy), other))
+    return _walked(last_id, reached_by, best_m) if last_id else None
+
+
+def path_lengths_to_nodes(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:
+    """Length of the shortest path from a point (m, map frame) to every reachable node, m."""
+    costs = _lengths_to_next_nodes(topology, x, y)
+    open_nodes = [(cost, node_id) for node_id, cost in costs.items()]
+    heapq.heapify(open_nodes)
+    closed: set[int] = set()
+    while open_nodes:
+        cost, node_id = heapq.heappop(open_nodes)
+        if node_id in closed:
+            continue
+        closed.add(node_id)
+        for edge in topology.edges_at(node_id):
+            other = edge.other(node_id)
+            if cost + edge.length_m < costs.get(other, np.inf):
+                costs[other] = cost + edge.length_m
+                heapq.heappush(open_nodes, (costs[other], other))
+    return costs
+
+
+def _lengths_to_next_nodes(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:
+    """Length to each node of the edge that is nearest to a point, or to a node that is nearer, m.
+
+    Empty if the map is.
+    """
+    found = topology.nearest_edge_point(x, y)
+    node = topology.nearest_node(x, y)
+    if node is None:
+        return {}
+    to_node = ((node.x - x) ** 2 + (node.y - y) ** 2) ** 0.5
+    if found is None or to_node < found[2] - 1e-9:
+        return {node.id: to_node}
+    edge_id, index, approach = found
+    edge = topology.edges[edge_id]
+    along = _along(edge)
+    ends: dict[int, float] = {}
+    for node_id, length in ((edge.a, along[index]), (edge.b, along[-1] - along[index])):
+        ends[node_id] = min(ends.get(node_id, np.inf), approach + float(length))
+    return ends
+
+
+def path_points(topology: TopologicalMap, route: Route) -> Array:
+    """Points (K, 2) of a route from its first to its last node, m, map frame, no duplicates."""
+    first = topology.nodes[route.node_ids[0]]
+    parts = [np.array([[first.x, first.y]])]
+    for node_id, edge_id in zip(route.node_ids, route.edge_ids, strict=False):
+        parts.append(_leaving(topology.edges[edge_id], node_id)[1:])
+    return np.concatenate(parts)
+
+
+def _leaving(edge: Edge, node_id: int) -> Array:
+    return edge.path if node_id == edge.a else edge.path[::-1]
+
+
+def _along(edge: Edge) -> Array:
+    """Length of the path from its start to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(edge.path, axis=0).T))])
+
+
+def _away(topology: TopologicalMap, node_id: int, xy: tuple[float, float]) -> float:
+    """Straight distance from a node to a point, m."""
+    node = topology.nodes[node_id]
+    return math.hypot(node.x - xy[0], node.y - xy[1])
+
+
+def _walked(last_id: int, reached_by: dict[int, tuple[int, int]], cost: float) -> Route:
+    nodes = [last_id]
+    edges = []
+    while nodes[-1] in reached_by:
+        node_id, edge_id = reached_by[nodes[-1]]
+        nodes.append(node_id)
+        edges.append(edge_id)
+    return Route(tuple(nodes[::-1]), tuple(edges[::-1]), cost)
+
+
+# Long paths: A* on the topological map finds the route, the wavefront the path along it.
+#
+# The wave spreads only in a band around the route. Its first and last part lead from the robot to
+# the graph and from the graph to the goal: the cells there are found on the grid. Edges that the
+# grid or scan points contradict are left out. Where the graph has no route, or no path along it is
+# open, and for goals that are near, the wavefront plans alone. Source: topological map paper
+# section 3.2.
+
 # Straight distance from which the wavefront in a band costs less than the wavefront alone.
 LONG_PATH_M = 20.0
+
 _BAND_M = 3.0  # half of its width: wide enough for the shortest path through most halls
+
 _ACCESS_M = 6.0  # the graph is looked for so far from either end; in halls twice that, and so on
+
 _MAX_ROUTES = 6  # that are tried, each without the contradicted edges of those before
 
 
