@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.planning.traversability import path_collides
+from thinmap_ros.core.planning.grid_search import path_collides
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologyConfig

@@ -13,13 +13,14 @@ from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.viewpoints import search_beside
 from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.grid_search import downsample_mask, path_lengths_from
-from thinmap_ros.core.planning.recent_path import RecentPath
-from thinmap_ros.core.planning.traversability import (
+from thinmap_ros.core.planning.grid_search import (
+    downsample_mask,
     escape_cells,
+    path_lengths_from,
     reachable_cells,
     traversable_cells,
 )
+from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.wavefront import START_ESCAPE_M, WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

@@ -10,8 +10,8 @@ from thinmap_ros.core.planning.grid_search import (
     distance_field_from,
     downsample_mask,
     path_lengths_from,
+    reachable_cells,
 )
-from thinmap_ros.core.planning.traversability import reachable_cells
 
 
 def dijkstra(allowed, start):

@@ -11,15 +11,15 @@ from thinmap_ros.core.exploration.frontiers import _clusters
 from thinmap_ros.core.exploration.visibility import field_of_view, visible_places
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.planning.grid_search import downsample_mask
-from thinmap_ros.core.planning.obstacle_points import _arc, _clear_steps, _points_around
-from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
-from thinmap_ros.core.planning.traversability import (
+from thinmap_ros.core.planning.grid_search import (
+    downsample_mask,
     path_collides,
     reachable_cells,
     traversable_cells,
     update_traversable_cells,
 )
+from thinmap_ros.core.planning.obstacle_points import _arc, _clear_steps, _points_around
+from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
 from thinmap_ros.core.scan import Scan
 

@@ -3,8 +3,8 @@ import pytest
 from support.ride import Ride
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.planning.grid_search import path_collides
 from thinmap_ros.core.planning.paths import route_band
-from thinmap_ros.core.planning.traversability import path_collides
 from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path, plan
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build

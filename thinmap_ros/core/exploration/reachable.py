@@ -11,14 +11,12 @@ from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.planning.grid_search import (
     distance_field_from,
     downsample_mask,
-)
-from thinmap_ros.core.planning.recent_path import RecentPath
-from thinmap_ros.core.planning.traversability import (
     escape_cells,
     reachable_cells,
     traversable_cells,
     update_traversable_cells,
 )
+from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.se2 import Array
 
 Mask = NDArray[np.bool_]

@@ -13,8 +13,8 @@ from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import Result
 from thinmap_ros.core.places.place_database import FREE, UNKNOWN, WALL, Bytes, Places, free_way
 from thinmap_ros.core.places.search import distinct_indices
+from thinmap_ros.core.planning.grid_search import escape_cells, traversable_cells
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
-from thinmap_ros.core.planning.traversability import escape_cells, traversable_cells
 from thinmap_ros.core.planning.wavefront import START_ESCAPE_M, WavefrontConfig, navigation_function
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError, require_type
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.grid_search import distance_field_from
-from thinmap_ros.core.planning.traversability import nearest_true, path_collides
+from thinmap_ros.core.planning.grid_search import distance_field_from, nearest_true, path_collides
 from thinmap_ros.core.planning.wavefront import (
     START_ESCAPE_M,
     Obstacles,

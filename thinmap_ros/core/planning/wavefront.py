@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter, robot_radius
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.traversability import disc, nearest_true, reachable_cells
+from thinmap_ros.core.planning.grid_search import disc, nearest_true, reachable_cells
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import column_distance, known_free
