@@ -20,7 +20,7 @@ from thinmap_ros.core.planning.grid_search import (
     reachable_cells,
     traversable_cells,
 )
-from thinmap_ros.core.planning.recent_path import RecentPath
+from thinmap_ros.core.planning.obstacles import RecentPath
 from thinmap_ros.core.planning.wavefront import START_ESCAPE_M, WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

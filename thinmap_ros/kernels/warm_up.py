@@ -239,7 +239,7 @@ def navigator() -> None:
 
 def _be_blind() -> None:
     """Warm up what takes the place of beams that measure nothing."""
-    from thinmap_ros.core.planning.blind_sectors import BlindSectors
+    from thinmap_ros.core.planning.obstacles import BlindSectors
 
     sectors = BlindSectors()
     for number in range(2):

@@ -7,7 +7,7 @@ import pytest
 from support.ride import Ride, room
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.planning.blind_sectors import BlindSectors
+from thinmap_ros.core.planning.obstacles import BlindSectors
 from thinmap_ros.core.scan import Scan
 
 MIN_OBSTACLE_WIDTH_M = 0.1

@@ -18,7 +18,7 @@ from thinmap_ros.core.planning.grid_search import (
     traversable_cells,
     update_traversable_cells,
 )
-from thinmap_ros.core.planning.obstacle_points import _arc, _clear_steps, _points_around
+from thinmap_ros.core.planning.obstacles import _arc, _clear_steps, _points_around
 from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
 from thinmap_ros.core.scan import Scan

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.planning.recent_path import RecentPath
+from thinmap_ros.core.planning.obstacles import RecentPath
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, find_path, plan
 
 FRAME = GridFrame(-1.0, 2.0, 0.1)

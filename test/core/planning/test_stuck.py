@@ -7,7 +7,7 @@ import pytest
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.navigator import Navigator
-from thinmap_ros.core.planning.stuck import StuckDetector, StuckPlaces
+from thinmap_ros.core.planning.obstacles import StuckDetector, StuckPlaces
 from thinmap_ros.core.se2 import pose
 from thinmap_ros.sim.robot import after_arc
 

@@ -24,7 +24,7 @@ from std_msgs.msg import String
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.planning.navigator import Navigator
-from thinmap_ros.core.planning.stuck import StuckDetector
+from thinmap_ros.core.planning.obstacles import StuckDetector
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.tf.transform_listener import TransformListener

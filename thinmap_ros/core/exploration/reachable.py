@@ -16,7 +16,7 @@ from thinmap_ros.core.planning.grid_search import (
     traversable_cells,
     update_traversable_cells,
 )
-from thinmap_ros.core.planning.recent_path import RecentPath
+from thinmap_ros.core.planning.obstacles import RecentPath
 from thinmap_ros.core.se2 import Array
 
 Mask = NDArray[np.bool_]

@@ -11,7 +11,12 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import SAFE_HIGHER, SAFE_LOWER, Config, parameter, part
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import path_collides
-from thinmap_ros.core.planning.obstacle_points import ObstaclePoints
+from thinmap_ros.core.planning.obstacles import (
+    ObstaclePoints,
+    RecentPath,
+    StuckDetector,
+    StuckPlaces,
+)
 from thinmap_ros.core.planning.path_follower import (
     PathFollower,
     PathFollowerConfig,
@@ -19,8 +24,6 @@ from thinmap_ros.core.planning.path_follower import (
     nearest_point,
 )
 from thinmap_ros.core.planning.paths import LONG_PATH_M, Band, plan_short_path, route_band
-from thinmap_ros.core.planning.recent_path import RecentPath
-from thinmap_ros.core.planning.stuck import StuckDetector, StuckPlaces
 from thinmap_ros.core.planning.wavefront import Obstacles, WavefrontConfig, find_path
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

@@ -1,0 +1,549 @@
+"""What stands in the way: points of the scan, blind sectors, and what only blocked wheels tell."""
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.patch import GridFrame
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import kernel
+
+# Blind sectors: invalid beams behind which an obstacle may stand.
+#
+# Between two valid beams an angle D apart, an obstacle of width w cannot hide closer than w / D.
+# The space beyond that in a sector of invalid beams is unobserved, unless a recent scan, made near
+# by, has observed it.
+
+# Width of the smallest relevant obstacle: a leg. Sectors are sampled at this spacing.
+MIN_OBSTACLE_WIDTH_M = 0.1
+
+
+class _Observation(NamedTuple):
+    """Observed ranges (N,), m (NaN: invalid), of a scan, and the laser pose (3,), map frame."""
+
+    seen_m: Array
+    first_rad: float
+    step_rad: float
+    T_map_laser: Array
+
+
+class BlindSectors:
+    """Sectors of invalid beams in the newest scan, less the space that recent scans observed."""
+
+    def __init__(self, scans: int = 32, apart_m: float = 0.05, apart_rad: float = 0.1) -> None:
+        """Remember so many scans, made at least some distance or angle apart."""
+        self._apart_m = apart_m
+        self._apart_rad = apart_rad
+        self._newest: _Observation | None = None
+        self._earlier: deque[_Observation] = deque(maxlen=scans)
+
+    def add_scan(self, T_map_laser: Array, scan: Scan) -> None:
+        """Add a scan made by a laser at a pose (3,), map frame."""
+        seen_m = np.where(scan.hit, scan.ranges_m, np.where(scan.valid, np.inf, np.nan))
+        seen_m = np.where(scan.below_range_min, 0.0, seen_m)
+        newest = _Observation(seen_m, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser)
+        if self._newest is not None and self._is_apart(self._newest.T_map_laser):
+            self._earlier.append(self._newest)
+        self._newest = newest
+
+    def _is_apart(self, T_map_laser: Array) -> bool:
+        if not self._earlier:
+            return True
+        moved = se2.between(self._earlier[-1].T_map_laser, T_map_laser)
+        has_moved = math.hypot(moved[0], moved[1]) > self._apart_m
+        return has_moved or abs(float(moved[2])) > self._apart_rad
+
+    def points(self, reach_m: float, remembered_m: float) -> Array:
+        """Points (K, 2), map frame, in unobserved space up to reach_m from the laser.
+
+        remembered_m: earlier scans count if they were made within this distance.
+        """
+        if self._newest is None:
+            return np.empty((0, 2))
+        newest = self._newest
+        invalid = np.isnan(newest.seen_m)
+        points = _sector_points(
+            invalid, newest.first_rad, newest.step_rad, newest.T_map_laser, reach_m
+        )
+        for earlier in reversed(self._earlier):
+            if not len(points):
+                break
+            if math.dist(earlier.T_map_laser[:2], newest.T_map_laser[:2]) <= remembered_m:
+                points = points[~_is_seen(points, *earlier)]
+        return points
+
+
+@kernel
+def _sector_points(
+    invalid: NDArray[np.bool_], first: float, step: float, laser: Array, reach: float
+) -> Array:
+    """Points (K, 2) in the sectors of invalid beams (N,), up to a reach, where obstacles can hide.
+
+    first, step: bearing of the first beam and increment, rad; laser (3,): its pose.
+    """
+    count = invalid.size
+    points = [(0.0, 0.0) for _ in range(0)]
+    # In a full circle, the last beam is beside the first.
+    is_circle = count * abs(step) > 2.0 * math.pi - 0.5 * abs(step)
+    start = 0
+    while is_circle and start < count and invalid[start]:
+        start += 1
+    begun = -1
+    for k in range(count + 1):
+        if k < count and invalid[(start + k) % count]:
+            begun = k if begun < 0 else begun
+            continue
+        if begun < 0:
+            continue
+        width = (k - begun + 1) * abs(step)
+        ring = MIN_OBSTACLE_WIDTH_M / width
+        while ring <= reach:
+            across = max(1, int(math.ceil(ring * (k - begun) * abs(step) / MIN_OBSTACLE_WIDTH_M)))
+            for j in range(across + 1):
+                beam = start + begun + (k - 1 - begun) * j / across
+                angle = laser[2] + first + step * beam
+                points.append(
+                    (laser[0] + ring * math.cos(angle), laser[1] + ring * math.sin(angle))
+                )
+            ring += MIN_OBSTACLE_WIDTH_M
+        begun = -1
+    found = np.empty((len(points), 2))
+    for i in range(len(points)):
+        found[i, 0], found[i, 1] = points[i]
+    return found
+
+
+@kernel
+def _is_seen(
+    points: Array, seen: Array, first: float, step: float, laser: Array
+) -> NDArray[np.bool_]:
+    """Whether beams of a scan passed points (K, 2): (K,).
+
+    seen (N,): observed range of each beam, m, NaN: invalid; first, step: bearing of the first beam
+    and increment, rad; laser (3,): pose of the laser.
+    """
+    result = np.zeros(points.shape[0], dtype=np.bool_)
+    turn = 2.0 * math.pi
+    for i in range(points.shape[0]):
+        dx = points[i, 0] - laser[0]
+        dy = points[i, 1] - laser[1]
+        bearing = math.atan2(dy, dx) - laser[2] - first
+        along = bearing if step > 0.0 else -bearing
+        beam = int(round((along % turn) / abs(step)))
+        if beam < seen.size and not math.isnan(seen[beam]):
+            result[i] = math.hypot(dx, dy) <= seen[beam]
+    return result
+
+
+# Obstacles around the robot as points, and the free path length of a disc among them.
+
+_REMEMBERED_M = 1.0
+
+_SWEEP_STEP_M = 0.03
+
+_NEIGHBOURS = 2  # beams on either side
+
+_SAME_M = 0.03  # maximum difference of ranges of the same obstacle
+
+
+class ObstaclePoints:
+    """Hits of the newest scan, and earlier hits near the robot outside its field of view.
+
+    A laser that looks ahead does not see the corner around which the robot is turning.
+    points (N, 2): map frame, m; they stay where they were first observed.
+    is_hidden: whether a blind sector, not a point, limited the last `free_arc_length_m`.
+    """
+
+    def __init__(self) -> None:
+        self.points: Array = np.empty((0, 2))
+        self.is_hidden = False
+        self._blind_sectors = BlindSectors()
+        self._scan: Scan | None = None
+
+    def add_scan(self, T_map_base: Array, scan: Scan | None) -> None:
+        """Add a scan made at a pose (3,). The newest one may be given again."""
+        if scan is None or scan is self._scan:
+            return
+        self._scan = scan
+        first = scan.angle_min_rad
+        step = scan.angle_increment_rad
+        T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
+        hits = np.where(scan.hit, scan.ranges_m, np.nan)
+        hits = np.where(scan.below_range_min, scan.range_min_m, hits)
+        self._blind_sectors.add_scan(T_map_laser, scan)
+        self.points = _points_around(hits, first, step, T_map_laser, self.points, T_map_base)
+
+    def query_radius(self, T_map_base: Array, reach_m: float) -> Array:
+        """Points (M, 2), m, within reach_m of a pose (3,)."""
+        return np.asarray(
+            self.points[np.square(self.points - T_map_base[:2]).sum(axis=1) < reach_m**2]
+        )
+
+    def clearance_along(self, path: Array, first: int, length_m: float) -> float:
+        """Distance, m, of points from a path (K, 2), from its point `first` for length_m.
+
+        inf without points.
+        """
+        return float(_clearance_along(path, first, length_m, self.points))
+
+    def free_arc_length_m(
+        self, T_map_base: Array, curvature: float, length_m: float, radius_m: float
+    ) -> float:
+        """Free length, m, of an arc from a pose (3,) for a disc, at most length_m.
+
+        Along it the disc touches no point and sweeps no unobserved space.
+        """
+        count = math.ceil(length_m / _SWEEP_STEP_M)
+        clear = _clear_steps_on_arc(T_map_base, curvature, length_m, count, self.points, radius_m)
+        unseen = self._blind_points_ahead(T_map_base, length_m, radius_m)
+        seen = _clear_steps_on_arc(T_map_base, curvature, length_m, count, unseen, radius_m)
+        self.is_hidden = seen < clear
+        return float(length_m * min(clear, seen) / max(count, 1))
+
+    def _blind_points_ahead(self, T_map_base: Array, length_m: float, radius_m: float) -> Array:
+        """Points (K, 2), map frame, in unobserved space that a disc at a pose (3,) may sweep."""
+        # The space beside the robot was in front of it one diameter ago.
+        points = self._blind_sectors.points(2.0 * radius_m + length_m, 2.0 * radius_m)
+        if not len(points):
+            return points
+        # Directly beside a robot that starts to move, no laser has observed anything yet.
+        away = se2.transform_points(se2.invert(T_map_base), points)
+        near = np.hypot(away[:, 0], away[:, 1]) < radius_m + MIN_OBSTACLE_WIDTH_M
+        return np.asarray(points[~(near & (np.abs(away[:, 1]) > away[:, 0]))])
+
+
+@kernel
+def _clearance_along(path: Array, first: int, length_m: float, points: Array) -> float:
+    """Distance, m, of points (N, 2) from a path (K, 2), from its point `first` for length_m.
+
+    inf without points.
+    """
+    nearest = np.inf
+    along = 0.0
+    for k in range(first, path.shape[0]):
+        if k > first:
+            along += math.hypot(path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1])
+        if along > length_m:
+            break
+        for i in range(points.shape[0]):
+            nearest = min(
+                nearest, (points[i, 0] - path[k, 0]) ** 2 + (points[i, 1] - path[k, 1]) ** 2
+            )
+    return math.sqrt(nearest)
+
+
+@kernel
+def _arc(start: Array, curvature: float, length_m: float, count: int) -> Array:
+    """Evenly spaced points (count + 1, 2) of an arc that starts at a pose (3,), m."""
+    points = np.empty((count + 1, 2))
+    for k in range(count + 1):
+        length = length_m * k / max(count, 1)
+        half = 0.5 * curvature * length
+        chord = length if half == 0.0 else length * math.sin(half) / half
+        points[k, 0] = start[0] + chord * math.cos(start[2] + half)
+        points[k, 1] = start[1] + chord * math.sin(start[2] + half)
+    return points
+
+
+@kernel
+def _clear_steps(centres: Array, points: Array, radius: float) -> int:
+    """Index of the last centre (K, 2) that a disc reaches without touching points (N, 2).
+
+    A point that is already too close to the first centre only forbids approaching it further.
+    """
+    clear: int = centres.shape[0]
+    for i in range(points.shape[0]):
+        limit = min(radius, math.hypot(points[i, 0] - centres[0, 0], points[i, 1] - centres[0, 1]))
+        for k in range(clear):
+            if math.hypot(points[i, 0] - centres[k, 0], points[i, 1] - centres[k, 1]) < limit:
+                clear = k
+                break
+    return max(clear - 1, 0)
+
+
+@kernel
+def _clear_steps_on_arc(
+    start: Array, curvature: float, length_m: float, count: int, points: Array, radius: float
+) -> int:
+    """Number of steps, of `count` along an arc, that a disc can move without touching points.
+
+    See `_arc` and `_clear_steps`.
+    """
+    return _clear_steps(_arc(start, curvature, length_m, count), points, radius)
+
+
+@kernel
+def _smoothed(ranges: Array, i: int) -> float:
+    """Smoothed range, m: mean of the neighbouring beams that differ by noise only (NaN: none).
+
+    The nearest of many noisy points is closer than the wall: without smoothing, passages appear too
+    narrow.
+    """
+    total = 0.0
+    count = 0
+    for k in range(max(i - _NEIGHBOURS, 0), min(i + _NEIGHBOURS + 1, ranges.size)):
+        if abs(ranges[k] - ranges[i]) < _SAME_M:
+            total += ranges[k]
+            count += 1
+    return total / count
+
+
+@kernel
+def _points_around(
+    ranges: Array, first: float, step: float, laser: Array, earlier: Array, robot: Array
+) -> Array:
+    """Hits of a scan (NaN: none), and the earlier points (N, 2) that remain valid.
+
+    Those are near the robot pose (3,) and outside the field of view. All in the map frame, m.
+    """
+    points = np.empty((ranges.size + earlier.shape[0], 2))
+    count = 0
+    for i in range(ranges.size):
+        if not math.isnan(ranges[i]):
+            angle = laser[2] + first + step * i
+            metres = _smoothed(ranges, i)
+            points[count, 0] = laser[0] + metres * math.cos(angle)
+            points[count, 1] = laser[1] + metres * math.sin(angle)
+            count += 1
+    last = first + step * (ranges.size - 1)
+    middle = laser[2] + 0.5 * (first + last)
+    half = 0.5 * abs(last - first)
+    for i in range(earlier.shape[0]):
+        dx = earlier[i, 0] - laser[0]
+        dy = earlier[i, 1] - laser[1]
+        off = math.pi - (math.pi - (math.atan2(dy, dx) - middle)) % (2.0 * math.pi)
+        near = (earlier[i, 0] - robot[0]) ** 2 + (earlier[i, 1] - robot[1]) ** 2 < _REMEMBERED_M**2
+        if near and abs(off) > half:
+            points[count, 0] = earlier[i, 0]
+            points[count, 1] = earlier[i, 1]
+            count += 1
+    return points[:count].copy()
+
+
+# Recent path of the robot.
+#
+# The robot can return along it, even if noise in the map makes a passage appear too narrow.
+
+
+class RecentPath:
+    """The last metres of the robot's path; reset when the pose jumps, as after a correction."""
+
+    def __init__(self, step_m: float = 0.03, jump_m: float = 0.5, capacity: int = 1300) -> None:
+        """Keep the last points, step_m apart; a longer step than jump_m is a jump."""
+        self._step_m = step_m
+        self._jump_m = jump_m
+        self._capacity = capacity
+        # Twice the capacity: points are moved to the front only when the array is full.
+        self._points = np.empty((2 * capacity, 2))
+        self._begin = self._end = 0
+
+    def add_pose(self, T_map_base: Array) -> None:
+        """Add a pose of the robot, (3,); poses that are not finite are ignored."""
+        if not se2.is_finite(T_map_base):
+            return
+        here = float(T_map_base[0]), float(T_map_base[1])
+        away = math.dist(here, self._points[self._end - 1]) if self._end > self._begin else math.inf
+        if away > self._jump_m:
+            self._begin = self._end = 0
+        if away >= self._step_m:
+            self._append(here)
+
+    def cells(self, frame: GridFrame, shape: tuple[int, ...]) -> NDArray[np.int64]:
+        """Cells (N, 2) of a map (H, W) on the path; consecutive cells share an edge."""
+        if self._end == self._begin:
+            return np.empty((0, 2), dtype=np.int64)
+        return np.asarray(
+            _connected_cells(
+                frame.cells_of(self._points[self._begin : self._end]), shape[0], shape[1]
+            )
+        )
+
+    def _append(self, here: tuple[float, float]) -> None:
+        if self._end == len(self._points):
+            kept = self._capacity - 1
+            self._points[:kept] = self._points[self._end - kept :]
+            self._begin = 0
+            self._end = kept
+        self._points[self._end] = here
+        self._end += 1
+        self._begin = max(self._begin, self._end - self._capacity)
+
+
+@kernel
+def _connected_cells(cells: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]:
+    """Cells (N, 2) and the cells between them, first along the column, then along the row.
+
+    Cells outside the map are omitted.
+    """
+    count = cells.shape[0]
+    for k in range(1, cells.shape[0]):
+        count += abs(cells[k, 0] - cells[k - 1, 0]) + abs(cells[k, 1] - cells[k - 1, 1])
+    found = np.empty((count, 2), dtype=np.int64)
+    row = cells[0, 0]
+    col = cells[0, 1]
+    used = 0
+    for k in range(cells.shape[0]):
+        while True:
+            if 0 <= row < rows and 0 <= col < cols:
+                found[used, 0] = row
+                found[used, 1] = col
+                used += 1
+            if row != cells[k, 0]:
+                row += 1 if cells[k, 0] > row else -1
+            elif col != cells[k, 1]:
+                col += 1 if cells[k, 1] > col else -1
+            else:
+                break
+    return found[:used].copy()
+
+
+# Robots that do not move as commanded: blocked wheels, or obstacles that the laser cannot see.
+
+# A robot is stuck if it has moved by less than this share of what it was commanded for a while, and
+# of so much that the noise of its pose does not matter. The least share of a simulated exploration
+# (dungeon/d1573, 543 s) is 0.88; a slow base, and wheels that slip while the localizer corrects
+# their odometry, lie between.
+_SHARE = 0.1
+
+_WINDOW_S = 1.5
+
+_MIN_PATH_M = 0.2
+
+_MIN_TURN_RAD = 0.5
+
+# Another pose than the one at which the robot was stuck.
+_MOVED_M = 0.1
+
+_MOVED_RAD = 0.3
+
+_RING = 2.0 * np.pi * np.arange(8) / 8.0
+
+
+class _Sample(NamedTuple):
+    """Pose (3,), and time, commanded path and turn, and turn of the pose since the first one."""
+
+    T_map_base: Array
+    time_s: float
+    path_m: float
+    commanded_rad: float
+    turned_rad: float
+
+
+class StuckDetector:
+    """Compares the motion of the robot with its commands.
+
+    is_turning: whether what was commanded last was a turn on the spot.
+    """
+
+    def __init__(self) -> None:
+        self.is_turning = False
+        self._samples: deque[_Sample] = deque()
+
+    def add(self, T_map_base: Array, v: float, w: float, dt_s: float) -> bool:
+        """Add a pose (3,), after a command v (m/s), w (rad/s) of dt_s.
+
+        Returns whether the robot is stuck. A stop restarts the comparison.
+        """
+        if (v == 0.0 and w == 0.0) or not self._samples:
+            self._samples = deque([_Sample(T_map_base, 0.0, 0.0, 0.0, 0.0)])
+            return False
+        last = self._samples[-1]
+        turned = se2.wrap(float(T_map_base[2] - last.T_map_base[2]))
+        now = _Sample(
+            T_map_base,
+            last.time_s + dt_s,
+            last.path_m + abs(v) * dt_s,
+            last.commanded_rad + w * dt_s,
+            last.turned_rad + turned,
+        )
+        self._samples.append(now)
+        while len(self._samples) > 2 and _is_enough(self._samples[1], now):
+            self._samples.popleft()
+        return self._is_stuck(self._samples[0], now)
+
+    def _is_stuck(self, then: _Sample, now: _Sample) -> bool:
+        if not _is_enough(then, now):
+            return False
+        path_m = now.path_m - then.path_m
+        self.is_turning = path_m < _MIN_PATH_M
+        if self.is_turning:
+            turned = now.turned_rad - then.turned_rad
+            is_stuck = abs(turned) < _SHARE * abs(now.commanded_rad - then.commanded_rad)
+        else:
+            is_stuck = math.dist(now.T_map_base[:2], then.T_map_base[:2]) < _SHARE * path_m
+        if is_stuck:
+            self._samples.clear()
+        return is_stuck
+
+
+def _is_enough(then: _Sample, now: _Sample) -> bool:
+    """Whether so much was commanded meanwhile that a robot must have moved."""
+    if now.time_s - then.time_s < _WINDOW_S:
+        return False
+    is_driven = now.path_m - then.path_m >= _MIN_PATH_M
+    return is_driven or abs(now.commanded_rad - then.commanded_rad) >= _MIN_TURN_RAD
+
+
+class StuckPlaces:
+    """Places at which the robot was stuck: discs of its radius ahead of it.
+
+    A robot that is stuck in two directions is blocked itself, and no place is. Until it has turned
+    away, a place counts for the goal of that time only. Only having driven there shows that a place
+    is free: what blocks the robot may be transparent to the laser.
+    """
+
+    def __init__(self, robot_radius_m: float) -> None:
+        self._radius_m = robot_radius_m
+        self._places: list[Array] = []
+        self._stuck: Array | None = None  # pose (3,) at which the robot was stuck, and still is
+        self._is_place = False
+        self._is_new_goal = False
+
+    def points(self) -> Array:
+        """Points (N, 2) on the discs, map frame, m."""
+        places = list(self._places)
+        if self._stuck is not None and self._is_place and not self._is_new_goal:
+            places.append(self._ahead(self._stuck))
+        ring = self._radius_m * np.column_stack([np.cos(_RING), np.sin(_RING)])
+        discs = [place + np.vstack([ring, np.zeros((1, 2))]) for place in places]
+        return np.concatenate(discs) if discs else np.empty((0, 2))
+
+    def goal_set(self) -> None:
+        """Try again where the robot has been stuck and has not moved since."""
+        self._is_new_goal = True
+
+    def add_pose(self, T_map_base: Array) -> None:
+        """Add a pose (3,) of the robot: places that it drives over are free."""
+        self._places = [
+            place for place in self._places if math.dist(place, T_map_base[:2]) > self._radius_m
+        ]
+        if self._stuck is None:
+            return
+        moved = se2.between(self._stuck, T_map_base)
+        if moved[0] >= _MOVED_M:
+            self._stuck = None  # it drove on
+        elif math.hypot(moved[0], moved[1]) >= _MOVED_M or abs(moved[2]) >= _MOVED_RAD:
+            if self._is_place:
+                self._places.append(self._ahead(self._stuck))
+            self._stuck = None
+
+    def add_stuck(self, T_map_base: Array, is_turning: bool) -> bool:
+        """The robot is stuck at a pose (3,). Returns whether it was, and has not moved since."""
+        is_repeated = self._stuck is not None
+        self._is_place = not is_repeated and not is_turning
+        self._is_new_goal = False
+        if not is_repeated:
+            self._stuck = T_map_base
+        return is_repeated
+
+    def _ahead(self, T_map_base: Array) -> Array:
+        """Centre (2,) of a disc that touches the robot in front."""
+        heading = float(T_map_base[2])
+        return T_map_base[:2] + 2.0 * self._radius_m * np.array(
+            [math.cos(heading), math.sin(heading)]
+        )
