@@ -6,7 +6,7 @@ from thinmap_msgs.msg import JoinStatus, MapTiles, RobotMap, TeamClaim
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.team.claims import Claim
 from thinmap_ros.core.grid.shared import TileSender
-from thinmap_ros.core.planning.give_way import Motion
+from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.team.team_messages import RobotClaim, RobotState, claim_msg, tiles_msg
 

@@ -20,7 +20,7 @@ from thinmap_msgs.msg import (
 )
 from thinmap_ros.core.config import SAFE_LOWER, Config, parameter
 from thinmap_ros.core.errors import counted
-from thinmap_ros.core.planning.give_way import MESSAGE_PERIOD_S, moved_on
+from thinmap_ros.core.planning.path_follower import MESSAGE_PERIOD_S, moved_on
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.steering.steering import Steering

@@ -10,8 +10,8 @@ from thinmap_ros.closed_loop import CONTROL_STEPS, ClosedLoop, ExplorationOutcom
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.team.claims import Claim
-from thinmap_ros.core.planning.give_way import NEAR_ROBOT_M, Motion, must_stop
 from thinmap_ros.core.planning.navigator import Command
+from thinmap_ros.core.planning.path_follower import NEAR_ROBOT_M, Motion, must_stop
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.sensing.beams import without_robots
 from thinmap_ros.sim.coverage import ObservableCells

@@ -8,7 +8,7 @@ import numpy as np
 from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError, one_line
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.give_way import Motion
+from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap

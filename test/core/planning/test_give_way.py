@@ -7,8 +7,8 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.planning.give_way import Motion, as_heard, moved_on, must_stop
 from thinmap_ros.core.planning.navigator import Navigator
+from thinmap_ros.core.planning.path_follower import Motion, as_heard, moved_on, must_stop
 
 HALL = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((60, 60), dtype=np.int8))
 

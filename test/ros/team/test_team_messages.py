@@ -15,7 +15,7 @@ from thinmap_ros.core.exploration.team.claims import Claim, SettledPlace
 from thinmap_ros.core.exploration.team.team import MAX_SETTLED
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.shared import TileSender
-from thinmap_ros.core.planning.give_way import Motion
+from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.team.team_messages import (
     RobotClaim,

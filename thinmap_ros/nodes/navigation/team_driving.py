@@ -6,8 +6,8 @@ import numpy as np
 
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.give_way import Motion, as_heard, must_stop
 from thinmap_ros.core.planning.navigator import Command, Navigator
+from thinmap_ros.core.planning.path_follower import Motion, as_heard, must_stop
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

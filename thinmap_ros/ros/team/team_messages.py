@@ -15,7 +15,7 @@ from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.exploration.team.claims import Claim, Place, SettledPlace
 from thinmap_ros.core.exploration.team.team import MAX_SETTLED
 from thinmap_ros.core.grid.shared import TileMessage
-from thinmap_ros.core.planning.give_way import Motion
+from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages
 
