@@ -12,8 +12,7 @@ from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, 
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import MAX_MISSES, FeatureConfig, FeatureMap
-from thinmap_ros.core.ekf_slam.features import FeatureTrack
-from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, Lines, extract_lines
+from thinmap_ros.core.ekf_slam.features import FeatureTrack, LineConfig, Lines, extract_lines
 
 R = np.diag([0.02**2, 0.01**2])
 SURE = 1e-8 * np.eye(3)

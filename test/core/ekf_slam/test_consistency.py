@@ -11,8 +11,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.association import AssociationConfig
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import WALL_FLATNESS_M, FeatureConfig, FeatureMap
-from thinmap_ros.core.ekf_slam.line_extraction import Lines
-from thinmap_ros.core.ekf_slam.models import observe_line
+from thinmap_ros.core.ekf_slam.features import Lines, observe_line
 
 FEATURES = FeatureConfig()
 # Noise of a step forward and of a rotation.

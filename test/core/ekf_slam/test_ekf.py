@@ -5,7 +5,7 @@ import pytest
 from reference_filter import DenseFilter
 
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam, line_difference
-from thinmap_ros.core.ekf_slam.models import observe_line
+from thinmap_ros.core.ekf_slam.features import observe_line
 from thinmap_ros.core.se2 import compose
 
 P0 = np.diag([0.01, 0.02, 0.003])

@@ -8,8 +8,8 @@ from scipy.optimize import least_squares
 from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam import line_extraction
-from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
+from thinmap_ros.core.ekf_slam import features
+from thinmap_ros.core.ekf_slam.features import LineConfig, extract_lines
 from thinmap_ros.core.scan import Scan
 
 BOX = np.array([[-2, -3, 4, -3], [4, -3, 4, 2], [4, 2, -2, 2], [-2, 2, -2, -3]], dtype=float)
@@ -94,7 +94,7 @@ def test_trimming_ends_where_too_few_points_are_left():
     sigmas = np.array([0.01, 0.001, 0.05])
     arguments = (x, y, np.hypot(x, y), np.arctan2(y, x))
     for fewest in (3, 6):
-        a, b = line_extraction._fit_trimmed(*arguments, 0, count, sigmas, fewest, np.empty(10))
+        a, b = features._fit_trimmed(*arguments, 0, count, sigmas, fewest, np.empty(10))
         assert 0 < a <= count - fewest + 1
         assert b - a == fewest - 1
 

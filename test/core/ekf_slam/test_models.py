@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thinmap_ros.core.ekf_slam.models import (
+from thinmap_ros.core.ekf_slam.features import (
     OdometryConfig,
     motion_jacobians,
     observe_line,

@@ -5,7 +5,7 @@ import pytest
 from support.slam_room import ROOM, corridor, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines, no_lines
+from thinmap_ros.core.ekf_slam.features import LineConfig, extract_lines, no_lines
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.wall_compass import Reference, WallCompass

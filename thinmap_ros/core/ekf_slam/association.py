@@ -16,8 +16,13 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
-from thinmap_ros.core.ekf_slam.features import FeatureTrack, normals_of, sides_of, tangents_of
-from thinmap_ros.core.ekf_slam.line_extraction import Lines
+from thinmap_ros.core.ekf_slam.features import (
+    FeatureTrack,
+    Lines,
+    normals_of,
+    sides_of,
+    tangents_of,
+)
 from thinmap_ros.core.se2 import Array, transform_points, wrap
 
 # Only pairs nearer than this are tested by their Mahalanobis distance.

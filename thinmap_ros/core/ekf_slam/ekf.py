@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.ekf_slam.models import motion_jacobians, observe_line, place_line
+from thinmap_ros.core.ekf_slam.features import motion_jacobians, observe_line, place_line
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.jit import kernel
 

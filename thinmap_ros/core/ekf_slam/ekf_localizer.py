@@ -20,9 +20,14 @@ from thinmap_ros.core.ekf_slam import feature_map
 from thinmap_ros.core.ekf_slam.association import AssociationConfig
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
-from thinmap_ros.core.ekf_slam.features import LineFeature
-from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
-from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odometry_variances
+from thinmap_ros.core.ekf_slam.features import (
+    LineConfig,
+    LineFeature,
+    OdometryConfig,
+    extract_lines,
+    odometry_slip,
+    odometry_variances,
+)
 from thinmap_ros.core.odometry import OdometryAnchor, OdometryIncrement, OdometryIncrements
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array

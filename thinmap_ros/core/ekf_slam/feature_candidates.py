@@ -6,9 +6,7 @@ import numpy as np
 
 from thinmap_ros.core.ekf_slam.association import mahalanobis, meeting
 from thinmap_ros.core.ekf_slam.ekf import line_difference
-from thinmap_ros.core.ekf_slam.features import FeatureTrack, interval
-from thinmap_ros.core.ekf_slam.line_extraction import Lines
-from thinmap_ros.core.ekf_slam.models import place_line
+from thinmap_ros.core.ekf_slam.features import FeatureTrack, Lines, interval, place_line
 from thinmap_ros.core.se2 import Array, transform_points
 
 

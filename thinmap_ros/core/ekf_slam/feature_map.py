@@ -22,12 +22,12 @@ from thinmap_ros.core.ekf_slam.feature_candidates import FeatureCandidate, Featu
 from thinmap_ros.core.ekf_slam.features import (
     FeatureTrack,
     LineFeature,
+    Lines,
     as_seen,
     ends_of,
     interval,
     normals_of,
 )
-from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.ekf_slam.local_area import LocalArea
 from thinmap_ros.core.ekf_slam.visibility import seen_through
 from thinmap_ros.core.scan import Scan

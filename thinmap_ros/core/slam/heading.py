@@ -1,7 +1,7 @@
 """Manhattan-world heading correction of the scans that are added to the local map."""
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
+from thinmap_ros.core.ekf_slam.features import LineConfig, extract_lines
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import PoseUncertainty

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.ekf_slam.features import LineFeature
-from thinmap_ros.core.ekf_slam.models import odometry_variances
+from thinmap_ros.core.ekf_slam.features import LineFeature, odometry_variances
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan

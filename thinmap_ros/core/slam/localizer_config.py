@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from thinmap_ros.core.config import parameter, parameters_of, part
-from thinmap_ros.core.ekf_slam.line_extraction import LineConfig
+from thinmap_ros.core.ekf_slam.features import LineConfig
 from thinmap_ros.core.slam.graph.keyframes import KeyframeConfig
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig

@@ -12,7 +12,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odometry_variances
+from thinmap_ros.core.ekf_slam.features import OdometryConfig, odometry_slip, odometry_variances
 from thinmap_ros.core.se2 import Array
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.models import odometry_variances
+from thinmap_ros.core.ekf_slam.features import odometry_variances
 from thinmap_ros.core.odometry import OdometryIncrement, OdometryIncrements
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, rotated_covariance, rotation

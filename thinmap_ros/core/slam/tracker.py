@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.models import odometry_slip
+from thinmap_ros.core.ekf_slam.features import odometry_slip
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, rotated_covariance, rotation
 from thinmap_ros.core.slam.graph.keyframes import Anchor

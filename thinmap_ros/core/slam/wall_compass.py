@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thinmap_ros.core.ekf_slam.line_extraction import Lines
+from thinmap_ros.core.ekf_slam.features import Lines
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.pose_graph import Systematic
 
