@@ -8,10 +8,16 @@ from scipy.stats import chi2
 from support.slam_room import BLIND, ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.ekf_slam.feature_map import MAX_MISSES, FeatureConfig, FeatureMap
+from thinmap_ros.core.ekf_slam.feature_map import (
+    MAX_MISSES,
+    AssociationConfig,
+    FeatureConfig,
+    FeatureMap,
+    associate,
+    mahalanobis,
+)
 from thinmap_ros.core.ekf_slam.features import FeatureTrack, LineConfig, Lines, extract_lines
 
 R = np.diag([0.02**2, 0.01**2])

@@ -8,9 +8,13 @@ from scipy.stats import chi2
 from support.slam_room import BLIND
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.association import AssociationConfig
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.ekf_slam.feature_map import WALL_FLATNESS_M, FeatureConfig, FeatureMap
+from thinmap_ros.core.ekf_slam.feature_map import (
+    WALL_FLATNESS_M,
+    AssociationConfig,
+    FeatureConfig,
+    FeatureMap,
+)
 from thinmap_ros.core.ekf_slam.features import Lines, observe_line
 
 FEATURES = FeatureConfig()

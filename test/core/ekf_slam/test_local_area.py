@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from thinmap_ros.core.ekf_slam.local_area import LocalArea
+from thinmap_ros.core.ekf_slam.feature_map import LocalArea
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 AHEAD = math.pi / 2.0

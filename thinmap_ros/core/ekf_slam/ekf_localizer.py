@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import part
 from thinmap_ros.core.ekf_slam import feature_map
-from thinmap_ros.core.ekf_slam.association import AssociationConfig
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
+from thinmap_ros.core.ekf_slam.feature_map import AssociationConfig, FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.features import (
     LineConfig,
     LineFeature,

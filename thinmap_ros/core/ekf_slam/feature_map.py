@@ -1,10 +1,11 @@
-"""Management of the line features: they are added, extended, merged and removed.
+"""Management of the line features: added, extended, merged, removed, and selected by place.
 
 Source: EKF-SLAM/TI paper sections 2 and 4. The paper does not define when features are added or
 removed. Here a feature is added after several observations, so that clutter does not enter the
 state, and removed after several consecutive scans saw through it.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,11 +15,8 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.ekf_slam import local_area
-from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis, meeting
-from thinmap_ros.core.ekf_slam.ekf import EkfSlam
+from thinmap_ros.core.ekf_slam.ekf import EkfSlam, line_difference
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.ekf_slam.feature_candidates import FeatureCandidate, FeatureCandidates
 from thinmap_ros.core.ekf_slam.features import (
     FeatureTrack,
     LineFeature,
@@ -27,19 +25,523 @@ from thinmap_ros.core.ekf_slam.features import (
     ends_of,
     interval,
     normals_of,
+    place_line,
+    sides_of,
+    tangents_of,
 )
-from thinmap_ros.core.ekf_slam.local_area import LocalArea
-from thinmap_ros.core.ekf_slam.visibility import seen_through
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array, transform_points
+from thinmap_ros.core.se2 import Array, compose, transform_points, wrap
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+
+# Data association: nearest neighbour of each line of a scan among the features.
+#
+# Source: EKF-SLAM/TI paper eq. (13), with the sign of the gate corrected: v' S^-1 v <= 5.99, two
+# degrees of freedom, 95 %. Collinear walls of different rooms are on one infinite line, so the
+# observed segments have to overlap or be near, too. The two faces of a thin wall are two features,
+# each observed from its own side. Ambiguous lines are associated after the others have updated the
+# pose, so that the scan is considered jointly (the idea of Neira and Tardos, "Data association in
+# stochastic mapping using the joint compatibility test", 2001).
+
+# Only pairs nearer than this are tested by their Mahalanobis distance.
+_NEAR_M = 0.5
+
+_NEAR_RAD = math.radians(15.0)
+
+
+@dataclass(frozen=True)
+class AssociationConfig(Config):
+    """Parameters of data association."""
+
+    gate: float = parameter(
+        5.99,
+        'Largest squared Mahalanobis distance between a line and a feature (2 degrees of freedom: '
+        '95 %). Raise it if features double, lower it if different walls are merged.',
+        low=0.1,
+        high=50.0,
+    )
+    max_gap_m: float = parameter(
+        3.0,
+        'Largest gap along the line between an observed segment and the feature that it extends '
+        '(m); at least the width of a door. Lower it if collinear walls of different rooms merge.',
+        low=0.0,
+        high=20.0,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Associations:
+    """Nearest feature of each line of a scan, and whether several features pass the gate.
+
+    Both (K,); index: -1 if no feature passes the gate.
+    """
+
+    index: NDArray[np.int64]
+    ambiguous: NDArray[np.bool_]
+
+
+def associate(
+    ekf: EkfSlam,
+    features: list[FeatureTrack],
+    lines: Lines,
+    laser_map: Array,
+    config: AssociationConfig,
+) -> Associations:
+    """Associate each line of a scan with its nearest feature, independently of other lines.
+
+    laser_map (2,): position of the laser, map frame. Ambiguous lines should be associated again
+    after the others have updated the pose.
+    """
+    chosen = np.full(len(lines), -1, dtype=np.int64)
+    passing = np.zeros(len(lines), dtype=np.int64)
+    if not features:
+        return Associations(chosen, passing > 1)
+    ends_map = transform_points(ekf.pose, lines.ends.reshape(-1, 2)).reshape(-1, 2, 2)
+    pairs = np.argwhere(meeting(ekf.lines, features, ends_map, laser_map, config.max_gap_m))
+    best = np.full(len(lines), np.inf)
+    for k, index in pairs:
+        expected, spread, _ = ekf.innovations(int(index))
+        v = lines.z[k] - expected
+        v[1] = wrap(float(v[1]))
+        distance = mahalanobis(v, spread + lines.covariances[k])
+        if distance > config.gate:
+            continue
+        passing[k] += 1
+        if distance <= best[k]:
+            best[k] = distance
+            chosen[k] = index
+    return Associations(chosen, passing > 1)
+
+
+def meeting(
+    lines_map: Array, features: list[FeatureTrack], ends_map: Array, seen_from: Array, gap_m: float
+) -> NDArray[np.bool_]:
+    """Whether segments with ends (K, 2, 2), map frame, may be part of features, (K, N).
+
+    Direction and offset agree roughly, the intervals along the line are at most gap_m apart, and
+    the laser, at seen_from (2,), is on the side from which the feature was first observed.
+    """
+    offsets = np.abs(ends_map.mean(axis=1) @ normals_of(lines_map).T - lines_map[:, 0])
+    chords = ends_map[:, 1] - ends_map[:, 0]
+    rise = np.abs(chords @ normals_of(lines_map).T) / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
+    along = ends_map @ tangents_of(lines_map).T
+    low = np.array([f.low for f in features])
+    high = np.array([f.high for f in features])
+    gaps = np.maximum(low - along.max(axis=1), along.min(axis=1) - high)
+    first_seen_from = np.array([f.first_seen_from for f in features]).reshape(-1, 2)
+    facing = sides_of(lines_map, seen_from) == sides_of(lines_map, first_seen_from)
+    return np.asarray(
+        (offsets <= _NEAR_M) & (rise <= math.sin(_NEAR_RAD)) & (gaps <= gap_m) & facing
+    )
+
+
+def mahalanobis(v: Array, S: Array) -> float:
+    """Squared Mahalanobis distance v' S^-1 v, v (2,), S (2, 2).
+
+    Infinite if S is not positive definite.
+    """
+    determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+    if not (determinant > 0.0 and S[0, 0] > 0.0):
+        return math.inf
+    squares = v[0] * v[0] * S[1, 1] + v[1] * v[1] * S[0, 0] - v[0] * v[1] * (S[0, 1] + S[1, 0])
+    return float(squares / determinant)
+
+
+# Feature candidates: a line becomes a feature after several observations at one place.
+
+
+@dataclass(eq=False)
+class FeatureCandidate:
+    """A line (r, alpha), map frame, and its observed interval.
+
+    z (2,) with covariance (2, 2): the last observation, robot frame.
+    """
+
+    line: Array
+    span: FeatureTrack
+    z: Array
+    covariance: Array
+    observations: int
+    last_observed: int
+
+
+class FeatureCandidates:
+    """The lines with too few observations to be features."""
+
+    def __init__(self, min_observations: int, max_misses: int, gate: float, gap_m: float) -> None:
+        """Create an empty set.
+
+        min_observations: number after which a line becomes a feature; max_misses: observations
+        without a match after which a candidate is dropped; gate, gap_m: as in `associate`.
+        """
+        self._min_observations = min_observations
+        self._max_misses = max_misses
+        self._gate = gate
+        self._gap_m = gap_m
+        self._all: list[FeatureCandidate] = []
+        self._observations = 0
+
+    def update(self, pose: Array, lines: Lines, laser_map: Array) -> list[FeatureCandidate]:
+        """Update by the lines of a scan at a pose (3,), with the laser at laser_map (2,).
+
+        Returns the candidates that have become features.
+        """
+        self._observations += 1
+        seen = [
+            self._take(pose, z, covariance, transform_points(pose, ends), laser_map)
+            for z, covariance, ends in zip(lines.z, lines.covariances, lines.ends, strict=True)
+        ]
+        ripe = [c for c in dict.fromkeys(seen) if c.observations >= self._min_observations]
+        oldest = self._observations - self._max_misses
+        self._all = [c for c in self._all if c.last_observed >= oldest and c not in ripe]
+        return ripe
+
+    def _take(
+        self, pose: Array, z: Array, covariance: Array, ends_map: Array, laser_map: Array
+    ) -> FeatureCandidate:
+        """Update the candidate that an observed line matches, or add a new one."""
+        line, _, by_seen = place_line(pose, z)
+        # Two observations of a line differ by the noise of both; the robot has hardly moved.
+        S = 2.0 * by_seen @ covariance @ by_seen.T
+        for candidate in self._meeting(ends_map, laser_map):
+            v, signs = line_difference(line, candidate.line)
+            if mahalanobis(v, S) <= self._gate:
+                candidate.line = v + signs * candidate.line
+                candidate.span.grow(*interval(candidate.line, ends_map))
+                candidate.z = z
+                candidate.covariance = covariance
+                candidate.observations += candidate.last_observed != self._observations
+                candidate.last_observed = self._observations
+                return candidate
+        span = FeatureTrack(0, *interval(line, ends_map), laser_map)
+        self._all.append(FeatureCandidate(line, span, z, covariance, 1, self._observations))
+        return self._all[-1]
+
+    def _meeting(self, ends_map: Array, laser_map: Array) -> list[FeatureCandidate]:
+        if not self._all:
+            return []
+        lines = np.array([c.line for c in self._all])
+        spans = [c.span for c in self._all]
+        near = meeting(lines, spans, ends_map[None], laser_map, self._gap_m)[0]
+        return [self._all[i] for i in np.flatnonzero(near)]
+
+
+# Detection of removed features, such as an opened door, by beams that pass through them.
+
+_BEYOND_M = 0.3  # a beam that ends this far behind a feature has passed through it
+
+_END_M = 0.15  # margin at the ends of a feature where beams are ignored
+
+_MIN_BEAMS = 8
+
+_SHARE = 0.7  # smallest share of passing beams among those that reach the feature
+
+_FLATTEST = 0.17  # smallest sine of the angle between beam and wall
+
+
+def seen_through(
+    scan: Scan, T_map_base: Array, lines: Array, features: list[FeatureTrack]
+) -> NDArray[np.bool_]:
+    """Whether the scan passes through each feature with its line (N, 2), map frame; (N,).
+
+    Most of the beams that should hit the feature, and enough of them, end well behind it. Beams
+    without return are ignored: glass and black walls cause them, too.
+    """
+    if not features:
+        return np.zeros(0, dtype=np.bool_)
+    T_map_laser = compose(T_map_base, scan.T_base_laser)
+    angles = scan.angles_rad[scan.hit] + T_map_laser[2]
+    beams = np.column_stack([np.cos(angles), np.sin(angles)])
+    towards = beams @ normals_of(lines).T
+    with np.errstate(divide='ignore', invalid='ignore'):
+        expected = (lines[:, 0] - normals_of(lines) @ T_map_laser[:2]) / towards
+        along = tangents_of(lines) @ T_map_laser[:2] + expected * (beams @ tangents_of(lines).T)
+    low, high = np.array([(f.low, f.high) for f in features]).T
+    aimed = (
+        (expected > 0.0)
+        & (np.abs(towards) > _FLATTEST)
+        & (along > low + _END_M)
+        & (along < high - _END_M)
+    )
+    ranges = scan.ranges_m[scan.hit][:, None]
+    through = (aimed & (ranges > expected + _BEYOND_M)).sum(axis=0)
+    reaching = (aimed & (ranges > expected - _BEYOND_M)).sum(axis=0)
+    return np.asarray((through >= _MIN_BEAMS) & (through > _SHARE * reaching))
+
+
+# Local area: selection of the features near the robot by the topological map.
+#
+# Features are stored at the nodes near which they were observed. The local area consists of the
+# features at the robot's node and at the nodes connected to it, except those out of view.
+# Source: EKF-SLAM/TI paper section 4, Fig. 6-8.
+
+AREA_FIELDS = {
+    'stored_at': Field(np.int64, ('s', 2), 1, MAX_ID),
+    'node_ids': Field(np.int64, ('a',), 1, MAX_ID),
+    'node_places': Field(np.float64, ('a', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+}
+
+
+@dataclass(frozen=True)
+class LocalAreaConfig:
+    """Which nodes make the local area.
+
+    path_m: largest path length to a node, except to the first one on each edge; beside_m: nodes
+    nearer than this are never behind the robot; list_m: radius in which nodes are listed, unless
+    none is near; near_m: tolerance within which nodes are as near as the nearest; turn_m_rad:
+    distance that costs as much as a rotation by a radian; trail_m: distance between nodes along the
+    robot's path, until a topology is set.
+    """
+
+    path_m: float = 8.0
+    beside_m: float = 2.0
+    list_m: float = 12.0
+    near_m: float = 1.0
+    turn_m_rad: float = 0.5
+    trail_m: float = 3.0
+
+
+class LocalArea:
+    """Features by the topological nodes near which they were observed.
+
+    Until `set_topology` is called with nodes, nodes are placed along the robot's path.
+    """
+
+    def __init__(self, config: LocalAreaConfig | None = None) -> None:
+        self._config = config or LocalAreaConfig()
+        self._topology = TopologicalMap()
+        self._trail: _Trail | None = _Trail(self._topology, self._config.trail_m)
+        self._features_at: dict[int, set[int]] = {}
+        self._nodes_of: dict[int, set[int]] = {}
+        # Ids and positions of the nodes that could be nearest, and the position (2,) of the robot
+        # when they were listed.
+        self._ids: list[int] = []
+        self._places: Array = np.empty((0, 2))
+        self._listed_at: Array = np.full(2, np.inf)
+        # Positions of the nodes with features when they were last listed, and their map.
+        self._place_of: dict[int, Array] = {}
+        self._listed: TopologicalMap | None = None
+
+    def set_topology(self, topology: TopologicalMap) -> None:
+        """Set the topological map: a newer version of the same map, or the same object, changed.
+
+        Features at removed nodes move to other nodes when nodes are next listed.
+        """
+        if not topology.nodes:
+            return
+        before = self._topology
+        trail = self._trail
+        self._topology = topology
+        self._trail = None
+        if trail is not None:
+            self._place_of = {i: before.nodes[i].position for i in self._features_at}
+            self._hand_over(list(self._features_at))
+            self._listed_at = np.full(2, np.inf)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Stored features (K, 2) as (feature, node), and the ids and positions of the nodes."""
+        nodes = self._topology.nodes
+        stored = [(f, n) for f, at in self._nodes_of.items() for n in sorted(at) if n in nodes]
+        ids = sorted({n for _, n in stored})
+        return {
+            'stored_at': np.array(stored, dtype=np.int64).reshape(-1, 2),
+            'node_ids': np.array(ids, dtype=np.int64),
+            'node_places': np.array([nodes[n].position for n in ids]).reshape(-1, 2),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Restore a saved `state`; its nodes are used until a topology is set.
+
+        state: checked by FIELDS. Raises InputError if features are stored at unknown nodes.
+        """
+        snapshot.require_unique(state['node_ids'], 'features: node')
+        used = state['stored_at'][:, 1]
+        snapshot.require_known(used, state['node_ids'], 'features: stored at node')
+        ids = state['node_ids'].tolist()
+        places = state['node_places']
+        if not ids:
+            return
+        nodes = [
+            Node(i, NodeKind.CORNER, x, y, 0.0)
+            for i, (x, y) in zip(ids, places.tolist(), strict=True)
+        ]
+        self._topology = TopologicalMap(nodes)
+        self._trail = None
+        self._ids = ids
+        self._places = places
+        self._place_of = dict(zip(ids, places, strict=True))
+        for feature_id, node_id in state['stored_at'].tolist():
+            self._put(feature_id, node_id)
+
+    def nodes_of(self, feature_id: int) -> list[int]:
+        """Ids of the nodes at which a feature is stored."""
+        return sorted(self._nodes_of.get(feature_id, ()))
+
+    def store(self, T_map_base: Array, feature_ids: list[int]) -> None:
+        """Store features that were observed from a pose (3,) at its nearest node."""
+        if self._trail is not None and self._trail.follow(T_map_base):
+            self._list_nodes(T_map_base)
+        node = self._node_at(T_map_base)
+        if node is not None:
+            for feature_id in feature_ids:
+                self._put(feature_id, node)
+
+    def remove(self, feature_id: int, heir: int | None = None) -> None:
+        """Remove a feature; if it was merged into another one, heir, store that instead."""
+        for node_id in self._nodes_of.pop(feature_id, set()):
+            self._features_at[node_id].discard(feature_id)
+            if heir is not None:
+                self._put(heir, node_id)
+
+    def features_near(self, T_map_base: Array, half_view_rad: float) -> set[int]:
+        """Features of the local area at a pose (3,).
+
+        half_view_rad: half of the laser's field of view.
+        """
+        here = self._node_at(T_map_base)
+        if here is None:
+            return set()
+        found = set(self._features_at.get(here, ()))
+        for node_id in self._along_edges(here):
+            bearing, distance = _from_robot(T_map_base, self._topology.nodes[node_id].position)
+            if abs(bearing) <= half_view_rad or distance <= self._config.beside_m:
+                found |= self._features_at.get(node_id, set())
+        return found
+
+    def _along_edges(self, here: int) -> list[int]:
+        """Nodes connected to a node: its neighbours, and others within reach along edges."""
+        lengths = {here: 0.0}
+        open_ids = [here]
+        while open_ids:
+            node_id = min(open_ids, key=lengths.__getitem__)
+            open_ids.remove(node_id)
+            for edge in self._topology.edges_at(node_id):
+                length = lengths[node_id] + edge.length_m
+                if node_id != here and length > self._config.path_m:
+                    continue
+                other = edge.other(node_id)
+                if other not in lengths:
+                    open_ids.append(other)
+                lengths[other] = min(length, lengths.get(other, length))
+        return [i for i in lengths if i != here]
+
+    def _node_at(self, T_map_base: Array) -> int | None:
+        """Nearest node; among nodes about as near, the one with the smallest bearing."""
+        if math.dist(T_map_base[:2], self._listed_at) > self._config.near_m:
+            self._list_nodes(T_map_base)
+        distances = np.hypot(*(self._places - T_map_base[:2]).T)
+        cost = math.inf
+        best = None
+        for i in np.flatnonzero(distances <= distances.min(initial=np.inf) + self._config.near_m):
+            bearing, distance = _from_robot(T_map_base, self._places[i])
+            if (
+                distance + self._config.turn_m_rad * abs(bearing) < cost
+                and self._ids[i] in self._topology.nodes
+            ):
+                cost = distance + self._config.turn_m_rad * abs(bearing)
+                best = self._ids[i]
+        return best
+
+    def _list_nodes(self, T_map_base: Array) -> None:
+        """List the nodes near a pose (3,).
+
+        Called once per metre; its time does not depend on the size of the map if nodes are near.
+        """
+        topology = self._topology
+        (x, y) = T_map_base[:2].tolist()
+        near = topology.nodes_near(x, y, self._config.list_m)
+        # After the next metre the nearest node may be a metre farther away, and nodes about as near
+        # another metre.
+        nearest = min((math.hypot(n.x - x, n.y - y) for n in near), default=math.inf)
+        sure = nearest + 3.0 * self._config.near_m
+        if sure > self._config.list_m:
+            near = list(topology.nodes.values())
+        self._ids = [node.id for node in near]
+        self._places = np.array([(n.x, n.y) for n in near]).reshape(-1, 2)
+        self._listed_at = T_map_base[:2].copy()
+        gone = self._features_at.keys() - topology.nodes.keys()
+        self._note_places(near if topology is self._listed else list(topology.nodes.values()))
+        self._listed = topology
+        self._hand_over(sorted(gone))
+
+    def _note_places(self, nodes: list[Node]) -> None:
+        """Store the positions of nodes with features.
+
+        In a map that is changed in place, distant nodes do not move.
+        """
+        self._place_of.update(
+            (node.id, node.position) for node in nodes if node.id in self._features_at
+        )
+
+    def _hand_over(self, gone: list[int]) -> None:
+        """Move the features of removed nodes to the nodes nearest to their former positions."""
+        features = {node_id: self._features_at.pop(node_id) for node_id in gone}
+        for node_id, left in features.items():
+            for feature_id in left:
+                self._nodes_of[feature_id].discard(node_id)
+        for node_id in gone:
+            x, y = self._place_of.pop(node_id).tolist()
+            heir = self._topology.nearest_node(x, y)
+            if heir is not None:
+                for feature_id in features[node_id]:
+                    self._put(feature_id, heir.id)
+
+    def _put(self, feature_id: int, node_id: int) -> None:
+        if node_id not in self._features_at:
+            self._place_of[node_id] = self._topology.nodes[node_id].position
+        self._features_at.setdefault(node_id, set()).add(feature_id)
+        self._nodes_of.setdefault(feature_id, set()).add(node_id)
+
+
+class _Trail:
+    """Places nodes along the robot's path in a topological map; returning to one reuses it."""
+
+    def __init__(self, topology: TopologicalMap, spacing_m: float) -> None:
+        self._map = topology
+        self._spacing_m = spacing_m
+        self._last: int | None = None
+        self._next_id = 1
+
+    def follow(self, T_map_base: Array) -> bool:
+        """Update by the robot's pose (3,); returns whether nodes or edges were added."""
+        x = float(T_map_base[0])
+        y = float(T_map_base[1])
+        node = self._map.nearest_node(x, y)
+        last = self._last
+        known = len(self._map.nodes) + len(self._map.edges)
+        if node is None or math.dist(node.position, (x, y)) > self._spacing_m:
+            node = Node(self._take_id(), NodeKind.CORNER, x, y, 0.0)
+            self._map.put_node(node)
+        if last is not None and last != node.id and node.id not in self._map.neighbours(last):
+            path = np.array([self._map.nodes[last].position, node.position])
+            length = math.dist(*path)
+            self._map.put_edge(Edge(self._take_id(), last, node.id, path, length, 0.0))
+        self._last = node.id
+        return len(self._map.nodes) + len(self._map.edges) != known
+
+    def _take_id(self) -> int:
+        self._next_id += 1
+        return self._next_id - 1
+
+
+def _from_robot(T_map_base: Array, place: Array) -> tuple[float, float]:
+    """Bearing (rad, robot frame) and distance (m) of a position (2,), map frame."""
+    dx = float(place[0] - T_map_base[0])
+    dy = float(place[1] - T_map_base[1])
+    return wrap(math.atan2(dy, dx) - float(T_map_base[2])), math.hypot(dx, dy)
+
 
 # Standard deviations of real walls about a straight line; with less, the filter is overconfident.
 WALL_FLATNESS_M = 0.02
+
 _WALL_FLATNESS_RAD = 0.006
+
 MAX_MISSES = 5  # consecutive scans through a feature until it is removed: a door has opened
+
 _SPARE = 8  # additional features that may stay in the local area
+
 _ROUNDING = 1e-6  # relative rounding error that is accepted in a covariance
+
 FIELDS = {
     'ids': Field(np.int64, ('n',), 1, MAX_ID),
     'lines': Field(
@@ -66,7 +568,7 @@ FIELDS = {
         ),
     ),
     'next_id': Field(np.int64, (), 1, MAX_ID),
-    **local_area.FIELDS,
+    **AREA_FIELDS,
 }
 
 
