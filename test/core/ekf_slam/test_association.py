@@ -8,8 +8,7 @@ from scipy.stats import chi2
 from support.slam_room import BLIND, ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.ekf import EkfSlam
-from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.ekf import CompressedEkf, EkfSlam
 from thinmap_ros.core.ekf_slam.feature_map import (
     MAX_MISSES,
     AssociationConfig,

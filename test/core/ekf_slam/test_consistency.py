@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from support.slam_room import BLIND
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.ekf import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import (
     WALL_FLATNESS_M,
     AssociationConfig,

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from reference_filter import DenseFilter
 
-from thinmap_ros.core.ekf_slam.ekf import EkfSlam
-from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf, _Store
+from thinmap_ros.core.ekf_slam.ekf import CompressedEkf, EkfSlam, _Store
 from thinmap_ros.core.ekf_slam.features import observe_line
 from thinmap_ros.core.se2 import compose
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import part
 from thinmap_ros.core.ekf_slam import feature_map
-from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.ekf import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import AssociationConfig, FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.features import (
     LineConfig,

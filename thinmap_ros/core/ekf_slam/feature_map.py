@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.ekf_slam.ekf import EkfSlam, line_difference
-from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.ekf import CompressedEkf, EkfSlam, line_difference
 from thinmap_ros.core.ekf_slam.features import (
     FeatureTrack,
     LineFeature,

@@ -6,7 +6,7 @@ from time import process_time
 
 import numpy as np
 
-from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.ekf import CompressedEkf
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.experiments.drives import Source
