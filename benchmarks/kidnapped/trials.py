@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from benchmarks.worlds import floors
 from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.places.global_localizer import GlobalLocalization, Hypothesis, Result, State
+from thinmap_ros.core.places.global_localizer import (
+    GlobalLocalization,
+    PoseHypothesis,
+    Result,
+    SearchState,
+)
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
@@ -111,7 +116,7 @@ def along(samples: Iterable[DriveSample], limit_m: float) -> Iterator[tuple[Driv
             return
 
 
-def offset(found: Hypothesis, truth: Array) -> tuple[float, float]:
+def offset(found: PoseHypothesis, truth: Array) -> tuple[float, float]:
     """How far a hypothesis is from where the robot truly is (3,): m and rad."""
     off = found.T_map_base - truth
     return float(np.hypot(off[0], off[1])), abs(wrap(float(off[2])))
@@ -171,7 +176,7 @@ def watch_twins(
     ]
     return {
         'steps': len(results),
-        'sure': sum(result.state == State.LOCALIZED for result in results),
+        'sure': sum(result.state == SearchState.LOCALIZED for result in results),
         'equal': sum(_gap(result) < 0.1 for result in results),
     }
 
@@ -193,7 +198,7 @@ def watch_foreign(
     record: Record = {'said_m': '', 'sure_m': '', 'last': ''}
     for sample, way in along(samples, limit_m):
         state = finder.step(sample.scan, sample.T_odom_base).state
-        for key, wanted in (('said_m', State.NOT_IN_MAP), ('sure_m', State.LOCALIZED)):
+        for key, wanted in (('said_m', SearchState.NOT_IN_MAP), ('sure_m', SearchState.LOCALIZED)):
             if state == wanted and record[key] == '':
                 record[key] = round(way, 2)
         record['last'] = state.name

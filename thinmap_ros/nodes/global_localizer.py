@@ -13,12 +13,8 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.active_search import ActiveSearch
-from thinmap_ros.core.places.global_localizer import (
-    GlobalLocalization,
-    GlobalLocalizationConfig,
-    Result,
-    State,
-)
+from thinmap_ros.core.places.config import GlobalLocalizationConfig
+from thinmap_ros.core.places.global_localizer import GlobalLocalization, Result, SearchState
 from thinmap_ros.core.planning.navigator import (
     CONTROL_PERIOD_S,
     SENSOR_DELAY_NS,
@@ -51,11 +47,11 @@ _SAMPLES_PERIOD_NS = 1_000_000_000
 _PATH_MARGIN_M = 0.05
 _STOP_MARGIN_M = 0.04
 _STATES = {
-    State.WAITING: LocalizationStatus.WAITING,
-    State.SEARCHING: LocalizationStatus.SEARCHING,
-    State.AMBIGUOUS: LocalizationStatus.AMBIGUOUS,
-    State.LOCALIZED: LocalizationStatus.LOCALIZED,
-    State.NOT_IN_MAP: LocalizationStatus.NOT_IN_MAP,
+    SearchState.WAITING: LocalizationStatus.WAITING,
+    SearchState.SEARCHING: LocalizationStatus.SEARCHING,
+    SearchState.AMBIGUOUS: LocalizationStatus.AMBIGUOUS,
+    SearchState.LOCALIZED: LocalizationStatus.LOCALIZED,
+    SearchState.NOT_IN_MAP: LocalizationStatus.NOT_IN_MAP,
 }
 
 

@@ -13,7 +13,12 @@ from thinmap_ros.core.places.active_search import (
     common_patch,
 )
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
-from thinmap_ros.core.places.global_localizer import GlobalLocalization, Hypothesis, Result, State
+from thinmap_ros.core.places.global_localizer import (
+    GlobalLocalization,
+    PoseHypothesis,
+    Result,
+    SearchState,
+)
 from thinmap_ros.core.places.place_database import FREE, Places
 from thinmap_ros.core.planning.navigator import NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
@@ -134,9 +139,11 @@ def test_where_nothing_tells_places_apart_the_robot_goes_on_and_stands_when_all_
     )
     search = ActiveSearch(places, CONFIG, driving)
     for T in seen:
-        search.take(Result(State.AMBIGUOUS, '', ()), T)
+        search.take(Result(SearchState.AMBIGUOUS, '', ()), T)
     search.take(
-        Result(State.AMBIGUOUS, '', tuple(Hypothesis(T, np.eye(3), 0.5, 1.0) for T in starts)),
+        Result(
+            SearchState.AMBIGUOUS, '', tuple(PoseHypothesis(T, np.eye(3), 0.5, 1.0) for T in starts)
+        ),
         np.zeros(3),
     )
     scan = LaserScanner(LaserScannerConfig(), 0).scan(world_of(shut), starts[0], 0)

@@ -12,7 +12,7 @@ from support.small_floor import CELL_M, OFFICE, START, WAY, drive, floor, map_of
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.places.global_localizer import GlobalLocalization, State
+from thinmap_ros.core.places.global_localizer import GlobalLocalization, SearchState
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 
@@ -34,7 +34,7 @@ def is_right(hypothesis, T):
 @pytest.mark.parametrize('start', [START, (3.2, 6.7, -2.0), (6.2, 7.0, -0.5)])
 def test_a_robot_switched_on_anywhere_is_found_and_never_wrongly_sure(finder, start):
     results = run(finder, drive(OFFICE, start, WAY if start == START else [(0.1, 0.05)] * 25))
-    sure = [(result.pose, T) for result, T in results if result.state == State.LOCALIZED]
+    sure = [(result.pose, T) for result, T in results if result.state == SearchState.LOCALIZED]
     assert sure, results[-1][0].reason
     assert all(is_right(pose, T) for pose, T in sure)
     for pose, _ in sure:
@@ -50,7 +50,7 @@ def test_scans_may_have_different_numbers_of_beams(finder):
         fewer = replace(scan, ranges_m=scan.ranges_m[k % 4 :], angle_min_rad=first)
         looks.append((fewer, odometry, T))
     results = run(finder, looks)
-    sure = [(result.pose, T) for result, T in results if result.state == State.LOCALIZED]
+    sure = [(result.pose, T) for result, T in results if result.state == SearchState.LOCALIZED]
     assert sure and all(is_right(pose, T) for pose, T in sure)
 
 
@@ -75,14 +75,14 @@ def test_once_a_laser_proves_to_drop_out_the_search_starts_again(finder):
         looks.append((replace(scan, ranges_m=ranges, drops_out=k > 3), odometry, T))
     late = run(finder, looks)
     known = run(finder, [(replace(scan, drops_out=True), *rest) for scan, *rest in looks[4:]])
-    sure = [[r.state == State.LOCALIZED for r, _ in results] for results in (late, known)]
-    assert all(is_right(r.pose, T) for r, T in late if r.state == State.LOCALIZED)
+    sure = [[r.state == SearchState.LOCALIZED for r, _ in results] for results in (late, known)]
+    assert all(is_right(r.pose, T) for r, T in late if r.state == SearchState.LOCALIZED)
     assert sure[0].index(True) <= sure[1].index(True) + 4 + 2
 
 
 def test_a_robot_that_stands_still_is_not_sure(finder):
     looks = list(drive(OFFICE, START, [(0.0, 0.0)] * 15))
-    assert State.LOCALIZED not in [result.state for result, _ in run(finder, looks)]
+    assert SearchState.LOCALIZED not in [result.state for result, _ in run(finder, looks)]
 
 
 def test_twin_rooms_stay_equally_likely():
@@ -90,7 +90,7 @@ def test_twin_rooms_stay_equally_likely():
     cells = np.concatenate([room, np.full((60, 3), 100, dtype=np.int8), room], axis=1)
     results = run(GlobalLocalization(*map_of(cells)), drive(cells, (1.45, 3.0, 1.5), WAY))
     for result, T in results:
-        assert result.state == State.AMBIGUOUS
+        assert result.state == SearchState.AMBIGUOUS
         first, second = result.hypotheses[:2]
         assert abs(first.weight - second.weight) < 0.1
         assert is_right(first, T) or is_right(second, T)
@@ -100,7 +100,7 @@ def test_a_floor_that_looks_the_same_when_turned_by_180_degrees_stays_ambiguous(
     half = floor((0, 30, 35, 32), (40, 10, 45, 18), (8, 70, 12, 76))
     turned = np.maximum(half, half[::-1, ::-1])
     for result, T in run(GlobalLocalization(*map_of(turned)), drive(turned, START, WAY[:20])):
-        assert result.state == State.AMBIGUOUS
+        assert result.state == SearchState.AMBIGUOUS
         first, second = result.hypotheses[:2]
         assert abs(first.weight - second.weight) < 0.1
         assert is_right(first, T) or is_right(second, T)
@@ -113,8 +113,8 @@ def test_a_robot_in_another_building_is_told_so():
     way = [(0.15, 0.0)] * 20 + [(0.0, 0.4)] * 4 + [(0.15, 0.0)] * 15
     results = run(GlobalLocalization(*map_of(OFFICE)), drive(other, (-0.2, 2.7, 0.0), way))
     states = [result.state for result, _ in results]
-    assert State.NOT_IN_MAP in states
-    assert State.LOCALIZED not in states
+    assert SearchState.NOT_IN_MAP in states
+    assert SearchState.LOCALIZED not in states
 
 
 def test_a_pose_found_is_followed_and_a_robot_carried_off_is_found_again(finder):
@@ -124,27 +124,29 @@ def test_a_pose_found_is_followed_and_a_robot_carried_off_is_found_again(finder)
         for scan, odometry, T in drive(OFFICE, (6.2, 7.0, -0.5), [(0.15, 0.05)] * 30)
     ]
     results = run(finder, before + after)
-    assert results[len(before) - 1][0].state == State.LOCALIZED
+    assert results[len(before) - 1][0].state == SearchState.LOCALIZED
     wrong = [
         T for result, T in results[len(before) :] if result.pose and not is_right(result.pose, T)
     ]
     assert len(wrong) <= 3  # until the first observations there
-    assert results[-1][0].state != State.LOCALIZED or is_right(results[-1][0].pose, results[-1][1])
+    assert results[-1][0].state != SearchState.LOCALIZED or is_right(
+        results[-1][0].pose, results[-1][1]
+    )
 
 
 def test_what_is_wrong_with_a_scan_or_the_odometry_is_said_and_waited_for(finder):
     (scan, odometry, _), *rest = list(drive(OFFICE, START, WAY))
     finder.restart()
     result = finder.step(scan, np.array([0.0, np.nan, 0.0]))
-    assert result.state == State.WAITING
+    assert result.state == SearchState.WAITING
     assert 'odometry' in result.reason
     blind = replace(scan, ranges_m=np.full(scan.ranges_m.size, np.nan))
     result = finder.step(blind, odometry)
-    assert result.state == State.WAITING
+    assert result.state == SearchState.WAITING
     assert 'beam' in result.reason
     finder.step(scan, odometry)
     result = finder.step(rest[0][0], odometry + (40.0, 0.0, 0.0))
-    assert result.state == State.WAITING
+    assert result.state == SearchState.WAITING
     assert 'jumped' in result.reason
     jumped = [finder.step(s, o + (40.0, 0.0, 0.0)) for s, o, _ in rest[1:]]
     numbers = [
@@ -159,7 +161,7 @@ def test_a_scan_that_meets_nothing_leaves_all_open(finder):
         (replace(s, ranges_m=np.full(s.ranges_m.size, np.inf)), o, T) for s, o, T in scans
     ]
     results = run(finder, open_field)
-    assert {result.state for result, _ in results} == {State.SEARCHING}
+    assert {result.state for result, _ in results} == {SearchState.SEARCHING}
     assert len(finder.samples) == finder.config.samples
 
 

@@ -4,7 +4,7 @@ They are matched with what each scan shows.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -15,67 +15,140 @@ from thinmap_ros.core.config import config_or_default
 from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
-from thinmap_ros.core.places.fit import usual_share
 from thinmap_ros.core.places.hypotheses import Hypotheses, missed_beams
-from thinmap_ros.core.places.likelihood import Judge
-from thinmap_ros.core.places.observation import Observation, observe
-from thinmap_ros.core.places.observation_model import NodeModel, calibrate
+from thinmap_ros.core.places.likelihood import HEADING_NOISE_RAD, Judge
+from thinmap_ros.core.places.observation import Observation, observe, observed_beams
+from thinmap_ros.core.places.observation_model import (
+    NodeModel,
+    calibrate,
+    random_pose,
+    simulated_scan,
+)
 from thinmap_ros.core.places.place_database import Places
 from thinmap_ros.core.places.search import ODOMETRY_NOISE, KeyView, candidates, judged_before, moved
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-__all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Result', 'State']
+# Share of a scan that a map explains from the right place, by scans simulated in that map.
+
+_TRIALS = 400  # where walls are smooth, few places leave anything unexplained
+
+_MIN_RATIO = 0.7  # whatever the map looks like: what explains less is not the right place
+
+
+def usual_share(
+    places: Places,
+    judge: Judge,
+    like: Scan,
+    config: GlobalLocalizationConfig,
+    rng: np.random.Generator,
+) -> float:
+    """Share of beams that the map explains from the right place, of those it says something about.
+
+    like: a scan of the laser in question. Scans are made in the map at random poses, with noise,
+    and compared from poses that are as far off as those of a hypothesis where all is well. Smooth
+    walls round empty rooms explain nearly all; a map in which there are legs of chairs, and edges
+    wherever somebody went by, a good deal less.
+    """
+    counts = 0.0
+    asked = 0.0
+    for _ in range(_TRIALS):
+        T = random_pose(places, rng)
+        scan = simulated_scan(places, T, like)
+        noisy = scan.ranges_m + rng.normal(0.0, config.beam_noise_m, scan.ranges_m.size)
+        seen = observed_beams(replace(scan, ranges_m=noisy), config)
+        noise = (config.map_noise_m, config.map_noise_m, HEADING_NOISE_RAD)
+        off = rng.normal(size=3) * noise
+        explained, silent = judge.explained((T + off)[None], seen)
+        counts += float(explained[0])
+        asked += len(seen.ranges_m) - float(silent[0])
+    return max(counts / max(asked, 1.0), _MIN_RATIO)
+
+
+__all__ = [
+    'GlobalLocalization',
+    'GlobalLocalizationConfig',
+    'PoseHypothesis',
+    'Result',
+    'SearchState',
+]
 
 # Nearer to the last update, a scan shows the same again.
 _LOOK_M = 0.1
+
 _LOOK_RAD = 0.1
+
 # Updates from about the same place meet the same errors of the map; they are independent after so
 # much motion.
 _NEW_WAY_M = 0.5
+
 _NEW_TURN_RAD = 0.5
+
 # Independent updates that a place must have explained: more for each e-fold of places that looked
 # alike, and for each update before it turned up. An update counts the less, the more it leaves
 # unexplained of what it should explain in this map, and nothing from a share on: so many times what
 # the right one leaves unexplained there (no less than the least, as few scans were made in the map;
 # no more than the most), and more in rough maps, which draw things in part.
 _SURE_UPDATES = 1.0
+
 _SURE_UPDATES_CROWD = 0.75
+
 _SURE_UPDATES_LATE = 2.0
+
 _WORTHLESS_TIMES = 10.0
+
 _MIN_WORTHLESS = 0.0075
+
 _MAX_WORTHLESS = 0.03
+
 _WORTHLESS_ROUGH = 0.5
+
 # After so many independent updates, a place that explains must have lasted for this share of them,
 # but not for ever.
 _MANY_UPDATES = 16.0
+
 _LASTING_SHARE = 0.4
+
 _LASTING_UPDATES = 20.0
+
 # Largest standard deviations of an accepted pose: half the basin of convergence of scan matching.
 _SURE_M = 0.15
+
 _SURE_RAD = 0.07
+
 _VIEWS = 6
+
 _FRESH_SHARE = 0.2  # of the samples: drawn from the whole map during the search
+
 _FRESH_BEST = 100
+
 # Samples whose beams are followed, where the likeliest pose of a place leaves some unexplained.
 _LOOKED_ALONG = 300
+
 # Odometry that moves farther from one scan to the next has been reset, or the robot was carried.
 _JUMP_M = 1.5
+
 _JUMP_RAD = 2.0
+
 _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
+
 # A search that looked at all of the map and did not find the right place: this often. So who turns
 # up late is unlikely, but what one search misses the next ones may miss for the same reason: so
 # often they all do.
 _LOG_MISSED = math.log(0.3)
+
 _MIN_LOG_PRIOR = math.log(0.05)
+
 _TRUST_FROM = 0.6  # share of the beams that must be explained for that
+
 # Updates: once all places are known, the map is searched less often.
 _FIRST_SEARCHES = 6
+
 _LATER_EVERY = 4.0
 
 
-class State(IntEnum):
+class SearchState(IntEnum):
     """How the search stands."""
 
     WAITING = 0
@@ -86,7 +159,7 @@ class State(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class PoseHypothesis:
     """A place where the robot may be.
 
     T_map_base (3,), covariance (3, 3), weight, and share of beams it explains.
@@ -105,14 +178,14 @@ class Result:
     The state, why in words, and the hypotheses, the likeliest first.
     """
 
-    state: State
+    state: SearchState
     reason: str
-    hypotheses: tuple[Hypothesis, ...]
+    hypotheses: tuple[PoseHypothesis, ...]
 
     @property
-    def pose(self) -> Hypothesis | None:
+    def pose(self) -> PoseHypothesis | None:
         """The one place where the robot is, once it is sure; None before."""
-        return self.hypotheses[0] if self.state == State.LOCALIZED else None
+        return self.hypotheses[0] if self.state == SearchState.LOCALIZED else None
 
 
 class GlobalLocalization:
@@ -383,31 +456,35 @@ class GlobalLocalization:
         return np.asarray(enough & (known.ages >= least_age))
 
     def _waiting(self, reason: str) -> Result:
-        return Result(State.WAITING, reason, ())
+        return Result(SearchState.WAITING, reason, ())
 
     def _result(self, T_odom_base: Array) -> Result:
         known = self._known
         if not len(known):
-            return Result(State.SEARCHING, 'the scans show too little to tell places apart', ())
+            return Result(
+                SearchState.SEARCHING, 'the scans show too little to tell places apart', ()
+            )
         motion = np.zeros(3) if self._T_look is None else se2.between(self._T_look, T_odom_base)
         poses = moved(known.poses, motion)
         weights = known.weights
         shares = known.shares_explained
         order = np.lexsort((-shares, -known.log_weights))
         hypotheses = tuple(
-            Hypothesis(poses[k], known.covariances[k], float(weights[k]), float(shares[k]))
+            PoseHypothesis(poses[k], known.covariances[k], float(weights[k]), float(shares[k]))
             for k in order.tolist()
         )
         best = hypotheses[0]
         if self.is_sure:
             reason = f'one place explains {best.explained:.0%} of what was seen'
-            return Result(State.LOCALIZED, reason, hypotheses)
+            return Result(SearchState.LOCALIZED, reason, hypotheses)
         if self._way_m >= self.config.not_in_map_distance_m and not self._lasting().any():
             share = self.config.min_inlier_ratio * self._usual
             reason = f'no place explains {share:.0%} of what was seen for long'
-            return Result(State.NOT_IN_MAP, reason, hypotheses)
+            return Result(SearchState.NOT_IN_MAP, reason, hypotheses)
         likely = int((weights > 0.05 * weights.max()).sum())
         if likely > 1:
-            return Result(State.AMBIGUOUS, f'{likely} places explain what was seen', hypotheses)
+            return Result(
+                SearchState.AMBIGUOUS, f'{likely} places explain what was seen', hypotheses
+            )
         reason = f'one place, not yet sure: {best.explained:.0%} explained'
-        return Result(State.SEARCHING, reason, hypotheses)
+        return Result(SearchState.SEARCHING, reason, hypotheses)

@@ -6,7 +6,7 @@ from itertools import islice
 import numpy as np
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.places.global_localizer import GlobalLocalization, Result, State
+from thinmap_ros.core.places.global_localizer import GlobalLocalization, Result, SearchState
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import build
@@ -63,7 +63,7 @@ def run(source: Source) -> Outcome:
         first = None
         for step, sample in enumerate(drive_samples, 1):
             result = finder.step(sample.scan, sample.T_odom_base)
-            state = State(result.state).name.lower()
+            state = SearchState(result.state).name.lower()
             rows.append([seed, step, _candidates(result), state, *_error(result, sample)])
             if first is None and result.pose is not None:
                 first = step
