@@ -9,7 +9,7 @@ from support.small_floor import CELL_M, OFFICE, START, drive, floor, map_of
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.places import likelihood_kernels
+from thinmap_ros.core.places import likelihood
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.likelihood import Judge
 from thinmap_ros.core.places.observation import observe, observed_beams, profile
@@ -53,7 +53,7 @@ def origin(places):
 def test_range_scores_are_the_sums_of_a_table(places, seen, poses):
     table = np.cos(np.arange(256.0))
     ends = seen.ends[seen.met]
-    found = likelihood_kernels.range_scores(poses, ends, places.near, origin(places), CELL_M, table)
+    found = likelihood.range_scores(poses, ends, places.near, origin(places), CELL_M, table)
     for T, score in zip(poses, found, strict=True):
         cells = places.frame.cells_of(se2.transform_points(T, ends))
         inside = ((cells >= 0) & (cells < places.near.shape)).all(axis=1)
@@ -100,9 +100,7 @@ def test_node_scores_are_those_of_the_nearest_node_in_sight(places, poses):
     model = np.array([0.3, 0.8, 0.5]), np.array([0.4, 0.3, 0.5]), np.array([20.0, 30.0, 10.0])
     sights = (places.blocks, places.first, places.in_sight)
     block_m = places.block_cells * CELL_M
-    found = likelihood_kernels.node_scores(
-        poses, nodes, kinds, sights, origin(places), block_m, *model
-    )
+    found = likelihood.node_scores(poses, nodes, kinds, sights, origin(places), block_m, *model)
     for T, score in zip(poses, found, strict=True):
         col, row = np.trunc((T[:2] - origin(places)) / block_m).astype(int)
         inside = 0 <= row < places.blocks.shape[0] and 0 <= col < places.blocks.shape[1]
@@ -146,7 +144,7 @@ def test_free_way_ends_where_small_steps_do(places):
 def test_the_true_pose_explains_nearly_all_and_one_behind_a_wall_little(places, seen):
     T = se2.pose(*START)
     tried = np.array([T, T + (4.5, 1.0, 0.0), T + (0.0, 0.0, 1.5)])
-    counts, silent = likelihood_kernels.explained(
+    counts, silent = likelihood.explained(
         tried,
         seen.laser,
         seen.ranges_m,
@@ -170,7 +168,7 @@ def test_of_the_unknown_the_map_says_nothing(places, seen):
     x, y = (se2.pose(*START)[:2] - origin(places)) / CELL_M
     ways = [free_way(states, x, y, START[2] + bearing, 500.0)[0] for bearing in seen.bearings_rad]
     ranges = np.where(seen.met, (np.array(ways) + 1e-3) * CELL_M, seen.ranges_m)
-    counts, silent = likelihood_kernels.explained(
+    counts, silent = likelihood.explained(
         se2.pose(*START)[None],
         seen.laser,
         ranges,
@@ -191,15 +189,13 @@ def test_refinement_comes_back_to_the_true_pose_and_never_fits_worse(places, see
     steps = np.array([[0.08, 0.03], [0.04, 0.015], [0.02, 0.008]])
     starts = se2.pose(*START) + np.array([[0.1, -0.1, 0.05], [-0.12, 0.05, -0.06], [0.0, 0.0, 0.0]])
     free = np.zeros((3, 3, 3))
-    before = likelihood_kernels.range_scores(
-        starts, ends, places.near, origin(places), CELL_M, table
-    )
-    found, scores = likelihood_kernels.refine(
+    before = likelihood.range_scores(starts, ends, places.near, origin(places), CELL_M, table)
+    found, scores = likelihood.refine(
         starts, ends, places.near, origin(places), CELL_M, table, steps, 8, starts, free
     )
     assert (scores >= before).all()
     assert np.hypot(*(found - START)[:, :2].T).max() < 0.12
-    held, _ = likelihood_kernels.refine(
+    held, _ = likelihood.refine(
         starts,
         ends,
         places.near,
@@ -223,7 +219,7 @@ def test_spots_are_those_whose_ranges_agree_best(places, seen):
     high = np.where(
         known & met, np.clip((ranges + slack) / RANGE_UNIT_M, 0.0, 255.0), 255.0
     ).astype(np.uint8)
-    spots, headings, counts = likelihood_kernels.spot_scores(places.around, low, high, 0)
+    spots, headings, counts = likelihood.spot_scores(places.around, low, high, 0)
     for k in range(0, len(spots), 97):
         turned = np.roll(places.around[spots[k]], -headings[k])
         assert counts[k] == ((turned >= low) & (turned <= high)).sum()

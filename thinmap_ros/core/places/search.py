@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.places import likelihood_kernels
+from thinmap_ros.core.places import likelihood
 from thinmap_ros.core.places.likelihood import SILENT_COUNTS, Judge
 from thinmap_ros.core.places.observation import Observation, profile
 from thinmap_ros.core.places.place_database import DIRECTIONS, RANGE_UNIT_M, Places
@@ -63,7 +63,7 @@ def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> 
     low = np.where(known, nearest, 0.0).astype(np.uint8)
     high = np.where(known & met, farthest, 255.0).astype(np.uint8)
     least = DIRECTIONS - round((1.0 - _MIN_SHARE) * int(known.sum()))
-    spots, headings, counts = likelihood_kernels.spot_scores(places.around, low, high, least)
+    spots, headings, counts = likelihood.spot_scores(places.around, low, high, least)
     # Equals in random order: where there are too many, each has its chance.
     order = np.argsort(-(counts + rng.random(len(counts))), kind='stable')[:_MAX_SPOTS]
     turns = headings[order] * (2.0 * np.pi / DIRECTIONS)
