@@ -16,8 +16,8 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
     from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
     from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-    from thinmap_ros.core.places.config import GlobalLocalizationConfig
     from thinmap_ros.core.places.global_localizer import GlobalLocalization as GlobalLocalizer
+    from thinmap_ros.core.places.place_database import GlobalLocalizationConfig
     from thinmap_ros.core.planning.paths import shortest_path
     from thinmap_ros.core.scan import LaserConfig, Scan
     from thinmap_ros.core.slam.localizer_config import LocalizerConfig
@@ -113,7 +113,7 @@ _PLACES = {
     'write_graph': 'files.graphs.write_graph',
     # localization in a finished map
     'GlobalLocalizer': 'core.places.global_localizer.GlobalLocalization',
-    'GlobalLocalizationConfig': 'core.places.config.GlobalLocalizationConfig',
+    'GlobalLocalizationConfig': 'core.places.place_database.GlobalLocalizationConfig',
     # exploration, also in the simulator
     'ExplorationOptions': 'closed_loop.Options',
     'LaserScannerConfig': 'sim.laser.LaserScannerConfig',

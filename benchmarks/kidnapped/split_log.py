@@ -12,8 +12,7 @@ from benchmarks.kidnapped.trials import Map, Record, fresh, prepared, search
 from thinmap_ros.core import se2
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.places.likelihood import Judge
-from thinmap_ros.core.places.observation import observe
-from thinmap_ros.core.places.observation_model import calibrate
+from thinmap_ros.core.places.place_database import calibrate, observe
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer

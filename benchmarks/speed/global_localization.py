@@ -13,11 +13,14 @@ from benchmarks.kidnapped.summary import summary
 from benchmarks.kidnapped.trials import shifted_map
 from benchmarks.time_and_memory import median_seconds
 from benchmarks.worlds import floors
-from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.likelihood import Judge
-from thinmap_ros.core.places.observation import observe
-from thinmap_ros.core.places.observation_model import NodeModel, random_pose
-from thinmap_ros.core.places.place_database import Places
+from thinmap_ros.core.places.place_database import (
+    GlobalLocalizationConfig,
+    NodeModel,
+    Places,
+    observe,
+    random_pose,
+)
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.sim.drives import random_drive

@@ -12,8 +12,8 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
+from thinmap_ros.core.places.place_database import GlobalLocalizationConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array

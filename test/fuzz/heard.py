@@ -12,7 +12,7 @@ from thinmap_ros.core.config import Config, parameters_of, with_values
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.places.config import GlobalLocalizationConfig
+from thinmap_ros.core.places.place_database import GlobalLocalizationConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.localizer_config import LocalizerConfig

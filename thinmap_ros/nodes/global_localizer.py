@@ -13,8 +13,8 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.active_search import ActiveSearch
-from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import GlobalLocalization, Result, SearchState
+from thinmap_ros.core.places.place_database import GlobalLocalizationConfig
 from thinmap_ros.core.planning.navigator import (
     CONTROL_PERIOD_S,
     SENSOR_DELAY_NS,

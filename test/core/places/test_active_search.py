@@ -12,14 +12,13 @@ from thinmap_ros.core.places.active_search import (
     best_viewpoint,
     common_patch,
 )
-from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import (
     GlobalLocalization,
     PoseHypothesis,
     Result,
     SearchState,
 )
-from thinmap_ros.core.places.place_database import FREE, Places
+from thinmap_ros.core.places.place_database import FREE, GlobalLocalizationConfig, Places
 from thinmap_ros.core.planning.navigator import NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig

@@ -8,11 +8,9 @@ import pytest
 from support.small_floor import OFFICE, START, drive, map_of
 
 from thinmap_ros.core.grid.patch import UNKNOWN
-from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import usual_share
 from thinmap_ros.core.places.likelihood import Judge
-from thinmap_ros.core.places.observation_model import calibrate
-from thinmap_ros.core.places.place_database import Places
+from thinmap_ros.core.places.place_database import GlobalLocalizationConfig, Places, calibrate
 
 CONFIG = GlobalLocalizationConfig()
 

@@ -10,18 +10,20 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.places import likelihood
-from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.likelihood import Judge
-from thinmap_ros.core.places.observation import observe, observed_beams, profile
-from thinmap_ros.core.places.observation_model import calibrate
 from thinmap_ros.core.places.place_database import (
     DIRECTIONS,
     NEAR_UNIT_M,
     NODE_WINDOW_M,
     RANGE_UNIT_M,
     SIGHT_UNIT_M,
+    GlobalLocalizationConfig,
     Places,
+    calibrate,
     free_way,
+    observe,
+    observed_beams,
+    profile,
 )
 
 CONFIG = GlobalLocalizationConfig()

@@ -14,17 +14,19 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import config_or_default
 from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.hypotheses import Hypotheses, missed_beams
 from thinmap_ros.core.places.likelihood import HEADING_NOISE_RAD, Judge
-from thinmap_ros.core.places.observation import Observation, observe, observed_beams
-from thinmap_ros.core.places.observation_model import (
+from thinmap_ros.core.places.place_database import (
+    GlobalLocalizationConfig,
     NodeModel,
+    Observation,
+    Places,
     calibrate,
+    observe,
+    observed_beams,
     random_pose,
     simulated_scan,
 )
-from thinmap_ros.core.places.place_database import Places
 from thinmap_ros.core.places.search import ODOMETRY_NOISE, KeyView, candidates, judged_before, moved
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array

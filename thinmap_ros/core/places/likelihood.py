@@ -8,15 +8,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.places.config import GlobalLocalizationConfig
-from thinmap_ros.core.places.observation import Observation
-from thinmap_ros.core.places.observation_model import NodeModel
 from thinmap_ros.core.places.place_database import (
     NEAR_UNIT_M,
     SIGHT_UNIT_M,
     UNKNOWN,
     WALL,
     Bytes,
+    GlobalLocalizationConfig,
+    NodeModel,
+    Observation,
     Places,
     Short,
     free_way,

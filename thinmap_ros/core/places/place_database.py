@@ -1,37 +1,121 @@
-"""What a finished map shows at each place: walls near by, ranges all round, nodes in sight."""
+"""What a finished map shows at each place, what one scan shows, and how reliable its nodes are."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import Config, laser_range_noise, parameter, robot_radius
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.fields import distance_cells
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup, line_is_clear
-from thinmap_ros.core.places.config import GlobalLocalizationConfig
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.topology import build
 from thinmap_ros.jit import kernel
 
+# Parameters of global localization.
+
+# A better laser meets walls that are rougher than it measures; the results were measured with this.
+_MIN_BEAM_NOISE_M = 0.02
+
+
+@dataclass(frozen=True)
+class GlobalLocalizationConfig(Config):
+    """How many samples, how often updated, what counts as explained, when the robot is sure."""
+
+    samples: int = parameter(
+        5000,
+        'Number of samples of the pose. Raise it for large maps, lower it to save time.',
+        low=100,
+        high=100_000,
+    )
+    max_beams: int = parameter(
+        60,
+        'Number of beams of a scan that are compared with the map. Raise it for similar rooms, '
+        'lower it to save time.',
+        low=8,
+        high=1000,
+    )
+    compared_range_m: float = 15.0  # longer ranges decide little and take time
+    robot_radius_m: float = robot_radius()
+    laser_range_noise_m: float = laser_range_noise()
+    map_noise_m: float = parameter(
+        0.05,
+        'Standard deviation of the position of a correct hypothesis in the map (m). Raise it for '
+        'a map with errors.',
+        low=0.001,
+        high=1.0,
+    )
+    accept_weight: float = parameter(
+        0.99,
+        'Smallest weight of the hypothesis that is accepted. Raise it against false localization, '
+        'lower it to be localized sooner.',
+        low=0.6,
+        high=1.0,
+    )
+    accept_updates: int = parameter(
+        3,
+        'Consecutive updates with one hypothesis before it is accepted. Raise it against false '
+        'localization, lower it to be localized sooner.',
+        low=1,
+        high=1000,
+    )
+    min_inlier_ratio: float = parameter(
+        0.8,
+        'Smallest inlier ratio of an accepted hypothesis, relative to the expected one. Lower it '
+        'where furniture has moved, raise it against false localization.',
+        low=0.3,
+        high=1.0,
+    )
+    not_in_map_distance_m: float = parameter(
+        2.0,
+        'Travelled distance without a hypothesis after which NOT_IN_MAP is reported (m). Raise it '
+        'for places that have changed much.',
+        low=0.0,
+        high=100.0,
+    )
+
+    @property
+    def beam_noise_m(self) -> float:
+        """Standard deviation of a range that is compared with the map (m)."""
+        return max(self.laser_range_noise_m, _MIN_BEAM_NOISE_M)
+
+
 Mask = NDArray[np.bool_]
+
 Bytes = NDArray[np.uint8]
+
 Short = NDArray[np.int16]
 
 DIRECTIONS = 72
+
 # Side of the square round the robot in which the nodes of a scan are observed and compared.
 NODE_WINDOW_M = 10.0
+
 NEAR_UNIT_M = 0.004  # of the distance to the nearest wall: up to 1.02 m in a byte
+
 RANGE_UNIT_M = 0.05  # of the ranges all round: up to 12.75 m in a byte
+
 _NEAR_CAP = 255
+
 _SPACING_M = 0.3
+
 _MAX_PLACES = 100_000
+
 _BLOCK_M = 0.5  # nodes in sight are listed for blocks of this size
+
 SIGHT_UNIT_M = 0.002  # of where these lie, from the corner of their block: up to 65 m in two bytes
 
 FREE = 0
+
 WALL = 1
+
 UNKNOWN = 2
 
 
@@ -238,3 +322,211 @@ def _list_sights(
                 count += 1
         first[i + 1] = count
     return first, in_sight[:count].copy()
+
+
+# What one scan shows: some of its beams, and the nodes of its own topological map.
+
+# One scan alone has to make cells free and occupied.
+_P_FREE = 0.2
+
+_P_OCCUPIED = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Beams and nodes of one scan in the robot frame.
+
+    laser (3,): its pose on the robot; ranges_m, bearings_rad (B,): beams from there, ranges cut at
+    what is usable; ends (B, 2): where they end; met (B,): whether they met something there; nodes
+    (K, 2): places of the nodes of the scan's topological map, and their kinds (K,).
+    """
+
+    laser: Array
+    ranges_m: Array
+    bearings_rad: Array
+    ends: Array
+    met: NDArray[np.bool_]
+    nodes: Array
+    node_kinds: NDArray[np.int64]
+
+
+def observe(scan: Scan, resolution_m: float, config: GlobalLocalizationConfig) -> Observation:
+    """Observation of a scan; the nodes are those of a grid with the map's resolution."""
+    nodes, kinds = observed_nodes(scan, resolution_m, config)
+    return replace(observed_beams(scan, config), nodes=nodes, node_kinds=kinds)
+
+
+def observed_beams(scan: Scan, config: GlobalLocalizationConfig) -> Observation:
+    """Observation of a scan without its nodes: beams alone."""
+    usable = np.flatnonzero(scan.returned | scan.no_return)
+    if usable.size > config.max_beams:
+        usable = usable[
+            np.linspace(0.0, usable.size - 1.0, config.max_beams).round().astype(np.int64)
+        ]
+    farthest = min(scan.range_max_m, scan.max_range_m, config.compared_range_m)
+    met = scan.hit[usable] & (scan.ranges_m[usable] < farthest)
+    ranges = np.where(met, scan.ranges_m[usable], farthest)
+    bearings = scan.angles_rad[usable]
+    ends = se2.transform_points(
+        scan.T_base_laser, np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+    )
+    none = np.empty(0, dtype=np.int64)
+    return Observation(scan.T_base_laser, ranges, bearings, ends, met, np.empty((0, 2)), none)
+
+
+def observed_nodes(
+    scan: Scan, resolution_m: float, config: GlobalLocalizationConfig
+) -> tuple[Array, NDArray[np.int64]]:
+    """Nodes (K, 2), robot frame, and their kinds (K,), of the topological map of one scan alone.
+
+    Source: topological map paper section 2.1; the active window is a square round the robot.
+    """
+    half = NODE_WINDOW_M / 2.0
+    grid = OccupancyGrid(
+        OccupancyConfig(
+            resolution_m=resolution_m,
+            p_miss=_P_FREE,
+            p_hit=_P_OCCUPIED,
+            no_return_clear_range_m=half,
+        )
+    )
+    grid.add_scan(replace(scan, max_range_m=min(scan.max_range_m, half)), np.zeros(3))
+    window = grid.window(0.0, 0.0, NODE_WINDOW_M)
+    topology = build(window, (0.0, 0.0), TopologyConfig(robot_radius_m=config.robot_radius_m))
+    nodes = np.array([node.position for node in topology.nodes.values()]).reshape(-1, 2)
+    return nodes, np.array([int(node.kind) for node in topology.nodes.values()], dtype=np.int64)
+
+
+def profile(observation: Observation) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Range in each of DIRECTIONS round the robot.
+
+    Ranges (DIRECTIONS,), m, which are known, and which met something.
+
+    Direction k covers the bearings k / DIRECTIONS of a turn, robot frame; of several beams the one
+    nearest to its middle counts. Ranges are cut at what `Places.around` can hold.
+    """
+    most = 254 * RANGE_UNIT_M
+    away = observation.ends
+    ranges = np.hypot(away[:, 0], away[:, 1])
+    turns = np.arctan2(away[:, 1], away[:, 0]) * (DIRECTIONS / (2.0 * math.pi))
+    bins = np.round(turns).astype(np.int64)
+    result = np.full(DIRECTIONS, most)
+    known = np.zeros(DIRECTIONS, dtype=np.bool_)
+    met = np.zeros(DIRECTIONS, dtype=np.bool_)
+    # The nearest to a direction's middle comes last and stays.
+    for k in np.argsort(-np.abs(turns - bins), kind='stable').tolist():
+        at = bins[k] % DIRECTIONS
+        result[at] = min(ranges[k], most)
+        known[at] = True
+        met[at] = bool(observation.met[k]) and ranges[k] < most
+    return result, known, met
+
+
+# Reliability of the nodes that a single scan shows, by scans simulated in the map.
+
+_TRIALS = 60
+
+_SAME_NODE_M = 1.0
+
+_RAYLEIGH_MEDIAN = 1.1774  # median distance of points with 1 sigma on each axis
+
+_VIEW_SHARE = 0.25  # of the active window: where an observed node may lie
+
+
+@dataclass(frozen=True, eq=False)
+class NodeModel:
+    """What an observed node is worth, by its kind (3,).
+
+    found: chance that the map has it; spread_m: 1 sigma of its place along each axis; gain: how
+    much likelier its place is, right there, than anywhere.
+    """
+
+    found: Array
+    spread_m: Array
+    gain: Array
+
+
+def calibrate(
+    places: Places, like: Scan, config: GlobalLocalizationConfig, rng: np.random.Generator
+) -> NodeModel:
+    """Node model for a map and a laser.
+
+    Scans are made in the map at random poses, and their nodes looked up in it.
+
+    like: a scan of that laser. So the tolerance follows from the grid and the sensor: from the
+    cells' size, the field of view, what a view from one side leaves unknown, and how the map's own
+    nodes were made.
+    """
+    distances: list[list[float]] = [[] for _ in NodeKind]
+    for _ in range(_TRIALS):
+        T = random_pose(places, rng)
+        nodes, kinds = observed_nodes(
+            simulated_scan(places, T, like), places.frame.resolution, config
+        )
+        away = se2.transform_points(T, nodes)[:, None, :] - places.nodes[None]
+        nearest = np.hypot(away[..., 0], away[..., 1]).min(axis=1)
+        for kind, distance in zip(kinds.tolist(), nearest.tolist(), strict=True):
+            distances[kind].append(distance)
+    chance = _chance(places)
+    window = _VIEW_SHARE * NODE_WINDOW_M**2
+    found = np.zeros(len(NodeKind))
+    spread = np.full(len(NodeKind), places.frame.resolution)
+    for kind in NodeKind:
+        all_of_it = np.array(distances[kind])
+        near = all_of_it[all_of_it < _SAME_NODE_M]
+        if near.size:
+            found[kind] = max(0.0, (near.size / all_of_it.size - chance) / (1.0 - chance))
+            spread[kind] = max(spread[kind], float(np.median(near)) / _RAYLEIGH_MEDIAN)
+    # A few trials do not prove a rate near 1.
+    return NodeModel(np.minimum(found, 0.9), spread, window / (2.0 * np.pi * spread**2))
+
+
+def random_pose(places: Places, rng: np.random.Generator) -> Array:
+    """Pose (3,) at which the robot can stand, each as likely as any other."""
+    at = places.frame.centres_of(
+        places.standing[rng.integers(len(places.standing))][None].astype(np.int64)
+    )[0]
+    return se2.pose(float(at[0]), float(at[1]), float(rng.uniform(-np.pi, np.pi)))
+
+
+def simulated_scan(places: Places, T_map_base: Array, like: Scan) -> Scan:
+    """The scan that a laser would make in the map, without noise.
+
+    What is unknown lets nothing through.
+    """
+    T_map_laser = se2.compose(T_map_base, like.T_base_laser)
+    resolution = places.frame.resolution
+    x = (T_map_laser[0] - places.frame.origin_x) / resolution
+    y = (T_map_laser[1] - places.frame.origin_y) / resolution
+    ranges = resolution * _ways(
+        places.states, x, y, T_map_laser[2] + like.angles_rad, like.range_max_m / resolution
+    )
+    return Scan.create(
+        like.stamp_ns,
+        ranges,
+        like.angle_min_rad,
+        like.angle_increment_rad,
+        like.range_min_m,
+        like.range_max_m,
+        like.T_base_laser,
+    )
+
+
+def _chance(places: Places) -> float:
+    """Share of the places in the map that have a node near by, whatever was observed."""
+    some = places.spots[:: max(1, len(places.spots) // 1000)]
+    away = some[:, None, :] - places.nodes[None]
+    return float((np.hypot(away[..., 0], away[..., 1]).min(axis=1) < _SAME_NODE_M).mean()) * (
+        1.0 - 1e-6
+    )
+
+
+@kernel
+def _ways(states: Bytes, x: float, y: float, angles: Array, most: float) -> Array:
+    """Cells to the first one that is not free, for each angle (N,); inf beyond `most`."""
+    ways = np.full(angles.size, np.inf)
+    for k in range(angles.size):
+        way, state = free_way(states, x, y, angles[k], most)
+        if state != FREE:
+            ways[k] = way
+    return ways

@@ -7,8 +7,13 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.places import likelihood
 from thinmap_ros.core.places.likelihood import SILENT_COUNTS, Judge
-from thinmap_ros.core.places.observation import Observation, profile
-from thinmap_ros.core.places.place_database import DIRECTIONS, RANGE_UNIT_M, Places
+from thinmap_ros.core.places.place_database import (
+    DIRECTIONS,
+    RANGE_UNIT_M,
+    Observation,
+    Places,
+    profile,
+)
 from thinmap_ros.core.se2 import Array
 
 # Standard deviation of odometry per metre and radian: of wheels that slip a little.
