@@ -10,6 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_CELL
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.places.global_localizer import Result
+from thinmap_ros.core.places.hypotheses import distinct_indices
 from thinmap_ros.core.places.place_database import (
     FREE,
     UNKNOWN,
@@ -19,7 +20,6 @@ from thinmap_ros.core.places.place_database import (
     Places,
     free_way,
 )
-from thinmap_ros.core.places.search import distinct_indices
 from thinmap_ros.core.planning.grid_search import escape_cells, traversable_cells
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
 from thinmap_ros.core.planning.wavefront import START_ESCAPE_M, WavefrontConfig, navigation_function

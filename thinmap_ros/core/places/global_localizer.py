@@ -14,7 +14,15 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import config_or_default
 from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.places.hypotheses import Hypotheses, missed_beams
+from thinmap_ros.core.places.hypotheses import (
+    ODOMETRY_NOISE,
+    Hypotheses,
+    KeyView,
+    candidates,
+    judged_before,
+    missed_beams,
+    moved,
+)
 from thinmap_ros.core.places.likelihood import HEADING_NOISE_RAD, Judge
 from thinmap_ros.core.places.place_database import (
     GlobalLocalizationConfig,
@@ -27,7 +35,6 @@ from thinmap_ros.core.places.place_database import (
     random_pose,
     simulated_scan,
 )
-from thinmap_ros.core.places.search import ODOMETRY_NOISE, KeyView, candidates, judged_before, moved
 from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
