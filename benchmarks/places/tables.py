@@ -12,10 +12,9 @@ from benchmarks.places import cases
 from benchmarks.places.recorded import RecordedPiece
 from benchmarks.places.truth import relative_errors, rigid_errors
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
-from thinmap_ros.core.places.recognition.decision import Decision, decide, recognize
+from thinmap_ros.core.places.recognition import JoinDecision, Recognition, decide, recognize
 from thinmap_ros.core.places.recognition.drawn_scans import drawn_piece
 from thinmap_ros.core.places.recognition.piece import MapPiece
-from thinmap_ros.core.places.recognition.recognition import Recognition
 from thinmap_ros.core.slam.joining.joined import JoinConfig, join
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
@@ -49,7 +48,7 @@ def _watched(known: RecordedPiece, query: RecordedPiece, maps: dict[str, MapPiec
     there = maps[known.name]
     own = maps[query.name]
     recognition = Recognition(there)
-    joined: Decision | None = None
+    joined: JoinDecision | None = None
     began = time.process_time()
     for view in own.views:
         recognition.add(view, own.landmarks.around(view))

@@ -8,7 +8,7 @@ from thinmap_ros.core.errors import InputError, ThinmapError, quoted
 from thinmap_ros.core.grid.edits import KeepOut, MapEdits, require_count
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.places.recognition.decision import JOIN_ODDS, recognize
+from thinmap_ros.core.places.recognition import JOIN_ODDS, recognize
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.joined import JoinedMap, join
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece

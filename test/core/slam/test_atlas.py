@@ -7,7 +7,7 @@ import pytest
 from support.carried_robot import carried
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.places.recognition.decision import JOIN_ODDS
+from thinmap_ros.core.places.recognition import JOIN_ODDS
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.stage import Destination
 

@@ -11,8 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.places.recognition.decision import decide
-from thinmap_ros.core.places.recognition.recognition import Placement, Recognition
+from thinmap_ros.core.places.recognition import Placement, Recognition, decide
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.joining.growing_piece import GrowingPiece

@@ -8,7 +8,7 @@ from rclpy.node import Node
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.places.recognition.decision import JOIN_ODDS
+from thinmap_ros.core.places.recognition import JOIN_ODDS
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.private_rclpy import given_parameters

@@ -10,7 +10,7 @@ from thinmap_ros.core.grid.correction import add_scan_outside
 from thinmap_ros.core.grid.edits import Erasure
 from thinmap_ros.core.grid.moved import MapMotion, overlaid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.places.recognition.recognition import Placement
+from thinmap_ros.core.places.recognition import Placement
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.places.recognition import PieceHypothesis
 from thinmap_ros.core.places.recognition.drift import DRIFT
-from thinmap_ros.core.places.recognition.recognition import Hypothesis
 from thinmap_ros.core.places.recognition.views import View
 from thinmap_ros.core.se2 import Array, inverse, rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, view_difference_m
@@ -27,7 +27,7 @@ Prior = tuple[int, Array]
 
 
 def placed_keyframes(
-    query: Sequence[Keyframe], views: Sequence[View], hypothesis: Hypothesis
+    query: Sequence[Keyframe], views: Sequence[View], hypothesis: PieceHypothesis
 ) -> Iterator[Prior]:
     """Keyframes of the views that a hypothesis places; views: all of the piece, by number."""
     placed = [views[number] for number in sorted(hypothesis.poses)]
@@ -67,7 +67,7 @@ def match_keyframes(
         yield Edge(j, k, se2.compose(T_j_base, match.pose), information, robust=True)
 
 
-def _pose_by(view: View, hypothesis: Hypothesis, frame: Keyframe) -> Array:
+def _pose_by(view: View, hypothesis: PieceHypothesis, frame: Keyframe) -> Array:
     T_view_frame = se2.between(view.T_piece_view, frame.T_map_base)
     return se2.compose(hypothesis.poses[view.number], T_view_frame)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from thinmap_ros.core.grid.moved import MapMotion, overlaid_bent
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
-from thinmap_ros.core.places.recognition.decision import JOIN_ODDS, recognize
+from thinmap_ros.core.places.recognition import JOIN_ODDS, recognize
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.joining.map_links import MapLink, MapLinks
