@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from thinmap_ros.core.places.recognition.views import WINDOW_M
+from thinmap_ros.core.places.views import WINDOW_M
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 from thinmap_ros.core.slam.matching.visibility import NOTHING, SeenThrough

@@ -7,8 +7,8 @@ import pytest
 from support.driven_pieces import KEYFRAME_M, driven_piece
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.places.recognition import views
-from thinmap_ros.core.places.recognition.views import ViewBuilder, views_of
+from thinmap_ros.core.places import views
+from thinmap_ros.core.places.views import ViewBuilder, views_of
 
 
 @pytest.fixture(scope='module')

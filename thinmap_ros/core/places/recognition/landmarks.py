@@ -10,7 +10,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.places.recognition.constellation_kernels import MAX_LENGTH_M
-from thinmap_ros.core.places.recognition.views import View
+from thinmap_ros.core.places.views import View
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 

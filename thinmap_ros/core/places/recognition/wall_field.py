@@ -7,7 +7,7 @@ from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.recognition import field_kernels
 from thinmap_ros.core.places.recognition.field_kernels import FAR, FREE, UNKNOWN, WALL, FieldArrays
-from thinmap_ros.core.places.recognition.views import LATTICE_M, View
+from thinmap_ros.core.places.views import LATTICE_M, View
 from thinmap_ros.core.se2 import Array
 
 REACH_M = 1.0  # larger distances to walls count as this

@@ -11,7 +11,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.places.recognition.drift import SAME_M
 from thinmap_ros.core.places.recognition.landmarks import Landmarks, landmarks_around
 from thinmap_ros.core.places.recognition.piece import MapPiece
-from thinmap_ros.core.places.recognition.views import View, ViewBuilder
+from thinmap_ros.core.places.views import View, ViewBuilder
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import TopologyBuilder
