@@ -8,8 +8,8 @@ from support.driven_pieces import driven_piece
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.places.recognition.wall_field import WallField
 from thinmap_ros.core.places.views import LATTICE_M
+from thinmap_ros.core.places.wall_field import WallField
 
 NO_KEYFRAMES = np.empty((0, 2))
 

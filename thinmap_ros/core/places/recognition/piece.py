@@ -9,8 +9,8 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.recognition.constellations import ConstellationIndex
 from thinmap_ros.core.places.recognition.drift import are_same
 from thinmap_ros.core.places.recognition.landmarks import Landmarks, landmarks_of
-from thinmap_ros.core.places.recognition.wall_field import WallField
 from thinmap_ros.core.places.views import PlacedScan, View, views_of
+from thinmap_ros.core.places.wall_field import WallField
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
