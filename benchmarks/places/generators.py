@@ -15,9 +15,7 @@ from benchmarks.places import cases
 from benchmarks.places.recorded import RecordedPiece
 from benchmarks.places.truth import true_pose
 from thinmap_ros.baselines.voronoi import build_voronoi
-from thinmap_ros.core.places.recognition.drift import are_same
-from thinmap_ros.core.places.recognition.landmarks import Landmarks, landmarks_of
-from thinmap_ros.core.places.recognition.piece import MapPiece
+from thinmap_ros.core.places.piece import Landmarks, MapPiece, are_same, landmarks_of
 from thinmap_ros.core.places.views import View
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.evaluation.outcome import Table

@@ -12,9 +12,8 @@ from benchmarks.places import cases
 from benchmarks.places.recorded import RecordedPiece
 from benchmarks.places.truth import relative_errors, rigid_errors
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
+from thinmap_ros.core.places.piece import MapPiece, drawn_piece
 from thinmap_ros.core.places.recognition import JoinDecision, Recognition, decide, recognize
-from thinmap_ros.core.places.recognition.drawn_scans import drawn_piece
-from thinmap_ros.core.places.recognition.piece import MapPiece
 from thinmap_ros.core.slam.joining.joined import JoinConfig, join
 from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap

@@ -8,7 +8,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
-from thinmap_ros.core.places.recognition.piece import MapPiece
+from thinmap_ros.core.places.piece import MapPiece
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.matching.surface import surface_points

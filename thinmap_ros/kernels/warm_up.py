@@ -127,8 +127,8 @@ def map_joiner() -> None:
 
 def _recognize() -> None:
     """Warm up place recognition: a room is looked for in itself."""
+    from thinmap_ros.core.places.piece import MapPiece
     from thinmap_ros.core.places.recognition import Recognition, log_odds_back
-    from thinmap_ros.core.places.recognition.piece import MapPiece
     from thinmap_ros.core.slam.graph.keyframes import Keyframe
     from thinmap_ros.core.slam.matching.surface import surface_points
     from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap

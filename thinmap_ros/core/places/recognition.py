@@ -15,9 +15,15 @@ from typing import NamedTuple
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.places.recognition.drift import DRIFT, SAME_M, SAME_RAD, agree, are_same
-from thinmap_ros.core.places.recognition.landmarks import Landmarks
-from thinmap_ros.core.places.recognition.piece import MapPiece
+from thinmap_ros.core.places.piece import (
+    DRIFT,
+    SAME_M,
+    SAME_RAD,
+    Landmarks,
+    MapPiece,
+    agree,
+    are_same,
+)
 from thinmap_ros.core.places.views import SPACING_M, WINDOW_M, View
 from thinmap_ros.core.se2 import Array, inverse
 

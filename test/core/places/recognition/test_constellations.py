@@ -5,10 +5,11 @@ import pytest
 from support.driven_pieces import driven_piece
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.places.recognition import constellation_kernels
-from thinmap_ros.core.places.recognition.constellations import ConstellationIndex
-from thinmap_ros.core.places.recognition.drift import SAME_M, SAME_RAD
-from thinmap_ros.core.places.recognition.landmarks import (
+from thinmap_ros.core.places import piece as constellation_kernels
+from thinmap_ros.core.places.piece import (
+    SAME_M,
+    SAME_RAD,
+    ConstellationIndex,
     Landmarks,
     landmarks_around,
     landmarks_of,

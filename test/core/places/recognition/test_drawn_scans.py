@@ -8,8 +8,8 @@ from support.driven_pieces import driven_piece, true_transform
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
+from thinmap_ros.core.places.piece import drawn_piece, drawn_scans
 from thinmap_ros.core.places.recognition import recognize
-from thinmap_ros.core.places.recognition.drawn_scans import drawn_piece, drawn_scans
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 

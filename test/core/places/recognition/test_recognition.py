@@ -9,9 +9,8 @@ from support.driven_pieces import driven_piece, true_transform
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.places.piece import MapPiece, landmarks_around
 from thinmap_ros.core.places.recognition import JOIN_ODDS, Recognition, ViewJudge, decide, recognize
-from thinmap_ros.core.places.recognition.landmarks import landmarks_around
-from thinmap_ros.core.places.recognition.piece import MapPiece
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import build
 

@@ -8,9 +8,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.places.recognition.drift import SAME_M
-from thinmap_ros.core.places.recognition.landmarks import Landmarks, landmarks_around
-from thinmap_ros.core.places.recognition.piece import MapPiece
+from thinmap_ros.core.places.piece import SAME_M, Landmarks, MapPiece, landmarks_around
 from thinmap_ros.core.places.views import View, ViewBuilder
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.topology.graph import TopologyConfig

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.places.piece import DRIFT
 from thinmap_ros.core.places.recognition import PieceHypothesis
-from thinmap_ros.core.places.recognition.drift import DRIFT
 from thinmap_ros.core.places.views import View
 from thinmap_ros.core.se2 import Array, inverse, rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, view_difference_m

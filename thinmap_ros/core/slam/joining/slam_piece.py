@@ -8,8 +8,7 @@ import numpy as np
 
 from thinmap_ros.core.grid.edits import Erasure
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.places.recognition.drawn_scans import drawn_scans
-from thinmap_ros.core.places.recognition.piece import MapPiece
+from thinmap_ros.core.places.piece import MapPiece, drawn_scans
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge

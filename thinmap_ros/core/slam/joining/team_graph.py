@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.places.recognition.drift import SAME_M, SAME_RAD
+from thinmap_ros.core.places.piece import SAME_M, SAME_RAD
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized

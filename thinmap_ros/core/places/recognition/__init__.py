@@ -1,1 +1,0 @@
-"""Place recognition: whether two pieces of map show the same place."""
