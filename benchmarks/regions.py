@@ -18,7 +18,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.regions import RegionMap
 from thinmap_ros.core.topology.segmentation import RegionTracker, find_regions
 from thinmap_ros.pipeline import Pipeline, PipelineConfig

@@ -28,7 +28,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.team_run import TeamOptions, make_team
 from thinmap_ros.files.atomic import atomic_write

@@ -9,7 +9,7 @@ import pytest
 from support.slam_room import ROOM, drive, drive_round_the_block, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 
 START = se2.pose(2.0, 2.0, 0.0)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.core.places.place_database import GlobalLocalizationConfig
     from thinmap_ros.core.planning.paths import shortest_path
     from thinmap_ros.core.scan import LaserConfig, Scan
-    from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+    from thinmap_ros.core.slam.track import LocalizerConfig
     from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig, topology_from_msg
     from thinmap_ros.core.topology.thinning import thin
     from thinmap_ros.core.topology.topology import build as build_topology
@@ -85,7 +85,7 @@ _PLACES = {
     # SLAM
     'Pipeline': 'pipeline.Pipeline',
     'PipelineConfig': 'pipeline.PipelineConfig',
-    'LocalizerConfig': 'core.slam.localizer_config.LocalizerConfig',
+    'LocalizerConfig': 'core.slam.track.LocalizerConfig',
     'EkfConfig': 'core.ekf_slam.ekf_localizer.EkfConfig',
     'plot': 'view.plotting.plot',
     'Scan': 'core.scan.Scan',

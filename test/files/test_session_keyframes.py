@@ -15,7 +15,7 @@ from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import LOCALIZATION
 from thinmap_ros.files import sessions
 from thinmap_ros.files.sessions import KEYFRAMES, LOCALIZER, load_localizer, save_localizer

@@ -27,13 +27,13 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizer_config import LIVE_PARAMETERS, LocalizerConfig
 from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
     adjust,
     config_class,
     parameters_elsewhere,
 )
+from thinmap_ros.core.slam.track import LIVE_PARAMETERS, LocalizerConfig
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import SCAN_MATCHING, Correction, Estimate, StartConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph

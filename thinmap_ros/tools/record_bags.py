@@ -10,7 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.experiments.drives import RECIPES, TRUTH_TOPIC, Source
 from thinmap_ros.files import package_data

@@ -11,12 +11,10 @@ from thinmap_ros.core.slam.graph.keyframes import Keyframes
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.heading import HeadingCorrection
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-from thinmap_ros.core.slam.map_evidence import MapEvidence
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
-from thinmap_ros.core.slam.track import Track
+from thinmap_ros.core.slam.track import LocalizerConfig, MapEvidence, Track
 
 FAILING = 4  # calls in a row
 

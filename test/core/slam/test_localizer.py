@@ -15,8 +15,8 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.matching.local_map import MIN_HIT_RATIO, LocalMapConfig
+from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import Destination
 from thinmap_ros.sim.drives import DriveConfig
 from thinmap_ros.sim.drives import drive as drive_along

@@ -6,7 +6,6 @@ from thinmap_ros.core.config import parameters_of
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizers import (
     config_class,
     config_with,
@@ -14,6 +13,7 @@ from thinmap_ros.core.slam.localizers import (
     localizer_class,
     parameters_elsewhere,
 )
+from thinmap_ros.core.slam.track import LocalizerConfig
 
 FILTERS = ('association.', 'features.')
 MATCHING = (

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from thinmap_ros.core.slam.map_evidence import MapEvidence
 from thinmap_ros.core.slam.matching.scan_matcher import Match
-from thinmap_ros.core.slam.matching.visibility import SeenThrough
+from thinmap_ros.core.slam.track import MapEvidence, SeenThrough
 
 ANGLES = np.linspace(-np.pi, np.pi, 90)
 ALL_AROUND = 4.0 * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])

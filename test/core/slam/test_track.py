@@ -10,11 +10,9 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import Anchor
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
-from thinmap_ros.core.slam.map_evidence import MapEvidence
 from thinmap_ros.core.slam.motion_model import MotionConfig
 from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction
-from thinmap_ros.core.slam.track import DeadReckoning, Track
+from thinmap_ros.core.slam.track import DeadReckoning, LocalizerConfig, MapEvidence, Track
 
 START = np.array([2.0, 2.0, 0.0])
 PERIOD_NS = 200_000_000

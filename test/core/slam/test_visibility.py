@@ -9,7 +9,7 @@ from support.slam_room import map_of, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.local_map import LocalMap
-from thinmap_ros.core.slam.matching.visibility import seen_through
+from thinmap_ros.core.slam.track import seen_through
 
 PERIOD_NS = 200_000_000
 # A hall of 30 x 30 m: in its middle no wall is in range.

@@ -11,7 +11,7 @@ from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.nodes.localization.recovery import Recovery, restored, saved_pose
 
 CONFIG = LocalizerConfig(initial_x_m=3.0, initial_y_m=1.2)

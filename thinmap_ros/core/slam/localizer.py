@@ -21,12 +21,11 @@ from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.localizer_map import LocalizerMap
 from thinmap_ros.core.slam.matching import local_map
 from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.slam.tracker import Tracked, Tracker
+from thinmap_ros.core.slam.track import LocalizerConfig, Tracked, Tracker
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.graph import TopologicalMap

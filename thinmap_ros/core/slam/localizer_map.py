@@ -17,9 +17,8 @@ from thinmap_ros.core.slam.graph.pose_graph import Systematic
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
 from thinmap_ros.core.slam.heading import HeadingCorrection
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS
-from thinmap_ros.core.slam.tracker import Surroundings, Tracker
+from thinmap_ros.core.slam.track import LocalizerConfig, Surroundings, Tracker
 from thinmap_ros.core.slam.wall_compass import Reference
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import Correction

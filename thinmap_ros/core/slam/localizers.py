@@ -6,7 +6,7 @@ from typing import Any, Protocol
 from thinmap_ros.core.config import parameters_of, with_values
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizer_config import LocalizerConfig
+from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import StartConfig
 
