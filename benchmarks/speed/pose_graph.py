@@ -12,7 +12,7 @@ from thinmap_ros.core.se2 import Array, inverse
 from thinmap_ros.core.slam.graph.keyframe_graph import KeyframeGraph
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Keyframes, Step
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import OdometryCalibration
 from thinmap_ros.core.slam.wall_compass import Heading, Reference
 from thinmap_ros.evaluation.outcome import Row, at_most
 

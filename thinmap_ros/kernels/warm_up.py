@@ -79,7 +79,7 @@ def localizer() -> None:
     from thinmap_ros.core.slam.graph.keyframes import Start, covariances_from
     from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
     from thinmap_ros.core.slam.localizer import Localizer
-    from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+    from thinmap_ros.core.slam.odometry import OdometryCalibration
 
     _sense()
     rehearsed = Localizer()

@@ -36,7 +36,7 @@ from thinmap_ros.core.grid.moved import aligned_patch
 from thinmap_ros.core.grid.patch import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridPatch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
-from thinmap_ros.core.slam.covariance import UNKNOWN
+from thinmap_ros.core.slam.odometry import UNKNOWN
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.graph import FIELDS, TopologicalMap, flat_topology
 from thinmap_ros.logs import decode

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from thinmap_ros.core.slam.covariance import UNKNOWN, PoseUncertainty
+from thinmap_ros.core.slam.odometry import UNKNOWN, PoseUncertainty
 
 
 def test_a_robot_that_is_put_somewhere_else_may_have_come_from_anywhere():

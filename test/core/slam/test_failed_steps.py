@@ -13,7 +13,7 @@ from thinmap_ros.core.slam.heading import HeadingCorrection
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import OdometryCalibration
 from thinmap_ros.core.slam.track import LocalizerConfig, MapEvidence, Track
 
 FAILING = 4  # calls in a row

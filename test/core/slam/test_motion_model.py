@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thinmap_ros.core.slam.motion_model import MotionConfig, MotionModel
+from thinmap_ros.core.slam.odometry import MotionConfig, MotionModel
 
 CONFIG = MotionConfig()
 SLIP = np.array([CONFIG.noise_floor_m, CONFIG.noise_floor_m, CONFIG.noise_floor_rad])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import OdometryCalibration
 
 # Odometry measures a metre as 1.04 m with 0.03 rad of rotation, and a radian as 1.05 rad. The laser
 # is mounted 1.5 deg askew.

@@ -6,10 +6,9 @@ from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.slam.covariance import PoseUncertainty
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.scan_matcher import Match
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import OdometryCalibration, PoseUncertainty
 from thinmap_ros.core.slam.track import LocalizerConfig
 
 PERIOD_NS = 200_000_000

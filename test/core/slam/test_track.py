@@ -10,8 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import Anchor
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.motion_model import MotionConfig
-from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction
+from thinmap_ros.core.slam.odometry import MotionConfig, OdometryPrediction
 from thinmap_ros.core.slam.track import DeadReckoning, LocalizerConfig, MapEvidence, Track
 
 START = np.array([2.0, 2.0, 0.0])

@@ -4,8 +4,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.features import LineConfig, extract_lines
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.covariance import PoseUncertainty
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import OdometryCalibration, PoseUncertainty
 from thinmap_ros.core.slam.wall_compass import Heading, Reference, WallCompass
 
 

@@ -23,7 +23,6 @@ from thinmap_ros.core.se2 import (
     rotated_covariance,
     rotation,
 )
-from thinmap_ros.core.slam.covariance import PoseUncertainty
 from thinmap_ros.core.slam.graph.keyframes import Anchor, KeyframeConfig
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.matching.local_map import (
@@ -38,8 +37,12 @@ from thinmap_ros.core.slam.matching.local_map import (
     slot_of,
 )
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS, Match, Matcher, MatchingConfig
-from thinmap_ros.core.slam.motion_model import MotionConfig
-from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction, Prediction
+from thinmap_ros.core.slam.odometry import (
+    MotionConfig,
+    OdometryPrediction,
+    PoseUncertainty,
+    Prediction,
+)
 from thinmap_ros.core.stage import SCAN_MATCHING, StartConfig
 from thinmap_ros.jit import kernel
 

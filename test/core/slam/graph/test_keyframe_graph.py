@@ -19,7 +19,7 @@ from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MatchingConfig
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import OdometryCalibration
 
 STEP = 1e-4 * np.eye(3)
 NOTHING = np.zeros((3, 3))

@@ -17,7 +17,7 @@ from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS, MatchingConfig
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import OdometryCalibration
 
 SIGMAS = np.array([0.02, 0.02, 0.003])
 STEP = np.diag(np.square(SIGMAS))

@@ -11,7 +11,6 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import inverse
-from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph import packed_scans, saved_keyframes
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.packed_scans import packed_scans as packed
@@ -19,7 +18,7 @@ from thinmap_ros.core.slam.graph.packed_scans import unpacked_scans
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, Systematic
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import UNKNOWN, OdometryCalibration
 from thinmap_ros.core.slam.wall_compass import Heading, Reference
 
 POSES = [se2.pose(2.0 + 0.7 * k, 2.0, 0.2 * k) for k in range(4)]

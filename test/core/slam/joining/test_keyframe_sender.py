@@ -8,7 +8,6 @@ from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import inverse
-from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph.edge_table import EdgeTable
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Step
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
@@ -19,7 +18,7 @@ from thinmap_ros.core.slam.joining.robot_keyframes import ReceivedKeyframes
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MatchingConfig
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import UNKNOWN, OdometryCalibration
 
 POSES = [se2.pose(2.0 + 0.7 * k, 2.0, 0.2 * k) for k in range(5)]
 COVARIANCE = np.diag([0.01, 0.02, 0.003])

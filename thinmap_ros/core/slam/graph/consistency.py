@@ -10,9 +10,9 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import inverse
-from thinmap_ros.core.slam.covariance import CHI2
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.odometry import CHI2
 
 
 def largest_consistent(candidates: Iterable[Edge], frames: Sequence[Keyframe]) -> list[Edge]:

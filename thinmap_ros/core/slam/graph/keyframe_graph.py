@@ -11,7 +11,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.edge_table import EdgeTable
 from thinmap_ros.core.slam.graph.keyframes import Keyframes
 from thinmap_ros.core.slam.graph.pose_graph import EdgeArrays, last, rounds
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import OdometryCalibration
 from thinmap_ros.core.stage import Correction
 
 _MIN_MOVE_M = 0.1  # smallest move of a keyframe for which the map follows the calibration

@@ -22,7 +22,6 @@ from thinmap_ros.core.se2 import (
     rotated_covariance,
     rotation,
 )
-from thinmap_ros.core.slam.covariance import CHI2
 from thinmap_ros.core.slam.graph.consistency import largest_consistent
 from thinmap_ros.core.slam.graph.keyframe_graph import KeyframeGraph
 from thinmap_ros.core.slam.graph.keyframes import (
@@ -39,7 +38,7 @@ from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import CHI2, OdometryCalibration
 from thinmap_ros.core.stage import Correction
 
 _RECENT = 8  # recent candidates among which consistent ones are searched

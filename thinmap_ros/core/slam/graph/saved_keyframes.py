@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, inverse
-from thinmap_ros.core.slam.covariance import UNKNOWN
 from thinmap_ros.core.slam.graph import packed_scans
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry import UNKNOWN, OdometryCalibration
 from thinmap_ros.core.slam.wall_compass import Heading, Reference
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, Field, Fields, State
 

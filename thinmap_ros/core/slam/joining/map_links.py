@@ -8,8 +8,8 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array, inverse, propagated_covariance, rotated_covariance
-from thinmap_ros.core.slam.covariance import CHI2
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
+from thinmap_ros.core.slam.odometry import CHI2
 
 
 @dataclass(frozen=True, eq=False)
