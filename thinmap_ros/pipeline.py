@@ -12,7 +12,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
-from thinmap_ros.core.slam.localizers import localizer_class
+from thinmap_ros.core.slam.localizer import localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import Estimate, LocalizedScan, StartConfig, Trajectory
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig

@@ -20,7 +20,7 @@ from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.reports import report_file, report_of, reports_there
 from thinmap_ros.core.config import parameters_of, suggestion
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.core.slam.localizers import default_config, parameters_elsewhere
+from thinmap_ros.core.slam.localizer import default_config, parameters_elsewhere
 from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.evaluation.machine import provenance, write_provenance
 from thinmap_ros.evaluation.parallel_jobs import (

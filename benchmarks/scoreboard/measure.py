@@ -24,7 +24,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizers import config_with
+from thinmap_ros.core.slam.localizer import config_with
 from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
 from thinmap_ros.experiments.slam.logs import laser_of

@@ -18,7 +18,7 @@ from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
-from thinmap_ros.core.slam.localizers import default_config, localizer_class
+from thinmap_ros.core.slam.localizer import default_config, localizer_class
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.topology import TopologyBuilder
 

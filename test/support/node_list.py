@@ -6,7 +6,7 @@ from pathlib import Path
 
 import rclpy
 
-from thinmap_ros.core.slam.localizers import parameters_elsewhere
+from thinmap_ros.core.slam.localizer import parameters_elsewhere
 from thinmap_ros.core.stage import SCAN_MATCHING
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -7,7 +7,7 @@ import pytest
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.scan import LaserConfig
-from thinmap_ros.core.slam.localizers import default_config
+from thinmap_ros.core.slam.localizer import default_config
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.tools.parameter_file import NodeParameters, read_parameter_file

@@ -9,7 +9,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizers import config_class
+from thinmap_ros.core.slam.localizer import config_class
 from thinmap_ros.pipeline import Pipeline, PipelineConfig, PipelineResult
 from thinmap_ros.sim.drives import DriveSample
 

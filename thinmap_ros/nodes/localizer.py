@@ -26,9 +26,9 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizers import (
+from thinmap_ros.core.slam.localizer import (
     AnyLocalizer,
+    Localizer,
     adjust,
     config_class,
     parameters_elsewhere,

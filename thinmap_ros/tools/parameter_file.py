@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 from thinmap_ros.core.config import Config, parameters_of, suggestion, with_values
 from thinmap_ros.core.errors import ConfigError, InputError, quoted
-from thinmap_ros.core.slam.localizers import default_config, parameters_elsewhere
+from thinmap_ros.core.slam.localizer import default_config, parameters_elsewhere
 from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.files.package_data import config_file
 from thinmap_ros.ros.foreign.sections import EXPECTED, WILDCARDS, bare, is_foreign, sections

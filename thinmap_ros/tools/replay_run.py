@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
-from thinmap_ros.core.slam.localizers import default_config
+from thinmap_ros.core.slam.localizer import default_config
 from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.evaluation.batch import REASON, Batch, FileJob, reported

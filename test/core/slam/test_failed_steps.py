@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from support.slam_room import drive_round_the_block
 
-from thinmap_ros.core.slam.active_map import ActiveMap
 from thinmap_ros.core.slam.graph.keyframes import Keyframes
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
-from thinmap_ros.core.slam.heading import HeadingCorrection
-from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.localizer import ActiveMap, HeadingCorrection, Localizer
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
 from thinmap_ros.core.slam.odometry import OdometryCalibration

@@ -8,8 +8,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizers import config_with, localizer_class
+from thinmap_ros.core.slam.localizer import Localizer, config_with, localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import build

@@ -6,8 +6,7 @@ from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizers import config_with, localizer_class
+from thinmap_ros.core.slam.localizer import Localizer, config_with, localizer_class
 
 
 @pytest.mark.parametrize('slam', ['scan_matching', 'ekf_ti'])

@@ -5,8 +5,8 @@ import pytest
 from thinmap_ros.core.config import parameters_of
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.errors import ConfigError
-from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizers import (
+from thinmap_ros.core.slam.localizer import (
+    Localizer,
     config_class,
     config_with,
     default_config,

@@ -15,7 +15,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.core.slam.localizers import default_config
+from thinmap_ros.core.slam.localizer import default_config
 from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.log import (

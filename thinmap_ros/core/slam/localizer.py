@@ -6,29 +6,410 @@ consistent. If scans contradict the local map, a new one is started. A dead-reck
 accumulated covariance connects the two.
 """
 
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.ekf_slam.features import LineFeature, odometry_variances
+from thinmap_ros.core.config import parameters_of, with_values
+from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
+from thinmap_ros.core.ekf_slam.features import (
+    LineConfig,
+    LineFeature,
+    extract_lines,
+    odometry_variances,
+)
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, rotated_covariance
-from thinmap_ros.core.slam.graph.keyframes import Keyframe
+from thinmap_ros.core.slam.atlas import Atlas
+from thinmap_ros.core.slam.graph.heading_table import heading_row
+from thinmap_ros.core.slam.graph.keyframes import (
+    Keyframe,
+    Keyframes,
+    Step,
+    heading_errors,
+    with_heading,
+)
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
-from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.graph.pieces import Pieces
+from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
-from thinmap_ros.core.slam.localizer_map import LocalizerMap
+from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
 from thinmap_ros.core.slam.matching import local_map
+from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points
+from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.core.slam.track import LocalizerConfig, Tracked, Tracker
+from thinmap_ros.core.slam.odometry import OdometryCalibration, PoseUncertainty
+from thinmap_ros.core.slam.track import LocalizerConfig, Surroundings, Tracked, Tracker
+from thinmap_ros.core.slam.wall_compass import Heading, Reference, WallCompass
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.stage import Estimate
+from thinmap_ros.core.stage import Correction, Estimate, StartConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
+
+# The local map for scan matching, re-rendered from the keyframes after a loop closure.
+
+
+class ActiveMap:
+    """The local map of a piece, its loaded cells, and the keyframes that are not yet rendered.
+
+    Loaded cells belong to the published map.
+    """
+
+    def __init__(self, config: LocalMapConfig, pieces: Pieces, render_first: int = 20) -> None:
+        """render_first: keyframes that are rendered at once after a correction."""
+        self._config = config
+        self._pieces = pieces
+        self._render_first = render_first
+        self.map = LocalMap(config)
+        self.refused = 0  # scans that lie too far from the others for one map
+        self._loaded: Mapping[str, NDArray[Any]] | None = None
+        self._loaded_keyframes = 0  # whose scans are in the loaded cells
+        self._pending: list[int] = []
+        self._revision = 0
+
+    def load(self, given: Mapping[str, NDArray[Any]], keyframes: int) -> None:
+        """Set the cells of a `LocalMap.state` with which every re-rendered map starts.
+
+        keyframes: number of the first keyframes that these cells are made of, 0 if they are not
+        known. Otherwise a corrected map is rendered from the keyframes alone.
+        """
+        self._loaded = given
+        self._loaded_keyframes = keyframes
+
+    @property
+    def is_of_keyframes(self) -> bool:
+        """Whether all of the published map can be rendered from keyframes."""
+        return self._loaded is None or self._loaded_keyframes > 0
+
+    def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> bool:
+        """Add surface points (N, 5), robot frame, of a scan at a pose (3,).
+
+        Returns False, and counts the scan in `refused`, if the map would become too large.
+        """
+        return self._add(points, T_base_laser, T_map_base)
+
+    def start_submap(self) -> None:
+        """Continue in an empty map."""
+        self.map = LocalMap(self._config)
+        self._pending = []
+
+    def rerender(self, keyframes: Sequence[Keyframe], T_map_base: Array) -> None:
+        """Re-render the map from the keyframes of the piece, those nearest to a pose (3,) first."""
+        self.map = self._empty(is_published=not self._pieces.is_apart)
+        places = np.array([frame.T_map_base for frame in keyframes]).reshape(-1, 3)[:, :2]
+        away = np.hypot(*(places - T_map_base[:2]).T)
+        order = np.argsort(-away).tolist()
+        first = self._first_rendered
+        self._pending = [
+            k for k in order if k >= first and self._pieces.is_here(keyframes[k].submap)
+        ]
+        self._render(keyframes, self._render_first)
+
+    def follow(self, keyframes: Keyframes, T_map_base: Array) -> None:
+        """Render the keyframes as they were corrected last, some in each step."""
+        if keyframes.revision != self._revision:
+            self._revision = keyframes.revision
+            self.rerender(keyframes.frames, T_map_base)
+        self._render(keyframes.frames)
+
+    def published(self, keyframes: Sequence[Keyframe]) -> LocalMap:
+        """The local map of the published piece: rendered again while the robot is in another."""
+        if not self._pieces.is_apart:
+            return self.map
+        rendered = self._empty(is_published=True)
+        for frame in keyframes[self._first_rendered :]:
+            if self._pieces.is_published(frame.submap):
+                with suppress(InputError):  # counted when it was added
+                    rendered.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
+        return rendered
+
+    def _render(self, keyframes: Sequence[Keyframe], count: int = 2) -> None:
+        """Render up to `count` of the pending keyframes."""
+        for _ in range(min(count, len(self._pending))):
+            frame = keyframes[self._pending.pop()]
+            self._add(frame.points, frame.scan.T_base_laser, frame.T_map_base)
+
+    @property
+    def _first_rendered(self) -> int:
+        """Number of the first keyframe that is not in the loaded cells."""
+        return 0 if self._revision else self._loaded_keyframes
+
+    def _empty(self, is_published: bool) -> LocalMap:
+        """An empty map, or the loaded cells, as long as they follow the keyframes."""
+        empty = LocalMap(self._config)
+        is_corrected = self._loaded_keyframes > 0 and self._revision > 0
+        if is_published and self._loaded is not None and not is_corrected:
+            empty.restore(self._loaded)
+        return empty
+
+    def _add(self, points: Array, T_base_laser: Array, T_map_base: Array) -> bool:
+        try:
+            self.map.add_scan(points, T_base_laser, T_map_base)
+        except InputError:
+            self.refused += 1
+            return False
+        return True
+
+
+# Manhattan-world heading correction of the scans that are added to the local map.
+
+
+class HeadingCorrection:
+    """Corrects the heading of scans before they are added to the map."""
+
+    def __init__(
+        self,
+        config: LineConfig,
+        calibration: OdometryCalibration,
+        min_sigma_rad: float = 5e-4,
+        new_ratio: float = 0.2,
+    ) -> None:
+        """new_ratio: of a match's error, that is independent of the previous map update."""
+        self._calibration = calibration
+        self._revision = 0
+        self._new_ratio = new_ratio
+        self._config = config
+        self._compass = WallCompass()
+        self._variance = min_sigma_rad**2  # of the heading since its last measurement
+        self.measured: Heading | None = None  # measured heading of the last scan
+
+    def correct(
+        self,
+        scan: Scan,
+        T_map_base: Array,
+        pose: PoseUncertainty,
+        path_m: float,
+        fits: bool,
+        own: Reference,
+        revision: int,
+    ) -> Array:
+        """Pose (3,) with the heading corrected by the wall directions, if they give one.
+
+        path_m: length of the path so far (m); walls near the start of the path weigh most.
+        fits: whether scans agree with the map; otherwise the pose is unchanged; own: error of the
+        heading, relative to where the map began; revision: number of corrections of the map, with
+        which the main direction turns as the calibration of the odometry has it.
+        """
+        if revision != self._revision:
+            self._revision = revision
+            self._compass.calibrate(self._calibration.smoothed())
+        # The gate is narrower than the variance of the pose: a larger heading error is also in the
+        # local map, and a scan that is corrected alone would no longer fit this map.
+        self._variance += float(pose.motion_part[2, 2] + self._new_ratio * pose.scan_part[2, 2])
+        self.measured = None
+        if not fits:
+            return T_map_base
+        lines = extract_lines(scan, self._config)
+        x, y, heading = T_map_base.tolist()
+        self.measured = self._compass.read(lines, heading, self._variance)
+        if self.measured is not None:
+            gain = self._variance / (self._variance + self.measured.variance)
+            heading = float(se2.wrap(heading + gain * (self.measured.yaw - heading)))
+            self._variance *= 1.0 - gain
+        self._compass.add_lines(lines, heading, path_m, own)
+        return se2.pose(x, y, heading)
+
+
+# The map of the localizer: its local map, keyframes, pose graph and trajectory.
+
+# A scan is added to the local map after so much motion: nearer ones show the same walls again.
+_UPDATE_M = 0.2
+
+_UPDATE_RAD = 0.2
+
+_VIEW_M = 1.0  # path length after which the errors of two matches are independent
+
+
+class LocalizerMap:
+    """Adds the scans of a tracker to the local map and to the keyframes, and closes loops."""
+
+    def __init__(self, config: LocalizerConfig, tracker: Tracker) -> None:
+        self._config = config
+        self._tracker = tracker
+        calibration = tracker.prediction.calibration
+        self._heading = HeadingCorrection(config.lines, calibration)
+        self.loops = LoopClosure(
+            config.loop_closure, config.keyframes, config.matching, config.local_map, calibration
+        )
+        self.atlas = Atlas(self.loops)
+        self.local = ActiveMap(config.local_map, self.loops.pieces)
+        self._path = KeyframeTrajectory()
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """What the next scan is matched with."""
+        keyframes = self.loops.keyframes
+        return Surroundings(
+            self.local.map,
+            self.loops.anchor,
+            keyframes.revision,
+            has_keyframes=len(keyframes) > 0,
+            is_apart=self.loops.pieces.is_apart,
+        )
+
+    @property
+    def pose(self) -> Array:
+        """Current pose T_map_base (3,)."""
+        return self.loops.anchor.pose(self._tracker.track.T_anchor_base)
+
+    def load(self, given: State | None, keyframes: SavedKeyframes | None) -> None:
+        """Begin with the cells of a `LocalMap.state`, and the keyframes that they are made of.
+
+        Without cells, these are rendered from the keyframes.
+        """
+        if keyframes is not None:
+            self.loops.load(keyframes)
+        if given is None:
+            self.local.rerender(self.loops.keyframes.frames, self.pose)
+        else:
+            self.local.load(given, len(self.loops.keyframes))
+
+    def place(self, T_map_base: Array, covariance: Array) -> None:
+        """Place the robot at a given pose (3,) with covariance (3, 3) in the published map."""
+        self.loops.pieces.return_to_published()
+        self.loops.return_to(T_map_base)
+        anchor = self.loops.anchor
+        self._tracker.place(anchor.relative(T_map_base), anchor.turned(covariance))
+
+    def add(self, scan: Scan, points: Array) -> None:
+        """Add a scan with surface points (N, 5) if the robot has moved far enough since the last.
+
+        In a submap of its own if scans contradict the map. The pose stays, whatever of it an error
+        ends.
+        """
+        T_map_base = self.pose
+        try:
+            self._add(scan, points)
+        except Exception:
+            # What it is relative to may be another keyframe.
+            self._tracker.track.T_anchor_base = self.loops.anchor.relative(T_map_base)
+            raise
+
+    def _add(self, scan: Scan, points: Array) -> None:
+        track = self._tracker.track
+        moved = track.since_update
+        path_m = 0.0 if moved is None else math.hypot(moved[0], moved[1])
+        turn = 0.0 if moved is None else abs(float(moved[2]))
+        is_near = path_m < _UPDATE_M and turn < _UPDATE_RAD
+        if moved is not None and is_near:
+            return
+        if track.evidence.needs_submap:
+            self.start_submap()
+        elif track.evidence.forbids_mapping:
+            return
+        self._correct_heading(scan)
+        if not self.local.add_scan(points, scan.T_base_laser, self.pose):
+            # No building is that large: the pose is wrong, or was.
+            self.start_submap()
+            self.local.add_scan(points, scan.T_base_laser, self.pose)
+        track.T_anchor_update = track.T_anchor_base
+        # Motion errors are independent in each step. The error of a match is correlated with that
+        # of the previous match as long as the same walls are observed.
+        track.uncertainty.map_updated(min(1.0, path_m / _VIEW_M + turn))
+        if len(points) >= MIN_POINTS and self.loops.needs_keyframe(track.T_anchor_base):
+            self._add_keyframe(scan, points)
+
+    def start_submap(self) -> None:
+        """Start a new local map at the dead-reckoned pose."""
+        covariance = self._tracker.fall_back()
+        track = self._tracker.track
+        track.uncertainty.start_submap(track.T_anchor_base, covariance)
+        track.evidence.start_submap()
+        self.loops.pieces.begin()
+        self.local.start_submap()
+
+    def close_loops(self) -> Correction | None:
+        """Do one step of loop closure; the local map follows its correction."""
+        self.atlas.step(self._config.loop_closure.join_odds)
+        correction = self.loops.step()
+        if correction is not None:
+            correction = replace(correction, join=self.atlas.take_join())
+        self.local.follow(self.loops.keyframes, self.pose)
+        return correction
+
+    def record_pose(self, stamp_ns: int) -> None:
+        """Store the pose of this step relative to its keyframe."""
+        keyframes = self.loops.keyframes
+        number = keyframes.anchor
+        T_keyframe = np.zeros(3) if number < 0 else keyframes.frames[number].T_map_base
+        self._path.add(stamp_ns, number, se2.between(T_keyframe, self.pose))
+
+    def trajectory(self) -> Array:
+        """Poses (N, 3) of all steps, after all corrections; pending matches are done."""
+        while self.loops.is_busy:
+            self.close_loops()
+        return self._path.poses(self.loops.finish())
+
+    def known_places(self) -> Array:
+        """Places (N, 2) that enclose the published map: cells, and keyframes, m."""
+        frames = self.loops.keyframes.frames
+        is_published = self.loops.pieces.is_published
+        keyframes = [frame.T_map_base[:2] for frame in frames if is_published(frame.submap)]
+        cells = self.local.published(frames).corners()
+        return np.vstack([cells, np.array(keyframes).reshape(-1, 2)])
+
+    def apart_points(self) -> Array:
+        """Scan points (N, 2) of the keyframes that are not in the published map, m."""
+        is_published = self.loops.pieces.is_published
+        points = [
+            se2.transform_points(frame.T_map_base, frame.scan.points_base())
+            for frame in self.loops.keyframes.frames
+            if not is_published(frame.submap)
+        ]
+        return np.vstack([np.zeros((0, 2)), *points])
+
+    def _correct_heading(self, scan: Scan) -> None:
+        """Correct the heading by the wall directions if scans agree with the map."""
+        anchor = self.loops.anchor
+        track = self._tracker.track
+        derivative = np.vstack([np.zeros((2, 4)), self._tracker.systematic(anchor)[2]])
+        variance = float(self._tracker.random_covariance(anchor)[2, 2])
+        corrected = self._heading.correct(
+            scan,
+            anchor.pose(track.T_anchor_base),
+            track.uncertainty,
+            anchor.path_m_at(track.T_anchor_base),
+            track.evidence.agrees,
+            Reference(variance, self._share(derivative)),
+            self.loops.keyframes.revision,
+        )
+        track.turn(anchor.relative(corrected))
+
+    def _add_keyframe(self, scan: Scan, points: Array) -> None:
+        """Make the scan a keyframe, to which the pose is relative from now on."""
+        loops = self.loops
+        tracker = self._tracker
+        anchor = loops.anchor
+        T_map_base = self.pose
+        uncertainty = tracker.track.uncertainty
+        covariance, jump = uncertainty.step()
+        step = Step(covariance, self._share(uncertainty.systematic))
+        # In a new submap the heading is unknown, also by multiples of 90 degrees.
+        is_lost = loops.pieces.is_apart or tracker.track.evidence.is_lost
+        heading = None if is_lost else self._heading.measured
+        (error,) = heading_errors(np.array([heading_row(heading)]), T_map_base[None])
+        covariance, systematic = with_heading(
+            tracker.random_covariance(anchor), tracker.systematic(anchor), error
+        )
+        submap = loops.pieces.current
+        path_m = anchor.path_m_at(tracker.track.T_anchor_base)
+        frame = Keyframe(scan, points, T_map_base, path_m, covariance, submap, heading, systematic)
+        loops.add(frame, step, jump)
+        tracker.track.begin_step()
+
+    def _share(self, derivative: Array) -> Systematic:
+        """Share of the odometry in a relative pose of this step, by its derivative (3, 4)."""
+        calibration = self._tracker.prediction.calibration
+        return Systematic(derivative, calibration.parameters, calibration.spans)
 
 
 class Localizer:
@@ -276,3 +657,78 @@ class Localizer:
             odometry_discontinuity=tracked.discontinuity,
             scan_information=match.scan_information if match and tracked.fits else None,
         )
+
+
+# The available localizers, and their selection by the parameter `slam`.
+
+AnyLocalizer = Localizer | EkfLocalizer
+
+
+class LocalizerClass(Protocol):
+    """What makes localizers; config: of the class that belongs to them."""
+
+    def __call__(self, config: Any) -> AnyLocalizer:
+        """With an empty map, at the configured initial pose."""
+
+    def from_state(self, state: State, config: Any) -> AnyLocalizer:
+        """In the map of a saved state, at the configured initial pose."""
+
+
+_LOCALIZERS: dict[type[StartConfig], LocalizerClass] = {
+    LocalizerConfig: Localizer,
+    EkfConfig: EkfLocalizer,
+}
+
+_CONFIGS = {slam: config for config in _LOCALIZERS for slam in config.of_slam}
+
+
+def config_class(slam: str) -> type[StartConfig]:
+    """Class of the configuration of the localizer that `slam` selects.
+
+    Raises ConfigError for another value.
+    """
+    return _CONFIGS[StartConfig(slam=slam).slam]
+
+
+def localizer_class(config: StartConfig) -> LocalizerClass:
+    """Class of the localizer that a configuration is for."""
+    return _LOCALIZERS[type(config)]
+
+
+def default_config(slam: str) -> StartConfig:
+    """Defaults of the localizer that `slam` selects. Raises ConfigError for another value."""
+    return config_class(slam)(slam=slam)
+
+
+def config_with(values: Mapping[str, Any]) -> StartConfig:
+    """Configuration of the localizer that `slam` among the values selects, with these values.
+
+    values: by the full names of the parameters. Raises ConfigError for a parameter that this
+    localizer does not have, or a value that is not allowed.
+    """
+    config = default_config(values.get('slam', StartConfig.slam))
+    return with_values(config, values)
+
+
+def parameters_elsewhere(slam: str) -> dict[str, str]:
+    """Names of the parameters that only other localizers have, with the `slam` of these in words.
+
+    Raises ConfigError for another value.
+    """
+    own = _names(config_class(slam))
+    return {
+        name: f'slam: {" or ".join(config.of_slam)}'
+        for config in _LOCALIZERS
+        for name in _names(config)
+        if name not in own
+    }
+
+
+def adjust(localizer: AnyLocalizer, config: StartConfig) -> None:
+    """Continue with other values of `LIVE_PARAMETERS`, which are all of scan matching."""
+    if isinstance(localizer, Localizer) and isinstance(config, LocalizerConfig):
+        localizer.adjust(config)
+
+
+def _names(config: type[StartConfig]) -> list[str]:
+    return [name for name, _, _ in parameters_of(config())]

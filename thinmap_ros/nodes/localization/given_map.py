@@ -5,7 +5,7 @@ from dataclasses import replace
 from thinmap_msgs.msg import SlamStatus
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizers import AnyLocalizer
+from thinmap_ros.core.slam.localizer import AnyLocalizer
 from thinmap_ros.core.stage import Estimate, StartConfig
 from thinmap_ros.nodes.localization.amcl_interface import AmclInterface
 from thinmap_ros.nodes.localization.config import GIVEN_COVARIANCE, LocalizationConfig

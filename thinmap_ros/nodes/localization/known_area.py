@@ -4,7 +4,7 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizers import AnyLocalizer
+from thinmap_ros.core.slam.localizer import AnyLocalizer
 
 # A robot farther away sees nothing of the map: the range of long lasers.
 _MARGIN_M = 30.0

@@ -7,8 +7,7 @@ import numpy as np
 
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
+from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.files import sessions
