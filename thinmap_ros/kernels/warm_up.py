@@ -75,9 +75,9 @@ _REHEARSAL = _Rehearsal(
 @cache
 def localizer() -> None:
     """Warm up localization."""
-    from thinmap_ros.core.slam.graph.edge_table import EdgeTable
     from thinmap_ros.core.slam.graph.keyframes import Start, covariances_from
     from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
+    from thinmap_ros.core.slam.graph.tables import EdgeTable
     from thinmap_ros.core.slam.localizer import Localizer
     from thinmap_ros.core.slam.odometry import OdometryCalibration
 

@@ -30,7 +30,6 @@ from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, rotated_covariance
 from thinmap_ros.core.slam.atlas import Atlas
-from thinmap_ros.core.slam.graph.heading_table import heading_row
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     Keyframes,
@@ -42,7 +41,7 @@ from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pieces import Pieces
 from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
-from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
+from thinmap_ros.core.slam.graph.tables import KeyframeTrajectory, heading_row
 from thinmap_ros.core.slam.matching import local_map
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points

@@ -18,7 +18,7 @@ from thinmap_ros.core.se2 import (
     rotated_covariance,
     rotation,
 )
-from thinmap_ros.core.slam.graph.rows import Rows
+from thinmap_ros.core.slam.graph.tables import Rows
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 from thinmap_ros.jit import kernel
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from thinmap_ros.core.slam.graph.edge_table import EdgeTable
 from thinmap_ros.core.slam.graph.pose_graph import Edge, EdgeArrays, Systematic
+from thinmap_ros.core.slam.graph.tables import EdgeTable
 
 
 def some_edges(rng, number=30):

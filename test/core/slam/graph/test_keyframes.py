@@ -10,8 +10,6 @@ from support.slam_room import ROOM, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph import keyframes as module
-from thinmap_ros.core.slam.graph.edge_table import EdgeTable
-from thinmap_ros.core.slam.graph.heading_table import heading_row
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
@@ -24,6 +22,7 @@ from thinmap_ros.core.slam.graph.keyframes import (
     with_heading,
 )
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, Systematic
+from thinmap_ros.core.slam.graph.tables import EdgeTable, heading_row
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.slam.wall_compass import Heading, Reference
 

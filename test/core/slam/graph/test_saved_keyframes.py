@@ -11,12 +11,12 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import inverse
-from thinmap_ros.core.slam.graph import packed_scans, saved_keyframes
+from thinmap_ros.core.slam.graph import saved_keyframes, tables
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
-from thinmap_ros.core.slam.graph.packed_scans import packed_scans as packed
-from thinmap_ros.core.slam.graph.packed_scans import unpacked_scans
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, Systematic
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
+from thinmap_ros.core.slam.graph.tables import packed_scans as packed
+from thinmap_ros.core.slam.graph.tables import unpacked_scans
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.slam.odometry import UNKNOWN, OdometryCalibration
 from thinmap_ros.core.slam.wall_compass import Heading, Reference
@@ -151,7 +151,7 @@ def test_what_contradicts_itself_is_refused(changes: dict[str, np.ndarray], reas
 
 def test_no_more_is_unpacked_than_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     state = saved().state()
-    monkeypatch.setattr(packed_scans, 'MAX_BEAMS_IN_ALL', 723)
+    monkeypatch.setattr(tables, 'MAX_BEAMS_IN_ALL', 723)
     with pytest.raises(InputError, match='724 ranges of 724 beams: expected as many, at most 723'):
         SavedKeyframes.from_state(state)
     monkeypatch.undo()

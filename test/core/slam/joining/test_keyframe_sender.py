@@ -8,10 +8,10 @@ from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import inverse
-from thinmap_ros.core.slam.graph.edge_table import EdgeTable
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Step
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.graph.tables import EdgeTable
 from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage
 from thinmap_ros.core.slam.joining.keyframe_sender import KeyframeSender
 from thinmap_ros.core.slam.joining.robot_keyframes import ReceivedKeyframes

@@ -8,9 +8,9 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.edge_table import EdgeTable
 from thinmap_ros.core.slam.graph.keyframes import Keyframes
 from thinmap_ros.core.slam.graph.pose_graph import EdgeArrays, last, rounds
+from thinmap_ros.core.slam.graph.tables import EdgeTable
 from thinmap_ros.core.slam.odometry import OdometryCalibration
 from thinmap_ros.core.stage import Correction
 

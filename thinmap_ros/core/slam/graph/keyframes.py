@@ -27,11 +27,8 @@ from thinmap_ros.core.se2 import (
     rotated_covariance,
     rotation,
 )
-from thinmap_ros.core.slam.graph.edge_table import EdgeTable
-from thinmap_ros.core.slam.graph.heading_table import HeadingTable
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, EdgeArrays, Systematic
-from thinmap_ros.core.slam.graph.rows import Rows
-from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
+from thinmap_ros.core.slam.graph.tables import EdgeTable, HeadingTable, KeyframeTrajectory, Rows
 from thinmap_ros.core.slam.wall_compass import Heading
 from thinmap_ros.jit import inlined, kernel
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, inverse
-from thinmap_ros.core.slam.graph import packed_scans
+from thinmap_ros.core.slam.graph import tables
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge
 from thinmap_ros.core.slam.matching.surface import surface_points
@@ -33,7 +33,7 @@ _LOW_HEADING = (-_MAX_YAW_RAD, _MIN_VARIANCE, 0.0)
 _HIGH_HEADING = (_MAX_YAW_RAD, _MAX_VALUE, _MAX_VALUE)
 # n keyframes with s = n - 1 steps, and m edges between visits. Symmetric matrices: upper triangle.
 FIELDS: Fields = {
-    **packed_scans.FIELDS,
+    **tables.FIELDS,
     'poses': Field(
         np.float64,
         ('n', 3),
@@ -139,7 +139,7 @@ class SavedKeyframes:
         frames = self.frames
         submaps = np.unique([frame.submap for frame in frames], return_inverse=True)[1]
         return {
-            **packed_scans.packed_scans([frame.scan for frame in frames]),
+            **tables.packed_scans([frame.scan for frame in frames]),
             'poses': np.array([frame.T_map_base for frame in frames]),
             'path_m': np.array([frame.path_m for frame in frames], dtype=np.float32),
             'covariances': _triangles([f.covariance for f in frames]).astype(np.float32),
@@ -160,7 +160,7 @@ class SavedKeyframes:
         checked = snapshot.validate(state, FIELDS, _WHAT)
         _check_sizes(checked)
         _check_edges(checked)
-        scans = packed_scans.unpacked_scans(checked, _WHAT)
+        scans = tables.unpacked_scans(checked, _WHAT)
         covariances = _matrices(checked['covariances'].astype(np.float64))
         _require_definite(covariances, 'covariances', -_ROUNDING)
         submaps = np.unique(checked['submaps'], return_inverse=True)[1].reshape(-1).tolist()

@@ -16,7 +16,7 @@ from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.errors import MAX_BEAMS, InputError, one_line_reason
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph import packed_scans
+from thinmap_ros.core.slam.graph import tables
 from thinmap_ros.core.slam.graph.saved_keyframes import MAX_EDGES, MAX_KEYFRAMES
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, State
 
@@ -55,7 +55,7 @@ class KeyframeMessage:
 
     def encode(self) -> bytes:
         """The message as bytes."""
-        packed = packed_scans.packed_scans([self.scan])
+        packed = tables.packed_scans([self.scan])
         head = _HEADER.pack(
             self.number,
             self.revision,
@@ -127,8 +127,8 @@ def _scan(laser: Array, unit_mm: int, ranges: NDArray[np.uint16]) -> Scan:
         'unit_mm': np.array([unit_mm], dtype=np.uint16),
         'ranges': ranges,
     }
-    checked = snapshot.validate(state, packed_scans.FIELDS, _WHAT)
-    return packed_scans.unpacked_scans(checked, _WHAT)[0]
+    checked = snapshot.validate(state, tables.FIELDS, _WHAT)
+    return tables.unpacked_scans(checked, _WHAT)[0]
 
 
 def _known_number(number: int) -> int:
