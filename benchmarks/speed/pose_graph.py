@@ -9,8 +9,8 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, inverse
-from thinmap_ros.core.slam.graph.keyframe_graph import KeyframeGraph
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Keyframes, Step
+from thinmap_ros.core.slam.graph.loop_closure import KeyframeGraph
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge
 from thinmap_ros.core.slam.odometry import OdometryCalibration
 from thinmap_ros.core.slam.wall_compass import Heading, Reference

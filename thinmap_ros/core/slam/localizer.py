@@ -37,8 +37,7 @@ from thinmap_ros.core.slam.graph.keyframes import (
     heading_errors,
     with_heading,
 )
-from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
-from thinmap_ros.core.slam.graph.pieces import Pieces
+from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, Pieces
 from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.graph.tables import KeyframeTrajectory, heading_row

@@ -12,9 +12,8 @@ from support.slam_room import ROOM, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph import keyframes as keyframes_module
 from thinmap_ros.core.slam.graph import pose_graph
-from thinmap_ros.core.slam.graph.keyframe_graph import KeyframeGraph
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Keyframes, Step
-from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
+from thinmap_ros.core.slam.graph.loop_closure import KeyframeGraph, LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MatchingConfig

@@ -8,11 +8,14 @@ from support.slam_room import ROOM, corridor_ring, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import inverse, propagated_covariance, rotated_covariance
-from thinmap_ros.core.slam.graph import keyframe_graph
+from thinmap_ros.core.slam.graph import loop_closure as keyframe_graph
 from thinmap_ros.core.slam.graph import loop_closure as module
-from thinmap_ros.core.slam.graph.consistency import largest_consistent
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Step
-from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
+from thinmap_ros.core.slam.graph.loop_closure import (
+    LoopClosure,
+    LoopClosureConfig,
+    largest_consistent,
+)
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS, MatchingConfig

@@ -5,7 +5,7 @@ import pytest
 
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
-from thinmap_ros.core.slam.graph.pieces import Pieces
+from thinmap_ros.core.slam.graph.loop_closure import Pieces
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 
 SCAN = Scan.create(1, np.ones(3), 0.0, 0.1, 0.05, 8.0, np.zeros(3))

@@ -8,7 +8,7 @@ from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
-from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
+from thinmap_ros.core.slam.graph.loop_closure import AGAIN_M, Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 from thinmap_ros.core.slam.matching.surface import surface_points
 

@@ -5,14 +5,16 @@ Several mutually consistent matches close a loop. Then the pose graph is optimiz
 """
 
 import math
-from collections import deque
-from collections.abc import Sequence
+from collections import OrderedDict, defaultdict, deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.places.recognition import JOIN_ODDS
 from thinmap_ros.core.se2 import (
     Array,
@@ -22,8 +24,6 @@ from thinmap_ros.core.se2 import (
     rotated_covariance,
     rotation,
 )
-from thinmap_ros.core.slam.graph.consistency import largest_consistent
-from thinmap_ros.core.slam.graph.keyframe_graph import KeyframeGraph
 from thinmap_ros.core.slam.graph.keyframes import (
     Anchor,
     Keyframe,
@@ -32,19 +32,340 @@ from thinmap_ros.core.slam.graph.keyframes import (
     Step,
     view_difference_m,
 )
-from thinmap_ros.core.slam.graph.pieces import Pieces
-from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.graph.pose_graph import Edge, EdgeArrays, last, rounds
 from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
-from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
-from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
+from thinmap_ros.core.slam.graph.tables import EdgeTable
+from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 from thinmap_ros.core.slam.odometry import CHI2, OdometryCalibration
 from thinmap_ros.core.stage import Correction
 
+# Submaps around keyframes, with which the scans of later visits are matched.
+
+AGAIN_M = 8.0  # smallest path length between two visits of a place
+
+
+class Submaps:
+    """Cache of submaps around keyframes; consecutive keyframes often match the same submap."""
+
+    def __init__(
+        self, config: LocalMapConfig, around: int = 4, stride: int = 4, capacity: int = 3
+    ) -> None:
+        """around: keyframes to either side of the centre of a submap.
+
+        stride: keyframes that share a submap, as building it takes longer than a match.
+        """
+        self._config = config
+        self._around = around
+        self._stride = stride
+        self._capacity = capacity
+        self._kept: OrderedDict[tuple[int, int], tuple[Array, LocalMap]] = OrderedDict()
+
+    def clear(self) -> None:
+        """Drop all submaps, after keyframes have moved."""
+        self._kept.clear()
+
+    def around(self, frames: Sequence[Keyframe], j: int, path_m: float) -> tuple[Array, LocalMap]:
+        """Pose (3,) of a submap around keyframe j, and the map in the frame of this pose.
+
+        path_m: length of the path now; keyframes after j that belong to the current visit are not
+        part of the submap.
+        """
+        centre = min(j - j % self._stride + self._stride // 2, len(frames) - 1)
+        key = (centre, frames[j].submap)
+        if key not in self._kept:
+            self._kept[key] = self._built(frames, centre, j, path_m)
+            if len(self._kept) > self._capacity:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+    def before(self, frames: Sequence[Keyframe], j: int) -> tuple[Array, LocalMap]:
+        """Pose (3,) of a submap of keyframe j and of those before it, and the map in its frame."""
+        return self._built(frames, j, j, -math.inf)
+
+    def _built(
+        self, frames: Sequence[Keyframe], centre: int, j: int, path_m: float
+    ) -> tuple[Array, LocalMap]:
+        base = frames[centre].T_map_base
+        submap = LocalMap(self._config)
+        for i in range(max(0, centre - self._around), min(centre + self._around + 1, len(frames))):
+            frame = frames[i]
+            is_earlier = i <= j or path_m - frame.path_m > AGAIN_M
+            if is_earlier and frame.submap == frames[j].submap:
+                T = se2.between(base, frame.T_map_base)
+                with suppress(InputError):  # kilometres away: nothing to match there
+                    submap.add_scan(frame.points, frame.scan.T_base_laser, T)
+        return base, submap
+
+
+# Loop-closure candidates that agree on the same correction.
+#
+# Source: Mangelson et al., "Pairwise consistent measurement set maximization for robust multi-robot
+# map merging", 2018.
+
+
+def largest_consistent(candidates: Iterable[Edge], frames: Sequence[Keyframe]) -> list[Edge]:
+    """Largest set of candidates that agree on the same correction (greedy).
+
+    Of keyframes that are in the graph; none if two of the set are of the same keyframe.
+    """
+    edges = [edge for edge in candidates if edge.b < len(frames)]
+    if not edges:
+        return []
+    n = len(edges)
+    agree = np.eye(n, dtype=np.bool_)
+    for i in range(n):
+        for j in range(i):
+            agree[i, j] = agree[j, i] = _are_consistent(edges[i], edges[j], frames)
+    best: list[int] = []
+    for i in range(n):
+        chosen = [i]
+        for j in np.argsort(-agree.sum(axis=0)):
+            if j != i and all(agree[j, k] for k in chosen):
+                chosen.append(int(j))
+        best = max(best, chosen, key=len)
+    return [edges[i] for i in best] if len({edges[i].b for i in best}) == len(best) else []
+
+
+def _are_consistent(one: Edge, other: Edge, frames: Sequence[Keyframe]) -> bool:
+    """Whether the loop over two matches and the path between them closes within the gate."""
+    if one.b == other.b:
+        return False
+    T_a_a = se2.between(frames[one.a].T_map_base, frames[other.a].T_map_base)
+    T_b_b = se2.between(frames[one.b].T_map_base, frames[other.b].T_map_base)
+    there = se2.compose(one.T_a_b, T_b_b)
+    back = se2.compose(T_a_a, other.T_a_b)
+    off = se2.pose_difference(there, back)
+    covariance = inverse(one.information) + inverse(other.information)
+    covariance[2, 2] += 1e-6
+    return float(off @ np.linalg.solve(covariance, off)) < CHI2
+
+
+# Pieces of map: submaps whose places relative to each other are known.
+
+_PUBLISHED = 0
+
+# Distance between two views of which each says something new. Of eight kidnapped robots that drove
+# for 440 s, one joined its piece at a wrong place where those 3 m of path apart were counted, and
+# none with this.
+_VIEW_M = 3.0
+
+_RECENT_SUBMAPS = 24  # matches among which consistent ones are searched
+
+
+class Pieces:
+    """The submaps by number, each in a piece; one of the pieces is the published map.
+
+    A submap that begins because scans contradict the map is a piece of its own. Matches of the
+    robot's piece with another one are stored; enough that agree are loop edges, which join the two.
+    """
+
+    def __init__(self) -> None:
+        self._piece_of = [_PUBLISHED]  # by the number of the submap
+        self._matches: deque[Edge] = deque(maxlen=_RECENT_SUBMAPS)
+
+    @property
+    def current(self) -> int:
+        """Number of the submap that the robot is in."""
+        return len(self._piece_of) - 1
+
+    @property
+    def piece(self) -> int:
+        """Number of the piece that the robot is in."""
+        return self._piece_of[-1]
+
+    @property
+    def is_apart(self) -> bool:
+        """Whether the place of the robot in the published map is unknown."""
+        return self._piece_of[-1] != _PUBLISHED
+
+    def load(self, submaps: int) -> None:
+        """Begin a submap of the published map, after a number of others of it."""
+        self._piece_of = [_PUBLISHED] * (submaps + 1)
+
+    def begin(self) -> None:
+        """Begin a submap, apart from all others."""
+        self._piece_of.append(len(self._piece_of))
+
+    def return_to_published(self) -> None:
+        """The pose in the published map was given: leave a piece that is apart."""
+        if self.is_apart:
+            self._piece_of.append(_PUBLISHED)
+
+    def is_here(self, submap: int) -> bool:
+        """Whether a submap is part of the piece that the robot is in."""
+        return self._piece_of[submap] == self._piece_of[-1]
+
+    def is_published(self, submap: int) -> bool:
+        """Whether a submap is part of the published map."""
+        return self._piece_of[submap] == _PUBLISHED
+
+    def join(self, frames: Sequence[Keyframe], edges: Sequence[Edge]) -> None:
+        """Make one piece of those that loop edges connect."""
+        for edge in edges:
+            ends = (frames[edge.a].submap, frames[edge.b].submap)
+            kept, gone = sorted(self._piece_of[submap] for submap in ends)
+            self._piece_of = [kept if piece == gone else piece for piece in self._piece_of]
+
+    def add_match(self, edge: Edge) -> None:
+        """Add a match of a keyframe in the robot's piece, edge.b, with one in another piece."""
+        self._matches.append(edge)
+
+    def take_edges(self, frames: Sequence[Keyframe], fewest: int) -> list[Edge]:
+        """Loop edges that join the robot's piece with another one; none while too few agree.
+
+        fewest: matches, each of another view, that join two pieces.
+        """
+        of_piece: dict[int, list[Edge]] = defaultdict(list)
+        for edge in self._matches:
+            if self.is_here(frames[edge.b].submap):
+                of_piece[self._piece_of[frames[edge.a].submap]].append(edge)
+        for edges in of_piece.values():
+            agreeing = largest_consistent(edges, frames)
+            along_path = sorted(edge.b for edge in agreeing)
+            if _count_views([frames[b].T_map_base for b in along_path]) >= fewest:
+                self._matches.clear()
+                return agreeing
+        return []
+
+
+def _count_views(poses: list[Array]) -> int:
+    """Number of poses (3,) that are a view apart from each other (greedy)."""
+    views: list[Array] = []
+    for T in poses:
+        if all(math.dist(T[:2], view[:2]) >= _VIEW_M for view in views):
+            views.append(T)
+    return len(views)
+
+
+# The pose graph of the keyframes, and its optimization, a slice of an iteration per step.
+
+_MIN_MOVE_M = 0.1  # smallest move of a keyframe for which the map follows the calibration
+
+
+class KeyframeGraph:
+    """Moves the keyframes as the edges between them and the calibration of the odometry have it.
+
+    edges: those between visits; the keyframes hold their steps and headings.
+    """
+
+    def __init__(self, keyframes: Keyframes, calibration: OdometryCalibration) -> None:
+        """calibration: of the odometry, as another part estimates it."""
+        self._keyframes = keyframes
+        self._calibration = calibration
+        self.edges = EdgeTable()
+        # The optimization in progress: None after each slice, and the correction at its end.
+        self._slices: Iterator[Correction | None] | None = None
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether an optimization is in progress."""
+        return self._slices is not None
+
+    def optimize(self, start: Array | None = None) -> None:
+        """Begin an optimization, at poses (N, 3); None: at the present ones."""
+        self._calibrate(self._calibration.smoothed())
+        poses = self._keyframes.poses() if start is None else start
+        self._slices = self._moved(rounds(poses, self._all_edges()), poses)
+
+    def optimized(self) -> Array:
+        """Poses (N, 3) of the keyframes after a whole optimization, which does not move them."""
+        self._calibrate(self._calibration.smoothed())
+        return last(rounds(self._keyframes.poses(), self._all_edges()))
+
+    def step(self) -> Correction | None:
+        """Do one slice; returns the correction of the keyframes after the last one."""
+        if self._slices is None:
+            return None
+        try:
+            correction = next(self._slices)
+        except StopIteration:
+            correction = None
+            self._slices = None
+        if correction is not None:
+            self._slices = None
+        return correction
+
+    def follow_calibration(self) -> None:
+        """Begin to move the poses by what is newly known of the calibration, and by nothing else.
+
+        The maps of loops that were accepted without an optimization agree within their noise. What
+        remains of their errors is no news: it stays until a loop closes.
+        """
+        if self._is_calibration_new():
+            self._slices = self._followed(self._calibration.smoothed())
+            self.step()
+
+    def _moved(self, moving: Iterator[Array], poses: Array) -> Iterator[Correction | None]:
+        """Slices of an optimization, from poses (N, 3)."""
+        for after in moving:
+            poses = after
+            yield None
+        # Keyframes that were added during the optimization move with their anchors.
+        for added in self._keyframes.steps[len(poses) - 1 :]:
+            poses = np.vstack([poses, se2.compose(poses[added.a], added.T_a_b)])
+        before = self._keyframes.poses()
+        for _ in self._keyframes.move(poses, self.edges):
+            yield None
+            before = self._keyframes.poses()
+        yield Correction(before, self._keyframes.poses())
+
+    def _followed(self, parameters: Array) -> Iterator[Correction | None]:
+        """Slices of a move by parameters (N, 4); none after the first iteration if it is small."""
+        poses = self._keyframes.poses()
+        anchor = self._keyframes.anchor  # others may be added between the slices
+        now = self._all_edges()
+        settled = now.settled(poses)
+        change = self._all_edges(parameters).T_a_b - now.T_a_b
+        moving = rounds(poses, replace(settled, T_a_b=settled.T_a_b + change))
+        moved = poses
+        for moved in moving:
+            if not np.array_equal(moved, poses):
+                break  # the first iteration is complete
+            yield None
+        self._calibration.applied = parameters[-1]
+        if math.dist(moved[anchor, :2], poses[anchor, :2]) > _MIN_MOVE_M:
+            self._calibrate(self._calibration.smoothed())
+            yield None
+            yield from self._moved(moving, moved)
+
+    def _is_calibration_new(self) -> bool:
+        """Whether the calibration may move the last keyframe by more than it is uncertain itself.
+
+        The parameters have a random walk: what they are now is not what they were.
+        """
+        if len(self._keyframes) < 2:
+            return False
+        by = self._keyframes.frames[self._keyframes.anchor].systematic[:2]
+        off = by @ (self._calibration.parameters - self._calibration.applied)
+        variance = float(np.trace(self._calibration.covariance_of(by)))
+        return float(off @ off) > max(_MIN_MOVE_M**2, variance)
+
+    def _calibrate(self, parameters: Array) -> None:
+        """Correct the edges by parameters (N, 4) of the calibration."""
+        self._keyframes.calibrate(parameters)
+        self.edges.calibrate(parameters)
+        self._calibration.applied = parameters[-1]
+
+    def _all_edges(self, parameters: Array | None = None) -> EdgeArrays:
+        """All edges, as they are or would be with parameters (N, 4) of the calibration."""
+        keyframes = self._keyframes
+        return EdgeArrays.joined(
+            [
+                keyframes.steps.arrays(parameters),
+                self.edges.arrays(parameters),
+                keyframes.headings(parameters),
+            ]
+        )
+
+
 _RECENT = 8  # recent candidates among which consistent ones are searched
+
 # Covariance (3, 3) that an edge between two visits has beside that of its match: of 5 cm and
 # 0.02 rad. More, and the path is changed less.
 EDGE_NOISE = np.diag(np.square([0.05, 0.05, 0.02]))
+
 # Scans within which a keyframe is matched. With three matches for each of the scans of a sparse
 # log, and one done at a time, a loop was closed up to 344 scans after its keyframes.
 _LATEST = 20

@@ -11,9 +11,8 @@ from thinmap_ros.core.places.recognition import PieceHypothesis
 from thinmap_ros.core.places.views import View
 from thinmap_ros.core.se2 import Array, inverse, rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, view_difference_m
-from thinmap_ros.core.slam.graph.loop_closure import EDGE_NOISE, LoopClosureConfig
+from thinmap_ros.core.slam.graph.loop_closure import EDGE_NOISE, LoopClosureConfig, Submaps
 from thinmap_ros.core.slam.graph.pose_graph import Edge
-from thinmap_ros.core.slam.graph.submaps import Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS, Matcher, MatchingConfig
 
