@@ -10,7 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.edits import Erasures, KeepOut, KeepOutArea, MapEdits
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
+from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files import sessions

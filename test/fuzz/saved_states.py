@@ -14,7 +14,7 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.correction import CorrectableGrid
 from thinmap_ros.core.grid.edits import Erasures, KeepOut, MapEdits
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
-from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
+from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files.worlds import read_world

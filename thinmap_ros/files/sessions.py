@@ -18,7 +18,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
+from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.snapshot import State

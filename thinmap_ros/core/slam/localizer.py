@@ -33,13 +33,13 @@ from thinmap_ros.core.slam.atlas import Atlas
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     Keyframes,
+    SavedKeyframes,
     Step,
     heading_errors,
     with_heading,
 )
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, Pieces
 from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
-from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.graph.tables import KeyframeTrajectory, heading_row
 from thinmap_ros.core.slam.matching import local_map
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig

@@ -7,7 +7,7 @@ import numpy as np
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.odometry import FIELDS, OdometryAnchor
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
+from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.snapshot import MAX_COUNT, Field, State

@@ -11,10 +11,9 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import inverse
-from thinmap_ros.core.slam.graph import saved_keyframes, tables
-from thinmap_ros.core.slam.graph.keyframes import Keyframe
+from thinmap_ros.core.slam.graph import keyframes, tables
+from thinmap_ros.core.slam.graph.keyframes import Keyframe, SavedKeyframes
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, Systematic
-from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.graph.tables import packed_scans as packed
 from thinmap_ros.core.slam.graph.tables import unpacked_scans
 from thinmap_ros.core.slam.matching.surface import surface_points
@@ -155,6 +154,6 @@ def test_no_more_is_unpacked_than_memory_holds(monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(InputError, match='724 ranges of 724 beams: expected as many, at most 723'):
         SavedKeyframes.from_state(state)
     monkeypatch.undo()
-    monkeypatch.setattr(saved_keyframes, 'MAX_KEYFRAMES', 3)
+    monkeypatch.setattr(keyframes, 'MAX_KEYFRAMES', 3)
     with pytest.raises(InputError, match='expected 1 to 3 keyframes'):
         SavedKeyframes.from_state(state)

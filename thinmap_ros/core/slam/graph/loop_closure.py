@@ -29,11 +29,11 @@ from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
     Keyframes,
+    SavedKeyframes,
     Step,
     view_difference_m,
 )
 from thinmap_ros.core.slam.graph.pose_graph import Edge, EdgeArrays, last, rounds
-from thinmap_ros.core.slam.graph.saved_keyframes import SavedKeyframes
 from thinmap_ros.core.slam.graph.tables import EdgeTable
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig

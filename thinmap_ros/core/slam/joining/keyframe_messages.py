@@ -17,7 +17,7 @@ from thinmap_ros.core.errors import MAX_BEAMS, InputError, one_line_reason
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph import tables
-from thinmap_ros.core.slam.graph.saved_keyframes import MAX_EDGES, MAX_KEYFRAMES
+from thinmap_ros.core.slam.graph.keyframes import MAX_EDGES, MAX_KEYFRAMES
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, State
 
 _WHAT = 'keyframe'

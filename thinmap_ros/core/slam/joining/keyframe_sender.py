@@ -4,9 +4,9 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array, inverse
+from thinmap_ros.core.slam.graph.keyframes import with_calibration
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Edge
-from thinmap_ros.core.slam.graph.saved_keyframes import with_calibration
 from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, SentEdge
 from thinmap_ros.core.slam.odometry import UNKNOWN
 
