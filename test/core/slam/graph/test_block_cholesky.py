@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thinmap_ros.core.slam.graph.block_cholesky import Factorization, Pattern
+from thinmap_ros.core.slam.graph.pose_graph import Factorization, Pattern
 
 
 def chain_with_loops(rng, count, loops):
