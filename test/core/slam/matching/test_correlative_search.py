@@ -8,11 +8,15 @@ from support.local_map_cells import cells_of, nearest
 from support.slam_room import ROOM, around, map_of, seen_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.matching import correlative_search
-from thinmap_ros.core.slam.matching.correlative_search import search
+from thinmap_ros.core.slam.matching import scan_matcher
 from thinmap_ros.core.slam.matching.local_map import MAX_WALL_DISTANCE_M, LocalMapConfig
-from thinmap_ros.core.slam.matching.matching_cost import SLIP_SIGMAS, UNSEEN_COST
-from thinmap_ros.core.slam.matching.scan_matcher import Matcher, weighted_points
+from thinmap_ros.core.slam.matching.scan_matcher import (
+    SLIP_SIGMAS,
+    UNSEEN_COST,
+    Matcher,
+    search,
+    weighted_points,
+)
 
 MATCHER = Matcher()
 CELL_M = LocalMapConfig().resolution_m
@@ -157,13 +161,13 @@ def test_a_prior_at_half_a_turn_is_searched_on_both_sides():
 def test_no_more_nodes_are_tried_than_allowed(monkeypatch, most_nodes):
     """Except the root nodes and the children of the last node."""
     tried = []
-    cost = correlative_search._cost
+    cost = scan_matcher._cost
 
     def counted(scan, pose, lattice, sigma, width, slack, most):
         tried.append(slack)
         return cost(scan, pose, lattice, sigma, width, slack, most)
 
-    monkeypatch.setattr(correlative_search, '_cost', counted)
+    monkeypatch.setattr(scan_matcher, '_cost', counted)
     ended = 0
     for seed in range(8):
         case = Case(seed)
@@ -197,7 +201,7 @@ def test_the_cost_is_that_of_the_reference_and_its_bound_is_lower(rng):
         lattice = case.local_map.lattice
 
         def cost(pose, slack, moving=moving, lattice=lattice):
-            return correlative_search._cost(moving, pose, lattice, *NOISE, slack, np.inf)
+            return scan_matcher._cost(moving, pose, lattice, *NOISE, slack, np.inf)
 
         flat = 1e-12 * np.eye(3)
         reference = Exhaustive(case.local_map)

@@ -8,7 +8,7 @@ from support.local_map_cells import read_cells
 from support.slam_room import ROOM, around, map_of, on_wall, seen_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.matching import matching_cost
+from thinmap_ros.core.slam.matching import scan_matcher
 from thinmap_ros.core.slam.matching.local_map import (
     HERE,
     MAX_WALL_DISTANCE_M,
@@ -16,15 +16,16 @@ from thinmap_ros.core.slam.matching.local_map import (
     LocalMapConfig,
     off_wall,
 )
-from thinmap_ros.core.slam.matching.matching_cost import (
+from thinmap_ros.core.slam.matching.scan_matcher import (
     FITS_SIGMAS,
     SLIP_SIGMAS,
     UNSEEN_COST,
+    Matcher,
     by_prior,
     evaluate,
     minimize,
+    weighted_points,
 )
-from thinmap_ros.core.slam.matching.scan_matcher import Matcher, weighted_points
 
 TRUTH = np.array([2.0, 2.0, 0.3])
 CORRIDOR = np.array([[-50.0, -1.0, 50.0, -1.0], [50.0, 1.0, -50.0, 1.0]])
@@ -384,7 +385,7 @@ def test_kernels_are_what_they_are_in_plain_python(rng, room, scan, monkeypatch)
     arguments = (thin, pose, prior, information, room.lattice, *NOISE)
     minimized = minimize(*arguments)
     # A compiled function cannot return a cell to Python.
-    monkeypatch.setattr(matching_cost, 'off_wall', off_wall.py_func)
+    monkeypatch.setattr(scan_matcher, 'off_wall', off_wall.py_func)
     for compiled, plain in zip(
         evaluated, evaluate.py_func(thin, pose, room.lattice, *NOISE), strict=True
     ):
