@@ -43,9 +43,12 @@ from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
 from thinmap_ros.core.slam.graph.tables import KeyframeTrajectory, heading_row
 from thinmap_ros.core.slam.matching import local_map
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
-from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS
-from thinmap_ros.core.slam.matching.surface import surface_points
+from thinmap_ros.core.slam.matching.surface import (
+    free_cells,
+    occupied_surface_points,
+    surface_points,
+)
 from thinmap_ros.core.slam.odometry import OdometryCalibration, PoseUncertainty
 from thinmap_ros.core.slam.track import LocalizerConfig, Surroundings, Tracked, Tracker
 from thinmap_ros.core.slam.wall_compass import Heading, Reference, WallCompass

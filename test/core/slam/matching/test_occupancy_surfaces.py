@@ -10,8 +10,8 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.local_map import LocalMap
-from thinmap_ros.core.slam.matching.occupancy_surfaces import free_cells, occupied_surface_points
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
+from thinmap_ros.core.slam.matching.surface import free_cells, occupied_surface_points
 from thinmap_ros.core.slam.track import LocalizerConfig
 
 START = np.array([2.0, 2.0, 0.0])
