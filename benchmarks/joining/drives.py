@@ -16,7 +16,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig
 from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, SentEdge
 from thinmap_ros.core.slam.joining.keyframe_sender import KeyframeSender
-from thinmap_ros.core.slam.joining.robot_keyframes import ReceivedKeyframes, RobotKeyframes
+from thinmap_ros.core.slam.joining.pieces import ReceivedKeyframes, RobotKeyframes
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.stage import Estimate

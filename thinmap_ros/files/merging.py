@@ -11,7 +11,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.recognition import JOIN_ODDS, recognize
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.joined import JoinedMap, join
-from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
+from thinmap_ros.core.slam.joining.pieces import SlamPiece
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import TopologyBuilder, build

@@ -14,8 +14,8 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.places.recognition import Placement, Recognition, decide
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Edge
-from thinmap_ros.core.slam.joining.growing_piece import GrowingPiece
 from thinmap_ros.core.slam.joining.links import match_keyframes, placed_keyframes
+from thinmap_ros.core.slam.joining.pieces import GrowingPiece
 from thinmap_ros.core.stage import Apart, Join
 
 # Of the published map, with each scan: its grid and graph are made again from its keyframes.

@@ -9,7 +9,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.places.recognition import recognize
 from thinmap_ros.core.slam.joining.joined import JoinConfig, join
 from thinmap_ros.core.slam.joining.links import match_keyframes, placed_keyframes
-from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
+from thinmap_ros.core.slam.joining.pieces import SlamPiece
 from thinmap_ros.core.topology.graph import NodeKind
 
 CONFIG = JoinConfig(OccupancyConfig(no_return_clear_range_m=8.0))

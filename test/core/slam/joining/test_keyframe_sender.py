@@ -14,7 +14,7 @@ from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.graph.tables import EdgeTable
 from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage
 from thinmap_ros.core.slam.joining.keyframe_sender import KeyframeSender
-from thinmap_ros.core.slam.joining.robot_keyframes import ReceivedKeyframes
+from thinmap_ros.core.slam.joining.pieces import ReceivedKeyframes
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MatchingConfig
 from thinmap_ros.core.slam.matching.surface import surface_points

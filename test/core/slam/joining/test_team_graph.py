@@ -11,7 +11,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.joining import team_graph
 from thinmap_ros.core.slam.joining.keyframe_messages import SentEdge
-from thinmap_ros.core.slam.joining.robot_keyframes import RobotKeyframes
+from thinmap_ros.core.slam.joining.pieces import RobotKeyframes
 from thinmap_ros.core.slam.joining.team_graph import TeamGraph
 from thinmap_ros.core.slam.joining.team_map import RobotMap, merged
 

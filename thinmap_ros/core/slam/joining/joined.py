@@ -15,8 +15,8 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
 from thinmap_ros.core.slam.joining.links import match_keyframes, placed_keyframes
+from thinmap_ros.core.slam.joining.pieces import SlamPiece
 from thinmap_ros.core.slam.joining.rigid import found, rigid_links, rigid_transform
-from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import Ids, TopologyBuilder, join_topologies, moved_map
 

@@ -8,7 +8,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array, inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
 from thinmap_ros.core.slam.joining.links import Prior, match_keyframes
-from thinmap_ros.core.slam.joining.slam_piece import SlamPiece
+from thinmap_ros.core.slam.joining.pieces import SlamPiece
 
 _MAX_LINKS = 100  # for one transform; more take time
 
