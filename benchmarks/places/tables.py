@@ -14,7 +14,7 @@ from benchmarks.places.truth import relative_errors, rigid_errors
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.places.piece import MapPiece, drawn_piece
 from thinmap_ros.core.places.recognition import JoinDecision, Recognition, decide, recognize
-from thinmap_ros.core.slam.joining.joined import JoinConfig, join
+from thinmap_ros.core.slam.joining.join import JoinConfig, join
 from thinmap_ros.core.slam.joining.pieces import SlamPiece
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.evaluation.outcome import Table

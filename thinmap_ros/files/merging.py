@@ -10,7 +10,7 @@ from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.recognition import JOIN_ODDS, recognize
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.joining.joined import JoinedMap, join
+from thinmap_ros.core.slam.joining.join import JoinedMap, join
 from thinmap_ros.core.slam.joining.pieces import SlamPiece
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.segmentation import RegionTracker

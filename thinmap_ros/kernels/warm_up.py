@@ -115,7 +115,7 @@ def ekf_localizer() -> None:
 @cache
 def map_joiner() -> None:
     """Warm up recognition between maps, and merging."""
-    from thinmap_ros.core.slam.joining.rigid import refined
+    from thinmap_ros.core.slam.joining.join import refined
     from thinmap_ros.core.slam.joining.team_map import RobotMap, merged
 
     topology_builder()

@@ -29,7 +29,6 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, rotated_covariance
-from thinmap_ros.core.slam.atlas import Atlas
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     Keyframes,
@@ -41,6 +40,7 @@ from thinmap_ros.core.slam.graph.keyframes import (
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, Pieces
 from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
 from thinmap_ros.core.slam.graph.tables import KeyframeTrajectory, heading_row
+from thinmap_ros.core.slam.joining.join import Atlas
 from thinmap_ros.core.slam.matching import local_map
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS

@@ -7,8 +7,7 @@ from support.driven_pieces import driven_piece, true_transform
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.places.recognition import recognize
-from thinmap_ros.core.slam.joining.joined import JoinConfig, join
-from thinmap_ros.core.slam.joining.links import match_keyframes, placed_keyframes
+from thinmap_ros.core.slam.joining.join import JoinConfig, join, match_keyframes, placed_keyframes
 from thinmap_ros.core.slam.joining.pieces import SlamPiece
 from thinmap_ros.core.topology.graph import NodeKind
 

@@ -14,7 +14,7 @@ from thinmap_ros.core.places.piece import SAME_M, SAME_RAD
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
-from thinmap_ros.core.slam.joining.links import match_keyframes
+from thinmap_ros.core.slam.joining.join import match_keyframes
 from thinmap_ros.core.slam.joining.pieces import RobotKeyframes
 
 _FEWEST_LINKS = LoopClosureConfig().min_consistent_matches

@@ -12,9 +12,9 @@ from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.places.recognition import JOIN_ODDS, recognize
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
+from thinmap_ros.core.slam.joining.join import refined
 from thinmap_ros.core.slam.joining.map_links import MapLink, MapLinks
 from thinmap_ros.core.slam.joining.pieces import RobotKeyframes, SlamPiece
-from thinmap_ros.core.slam.joining.rigid import refined
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import TopologyBuilder, build, join_topologies, moved_map
 
