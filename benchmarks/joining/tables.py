@@ -14,8 +14,7 @@ from benchmarks.places.truth import overlap_errors
 from benchmarks.worlds import Floor
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.joining.team_graph import TeamGraph
-from thinmap_ros.core.slam.joining.team_map import WORLD, Team
+from thinmap_ros.core.slam.joining.team import WORLD, Team, TeamGraph
 from thinmap_ros.evaluation.outcome import Table
 from thinmap_ros.nodes.joining.joint_map import JointMap
 

@@ -116,7 +116,7 @@ def ekf_localizer() -> None:
 def map_joiner() -> None:
     """Warm up recognition between maps, and merging."""
     from thinmap_ros.core.slam.joining.join import refined
-    from thinmap_ros.core.slam.joining.team_map import RobotMap, merged
+    from thinmap_ros.core.slam.joining.team import RobotMap, merged
 
     topology_builder()
     _recognize()

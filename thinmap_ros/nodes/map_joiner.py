@@ -6,8 +6,7 @@ from thinmap_msgs.srv import JoinMaps, SeparateMaps
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.joining.map_links import MapLink
-from thinmap_ros.core.slam.joining.team_map import WORLD, RobotMap, Search, Team
+from thinmap_ros.core.slam.joining.team import WORLD, LinkSearch, MapLink, RobotMap, Team
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.joining.joint_map import JointMap
 from thinmap_ros.nodes.joining.robot_maps import RobotMaps
@@ -118,12 +117,12 @@ class MapJoinerNode(ThinmapNode):
             if search is not None:
                 self._worker.begin(lambda: self._searched(search))
 
-    def _searched(self, search: Search) -> Result:
+    def _searched(self, search: LinkSearch) -> Result:
         """Search, in the thread of the worker."""
         result = search.run()
         return lambda: self._found(search, *result)
 
-    def _found(self, search: Search, link: MapLink | None, log_odds: float) -> None:
+    def _found(self, search: LinkSearch, link: MapLink | None, log_odds: float) -> None:
         before = self._team.links.between(search.a, search.b)
         self._report_dropped(self._team.found(search, link, log_odds))
         after = self._team.links.between(search.a, search.b)

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.joining.team_graph import Bend, TeamGraph
-from thinmap_ros.core.slam.joining.team_map import MergedMap, RobotMap, merged
+from thinmap_ros.core.slam.joining.team import Bend, RobotMap, TeamGraph, TeamMap, merged
 from thinmap_ros.core.topology.regions import RegionMap
 from thinmap_ros.core.topology.segmentation import RegionTracker
 
@@ -14,7 +13,7 @@ from thinmap_ros.core.topology.segmentation import RegionTracker
 class Merge:
     """A joint map, and how the maps of the robots bend in it."""
 
-    merged: MergedMap
+    merged: TeamMap
     regions: RegionMap
     bend: Bend
 
@@ -24,7 +23,7 @@ class JointMap:
 
     def __init__(self) -> None:
         self.bend = Bend()
-        self._merged: MergedMap | None = None
+        self._merged: TeamMap | None = None
         self._graph = TeamGraph()
         self._regions = RegionTracker()
 

@@ -11,7 +11,7 @@ from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, checked_poses
 from thinmap_ros.core.slam.joining.pieces import ReceivedKeyframes, RobotKeyframes
-from thinmap_ros.core.slam.joining.team_map import RobotMap
+from thinmap_ros.core.slam.joining.team import RobotMap
 from thinmap_ros.core.topology.graph import TopologicalMap, topology_from_msg
 from thinmap_ros.nodes.joining.settings import MapJoinerConfig
 from thinmap_ros.ros import messages, qos

@@ -9,7 +9,7 @@ from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import JoinStatus, RegionArray, RobotMap, TopologicalMap
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.joining.team_map import MergedMap, Team
+from thinmap_ros.core.slam.joining.team import Team, TeamMap
 from thinmap_ros.core.stage import MAX_ODDS
 from thinmap_ros.core.topology.regions import RegionMap, membership_of
 from thinmap_ros.nodes.mapping.region_messages import region_array_msg
@@ -29,7 +29,7 @@ class TeamPublishers:
         self._status = node.create_publisher(JoinStatus, 'join_status', qos.LATCHED)
         self._transforms = node.create_publisher(TFMessage, '/tf_static', qos.STATIC_TRANSFORMS)
 
-    def publish_map(self, merged: MergedMap, regions: RegionMap) -> None:
+    def publish_map(self, merged: TeamMap, regions: RegionMap) -> None:
         """Publish the joint map, its graph and its regions."""
         now_ns = self._now_ns
         frame = self._frame

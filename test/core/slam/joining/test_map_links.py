@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.joining.map_links import MapLink, MapLinks
+from thinmap_ros.core.slam.joining.team import MapLink, MapLinks
 
 NEAR = np.diag([0.05**2, 0.05**2, 0.01**2])
 

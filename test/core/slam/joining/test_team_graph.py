@@ -9,11 +9,10 @@ from support.driven_pieces import driven_piece, true_transform
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
-from thinmap_ros.core.slam.joining import team_graph
+from thinmap_ros.core.slam.joining import team
 from thinmap_ros.core.slam.joining.keyframe_messages import SentEdge
 from thinmap_ros.core.slam.joining.pieces import RobotKeyframes
-from thinmap_ros.core.slam.joining.team_graph import TeamGraph
-from thinmap_ros.core.slam.joining.team_map import RobotMap, merged
+from thinmap_ros.core.slam.joining.team import RobotMap, TeamGraph, merged
 
 DRIVES = {'/a': (1, 1), '/b': (1, 2), '/c': (1, 3)}
 DRIFT = 0.01  # m of error per metre of path
@@ -118,7 +117,7 @@ def test_three_maps_are_one_graph_and_one_without_keyframes_stays_rigid():
 
 def test_too_few_matches_bend_nothing(monkeypatch):
     fewest = LoopClosureConfig().min_consistent_matches
-    monkeypatch.setattr(team_graph, '_MAX_MATCHES', fewest - 1)
+    monkeypatch.setattr(team, '_MAX_MATCHES', fewest - 1)
     graph = TeamGraph()
     maps = {'/a': keyframes('/a'), '/b': keyframes('/b', DRIFT)}
     places = {name: place(name) for name in maps}

@@ -8,8 +8,8 @@ from support.driven_pieces import driven_piece, true_transform
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.slam.joining import team_map
-from thinmap_ros.core.slam.joining.team_map import WORLD, RobotMap, Search, Team, merged
+from thinmap_ros.core.slam.joining import team as team_map
+from thinmap_ros.core.slam.joining.team import WORLD, LinkSearch, RobotMap, Team, merged
 
 ROBOTS = {'/a': (1, 1), '/b': (1, 2), '/c': (1, 3), '/foreign': (3, 1)}
 
@@ -78,7 +78,7 @@ def test_a_place_is_left_for_a_surer_one(three, monkeypatch, log_odds, is_left):
     right = team.links.between('/a', '/b')
     wrong = replace(right, T_a_b=right.T_a_b + (50.0, 0.0, 0.0), log_odds=log_odds)
     maps = (team.maps['/a'], team.maps['/b'])
-    link, _ = Search('/a', '/b', *maps, wrong, None, 100_000.0).run()
+    link, _ = LinkSearch('/a', '/b', *maps, wrong, None, 100_000.0).run()
     assert link.contradicts(wrong) == is_left
     assert link.contradicts(right) != is_left
 
