@@ -14,8 +14,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig
-from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, SentEdge
-from thinmap_ros.core.slam.joining.keyframe_sender import KeyframeSender
+from thinmap_ros.core.slam.joining.messages import KeyframeMessage, KeyframeSender, SentEdge
 from thinmap_ros.core.slam.joining.pieces import ReceivedKeyframes, RobotKeyframes
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.surface import surface_points

@@ -19,7 +19,7 @@ from thinmap_msgs.msg import Keyframe, KeyframePoses, SlamStatus
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
-from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, checked_poses
+from thinmap_ros.core.slam.joining.messages import KeyframeMessage, checked_poses
 from thinmap_ros.core.slam.joining.pieces import ReceivedKeyframes
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.files import occupancy_maps, package_data, sessions

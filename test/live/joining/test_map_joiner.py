@@ -9,7 +9,7 @@ from tf2_msgs.msg import TFMessage
 from thinmap_msgs.msg import JoinStatus, Keyframe, KeyframePoses, RegionArray, TopologicalMap
 from thinmap_msgs.srv import JoinMaps, SeparateMaps
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, SentEdge
+from thinmap_ros.core.slam.joining.messages import KeyframeMessage, SentEdge
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.ros import messages, qos
 

@@ -9,7 +9,7 @@ from thinmap_msgs.msg import Keyframe as KeyframeMsg
 from thinmap_msgs.msg import KeyframePoses
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, checked_poses
+from thinmap_ros.core.slam.joining.messages import KeyframeMessage, checked_poses
 from thinmap_ros.core.slam.joining.pieces import ReceivedKeyframes, RobotKeyframes
 from thinmap_ros.core.slam.joining.team import RobotMap
 from thinmap_ros.core.topology.graph import TopologicalMap, topology_from_msg

@@ -3,7 +3,7 @@
 from rclpy.node import Node
 
 from thinmap_msgs.msg import Keyframe, KeyframePoses
-from thinmap_ros.core.slam.joining.keyframe_sender import KeyframeSender
+from thinmap_ros.core.slam.joining.messages import KeyframeSender
 from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import new_map_id

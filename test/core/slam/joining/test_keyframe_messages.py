@@ -12,11 +12,7 @@ from support.slam_room import ROOM, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.slam.joining.keyframe_messages import (
-    KeyframeMessage,
-    SentEdge,
-    checked_poses,
-)
+from thinmap_ros.core.slam.joining.messages import KeyframeMessage, SentEdge, checked_poses
 
 T = se2.pose(2.0, 2.5, 0.4)
 UPPER = np.triu_indices(3)

@@ -12,8 +12,7 @@ from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Step
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.graph.tables import EdgeTable
-from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage
-from thinmap_ros.core.slam.joining.keyframe_sender import KeyframeSender
+from thinmap_ros.core.slam.joining.messages import KeyframeMessage, KeyframeSender
 from thinmap_ros.core.slam.joining.pieces import ReceivedKeyframes
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MatchingConfig

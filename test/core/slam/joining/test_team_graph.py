@@ -10,7 +10,7 @@ from support.driven_pieces import driven_piece, true_transform
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.joining import team
-from thinmap_ros.core.slam.joining.keyframe_messages import SentEdge
+from thinmap_ros.core.slam.joining.messages import SentEdge
 from thinmap_ros.core.slam.joining.pieces import RobotKeyframes
 from thinmap_ros.core.slam.joining.team import RobotMap, TeamGraph, merged
 

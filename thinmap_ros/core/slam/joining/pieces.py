@@ -16,7 +16,7 @@ from thinmap_ros.core.places.views import View, ViewBuilder
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
-from thinmap_ros.core.slam.joining.keyframe_messages import KeyframeMessage, SentEdge
+from thinmap_ros.core.slam.joining.messages import KeyframeMessage, SentEdge
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import TopologyBuilder
