@@ -5,7 +5,6 @@ from dataclasses import replace
 from std_srvs.srv import Trigger
 
 from thinmap_msgs.action import Explore
-from thinmap_ros.core.exploration.live.mission_state import mission_state, resumed_mission
 from thinmap_ros.core.exploration.mission import (
     Action,
     DriveTo,
@@ -13,6 +12,8 @@ from thinmap_ros.core.exploration.mission import (
     Mission,
     MissionGoal,
     MissionState,
+    mission_state,
+    resumed_mission,
 )
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import FinishCode, Strategy

@@ -4,22 +4,249 @@ A mission asks a strategy where to drive, and answers what the robot shall do ne
 and no ROS: time is an argument, in s.
 """
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from thinmap_ros.core import errors
-from thinmap_ros.core.exploration.live.drives import Drives
+from thinmap_ros.core import errors, snapshot
 from thinmap_ros.core.exploration.observations import Observation
-from thinmap_ros.core.exploration.strategy import Decision, FinishCode, Strategy
+from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode, Strategy
 from thinmap_ros.core.grid.edits import masked_outside
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, Field
+
+# Whether a drive makes progress.
+
+_STEP_M = 0.1
+
+_DETOUR_M = 1.0
+
+_MAX_DETOURS = 3
+
+# Longer gaps between two updates are missing inputs, no standstill.
+_MAX_GAP_S = 10.0
+
+_SAME_M = 0.1
+
+_SAME_RAD = 0.2
+
+
+def is_same_goal(a: Array, b: Array) -> bool:
+    """Whether two goals (3,) are so near to each other that they are one."""
+    near = math.dist(a[:2], b[:2]) <= _SAME_M
+    return near and abs(wrap(float(a[2] - b[2]))) <= _SAME_RAD
+
+
+@dataclass
+class _Approach:
+    """Smallest distance to a goal so far, m."""
+
+    nearest_m: float = math.inf
+
+    def is_closer(self, distance_m: float) -> bool:
+        """Whether a distance is clearly smaller than all before."""
+        if distance_m > self.nearest_m - _STEP_M:
+            return False
+        self.nearest_m = distance_m
+        return True
+
+
+@dataclass
+class DriveProgress:
+    """Time without progress of a drive to a goal (3,).
+
+    Progress is a smaller distance to the goal than ever, straight or along the remaining path. A
+    new path that is longer by a metre is a detour, and its progress is measured anew, up to three
+    times.
+    """
+
+    goal: Array
+    idle_s: float = 0.0
+    _straight: _Approach = field(default_factory=_Approach)
+    _path: _Approach = field(default_factory=_Approach)
+    _detours: int = 0
+    _last_s: float = math.nan
+
+    def update(self, T_map_base: Array, remaining_m: float | None, now_s: float) -> None:
+        """Process the present pose (3,) and the remaining path, m; None where it is unknown."""
+        gap_s = 0.0 if math.isnan(self._last_s) else now_s - self._last_s
+        self._last_s = now_s
+        self.idle_s += min(max(gap_s, 0.0), _MAX_GAP_S)
+        is_closer = self._straight.is_closer(math.dist(T_map_base[:2], self.goal[:2]))
+        if remaining_m is not None:
+            self._check_detour(remaining_m)
+            is_closer |= self._path.is_closer(remaining_m)
+        if is_closer:
+            self.idle_s = 0.0
+
+    def _check_detour(self, remaining_m: float) -> None:
+        if remaining_m > self._path.nearest_m + _DETOUR_M and self._detours < _MAX_DETOURS:
+            self._detours += 1
+            self._path = _Approach()
+
+
+# A goal at an action server that may answer late, never, or refuse.
+
+_FIRST_ANSWER_S = 5.0
+
+_LAST_ANSWER_S = 20.0
+
+_MAX_UNANSWERED = 3
+
+_MAX_REJECTED = 5
+
+_REJECTED_PAUSE_S = 2.0
+
+
+@dataclass
+class DriveRequest:
+    """Goal (3,) that the server was given at sent_s, and what it reported on it; times in s.
+
+    answer_timeout_s: after which the request counts as lost; feedback_timeout_s: after which a
+    server that has published feedback is silent. A server without any feedback is never silent.
+    """
+
+    goal: Array
+    sent_s: float
+    answer_timeout_s: float = _FIRST_ANSWER_S
+    feedback_timeout_s: float = 3.0
+    is_accepted: bool = False
+    remaining_m: float | None = None
+    _last_feedback_s: float | None = None
+
+    def is_same(self, goal: Array) -> bool:
+        """Whether another goal (3,) is so near that it need not be sent."""
+        return is_same_goal(self.goal, goal)
+
+    def add_feedback(self, remaining_m: float, now_s: float) -> None:
+        """Register feedback; a remaining path of 0 m is not known."""
+        self._last_feedback_s = now_s
+        self.remaining_m = remaining_m if remaining_m > 0.0 else None
+
+    def is_unanswered(self, now_s: float) -> bool:
+        """Whether the server neither accepted nor rejected the goal in time."""
+        return not self.is_accepted and now_s - self.sent_s >= self.answer_timeout_s
+
+    def is_silent(self, now_s: float) -> bool:
+        """Whether the server stopped reporting: it may have been restarted and lost the goal."""
+        if self._last_feedback_s is None:
+            return False
+        return now_s - self._last_feedback_s >= self.feedback_timeout_s
+
+
+@dataclass
+class Retries:
+    """How often a goal may be sent again to a server that rejects it or does not answer.
+
+    Each time, the server has twice as long to answer.
+    """
+
+    _unanswered: int = 0
+    _rejected: int = 0
+    _not_before_s: float = 0.0
+
+    @property
+    def answer_timeout_s(self) -> float:
+        """Time that the server has for its next answer, s."""
+        return min(_FIRST_ANSWER_S * 2.0**self._unanswered, _LAST_ANSWER_S)
+
+    def add_accepted(self) -> None:
+        """Register an accepted goal."""
+        self._unanswered = 0
+        self._rejected = 0
+
+    def add_unanswered(self) -> bool:
+        """Register a goal without answer; returns whether it has to be given up."""
+        self._unanswered = min(self._unanswered + 1, _MAX_UNANSWERED)
+        return self._unanswered >= _MAX_UNANSWERED
+
+    def add_rejected(self, now_s: float) -> bool:
+        """Register a rejected goal; returns whether it has to be given up."""
+        self._unanswered = 0
+        self._rejected += 1
+        self._not_before_s = now_s + _REJECTED_PAUSE_S
+        if self._rejected < _MAX_REJECTED:
+            return False
+        self._rejected = 0
+        return True
+
+    def may_send(self, now_s: float) -> bool:
+        """Whether the pause after a rejected goal is over; a clock that went back ends it."""
+        return not 0.0 < self._not_before_s - now_s <= _REJECTED_PAUSE_S
+
+
+# Whether the drives of an exploration have come to anything.
+
+_MAX_ARRIVALS = 6
+
+STAYS = 'reached, but the target stays'
+
+# Within the distance at which a goal counts as reached: turns in place, and corrections of a pose.
+_DRIVEN_M = 0.3
+
+
+@dataclass
+class Drives:
+    """What came of the drives so far.
+
+    has_settled: whether a target was reached, or was none any more before the robot was there;
+    failure: why the last drive failed.
+    """
+
+    has_settled: bool = False
+    failure: str = ''
+    _target: EndNode | None = None
+    _arrivals: int = 0
+
+    def follow(self, target: EndNode | None, strategy: Strategy) -> Array | None:
+        """Goal (3,) to drive to for the target of a strategy's decision; None: nowhere.
+
+        A target that is where it was although the robot has arrived there again and again has
+        failed: the strategy does not see it as reached.
+        """
+        last = self._target
+        self._target = target
+        self.has_settled |= last is not None and (target is None or target.node_id != last.node_id)
+        if target is None:
+            return None
+        if last is None or not is_same_goal(target.goal, last.goal):
+            self._arrivals = 0
+        if self._arrivals < _MAX_ARRIVALS:
+            return target.goal
+        self.add_result(False, STAYS)
+        strategy.target_failed(STAYS)
+        return None
+
+    def add_result(self, is_success: bool, reason: str) -> None:
+        """Register how the drive to the present target ended."""
+        self.has_settled |= is_success
+        self._arrivals += is_success
+        if not is_success:
+            self.failure = reason
+            self._target = None
+
+    def shortcoming(self, end: Decision, distance_m: float) -> str:
+        """Why an exploration that leaves something has explored nothing; else empty.
+
+        distance_m: travelled. A strategy that resolves all end nodes from the start needs no drive.
+        """
+        if end.code != FinishCode.UNREACHABLE:
+            return ''
+        if self.failure and not (self.has_settled and distance_m > _DRIVEN_M):
+            return f'no target was reached: {self.failure}'
+        return '' if distance_m > _DRIVEN_M else 'the robot has not driven'
+
 
 _MIN_STEP_M = 0.02
+
 _MIN_CORNERS = 3
+
 _EXPLORED = (FinishCode.ALL_RESOLVED, FinishCode.UNREACHABLE)
 
 
@@ -128,6 +355,7 @@ class Finish(NamedTuple):
 
 
 Action = DriveTo | Finish | None
+
 """What the robot shall do now; None: continue."""
 
 
@@ -325,3 +553,65 @@ class Mission:
         self.state = MissionState.FINISHED
         self.is_paused = False
         return end
+
+
+# A mission as arrays, without its strategy: for an explorer that is killed and started again.
+
+FIELDS = {
+    'budget': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+    'area': Field(np.float64, ('n', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+    'return_to_start': Field(np.bool_),
+    'phase': Field(np.int64, (), min(MissionState), max(MissionState)),
+    'end_code': Field(np.int64, (), min(FinishCode), max(FinishCode)),
+    'end_reason': Field(np.uint8, ('t',)),  # UTF-8
+    'elapsed_s': Field(np.float64, (), 0.0, MAX_COUNT),
+    'start': Field(np.float64, ('s', 3), -MAX_COORDINATE_M, MAX_COORDINATE_M),  # none, or one
+    'distance_m': Field(np.float64, (), 0.0, MAX_COUNT),
+    'is_paused': Field(np.bool_),
+    'has_returned': Field(np.bool_),
+    'has_explored': Field(np.bool_),
+    'has_settled': Field(np.bool_),
+}
+
+
+def mission_state(mission: Mission, now_s: float) -> dict[str, NDArray[Any]]:
+    """Goal and progress of a mission as arrays by name; `resumed_mission` continues it."""
+    budget = mission.goal.budget
+    start = mission.odometer.start
+    return {
+        'budget': np.array([budget.time_s, budget.distance_m, budget.area_m2]),
+        'area': mission.goal.area.reshape(-1, 2),
+        'return_to_start': np.array(mission.goal.return_to_start),
+        'phase': np.array(int(mission.state)),
+        'end_code': np.array(int(mission.end.code)),
+        'end_reason': np.frombuffer(mission.end.reason.encode(), dtype=np.uint8),
+        'elapsed_s': np.array(max(mission.elapsed_s(now_s), 0.0)),
+        'start': np.empty((0, 3)) if start is None else start.reshape(1, 3),
+        'distance_m': np.array(mission.odometer.distance_m),
+        'is_paused': np.array(mission.is_paused),
+        'has_returned': np.array(mission.has_returned),
+        'has_explored': np.array(mission.end.has_explored),
+        'has_settled': np.array(mission.drives.has_settled),
+    }
+
+
+def resumed_mission(
+    state: Mapping[str, NDArray[Any]], strategy: Strategy, watchdog: InputWatchdog, now_s: float
+) -> Mission:
+    """Mission that continues another's `mission_state`, with a strategy.
+
+    Raises InputError where it is no such state.
+    """
+    own = snapshot.validate(state, FIELDS, 'mission')
+    goal = MissionGoal(Budget(*own['budget'].tolist()), own['area'], bool(own['return_to_start']))
+    phase = MissionState(int(own['phase']))
+    mission = Mission(goal, strategy, watchdog, now_s, phase, float(own['elapsed_s']))
+    reason = own['end_reason'].tobytes().decode(errors='replace')
+    has_explored = bool(own['has_explored'])
+    mission.end = Finish(FinishCode(int(own['end_code'])), reason, has_explored)
+    mission.drives.has_settled = bool(own['has_settled'])
+    mission.odometer.start = own['start'][0] if len(own['start']) else None
+    mission.odometer.distance_m = float(own['distance_m'])
+    mission.is_paused = bool(own['is_paused'])
+    mission.has_returned = bool(own['has_returned'])
+    return mission

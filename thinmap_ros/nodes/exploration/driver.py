@@ -7,7 +7,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 
-from thinmap_ros.core.exploration.live.drive_progress import is_same_goal
+from thinmap_ros.core.exploration.mission import is_same_goal
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.nodes.exploration.goal_monitor import PREFIX_BYTES
 from thinmap_ros.ros import messages, qos

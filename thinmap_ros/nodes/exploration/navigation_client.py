@@ -9,8 +9,7 @@ from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
 from rclpy.task import Future
 
-from thinmap_ros.core.exploration.live.drive_progress import DriveProgress
-from thinmap_ros.core.exploration.live.drive_request import DriveRequest, Retries
+from thinmap_ros.core.exploration.mission import DriveProgress, DriveRequest, Retries
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.nodes.exploration.driver import OnResult
 from thinmap_ros.nodes.exploration.goal_monitor import GoalMonitor, action_servers

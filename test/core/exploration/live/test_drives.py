@@ -5,9 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from thinmap_ros.core.exploration.live.drive_progress import DriveProgress
-from thinmap_ros.core.exploration.live.drive_request import DriveRequest, Retries
-from thinmap_ros.core.exploration.live.drives import Drives
+from thinmap_ros.core.exploration.mission import DriveProgress, DriveRequest, Drives, Retries
 from thinmap_ros.core.exploration.strategy import unobserved
 from thinmap_ros.core.se2 import pose
 

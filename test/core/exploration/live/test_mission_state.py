@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.live.mission_state import mission_state, resumed_mission
 from thinmap_ros.core.exploration.mission import (
     Budget,
     DriveTo,
@@ -13,6 +12,8 @@ from thinmap_ros.core.exploration.mission import (
     Mission,
     MissionGoal,
     MissionState,
+    mission_state,
+    resumed_mission,
 )
 from thinmap_ros.core.exploration.strategy import FinishCode
 from thinmap_ros.core.se2 import pose
