@@ -24,7 +24,7 @@ from thinmap_msgs.msg import (
     TeamClaim,
     TopologicalMap,
 )
-from thinmap_ros.core.exploration.team.team import MAX_SETTLED
+from thinmap_ros.core.exploration.team import MAX_SETTLED
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.shared import JoinedMaps, TileSender
 from thinmap_ros.core.stage import Destination

@@ -4,7 +4,7 @@ import numpy as np
 
 from thinmap_msgs.msg import JoinStatus, MapTiles, RobotMap, TeamClaim
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.team.claims import Claim
+from thinmap_ros.core.exploration.team import Claim
 from thinmap_ros.core.grid.shared import TileSender
 from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.ros import messages, qos

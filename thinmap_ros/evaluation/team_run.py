@@ -9,7 +9,7 @@ import numpy as np
 
 from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
 from thinmap_ros.core.exploration.explorer import Explorer
-from thinmap_ros.core.exploration.team.team import Team, TeamConfig
+from thinmap_ros.core.exploration.team import Team, TeamConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_metrics import MILESTONES, first_time
 from thinmap_ros.sim.coverage import robot_observable_cells

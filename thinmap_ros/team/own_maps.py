@@ -7,7 +7,7 @@ import numpy as np
 
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop
 from thinmap_ros.core.exploration.explorer import Explorer
-from thinmap_ros.core.exploration.team.team import Team
+from thinmap_ros.core.exploration.team import Team
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import (
     ReceivedTiles,

@@ -11,8 +11,7 @@ import pytest
 from thinmap_msgs.msg import MapTiles, TeamClaim
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.team.claims import Claim, SettledPlace
-from thinmap_ros.core.exploration.team.team import MAX_SETTLED
+from thinmap_ros.core.exploration.team import MAX_SETTLED, Claim, SettledPlace
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.shared import TileSender
 from thinmap_ros.core.planning.path_follower import Motion

@@ -41,8 +41,7 @@ from thinmap_ros.core.exploration.strategy import (
     is_at,
     is_near,
 )
-from thinmap_ros.core.exploration.team.claims import SAME_PLACE_M, Claim
-from thinmap_ros.core.exploration.team.team import Team
+from thinmap_ros.core.exploration.team import SAME_PLACE_M, Claim, Team
 from thinmap_ros.core.exploration.unknown_space import hidden_area_m2
 from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.patch import GridPatch

@@ -14,8 +14,7 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.mission import Mission, MissionState
 from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Strategy
-from thinmap_ros.core.exploration.team.claims import Claim, Place
-from thinmap_ros.core.exploration.team.team import Team, TeamConfig
+from thinmap_ros.core.exploration.team import Claim, Place, Team, TeamConfig
 from thinmap_ros.core.planning.path_follower import MESSAGE_PERIOD_S, NEAR_ROBOT_M, Motion, moved_on
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.nodes.exploration.tile_output import TileOutput

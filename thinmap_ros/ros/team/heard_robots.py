@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from thinmap_msgs.msg import TeamClaim
-from thinmap_ros.core.exploration.team.claims import SilenceConfig
+from thinmap_ros.core.exploration.team import SilenceConfig
 from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import parameters, qos

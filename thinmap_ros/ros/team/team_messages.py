@@ -12,8 +12,7 @@ from thinmap_msgs.msg import MapTiles, TeamClaim, TileRequest
 from thinmap_msgs.msg import SettledPlace as SettledPlaceMsg
 from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.exploration.team.claims import Claim, Place, SettledPlace
-from thinmap_ros.core.exploration.team.team import MAX_SETTLED
+from thinmap_ros.core.exploration.team import MAX_SETTLED, Claim, Place, SettledPlace
 from thinmap_ros.core.grid.shared import TileMessage
 from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.core.se2 import Array

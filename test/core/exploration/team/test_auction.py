@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from thinmap_ros.core.exploration.team.auction import NOTHING, auction
+from thinmap_ros.core.exploration.team import NOTHING, auction
 
 MARGIN_M = 2.0
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from thinmap_ros.core.exploration.team.claims import Claim, Claims
+from thinmap_ros.core.exploration.team import Claim, Claims
 from thinmap_ros.core.se2 import SECOND_NS
 
 

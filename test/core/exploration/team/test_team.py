@@ -11,8 +11,7 @@ from thinmap_ros.core.exploration.belief.evidence import Evidence
 from thinmap_ros.core.exploration.candidates import Candidate
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
-from thinmap_ros.core.exploration.team.claims import Claim, SettledPlace
-from thinmap_ros.core.exploration.team.team import Team, TeamConfig
+from thinmap_ros.core.exploration.team import Claim, SettledPlace, Team, TeamConfig
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.navigator import NO_PATH
 from thinmap_ros.core.scan import Scan

@@ -1,1 +1,0 @@
-"""Exploration by several robots, which share the candidates by what each claims."""
