@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from benchmarks.exploration.cases import generated
 from benchmarks.exploration.observed_candidates import COLUMNS, Case, observe
-from thinmap_ros.core.exploration.belief import fitted
+from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel, fitted
 from thinmap_ros.core.exploration.belief.fitted import FITTED
-from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2, BeliefModel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.parallel_jobs import add_run_options, failure_summary, run_pending
 from thinmap_ros.files.atomic import read_text, write_text
@@ -153,7 +152,7 @@ def source(model: BeliefModel) -> str:
         '"""Constants of the belief about candidates.\n\n'
         'Written by `python -m benchmarks.exploration.fit_belief --write`, '
         f'{datetime.now(UTC):%Y-%m-%d}.\nFit again instead of editing.\n"""\n\n'
-        'from thinmap_ros.core.exploration.belief.model import BeliefModel\n\n'
+        'from thinmap_ros.core.exploration.belief import BeliefModel\n\n'
         f'FITTED = BeliefModel(\n{values}\n)\n'
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.closed_loop import ExplorationOutcome
-from thinmap_ros.core.exploration.belief.model import MissingArea
+from thinmap_ros.core.exploration.belief import MissingArea
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.evaluation.exploration_metrics import (
     MIN_OBSERVATIONS,

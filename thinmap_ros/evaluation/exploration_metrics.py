@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.closed_loop import ExplorationOutcome
-from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2, MissingArea
+from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, MissingArea
 from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.se2 import Array

@@ -11,7 +11,7 @@ import numpy as np
 from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.belief.model import MissingArea
+from thinmap_ros.core.exploration.belief import MissingArea
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import Array

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2
+from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2
 from thinmap_ros.view import html_page
 
 NAME = 'report.html'

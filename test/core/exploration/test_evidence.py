@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.belief.evidence import FIELDS, EvidenceStore
+from thinmap_ros.core.exploration.belief import FIELDS, EvidenceStore
 from thinmap_ros.core.snapshot import validate
 
 CELL_M = 0.1

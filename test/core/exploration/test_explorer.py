@@ -9,7 +9,7 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.belief.evidence import Evidence
+from thinmap_ros.core.exploration.belief import Evidence
 from thinmap_ros.core.exploration.candidates import Candidate
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.look_around import TURN_ID

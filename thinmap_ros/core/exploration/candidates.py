@@ -16,8 +16,7 @@ from scipy.spatial.distance import cdist
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter, robot_radius
-from thinmap_ros.core.exploration.belief.evidence import Evidence, EvidenceStore, Place
-from thinmap_ros.core.exploration.belief.model import BeliefModel
+from thinmap_ros.core.exploration.belief import BeliefModel, Evidence, EvidenceStore, Place
 from thinmap_ros.core.exploration.frontiers import Cells, FrontierMap
 from thinmap_ros.core.exploration.reachable import Reachable
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode, unobserved

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import config_or_default, parameter
-from thinmap_ros.core.exploration.belief import evidence
+from thinmap_ros.core.exploration import belief
+from thinmap_ros.core.exploration.belief import BeliefModel
 from thinmap_ros.core.exploration.belief.fitted import FITTED
-from thinmap_ros.core.exploration.belief.model import BeliefModel
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.look_around import LookAround, turn_target
@@ -139,7 +139,7 @@ class Explorer:
         Raises InputError where it is no such state.
         """
         explorer = Explorer(config)
-        checked = snapshot.validate(state, evidence.FIELDS, 'exploration')
+        checked = snapshot.validate(state, belief.FIELDS, 'exploration')
         explorer._finder.store.restore(checked)
         return explorer
 

@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.belief.evidence import Evidence
-from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2
+from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, Evidence
 from thinmap_ros.core.exploration.candidates import Candidate
 from thinmap_ros.core.se2 import Array
 

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.belief.model import MissingArea, missing_area
+from thinmap_ros.core.exploration.belief import MissingArea, missing_area
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.exploration.belief.evidence import Evidence
+from thinmap_ros.core.exploration.belief import Evidence
 from thinmap_ros.core.exploration.candidates import Candidate
 from thinmap_ros.core.se2 import SECOND_NS, Array
 

@@ -5,7 +5,7 @@ depth fitted again with these as offset, on four buildings and a dungeon.
 Fit again instead of editing.
 """
 
-from thinmap_ros.core.exploration.belief.model import BeliefModel
+from thinmap_ros.core.exploration.belief import BeliefModel
 
 FITTED = BeliefModel(
     log_odds=0.064,

@@ -1,35 +1,122 @@
-"""Evidence: which frontier is which place, and what was tried there.
+"""Belief about a candidate: what was tried, and how likely nothing is hidden behind it."""
 
-- *The same place.* A frontier continues an earlier one if at least half of its cells lie on it. A
-  cell lies on a frontier up to `_SAME_M` away, as corrections of the map move cells.
-- *Tries* are visits that showed nothing, and failed drives. They are about the frontier as it was
-  then: once half of it has changed, it is another place, and is tried anew. A visit is one from a
-  place: where nothing has changed, another one from there shows nothing, either.
-- *Left* is a place to which the robot was on its way when another one became cheaper. It counts
-  until the robot has seen something new.
-"""
-
+import bisect
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
-from thinmap_ros.core.exploration.belief.model import WORTH_SEEING_M2
-from thinmap_ros.core.snapshot import (
-    MAX_CELL_INDEX,
-    MAX_COORDINATE_M,
-    MAX_COUNT,
-    MAX_ID,
-    Field,
-)
+from thinmap_ros.core.snapshot import MAX_CELL_INDEX, MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
 from thinmap_ros.jit import inlined, kernel
 
+# Belief about a candidate: the probability that nothing is hidden behind it, and the area if not.
+#
+# The paper's threshold on a probability remains; the probability itself comes from the map:
+#
+# - the length of the frontier, the unknown area in line of sight behind it, and how deep the
+#   unknown is: inside of a wall it is two or three cells;
+# - each visit that showed nothing.
+#
+# Distance and angles of observations, the paper's D and A, add nothing to these.
+#
+# Source: exploration paper section 3.2; the constants are fitted, see `benchmarks/exploration/`.
+
+WORTH_SEEING_M2 = 0.5  # a smaller hidden area counts as nothing
+
+_LOG_ODDS_LIMIT = 14.0
+
+_MIN_LENGTH_M = 0.1
+
+_MIN_M2 = 0.05
+
+_MIN_DEPTH_M = 0.05
+
+_DEVIATIONS = 1.645  # of a normal distribution at 95 %
+
+
+@dataclass(frozen=True)
+class BeliefModel:
+    """Fitted constants of the belief.
+
+    log_odds: that nothing is hidden behind a frontier of 1 m, 1 m deep, with 1 m2 in line of sight;
+    length, hidden, depth: added per natural logarithm of the length, m, of the area in line of
+    sight, m2, and of the depth, m, of the unknown straight behind; visit: added for each visit that
+    showed nothing. area_limits_m2, mean_area_m2: mean hidden area, if there is any, where less than
+    a limit is in line of sight; the last one, where more is.
+    """
+
+    log_odds: float
+    length: float
+    hidden: float
+    depth: float
+    visit: float
+    area_limits_m2: tuple[float, ...]
+    mean_area_m2: tuple[float, ...]
+
+    def probability(
+        self, length_m: float, hidden_m2: float, depth_m: float, visits: int = 0
+    ) -> float:
+        """Probability that nothing worth seeing is behind a frontier."""
+        log_odds = (
+            self.log_odds
+            + self.length * math.log(max(length_m, _MIN_LENGTH_M))
+            + self.hidden * math.log(max(hidden_m2, _MIN_M2))
+            + self.depth * math.log(max(depth_m, _MIN_DEPTH_M))
+            + self.visit * visits
+        )
+        return 1.0 / (1.0 + math.exp(-min(max(log_odds, -_LOG_ODDS_LIMIT), _LOG_ODDS_LIMIT)))
+
+    def mean_area(self, hidden_m2: float) -> float:
+        """Mean area, m2, behind a frontier if something is."""
+        return self.mean_area_m2[bisect.bisect(self.area_limits_m2, hidden_m2)]
+
+
+class MissingArea(NamedTuple):
+    """Free area, m2, that an exploration has not seen: expected, and its 95 % bound."""
+
+    expected_m2: float
+    bound_m2: float
+
+
+def missing_area(hidden: Iterable[tuple[float, float]]) -> MissingArea:
+    """Area behind candidates, of each its probability that nothing is behind, and the mean if not.
+
+    Each hides nothing, or an exponentially distributed area. The bound is that of the gamma
+    distribution with the mean and the variance of their sum.
+    Source: Wilson and Hilferty, "The distribution of chi-square", 1931 (quantile of a gamma
+    distribution).
+    """
+    mean = 0.0
+    variance = 0.0
+    for probability, area_m2 in hidden:
+        share = 1.0 - probability
+        mean += share * area_m2
+        variance += share * (2.0 - share) * area_m2**2
+    if mean <= 0.0:
+        return MissingArea(0.0, 0.0)
+    per_shape = variance / mean**2
+    root = 1.0 - per_shape / 9.0 + _DEVIATIONS * math.sqrt(per_shape) / 3.0
+    return MissingArea(mean, mean * max(root, 0.0) ** 3)
+
+
+# Evidence: which frontier is which place, and what was tried there.
+#
+# - *The same place.* A frontier continues an earlier one if at least half of its cells lie on it. A
+#   cell lies on a frontier up to `_SAME_M` away, as corrections of the map move cells.
+# - *Tries* are visits that showed nothing, and failed drives. They are about the frontier as it was
+#   then: once half of it has changed, it is another place, and is tried anew. A visit is one from a
+#   place: where nothing has changed, another one from there shows nothing, either.
+# - *Left* is a place to which the robot was on its way when another one became cheaper. It counts
+#   until the robot has seen something new.
+
 Place = tuple[float, float]
-Cells = NDArray[np.int64]
+
+_Cells = NDArray[np.int64]
+
 FIELDS = {
     'ids': Field(np.int64, ('n',), 1, MAX_ID),
     'places': Field(np.float64, ('n', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
@@ -38,11 +125,13 @@ FIELDS = {
     # of the lattice of the map, place after place
     'cells': Field(np.int64, ('k', 2), -MAX_CELL_INDEX, MAX_CELL_INDEX),
 }
+
 _SAME_M = 0.5
+
 _SHARE = 0.5
 
 
-def _no_cells() -> Cells:
+def _no_cells() -> _Cells:
     return np.zeros((0, 2), dtype=np.int64)
 
 
@@ -59,7 +148,7 @@ class Evidence:
 
     id: int
     place: Place
-    cells: Cells = field(default_factory=_no_cells)
+    cells: _Cells = field(default_factory=_no_cells)
     visits: int = 0
     seen_from: tuple[Place, ...] = ()
     failures: int = 0
@@ -101,7 +190,7 @@ class EvidenceStore:
         self._next_id = first_id
 
     def follow(
-        self, places: Sequence[Place], frontiers: Sequence[Cells], resolution: float
+        self, places: Sequence[Place], frontiers: Sequence[_Cells], resolution: float
     ) -> list[Evidence]:
         """Evidence of each frontier (N, 2) now, on the lattice of the map, with its place, m."""
         # Of two that a frontier continues equally, what was tried counts.
@@ -165,7 +254,7 @@ class EvidenceStore:
         return self._next_id - 1
 
 
-def _joined(parts: Sequence[Cells]) -> tuple[Cells, NDArray[np.int64]]:
+def _joined(parts: Sequence[_Cells]) -> tuple[_Cells, NDArray[np.int64]]:
     """Cells (K, 2) of all parts (N, 2), and where each part begins and the last one ends."""
     ends = np.cumsum([0, *map(len, parts)], dtype=np.int64)
     return np.concatenate([_no_cells(), *parts]), ends
@@ -173,9 +262,9 @@ def _joined(parts: Sequence[Cells]) -> tuple[Cells, NDArray[np.int64]]:
 
 @kernel
 def _continued(
-    earlier: Cells,
+    earlier: _Cells,
     earlier_ends: NDArray[np.int64],
-    cells: Cells,
+    cells: _Cells,
     ends: NDArray[np.int64],
     reach: int,
 ) -> NDArray[np.int64]:
@@ -205,7 +294,7 @@ def _continued(
 
 
 @inlined
-def _count_on(cells: Cells, frontier: Cells, reach: int) -> int:
+def _count_on(cells: _Cells, frontier: _Cells, reach: int) -> int:
     """How many cells (N, 2) lie on a frontier (M, 2), or within reach of it."""
     if frontier.shape[0] == 0:
         return 0
