@@ -2,7 +2,7 @@
 
 Usage: python -m benchmarks.exploration.fit_belief -o DIR [--write [--buildings N]]. Explorations
 are kept in DIR. With --write the belief is fitted first, and its constants go to
-core/exploration/belief/fitted.py.
+core/exploration/fitted.py.
 """
 
 import argparse
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from benchmarks.exploration.cases import generated
 from benchmarks.exploration.observed_candidates import COLUMNS, Case, observe
-from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel, fitted
-from thinmap_ros.core.exploration.belief.fitted import FITTED
+from thinmap_ros.core.exploration import fitted
+from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel
+from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.parallel_jobs import add_run_options, failure_summary, run_pending
 from thinmap_ros.files.atomic import read_text, write_text

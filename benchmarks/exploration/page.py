@@ -63,7 +63,7 @@ _BELIEF = """\
 
 The belief is the probability that nothing is hidden behind a frontier candidate. It is evaluated on
 20 generated buildings, four dungeons and a floor on which it was not fitted
-(`python -m benchmarks.exploration.fit_belief -o DIR`); `core/exploration/belief/fitted.py` tells on
+(`python -m benchmarks.exploration.fit_belief -o DIR`); `core/exploration/fitted.py` tells on
 which it was. Nothing is hidden if less than 0.5 m2 of observable area lies behind the frontier.
 Each candidate counts once.
 

@@ -19,7 +19,7 @@ from benchmarks.exploration.fit_belief import (
     source,
 )
 from benchmarks.exploration.observed_candidates import COLUMNS, Case, hidden_areas
-from thinmap_ros.core.exploration.belief.fitted import FITTED
+from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.sim.coverage import ObservableCells
 

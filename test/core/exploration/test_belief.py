@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.exploration.belief import missing_area
-from thinmap_ros.core.exploration.belief.fitted import FITTED
+from thinmap_ros.core.exploration.fitted import FITTED
 
 
 def probability(length_m=1.0, hidden_m2=1.0, depth_m=1.0, visits=0):

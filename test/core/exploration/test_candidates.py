@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.belief.fitted import FITTED
 from thinmap_ros.core.exploration.candidates import CandidateConfig, CandidateFinder
+from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.reachable import ReachableSpace
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID

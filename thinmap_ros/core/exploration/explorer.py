@@ -28,8 +28,8 @@ from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import config_or_default, parameter
 from thinmap_ros.core.exploration import belief
 from thinmap_ros.core.exploration.belief import BeliefModel
-from thinmap_ros.core.exploration.belief.fitted import FITTED
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
+from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.look_around import LookAround, turn_target
 from thinmap_ros.core.exploration.reachable import ReachableSpace

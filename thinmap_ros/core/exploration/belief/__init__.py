@@ -1,1 +1,0 @@
-"""What an exploration believes of its candidates: evidence, fitted model, missing area."""
