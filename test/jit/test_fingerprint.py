@@ -98,7 +98,7 @@ def test_a_changed_kernel_changes_those_that_call_it(copied_package: Path) -> No
     after = fingerprints(copied_package.parent)
     changed_kernels = {name for name, word in after.items() if word != before[name]}
     assert 'thinmap_ros.core.grid.raytrace.line_is_clear' in changed_kernels
-    assert 'thinmap_ros.core.exploration.frontiers._hidden_cells' not in changed_kernels
+    assert 'thinmap_ros.core.exploration.space._hidden_cells' not in changed_kernels
     assert 1 < len(changed_kernels) < 30
 
 

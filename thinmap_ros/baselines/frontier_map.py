@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.candidates import ASSIGNMENT_RADIUS_M
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
-from thinmap_ros.core.exploration.frontiers import FrontierMap
-from thinmap_ros.core.exploration.viewpoints import search_beside
-from thinmap_ros.core.exploration.visibility import box_of_scan
+from thinmap_ros.core.exploration.space import FrontierMap, box_of_scan, search_beside
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import (
     downsample_mask,

@@ -200,7 +200,7 @@ def topology_builder() -> None:
 def explorer() -> None:
     """Warm up the choice of an end node, in a partly unknown room, and what other maps need."""
     from thinmap_ros.core.exploration.explorer import Explorer
-    from thinmap_ros.core.exploration.viewpoints import search_beside
+    from thinmap_ros.core.exploration.space import search_beside
     from thinmap_ros.core.grid.patch import scan_in_map
     from thinmap_ros.core.grid.raytrace import line_is_clear
     from thinmap_ros.core.planning.grid_search import path_lengths_from

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, ground_truth_poses
-from thinmap_ros.core.exploration.visibility import box_of_scan
+from thinmap_ros.core.exploration.space import box_of_scan
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan

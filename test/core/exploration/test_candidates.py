@@ -8,10 +8,8 @@ import pytest
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.candidates import CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.fitted import FITTED
-from thinmap_ros.core.exploration.frontiers import FrontierMap
-from thinmap_ros.core.exploration.reachable import ReachableSpace
+from thinmap_ros.core.exploration.space import FrontierMap, ReachableSpace, search_beside
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
-from thinmap_ros.core.exploration.viewpoints import search_beside
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan

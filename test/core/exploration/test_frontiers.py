@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.frontiers import NOTHING, FrontierMap
-from thinmap_ros.core.exploration.unknown_space import depth_behind_m, hidden_area_m2
-from thinmap_ros.core.exploration.visibility import box_of_scan
+from thinmap_ros.core.exploration.space import (
+    NOTHING,
+    FrontierMap,
+    box_of_scan,
+    depth_behind_m,
+    hidden_area_m2,
+)
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.visibility import field_of_view, visible_places
+from thinmap_ros.core.exploration.space import field_of_view, visible_places
 from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.scan import Scan
 

@@ -7,8 +7,7 @@ import pytest
 from scipy import ndimage
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.frontiers import _clusters
-from thinmap_ros.core.exploration.visibility import field_of_view, visible_places
+from thinmap_ros.core.exploration.space import _clusters, field_of_view, visible_places
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.grid_search import (

@@ -17,11 +17,17 @@ from scipy.spatial.distance import cdist
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter, robot_radius
 from thinmap_ros.core.exploration.belief import BeliefModel, Evidence, EvidenceStore, Place
-from thinmap_ros.core.exploration.frontiers import Cells, FrontierMap
-from thinmap_ros.core.exploration.reachable import Reachable
+from thinmap_ros.core.exploration.space import (
+    Cell,
+    Cells,
+    FrontierMap,
+    Reachable,
+    depth_behind_m,
+    hidden_area_m2,
+    place_for,
+    search_beside,
+)
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode, unobserved
-from thinmap_ros.core.exploration.unknown_space import depth_behind_m, hidden_area_m2
-from thinmap_ros.core.exploration.viewpoints import Cell, place_for, search_beside
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap

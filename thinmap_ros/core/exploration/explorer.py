@@ -30,9 +30,13 @@ from thinmap_ros.core.exploration import belief
 from thinmap_ros.core.exploration.belief import BeliefModel
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.fitted import FITTED
-from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.look_around import LookAround, turn_target
-from thinmap_ros.core.exploration.reachable import ReachableSpace
+from thinmap_ros.core.exploration.space import (
+    FrontierMap,
+    ReachableSpace,
+    box_of_scan,
+    hidden_area_m2,
+)
 from thinmap_ros.core.exploration.strategy import (
     Decision,
     Start,
@@ -42,8 +46,6 @@ from thinmap_ros.core.exploration.strategy import (
     is_near,
 )
 from thinmap_ros.core.exploration.team import SAME_PLACE_M, Claim, Team
-from thinmap_ros.core.exploration.unknown_space import hidden_area_m2
-from thinmap_ros.core.exploration.visibility import box_of_scan
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import NO_PATH
 from thinmap_ros.core.scan import Scan

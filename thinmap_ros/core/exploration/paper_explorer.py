@@ -18,13 +18,13 @@ import math
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.frontiers import FrontierMap
 from thinmap_ros.core.exploration.paper_evidence import (
     PaperConfig,
     PaperEndNode,
     PaperEndNodes,
 )
 from thinmap_ros.core.exploration.position_probability import bayes_update
+from thinmap_ros.core.exploration.space import FrontierMap, box_of_scan, visible_places
 from thinmap_ros.core.exploration.strategy import (
     Decision,
     EndNode,
@@ -34,7 +34,6 @@ from thinmap_ros.core.exploration.strategy import (
     is_near,
     unobserved,
 )
-from thinmap_ros.core.exploration.visibility import box_of_scan, visible_places
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.paths import path_lengths_to_nodes
 from thinmap_ros.core.scan import Scan

@@ -1,0 +1,671 @@
+"""Where the known space ends: frontiers, what may be behind them, and from where it is seen."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.patch import Bounds, GridFrame, GridPatch, union
+from thinmap_ros.core.grid.raytrace import axis_setup, line_is_clear
+from thinmap_ros.core.planning.grid_search import (
+    distance_field_from,
+    downsample_mask,
+    escape_cells,
+    reachable_cells,
+    traversable_cells,
+    update_traversable_cells,
+)
+from thinmap_ros.core.planning.obstacles import RecentPath
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.thinning import known_free, true_cells
+from thinmap_ros.jit import inlined, kernel
+
+# Frontiers of the whole map: where known free space ends although nothing stands there.
+#
+# A frontier cell is a free cell with an unknown cell above, below, left or right. Cells are found
+# again only where a scan can have changed the map. A single missing beam makes a frontier, too, so
+# only clusters of some length count.
+# Source: Yamauchi, "A frontier-based approach for autonomous exploration", 1997.
+
+Mask = NDArray[np.bool_]
+
+Cells = NDArray[np.int64]
+
+Place = tuple[float, float]
+
+NOTHING: Bounds = (0, 0, 0, 0)
+
+_GAPS = TopologyConfig()
+
+_SPARE_CELLS = 64  # of room on each side: where it is used up, all is rebuilt
+
+_MARGIN_CELLS = 3  # read beyond those that are written, so that the cut is no frontier
+
+_UPDATES_PER_WHOLE_MAP = 100  # corrections of the map reach cells that no scan can change
+
+
+class FrontierMap:
+    """Frontier cells of the whole map, updated where a scan can have changed it.
+
+    free (H, W): known free cells, small gaps closed; passable (H, W): all but occupied cells; mask
+    (H, W): frontier cells; all on the cells of `frame`, which holds the map and some room for it to
+    grow. free_cells: how many are free.
+    """
+
+    def __init__(self) -> None:
+        self._updates = 0
+        self._changed: Bounds | None = None
+        self._begin(GridPatch(GridFrame(0.0, 0.0, 1.0), np.zeros((0, 0), dtype=np.int8)), 0)
+
+    @property
+    def known_area_m2(self) -> float:
+        """Known free area."""
+        return self.free_cells * self.frame.resolution**2
+
+    def update(self, patch: GridPatch, *boxes: Array) -> None:
+        """Find the frontier cells of the whole map in some boxes; now and then everywhere.
+
+        boxes (2, 2): lower left and upper right corner, m, of what a scan (visibility.box_of_scan)
+        or another robot has changed. It begins anew where the map has outgrown its room, lies on
+        another lattice, or is replaced.
+        """
+        is_whole = self._updates % _UPDATES_PER_WHOLE_MAP == 0
+        self._updates += 1
+        if patch.is_replaced or not self._holds(patch):
+            has_grown = self.mask.size > 0 and not patch.is_replaced
+            self._begin(patch, _SPARE_CELLS if has_grown else 0)
+            is_whole = True
+        for part in [(0, 0, *patch.shape)] if is_whole else [_part(patch, box) for box in boxes]:
+            self._update_part(patch, part)
+
+    def take_changes(self) -> Bounds | None:
+        """Part in which cells may have changed since the last call; None: everywhere."""
+        changed = self._changed
+        self._changed = NOTHING
+        return changed
+
+    def _begin(self, patch: GridPatch, spare: int) -> None:
+        """Forget all cells; the next ones are those of a map, and spare ones on each side."""
+        rows, cols = (size + 2 * spare for size in patch.shape)
+        self.frame = patch.frame.with_origin_at(-spare, -spare)
+        self.free: Mask = np.zeros((rows, cols), dtype=np.bool_)
+        self.mask: Mask = np.zeros((rows, cols), dtype=np.bool_)
+        self.passable: Mask = np.ones((rows, cols), dtype=np.bool_)
+        self.free_cells = 0
+        self._room = GridPatch(self.frame, self.mask.view(np.int8))
+        self._changed = None
+        # For each cell and a margin of one cell, kept: a map has few frontier cells.
+        self._zeros = np.zeros((rows + 2) * (cols + 2), dtype=np.int32)
+
+    def _holds(self, patch: GridPatch) -> bool:
+        """Whether all cells of a map are cells of these arrays."""
+        return self._room.is_aligned_with(patch) and not any(self._room.overhang_of(patch))
+
+    def _update_part(self, patch: GridPatch, part: Bounds) -> None:
+        """Find the frontier cells in a part of a map."""
+        top, left, bottom, right = part
+        row = max(top - _MARGIN_CELLS, 0)
+        col = max(left - _MARGIN_CELLS, 0)
+        cut = patch.part((row, col, bottom + _MARGIN_CELLS, right + _MARGIN_CELLS))
+        inner = np.s_[top - row : bottom - row, left - col : right - col]
+        first_row, first_col = self._room.offset_of(patch)
+        to = (top + first_row, left + first_col, bottom + first_row, right + first_col)
+        at = np.s_[to[0] : to[2], to[1] : to[3]]
+        self._mark_changed(to)
+        known = known_free(cut, _GAPS)
+        # Cells outside of the map are unknown.
+        unknown = np.ones((known.shape[0] + 2, known.shape[1] + 2), dtype=np.bool_)
+        unknown[1:-1, 1:-1] = cut.unknown & ~known
+        beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]
+        gone = int(np.count_nonzero(self.free[at]))
+        self.free_cells += int(np.count_nonzero(known[inner])) - gone
+        self.free[at] = known[inner]
+        self.mask[at] = (known & beside)[inner]
+        self.passable[at] = ~cut.occupied[inner]
+
+    def _mark_changed(self, part: Bounds) -> None:
+        if self._changed == NOTHING:
+            self._changed = part
+        elif self._changed is not None:
+            self._changed = union(self._changed, part)
+
+    def clusters(self, min_length_m: float) -> list[Cells]:
+        """Frontier cells (N, 2) of each cluster that is long enough, in the order of first cells.
+
+        Cells of a cluster are joined over edges and corners.
+        """
+        cells = true_cells(self.mask)
+        numbers, sizes = _clusters(self.mask.shape, cells, self._zeros)
+        cells = cells[np.argsort(numbers, kind='stable')]
+        ends = np.cumsum(sizes).tolist()
+        return [
+            cells[end - size : end]
+            for end, size in zip(ends, sizes.tolist(), strict=True)
+            if self.is_long(size, min_length_m)
+        ]
+
+    def is_long(self, cell_count: int, min_length_m: float) -> bool:
+        """Whether a number of cells is at least so long; a cell counts as its edge."""
+        return cell_count > 0 and cell_count * self.frame.resolution >= min_length_m - 1e-6
+
+    def remaining(self, cells: Cells) -> int:
+        """How many of some cells (N, 2) are still frontier cells."""
+        return int(np.count_nonzero(self.mask[cells[:, 0], cells[:, 1]]))
+
+    def middle_of(self, cells: Cells) -> Place:
+        """Centre, m, of the cell of a cluster (N, 2) nearest to its centroid."""
+        row, col = _middle(cells)
+        frame = self.frame
+        return (
+            frame.origin_x + (col + 0.5) * frame.resolution,
+            frame.origin_y + (row + 0.5) * frame.resolution,
+        )
+
+
+def _part(patch: GridPatch, box: Array) -> Bounds:
+    """Rows and columns of a map that lie in a box (2, 2), m."""
+    cells = patch.frame.cells_of(box) + [[0], [1]]
+    (top, left), (bottom, right) = np.clip(cells, 0, patch.shape).tolist()
+    return top, left, bottom, right
+
+
+@kernel
+def _middle(cells: Cells) -> tuple[int, int]:
+    """Cell of a cluster (N, 2) nearest to its centroid."""
+    row = cells[:, 0].sum() / cells.shape[0]
+    col = cells[:, 1].sum() / cells.shape[0]
+    best = 0
+    nearest = math.inf
+    for i in range(cells.shape[0]):
+        away = (cells[i, 0] - row) ** 2 + (cells[i, 1] - col) ** 2
+        if away < nearest:
+            nearest = away
+            best = i
+    return cells[best, 0], cells[best, 1]
+
+
+@kernel
+def _clusters(
+    shape: tuple[int, int], cells: Cells, at: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of the cluster of each cell (N, 2) of an array, (N,), and the size of each cluster.
+
+    at: zeros for the array with a margin of one cell; they are zeros again afterwards.
+    """
+    cols = shape[1] + 2
+    # Index + 1 of the cell that lies there; the empty margin makes bounds checks unnecessary.
+    places = (cells[:, 0] + 1) * cols + cells[:, 1] + 1
+    for i in range(places.size):
+        at[places[i]] = i + 1
+    numbers = np.full(places.size, -1, dtype=np.int64)
+    sizes = np.zeros(places.size, dtype=np.int64)
+    stack = np.empty(places.size, dtype=np.int64)
+    clusters = 0
+    for first in range(places.size):
+        if numbers[first] >= 0:
+            continue
+        numbers[first] = clusters
+        stack[0] = first
+        count = 1
+        while count > 0:
+            count -= 1
+            here = places[stack[count]]
+            sizes[clusters] += 1
+            for to in (-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1):
+                i = at[here + to] - 1
+                if i >= 0 and numbers[i] < 0:
+                    numbers[i] = clusters
+                    stack[count] = i
+                    count += 1
+        clusters += 1
+    for place in places:
+        at[place] = 0
+    return numbers, sizes[:clusters].copy()
+
+
+# Unknown space behind a frontier: its area in line of sight, and its depth straight behind.
+#
+# Both are evidence of what the frontier hides: behind one that runs along a wall, inside of which
+# no cell is known, the unknown is two or three cells deep.
+
+HIDDEN_REACH_M = 4.0  # to which unknown area counts as in line of sight
+
+DEPTH_REACH_M = 1.0  # deeper frontiers hide something alike often
+
+_RAYS = 120
+
+_DEPTH_RAYS = 64  # of a cluster at most
+
+_DEPTH_QUANTILE = 0.8
+
+_AROUND = 2  # cells on each side of a frontier cell that show where the unknown lies
+
+_SKIPPED = 2  # free cells with which a ray at an angle may begin
+
+
+def hidden_area_m2(frontiers: FrontierMap, place: Place, reach_m: float = HIDDEN_REACH_M) -> float:
+    """Unknown area in line of sight of a place, m: through the unknown, up to an obstacle."""
+    row, col = frontiers.frame.cells_of(np.array([place]))[0]
+    resolution = frontiers.frame.resolution
+    reach = reach_m / resolution
+    return float(_hidden_cells(frontiers.free, frontiers.passable, row, col, reach)) * resolution**2
+
+
+def depth_behind_m(frontiers: FrontierMap, cells: Cells) -> float:
+    """Depth of the unknown straight behind a cluster (N, 2), up to the next known cell.
+
+    80 % of its cells have at most this depth: where a doorway belongs to a cluster that runs along
+    a wall, the doorway counts. At most DEPTH_REACH_M.
+    """
+    resolution = frontiers.frame.resolution
+    reach = round(DEPTH_REACH_M / resolution)
+    depths = _depths(frontiers.free, frontiers.passable, cells, reach)
+    return float(np.quantile(depths, _DEPTH_QUANTILE)) * resolution
+
+
+@kernel
+def _hidden_cells(free: Mask, passable: Mask, row: int, col: int, reach: float) -> int:
+    """Cells neither free nor occupied on rays from a cell, each counted once."""
+    rows, cols = free.shape
+    whole = int(reach) + 2
+    seen = np.zeros((2 * whole + 1, 2 * whole + 1), dtype=np.bool_)
+    count = 0
+    for k in range(_RAYS):
+        angle = 2.0 * math.pi * k / _RAYS
+        c, step_x, next_x, delta_x = axis_setup(col + 0.5, math.cos(angle))
+        r, step_y, next_y, delta_y = axis_setup(row + 0.5, math.sin(angle))
+        travelled = 0.0
+        while travelled <= reach:
+            inside = 0 <= r < rows and 0 <= c < cols
+            if inside and not passable[r, c] and not free[r, c]:
+                break
+            if not (inside and free[r, c]) and not seen[r - row + whole, c - col + whole]:
+                seen[r - row + whole, c - col + whole] = True
+                count += 1
+            if next_x < next_y:
+                travelled = next_x
+                next_x += delta_x
+                c += step_x
+            else:
+                travelled = next_y
+                next_y += delta_y
+                r += step_y
+    return count
+
+
+@kernel
+def _depths(free: Mask, passable: Mask, cells: Cells, reach: int) -> Array:
+    """Unknown cells in a row, at most `reach`, behind some of a cluster's cells (N, 2)."""
+    count = min(cells.shape[0], _DEPTH_RAYS)
+    depths = np.empty(count)
+    for i in range(count):
+        k = (2 * i + 1) * cells.shape[0] // (2 * count)
+        depths[i] = _depth(free, passable, cells[k, 0], cells[k, 1], reach)
+    return depths
+
+
+@inlined
+def _depth(free: Mask, passable: Mask, row: int, col: int, reach: int) -> float:
+    """Unknown cells behind a cell, straight on, up to a known cell; outside all is unknown."""
+    rows, cols = free.shape
+    down = 0.0
+    right = 0.0
+    for r in range(row - _AROUND, row + _AROUND + 1):
+        for c in range(col - _AROUND, col + _AROUND + 1):
+            inside = 0 <= r < rows and 0 <= c < cols
+            if not inside or (not free[r, c] and passable[r, c]):
+                down += r - row
+                right += c - col
+    length = math.hypot(down, right)
+    if length < 0.5:  # unknown on both sides: a cell or two
+        return 1.0
+    depth = 0.0
+    for step in range(1, reach + _SKIPPED + 1):
+        r = int(round(row + step * down / length))
+        c = int(round(col + step * right / length))
+        inside = 0 <= r < rows and 0 <= c < cols
+        if inside and free[r, c] and depth == 0.0 and step <= _SKIPPED:
+            continue
+        if depth >= reach or (inside and (free[r, c] or not passable[r, c])):
+            break
+        depth += 1.0
+    return depth
+
+
+# What a scan sees, and where it may have changed the map.
+
+_RIM_M = 0.5
+
+
+def field_of_view(scan: Scan) -> tuple[float, float]:
+    """Field of view of a scan: its first and last direction, rad, laser frame.
+
+    The outer beams, and as much again as between two beams.
+    """
+    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
+    more = abs(scan.angle_increment_rad)
+    return min(scan.angle_min_rad, last) - more, max(scan.angle_min_rad, last) + more
+
+
+def visible_places(
+    places: Array, scan: Scan, T_map_laser: Array, free: Mask, frame: GridFrame
+) -> Mask:
+    """Which places (N, 2), m, a scan made by a laser at a pose (3,) sees, (N,).
+
+    They lie in its range and field of view, with free cells (H, W) of a frame all the way.
+    """
+    low, high = field_of_view(scan)
+    offsets = places - T_map_laser[:2]
+    bearings = np.arctan2(offsets[:, 1], offsets[:, 0]) - T_map_laser[2]
+    is_ahead = np.abs(se2.wrap(bearings - 0.5 * (low + high))) <= 0.5 * (high - low)
+    seen = is_ahead & (np.hypot(*offsets.T) < scan.range_max_m)
+    laser = frame.cells_of(T_map_laser[:2])[0]
+    cells = frame.cells_of(places)
+    seen[seen] = [line_is_clear(free, *laser, *cell) for cell in cells[seen]]
+    return np.asarray(seen)
+
+
+def box_of_scan(scan: Scan, T_map_base: Array) -> Array:
+    """Lower left and upper right corner (2, 2), m, of what a scan made at (3,) may have changed."""
+    T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
+    # Some drivers publish an infinite range_max.
+    limits = (scan.range_min_m, min(scan.range_max_m, se2.MAX_COORDINATE_M))
+    return np.asarray(
+        _box(scan.ranges_m, limits, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser)
+    )
+
+
+@kernel
+def _box(
+    ranges: Array, limits: tuple[float, float], first: float, step: float, laser: Array
+) -> Array:
+    """Corners (2, 2) of what beams (N,) from a laser at a pose (3,) reach, and _RIM_M more.
+
+    See box_of_scan.
+    """
+    left = bottom = right = top = 0.0
+    for i in range(ranges.size):
+        if (ranges[i] >= limits[0] and ranges[i] > 0.0) or ranges[i] >= limits[1]:
+            reach = min(ranges[i], limits[1])
+            angle = first + step * i + laser[2]
+            x = reach * math.cos(angle)
+            y = reach * math.sin(angle)
+            left = min(left, x)
+            right = max(right, x)
+            bottom = min(bottom, y)
+            top = max(top, y)
+    box = np.empty((2, 2))
+    box[0, 0] = laser[0] + left - _RIM_M
+    box[0, 1] = laser[1] + bottom - _RIM_M
+    box[1, 0] = laser[0] + right + _RIM_M
+    box[1, 1] = laser[1] + top + _RIM_M
+    return box
+
+
+# Viewpoints: from where a robot sees most of what a frontier hides.
+#
+# Some points straight behind the frontier's cells stand for the unknown. A viewpoint has the
+# shortest path of all places from which most of these points could be seen if nothing stands in the
+# unknown. A robot on the known side of a corner sees along the frontier, but nothing that the
+# corner hides; one at the end of its laser's range has to come only a little nearer.
+
+Cell = tuple[int, int]
+
+# Not more: across a wall one cell thick places where a robot can stand are six cells apart, and
+# stay apart in squares.
+SQUARE = 3
+
+# Most of what a border hides: so much of so many points. Of a long one, with a point every so many
+# cells, as many.
+_POINTS = 8
+
+_SHARE = 0.7
+
+_SPACING = 10
+
+_STRIDE = 4
+
+_SLACK_CELLS = 5
+
+
+def place_for(
+    free: Mask, passable: Mask, cells: Cells, allowed: Mask, ways: Array, depth: int, reach: float
+) -> Cell | None:
+    """Allowed cell with the shortest path that observes most of the space behind a frontier (N, 2).
+
+    free, passable (all cells that are not occupied), allowed (H, W);
+    ways (ceil(H / SQUARE), ceil(W / SQUARE)): path length to each square of SQUARE x SQUARE cells;
+    the robot would stand in its middle; depth: of the space behind the frontier, in cells;
+    reach: range of the laser, in cells.
+    """
+    most = max(_POINTS, len(cells) // _SPACING)
+    points = _hidden_points(free, passable, cells, depth, most)
+    need = math.ceil(_SHARE * min(len(points), _POINTS))
+    row, col = _view_place(ways, SQUARE, allowed, passable, points, reach, need)
+    return None if row < 0 else (int(row), int(col))
+
+
+def search_beside(
+    free: Mask, cells: Cells, allowed: Mask, standing: Mask, max_steps: int, towards: Cell
+) -> tuple[Cell | None, bool]:
+    """The allowed cell beside a frontier (N, 2) that is nearest to another cell; None: none.
+
+    Of the allowed cells whose path to the frontier over free cells has at most max_steps cells, and
+    is nearly the shortest: around a pillar all sides are equally near. Also whether the frontier is
+    enclosed: no path leads from it to a cell where the robot could stand. free, standing (H, W).
+    """
+    row, col, is_enclosed = _search_beside(free, cells, allowed, standing, max_steps, towards)
+    return (None if row < 0 else (int(row), int(col))), bool(is_enclosed)
+
+
+@kernel
+def _hidden_points(free: Mask, passable: Mask, cells: Cells, depth: int, most: int) -> Cells:
+    """Cells behind some of a border's cells (N, 2).
+
+    They lie straight on into the unknown, up to a depth or something known.
+    """
+    rows, cols = free.shape
+    count = min(cells.shape[0], most)
+    points = np.empty((count, 2), dtype=np.int64)
+    for i in range(count):
+        k = (2 * i + 1) * cells.shape[0] // (2 * count)
+        row = cells[k, 0]
+        col = cells[k, 1]
+        # Which way the unknown lies, from the cells around.
+        down = 0.0
+        right = 0.0
+        for r in range(max(row - 3, 0), min(row + 4, rows)):
+            for c in range(max(col - 3, 0), min(col + 4, cols)):
+                if not free[r, c] and passable[r, c]:
+                    down += r - row
+                    right += c - col
+        length = max(math.hypot(down, right), 1e-9)
+        points[i, 0] = row
+        points[i, 1] = col
+        for step in range(1, depth + 1):
+            r = int(round(row + step * down / length))
+            c = int(round(col + step * right / length))
+            if r < 0 or r >= rows or c < 0 or c >= cols or not passable[r, c]:
+                break
+            points[i, 0] = r
+            points[i, 1] = c
+    return points
+
+
+@kernel
+def _view_place(
+    ways: Array, factor: int, allowed: Mask, passable: Mask, points: Cells, reach: float, need: int
+) -> tuple[int, int]:
+    """Middle of the square with the shortest path that sees at least `need` points, or -1.
+
+    A line of sight runs over passable cells, and is shorter than reach.
+    """
+    rows, cols = allowed.shape
+    low_r = points[:, 0].min() - reach
+    high_r = points[:, 0].max() + reach
+    low_c = points[:, 1].min() - reach
+    high_c = points[:, 1].max() + reach
+    top = max(int(low_r) // factor, 0)
+    bottom = min(int(high_r) // factor + 1, ways.shape[0])
+    left = max(int(low_c) // factor, 0)
+    right = min(int(high_c) // factor + 1, ways.shape[1])
+    best = np.inf
+    best_row = -1
+    best_col = -1
+    # First a few squares here and there: with a good place in hand most others need no look.
+    for stride in (_STRIDE, 1):
+        for r in range(top, bottom, stride):
+            for c in range(left, right, stride):
+                row = r * factor + factor // 2
+                col = c * factor + factor // 2
+                if ways[r, c] >= best or row >= rows or col >= cols or not allowed[row, col]:
+                    continue
+                if _sees_enough(passable, row, col, points, reach, need):
+                    best = ways[r, c]
+                    best_row = row
+                    best_col = col
+    return best_row, best_col
+
+
+@inlined
+def _sees_enough(
+    passable: Mask, row: int, col: int, points: Cells, reach: float, need: int
+) -> bool:
+    """Whether so many of the points (N, 2) are in sight of a cell."""
+    seen = 0
+    for i in range(points.shape[0]):
+        if seen + points.shape[0] - i < need:
+            break
+        away = math.hypot(points[i, 0] - row, points[i, 1] - col)
+        if away < reach and line_is_clear(passable, points[i, 0], points[i, 1], row, col):
+            seen += 1
+    return seen >= need
+
+
+@kernel
+def _search_beside(
+    free: Mask, cells: Cells, allowed: Mask, standing: Mask, most_steps: int, towards: Cell
+) -> tuple[int, int, bool]:
+    """Breadth first over free cells, from all frontier cells at once; see search_beside.
+
+    It goes _SLACK_CELLS steps on after the first find.
+    """
+    rows, cols = free.shape
+    seen = np.zeros((rows, cols), dtype=np.bool_)
+    queue = np.empty((rows * cols, 3), dtype=np.int64)
+    tail = 0
+    for row, col in cells:
+        queue[tail] = row, col, 0
+        seen[row, col] = True
+        tail += 1
+    head = 0
+    best = np.inf
+    place = (-1, -1)
+    is_enclosed = True
+    while head < tail and (is_enclosed or queue[head, 2] <= most_steps):
+        row, col, steps = queue[head]
+        head += 1
+        is_enclosed &= not standing[row, col]
+        away = math.hypot(row - towards[0], col - towards[1])
+        if allowed[row, col] and steps <= most_steps and away < best:
+            if place[0] < 0:
+                most_steps = min(most_steps, steps + _SLACK_CELLS)
+            best = away
+            place = (row, col)
+        for r, c in ((row + 1, col), (row - 1, col), (row, col + 1), (row, col - 1)):
+            if 0 <= r < rows and 0 <= c < cols and free[r, c] and not seen[r, c]:
+                seen[r, c] = True
+                queue[tail] = r, c, steps + 1
+                tail += 1
+    return place[0], place[1], is_enclosed
+
+
+# Where the robot can stand, where it can get from here, and how long the paths are.
+
+_ESCAPE_M = 0.6
+
+_DETOUR = 3.0  # of the straight line, where no path is known
+
+
+class Reachable(NamedTuple):
+    """Reachable cells (H, W), and the path length, in squares, to each of their squares.
+
+    standing (H, W): cells where the robot fits, reachable or not.
+    """
+
+    cells: Mask
+    standing: Mask
+    path_lengths: Array
+    frame: GridFrame
+
+    def lengths_to(self, T_map_base: Array, goals: Array) -> Array:
+        """Path lengths (N,), m, to goals (N, 2) from where the robot is, at (3,).
+
+        At least the straight line; a detour where there is no path.
+        """
+        rows, cols = (self.frame.cells_of(goals) // SQUARE).T
+        height, width = self.path_lengths.shape
+        inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
+        squares = np.full(len(goals), np.inf)
+        squares[inside] = self.path_lengths[rows[inside], cols[inside]]
+        straight_m = np.hypot(*(goals - T_map_base[:2]).T)
+        known = np.isfinite(squares)
+        lengths_m = np.where(known, squares * SQUARE * self.frame.resolution, _DETOUR * straight_m)
+        return np.asarray(np.maximum(lengths_m, straight_m))
+
+
+class ReachableSpace:
+    """Reachable space of a robot of a radius, updated where the map has changed."""
+
+    def __init__(self, robot_radius_m: float) -> None:
+        self._radius_m = robot_radius_m
+        self._recent_path = RecentPath()
+        self._standing: Mask = np.zeros((0, 0), dtype=np.bool_)
+        self._passable = self._standing
+        nowhere = np.zeros((0, 0))
+        self.now = Reachable(self._standing, self._standing, nowhere, GridFrame(0.0, 0.0, 1.0))
+
+    def add_pose(self, T_map_base: Array) -> None:
+        """Add a pose (3,): the robot can return over its recent path."""
+        self._recent_path.add_pose(T_map_base)
+
+    def update(self, frontiers: FrontierMap, T_map_base: Array) -> None:
+        """Find what can be reached from a pose (3,) in the map of the frontiers."""
+        self._update_standing(frontiers)
+        self._passable = frontiers.passable
+        recent = self._recent_path.cells(frontiers.frame, frontiers.free.shape)
+        self.now = self._reach(T_map_base, frontiers.frame, recent)
+
+    def path_lengths(self, T_map_base: Array, goals: Array) -> Array:
+        """Path lengths (N,), m, to goals (N, 2); estimated where there is no path."""
+        return self.now.lengths_to(T_map_base, goals)
+
+    def path_lengths_from(self, T_map_base: Array, goals: Array) -> Array:
+        """Path lengths (N,), m, to goals (N, 2) from a pose (3,) of another robot."""
+        return self._reach(T_map_base, self.now.frame).lengths_to(T_map_base, goals)
+
+    def _reach(self, T_map_base: Array, frame: GridFrame, recent: Cells | None = None) -> Reachable:
+        """What can be reached from a pose (3,); recent (N, 2): cells where the robot was."""
+        xy = (float(T_map_base[0]), float(T_map_base[1]))
+        allowed = escape_cells(self._standing, self._passable, frame, xy, _ESCAPE_M, recent)
+        row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
+        # Cells say whether there is a way, as the navigator does; squares, which join what a narrow
+        # gap separates, say how long it is.
+        reached = reachable_cells(allowed, (row, col))
+        lengths = distance_field_from(
+            downsample_mask(reached, SQUARE), (row // SQUARE, col // SQUARE)
+        )
+        return Reachable(reached & self._standing, allowed, lengths, frame)
+
+    def _update_standing(self, frontiers: FrontierMap) -> None:
+        radius_m = self._radius_m
+        resolution = frontiers.frame.resolution
+        part = frontiers.take_changes()
+        if part is None:
+            self._standing = traversable_cells(frontiers.free, radius_m, resolution)
+        elif part != NOTHING:
+            update_traversable_cells(self._standing, frontiers.free, part, radius_m, resolution)
