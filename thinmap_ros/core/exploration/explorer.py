@@ -27,24 +27,16 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import config_or_default, parameter
 from thinmap_ros.core.exploration import belief
-from thinmap_ros.core.exploration.belief import BeliefModel
+from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel, Evidence
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.fitted import FITTED
-from thinmap_ros.core.exploration.look_around import LookAround, turn_target
 from thinmap_ros.core.exploration.space import (
     FrontierMap,
     ReachableSpace,
     box_of_scan,
     hidden_area_m2,
 )
-from thinmap_ros.core.exploration.strategy import (
-    Decision,
-    Start,
-    Streak,
-    decide,
-    is_at,
-    is_near,
-)
+from thinmap_ros.core.exploration.strategy import Decision, Start, Streak, decide, is_at, is_near
 from thinmap_ros.core.exploration.team import SAME_PLACE_M, Claim, Team
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import NO_PATH
@@ -52,18 +44,86 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
+# A full turn in place, before an exploration gives up beside unknown space.
+
+# Of the place where the robot turns; the end nodes' ids are below.
+TURN_ID = 2**32 - 1
+
+# With two parts, both ways to the next heading would be of the same length.
+_PARTS = 3
+
+_IS_THERE_RAD = 0.35
+
+
+class LookAround:
+    """One full turn in place, if it can show anything.
+
+    At its start, a robot whose laser does not see all round may stand where it has not seen enough
+    free space to drive to. is_in_the_dark: whether more is hidden around it than is known.
+    """
+
+    def __init__(self) -> None:
+        self.is_in_the_dark = False
+        self._was_tried = False
+        self._goals: list[Array] = []
+
+    def next_goal(
+        self, T_map_base: Array, hidden_m2: float, known_m2: float, is_left: bool
+    ) -> Array | None:
+        """Where to turn from a pose (3,), as a pose (3,); None: no more, or no use.
+
+        hidden_m2: unknown area in line of sight of the robot, were it to look there; known_m2: of
+        the map; is_left: whether end nodes are left.
+        """
+        self.is_in_the_dark = hidden_m2 > known_m2
+        is_of_use = self.is_in_the_dark or (is_left and hidden_m2 >= WORTH_SEEING_M2)
+        if is_of_use and not self._was_tried:
+            x, y, theta = T_map_base.tolist()
+            part = 2.0 * math.pi / _PARTS
+            self._goals = [se2.pose(x, y, theta + k * part) for k in range(1, _PARTS + 1)]
+        self._was_tried = True
+        while self._goals and _has_heading(T_map_base, self._goals[0]):
+            self._goals.pop(0)
+        return self._goals[0] if self._goals else None
+
+    def stop(self) -> None:
+        """End a turn: it has shown where to drive, or is not possible."""
+        self._goals = []
+
+
+def turn_target(goal: Array) -> Candidate:
+    """The place (3,) where the robot turns, as a target: it has no frontier of its own."""
+    place = float(goal[0]), float(goal[1])
+    nothing = np.zeros((0, 2), dtype=np.int64)
+    return Candidate(Evidence(TURN_ID, place), nothing, place, goal=goal)
+
+
+def _has_heading(T_map_base: Array, goal: Array) -> bool:
+    return abs(se2.wrap(float(goal[2] - T_map_base[2]))) <= _IS_THERE_RAD
+
+
 _TURN_FROM_M = 0.3  # paths that are shorter begin with no turn
+
 _SAME_PLACE_M = 1.5  # a target or viewpoint that moves less is the same one
+
 _TURN_COST_M_RAD = 0.2  # driven in the time of a turn by one radian, at 0.2 m/s and 1 rad/s
+
 _SWITCH_MARGIN_M = (
     2.0  # saving for which the target is changed, so that the robot does not oscillate
 )
+
 _SWITCH_MARGIN_M = 2.0
+
 _FIND_PERIOD_S = 1.0  # between two searches for candidates, which take time in large maps
+
 _MAX_VISITS = 3  # until a candidate is given up
+
 _MAX_FAILURES = 2
+
 _MAX_RESOLVED_M2 = 2.0  # of area that candidates may hide of which none is worth a visit
+
 _GONE_S = 0.35
+
 _FINAL_PAUSE_S = 40.0  # a navigator that starts, or is blocked by people, refuses goals meanwhile
 
 
