@@ -5,7 +5,7 @@ import pytest
 from thinmap_ros.baselines.exploration import NearestFrontier
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
-from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
+from thinmap_ros.core.exploration.paper import PaperExplorer
 from thinmap_ros.core.exploration.strategy import Strategy
 from thinmap_ros.strategies import DEFAULT, NAMES, make_strategy
 

@@ -10,8 +10,7 @@ from importlib import import_module
 
 from thinmap_ros.core.errors import ConfigError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
-from thinmap_ros.core.exploration.paper_evidence import PaperConfig
-from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
+from thinmap_ros.core.exploration.paper import PaperConfig, PaperExplorer
 from thinmap_ros.core.exploration.strategy import Strategy
 
 DEFAULT = 'position_probability'

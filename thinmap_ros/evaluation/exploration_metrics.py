@@ -9,7 +9,7 @@ import numpy as np
 
 from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, MissingArea
-from thinmap_ros.core.exploration.position_probability import NEAR_M
+from thinmap_ros.core.exploration.paper import NEAR_M
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.trajectory_errors import aligned_rms

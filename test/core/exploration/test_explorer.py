@@ -12,7 +12,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.belief import Evidence
 from thinmap_ros.core.exploration.candidates import Candidate
 from thinmap_ros.core.exploration.explorer import TURN_ID, Explorer, ExplorerConfig
-from thinmap_ros.core.exploration.paper_explorer import PaperExplorer
+from thinmap_ros.core.exploration.paper import PaperExplorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision, FinishCode
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch

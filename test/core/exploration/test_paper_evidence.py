@@ -5,13 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from thinmap_ros.core.exploration.paper_evidence import (
+from thinmap_ros.core.exploration.paper import (
     PRIOR,
     PaperConfig,
     PaperEndNode,
     PaperEndNodes,
+    angle_index,
+    distance_index,
 )
-from thinmap_ros.core.exploration.position_probability import angle_index, distance_index
 from thinmap_ros.core.topology.graph import Node, NodeKind
 
 CONFIG = PaperConfig()

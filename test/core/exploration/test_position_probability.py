@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thinmap_ros.core.exploration.position_probability import (
+from thinmap_ros.core.exploration.paper import (
     angle_difference,
     angle_index,
     bayes_update,
