@@ -11,8 +11,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter, part
 from thinmap_ros.core.errors import ConfigError, quoted
 from thinmap_ros.core.exploration.mission import Drives, Odometer
-from thinmap_ros.core.exploration.observations import Observation
-from thinmap_ros.core.exploration.strategy import Decision, Strategy
+from thinmap_ros.core.exploration.strategy import Decision, Observation, Strategy
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig

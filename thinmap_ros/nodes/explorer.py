@@ -15,8 +15,7 @@ from thinmap_ros.core.exploration.mission import (
     mission_state,
     resumed_mission,
 )
-from thinmap_ros.core.exploration.observations import Observation
-from thinmap_ros.core.exploration.strategy import FinishCode, Strategy
+from thinmap_ros.core.exploration.strategy import FinishCode, Observation, Strategy
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.sessions import EXPLORATION
 from thinmap_ros.kernels import warm_up

@@ -8,7 +8,7 @@ import numpy as np
 
 from thinmap_ros.closed_loop import CONTROL_STEPS, ClosedLoop, ExplorationOutcome, RightOfWay
 from thinmap_ros.core.exploration.explorer import Explorer
-from thinmap_ros.core.exploration.observations import Observation
+from thinmap_ros.core.exploration.strategy import Observation
 from thinmap_ros.core.exploration.team import Claim
 from thinmap_ros.core.planning.navigator import Command
 from thinmap_ros.core.planning.path_follower import NEAR_ROBOT_M, Motion, must_stop

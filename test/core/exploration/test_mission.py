@@ -16,8 +16,7 @@ from thinmap_ros.core.exploration.mission import (
     MissionState,
     Odometer,
 )
-from thinmap_ros.core.exploration.observations import Observation
-from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
+from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode, Observation
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import pose

@@ -14,8 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import errors, snapshot
-from thinmap_ros.core.exploration.observations import Observation
-from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode, Strategy
+from thinmap_ros.core.exploration.strategy import (
+    Decision,
+    EndNode,
+    FinishCode,
+    Observation,
+    Strategy,
+)
 from thinmap_ros.core.grid.edits import masked_outside
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array, wrap

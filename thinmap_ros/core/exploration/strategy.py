@@ -17,9 +17,13 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 
 # Ids from here on are those of frontier candidates that no end node sees.
 FIRST_FRONTIER_ID = 2_000_000_000
+
 _NEAR_M = 0.3
+
 _NEAR_RAD = 0.35
+
 _MIN_SCANS = 3
+
 _START_S = 5.0
 
 
@@ -203,3 +207,15 @@ def decide(
     return Decision(
         target, is_finished, words, code, end_nodes, sorted(aside), known_area_m2, left, hidden
     )
+
+
+# What a strategy decides from.
+
+
+class Observation(NamedTuple):
+    """A scan made at a pose (3,) in the map frame, with the graph and the whole map of then."""
+
+    topology: TopologicalMap
+    patch: GridPatch
+    scan: Scan
+    T_map_base: Array

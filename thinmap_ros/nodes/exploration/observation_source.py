@@ -9,7 +9,7 @@ from thinmap_msgs.msg import KeepOut as KeepOutMsg
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid, TopologicalMap
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.mission import InputWatchdog
-from thinmap_ros.core.exploration.observations import Observation
+from thinmap_ros.core.exploration.strategy import Observation
 from thinmap_ros.core.grid.edits import KeepOut
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import SECOND_NS, Array

@@ -12,8 +12,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.mission import Mission, MissionState
-from thinmap_ros.core.exploration.observations import Observation
-from thinmap_ros.core.exploration.strategy import Strategy
+from thinmap_ros.core.exploration.strategy import Observation, Strategy
 from thinmap_ros.core.exploration.team import Claim, Place, Team, TeamConfig
 from thinmap_ros.core.planning.path_follower import MESSAGE_PERIOD_S, NEAR_ROBOT_M, Motion, moved_on
 from thinmap_ros.core.se2 import SECOND_NS, Array
