@@ -13,7 +13,7 @@ from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.results_page import made_lines, read_reports
 from thinmap_ros.evaluation.machine import provenance
 from thinmap_ros.evaluation.peers import INTEL, PEERS, Origin, PeerRun, runs, shown
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.safe import read_text, write_text
 
 _CHART = 'peers'
 _TEMPLATE = Path(__file__).with_suffix('.md')

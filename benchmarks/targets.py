@@ -15,7 +15,7 @@ from benchmarks.speed.page import sections as speed_sections
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.machine import provenance
 from thinmap_ros.evaluation.outcome import VERDICTS
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 
 _HEAD = """\
 # Targets

@@ -31,9 +31,9 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.team_run import TeamOptions, make_team
-from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.package_data import world_path
+from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import observable_cells

@@ -22,7 +22,7 @@ from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel
 from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.parallel_jobs import add_run_options, failure_summary, run_pending
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.safe import read_text, write_text
 
 FITTED_ON = ('dungeon/d114', 'dungeon/d1305', 'dungeon/d1336', 'dungeon/d1407', 'kth/50052749')
 UNSEEN = ('dungeon/d1573', 'dungeon/d1641', 'dungeon/d2191', 'dungeon/d3230', 'kth/50052751')

@@ -22,7 +22,7 @@ from thinmap_ros.evaluation.strategy_comparison import (
     markdown,
     relative_saving,
 )
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.safe import read_text, write_text
 
 Report = dict[str, Any]
 _CHART = 'exploration'

@@ -13,7 +13,7 @@ from benchmarks.kidnapped.summary import Written, by_group, summary
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.machine import provenance
 from thinmap_ros.evaluation.outcome import Row
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 
 _CHART = 'localization'
 _HEAD = """\

@@ -30,7 +30,7 @@ from thinmap_ros.evaluation.parallel_jobs import (
     read_report,
     run_pending,
 )
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.safe import read_text, write_text
 from thinmap_ros.tools import cli
 
 _SHARED = Path(__file__).resolve().parents[3] / 'shared'

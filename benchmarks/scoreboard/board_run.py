@@ -19,7 +19,7 @@ from benchmarks.scoreboard.reports import report_file, report_of, reports_there
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.machine import provenance, write_provenance
 from thinmap_ros.evaluation.parallel_jobs import Failure, failure_summary, read_report, run_pending
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 
 FOLDER = 'board'  # of the results; a case of the complete scoreboard may have the same name
 # A graph costs more than a pose, and the pose needs little of it: of replayed drives there is a new

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import RobotConfig, WheelOdometry

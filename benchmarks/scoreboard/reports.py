@@ -8,7 +8,7 @@ from benchmarks.scoreboard.cases import Case
 from benchmarks.scoreboard.played import Numbers
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.parallel_jobs import Failure, read_report
-from thinmap_ros.files.atomic import read_text
+from thinmap_ros.files.safe import read_text
 
 RESULTS = 'results'
 

@@ -19,7 +19,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation import peers
 from thinmap_ros.evaluation.machine import provenance
 from thinmap_ros.evaluation.peers import CARTOGRAPHER, COMPLETE, INTEL, LAMA, Origin, shown
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.safe import read_text, write_text
 
 _CHART = 'slam'
 _NAMES = {

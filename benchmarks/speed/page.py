@@ -14,7 +14,7 @@ from benchmarks.scoreboard.results_page import read_reports
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.machine import provenance
 from thinmap_ros.evaluation.peers import INTEL, Origin, runs
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 
 _CHART = 'speed'
 _HEAD = """\

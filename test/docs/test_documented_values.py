@@ -9,7 +9,7 @@ import pytest
 import yaml
 from support.node_list import ROOT
 
-from thinmap_ros.files.yaml import parse_yaml
+from thinmap_ros.files.safe import parse_yaml
 from thinmap_ros.nodes import thinmap
 from thinmap_ros.ros.foreign.values import is_known
 

@@ -15,8 +15,8 @@ from PIL import Image
 
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.files.safe import parse_yaml
 from thinmap_ros.files.worlds import read_starts, read_tour, read_world
-from thinmap_ros.files.yaml import parse_yaml
 
 WORLD = {'resolution': 0.1, 'wall_thickness': 0.2, 'start': [1, 1, 0], 'walls': [[[0, 0], [4, 0]]]}
 MAP = {'image': 'm.png', 'resolution': 0.05, 'origin': [0, 0, 0]}

@@ -16,7 +16,7 @@ from PIL import Image
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.files.occupancy_maps import read_map, write_map
-from thinmap_ros.files.yaml import number_of, parse_yaml
+from thinmap_ros.files.safe import number_of, parse_yaml
 
 YAML = {
     'image': 'm.pgm',

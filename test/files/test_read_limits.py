@@ -34,7 +34,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.carmen_log import carmen_lines
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.files.limits import LOGS
+from thinmap_ros.files.safe import LOGS
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog

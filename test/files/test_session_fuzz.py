@@ -28,9 +28,8 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files import sessions
-from thinmap_ros.files.npz import read_arrays
+from thinmap_ros.files.safe import VERSION, read_arrays
 from thinmap_ros.files.sessions import load_grid
-from thinmap_ros.files.snapshots import VERSION
 
 
 @pytest.fixture(scope='module')

@@ -10,7 +10,7 @@ import pytest
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.files import occupancy_maps, sessions, trajectories, worlds, yaml
+from thinmap_ros.files import occupancy_maps, safe, sessions, trajectories, worlds
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_directory import bag_files
 from thinmap_ros.logs.carmen import CarmenLog
@@ -48,7 +48,7 @@ READERS = {
     'resolution.yaml': occupancy_maps.read_resolution,
     'world.yaml': worlds.read_world,
     'tour.yaml': worlds.read_tour,
-    'laser.yaml': lambda path: yaml.read_mapping(path, 'a mapping'),
+    'laser.yaml': lambda path: safe.read_mapping(path, 'a mapping'),
     'poses.tum': trajectories.read_tum,
     'room.grid.npz': lambda path: sessions.load_grid(str(path)),
     'room.yaml': lambda path: sessions.load_grid(str(path)),
@@ -100,4 +100,4 @@ def test_a_folder_of_a_bag_holds_files(tmp_path, name):
 def test_a_link_to_a_file_is_read_as_the_file(tmp_path):
     (tmp_path / 'real.yaml').write_text('a: 1\n')
     (tmp_path / 'link.yaml').symlink_to(tmp_path / 'real.yaml')
-    assert yaml.read_mapping(tmp_path / 'link.yaml', 'a mapping') == {'a': 1}
+    assert safe.read_mapping(tmp_path / 'link.yaml', 'a mapping') == {'a': 1}

@@ -13,7 +13,7 @@ from support.bag_maker import TF, UPRIGHT, Maker, drive, write
 from support.ros1_bag import NEW_TF, OLD_TF, converted, ros1_bag
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.files.limits import LOGS
+from thinmap_ros.files.safe import LOGS
 from thinmap_ros.logs import ros1_storage
 from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.bag_writer import BagWriter

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from thinmap_ros.files.atomic import atomic_write, partial_files
+from thinmap_ros.files.safe import atomic_write, partial_files
 from thinmap_ros.ros.checkpoint import Checkpoint, checkpoint_directory
 
 STATE = {'a': np.arange(3), 'b': np.array(2.5)}

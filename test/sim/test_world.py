@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files import worlds
-from thinmap_ros.files.limits import FILES
+from thinmap_ros.files.safe import FILES
 from thinmap_ros.files.worlds import read_starts, read_world
 from thinmap_ros.sim.world import World
 

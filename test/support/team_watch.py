@@ -16,7 +16,7 @@ from rclpy.utilities import remove_ros_args
 from std_msgs.msg import UInt32
 
 from thinmap_msgs.msg import ExplorationStatus
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 from thinmap_ros.ros import qos
 
 

@@ -19,7 +19,7 @@ from thinmap_ros.evaluation.parallel_jobs import (
     read_report,
     run_pending,
 )
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 from thinmap_ros.view import batch_page
 
 SUMMARY = 'summary.csv'

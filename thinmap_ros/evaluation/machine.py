@@ -5,7 +5,7 @@ import platform
 import subprocess
 from pathlib import Path
 
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.safe import read_text, write_text
 
 _ROOT = Path(__file__).resolve().parents[2]
 _PROVENANCE = 'provenance.txt'

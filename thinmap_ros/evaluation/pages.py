@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from thinmap_ros.evaluation.machine import provenance
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.safe import read_text, write_text
 from thinmap_ros.view.figures import write_small_png
 
 About = dict[str, Any]

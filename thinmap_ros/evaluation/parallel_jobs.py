@@ -16,7 +16,7 @@ from threading import Thread
 from typing import Any, Protocol, TypeVar
 
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.safe import read_text, write_text
 from thinmap_ros.view.progress_bar import ProgressBar
 
 Report = dict[str, Any]

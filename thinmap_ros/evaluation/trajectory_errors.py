@@ -8,7 +8,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array, wrap
-from thinmap_ros.files.atomic import read_text
+from thinmap_ros.files.safe import read_text
 
 
 def between_paths(path: Array, onto: Array) -> Array:

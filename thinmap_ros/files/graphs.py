@@ -29,8 +29,7 @@ from thinmap_ros.core.errors import InputError, require_type
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.regions import Membership, Region
-from thinmap_ros.files.atomic import atomic_write, write_text
-from thinmap_ros.files.paths import path_of
+from thinmap_ros.files.safe import atomic_write, path_of, write_text
 
 Writer = Callable[[Path, TopologicalMap, Membership | None], None]
 _MAX_ID = 2**32 - 1

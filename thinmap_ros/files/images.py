@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import UNKNOWN
-from thinmap_ros.files.limits import FILES, PIECE_BYTES
-from thinmap_ros.files.regular_files import open_regular_file
+from thinmap_ros.files.safe import FILES, PIECE_BYTES, open_regular_file
 
 if TYPE_CHECKING:
     from PIL import Image

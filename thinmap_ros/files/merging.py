@@ -16,9 +16,8 @@ from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import TopologyBuilder, build
 from thinmap_ros.files import sessions
-from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.occupancy_maps import Report, read_map, warn
-from thinmap_ros.files.paths import path_of
+from thinmap_ros.files.safe import atomic_write, path_of
 from thinmap_ros.files.sessions import EXPLORATION, GRID, KEYFRAMES, LOCALIZER, REGIONS, TOPOLOGY
 
 MIN_MAPS = 2

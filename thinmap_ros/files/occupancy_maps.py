@@ -21,12 +21,17 @@ from thinmap_ros.core.errors import InputError, one_line_reason, quoted, require
 from thinmap_ros.core.grid.moved import aligned_patch
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
-from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.files.images import CellRule, ImageCells, read_cells
-from thinmap_ros.files.limits import FILES
-from thinmap_ros.files.paths import path_of
-from thinmap_ros.files.regular_files import open_regular_file
-from thinmap_ros.files.yaml import boolean_of, number_of, read_texts
+from thinmap_ros.files.safe import (
+    FILES,
+    atomic_write,
+    boolean_of,
+    number_of,
+    open_regular_file,
+    path_of,
+    read_texts,
+    write_text,
+)
 
 Report = Callable[[str], object]
 """Receives a line that the user of a map should know."""

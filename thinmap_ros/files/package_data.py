@@ -10,7 +10,7 @@ from importlib import resources, util
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.files.paths import path_of
+from thinmap_ros.files.safe import path_of
 
 _PACKAGE = 'thinmap_ros'
 

@@ -26,7 +26,6 @@ from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import TopologyBuilder
-from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.occupancy_maps import (
     Report,
     is_own_map,
@@ -35,8 +34,13 @@ from thinmap_ros.files.occupancy_maps import (
     warn,
     write_map,
 )
-from thinmap_ros.files.regular_files import open_regular_file
-from thinmap_ros.files.snapshots import is_snapshot, read_snapshot, write_snapshot
+from thinmap_ros.files.safe import (
+    atomic_write,
+    is_snapshot,
+    open_regular_file,
+    read_snapshot,
+    write_snapshot,
+)
 
 _MAP_ENDING = '.yaml'
 _IMAGE_ENDING = '.pgm'

@@ -9,7 +9,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import SECOND_NS, Array
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.safe import read_text, write_text
 
 
 def write_tum(path: Path, stamps_ns: Sequence[int], poses: Sequence[Array]) -> None:

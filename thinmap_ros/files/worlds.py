@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.patch import MIN_RESOLUTION_M, GridFrame, GridPatch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, pose
-from thinmap_ros.files.limits import FILES
 from thinmap_ros.files.occupancy_maps import read_map
-from thinmap_ros.files.paths import path_of
-from thinmap_ros.files.yaml import read_mapping
+from thinmap_ros.files.safe import FILES, path_of, read_mapping
 
 _MARGIN_M = 0.2
 _NUDGE_M = 1e-9

@@ -13,8 +13,7 @@ from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.files.limits import LOGS
-from thinmap_ros.files.regular_files import require_regular_file
+from thinmap_ros.files.safe import LOGS, require_regular_file
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag_directory import DecompressedFile, bag_files
 from thinmap_ros.logs.formats import is_bag, is_ros1, is_sqlite

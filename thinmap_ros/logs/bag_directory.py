@@ -8,10 +8,14 @@ from typing import IO, Any
 import zstandard
 
 from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.files.atomic import read_text
-from thinmap_ros.files.limits import FILES, LOGS, PIECE_BYTES
-from thinmap_ros.files.regular_files import open_regular_file
-from thinmap_ros.files.yaml import parse_yaml
+from thinmap_ros.files.safe import (
+    FILES,
+    LOGS,
+    PIECE_BYTES,
+    open_regular_file,
+    parse_yaml,
+    read_text,
+)
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from mcap.records import Channel, ChunkIndex, Message, Schema, Statistics
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.files.limits import LOGS, PIECE_BYTES
-from thinmap_ros.files.regular_files import open_regular_file
+from thinmap_ros.files.safe import LOGS, PIECE_BYTES, open_regular_file
 from thinmap_ros.logs.mcap_records import (
     FIRST_PRIVATE_OPCODE,
     HEAD,

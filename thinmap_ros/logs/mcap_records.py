@@ -21,7 +21,7 @@ from mcap.records import Channel, Message, Schema
 from numpy.typing import NDArray
 
 from thinmap_ros.core.se2 import LATEST_NS
-from thinmap_ros.files.limits import LOGS, PIECE_BYTES
+from thinmap_ros.files.safe import LOGS, PIECE_BYTES
 
 MAGIC = b'\x89MCAP0\r\n'
 FIRST_PRIVATE_OPCODE = 0x80

@@ -7,7 +7,7 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from thinmap_ros.files.limits import PIECE_BYTES
+from thinmap_ros.files.safe import PIECE_BYTES
 from thinmap_ros.logs.carmen import open_unpacked
 
 

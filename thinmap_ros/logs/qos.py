@@ -14,8 +14,7 @@ from rosbags.interfaces import (
 from rosbags.rosbag2.metadata import parse_qos
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.files.limits import LOGS
-from thinmap_ros.files.yaml import parse_yaml
+from thinmap_ros.files.safe import LOGS, parse_yaml
 
 KEY = 'offered_qos_profiles'
 """Key of a channel's metadata in an MCAP file; its value is YAML."""

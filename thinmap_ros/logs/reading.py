@@ -9,7 +9,7 @@ from thinmap_ros.core.errors import InputError, pose_of, quoted
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.files.paths import path_of
+from thinmap_ros.files.safe import path_of
 from thinmap_ros.logs.laser_options import LaserOptions
 from thinmap_ros.logs.log import Event, Log, OdometryEvent
 from thinmap_ros.logs.log_format import LogOptions, format_of

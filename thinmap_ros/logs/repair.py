@@ -10,8 +10,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2.metadata import dump_qos_v9
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.files.atomic import write_text
-from thinmap_ros.files.limits import LOGS
+from thinmap_ros.files.safe import LOGS, write_text
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.mcap_reader import Damage, Definitions, intact_records
 from thinmap_ros.logs.mcap_records import DamagedError, decompress

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.files.limits import LOGS
+from thinmap_ros.files.safe import LOGS
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.mcap_reader import Damage, McapFile
 

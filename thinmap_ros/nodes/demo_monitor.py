@@ -16,7 +16,7 @@ from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files import package_data
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.nodes.simulation.requested_exploration import RequestedExploration
 from thinmap_ros.nodes.simulation.starts import poses_from

@@ -9,9 +9,13 @@ from rclpy.node import Node
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.files.atomic import atomic_write, partial_files
-from thinmap_ros.files.regular_files import open_regular_file
-from thinmap_ros.files.snapshots import read_snapshot, write_snapshot
+from thinmap_ros.files.safe import (
+    atomic_write,
+    open_regular_file,
+    partial_files,
+    read_snapshot,
+    write_snapshot,
+)
 from thinmap_ros.jit.private_folder import private_folder, temporary_folder
 
 _FOLDER = 'THINMAP_STATE_DIR'

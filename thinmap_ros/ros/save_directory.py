@@ -13,7 +13,7 @@ from typing import Any
 from rclpy.node import Node
 
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.files.limits import FILES
+from thinmap_ros.files.safe import FILES
 from thinmap_ros.files.sessions import ENDINGS, SessionPart, require_own_files, stem_of
 from thinmap_ros.ros import parameters
 

@@ -25,7 +25,7 @@ from thinmap_ros.evaluation.parallel_jobs import (
 )
 from thinmap_ros.evaluation.strategy_comparison import markdown
 from thinmap_ros.files import package_data
-from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.safe import read_text, write_text
 from thinmap_ros.files.worlds import read_starts, read_world
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import NAMES, check_strategy

@@ -13,7 +13,7 @@ from thinmap_ros.evaluation.trajectory_comparison import (
     compare_with_relations,
     compare_with_tum,
 )
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser, check_place
 

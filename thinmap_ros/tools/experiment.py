@@ -29,7 +29,7 @@ from thinmap_ros.experiments.topological_map import (
     thinning_voronoi,
     wavefront_path,
 )
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 from thinmap_ros.view.plot_writer import write_plot

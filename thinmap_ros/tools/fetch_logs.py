@@ -12,7 +12,7 @@ from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.core.se2 import SECOND_NS
-from thinmap_ros.files.atomic import atomic_write, write_text
+from thinmap_ros.files.safe import atomic_write, write_text
 from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import OdometryEvent
 from thinmap_ros.logs.published_logs import PUBLISHED, PublishedLog, unpacked_sha256

@@ -13,7 +13,7 @@ from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.evaluation.batch import REASON, Batch, FileJob, reported
 from thinmap_ros.evaluation.parallel_jobs import Report
-from thinmap_ros.files.atomic import read_text
+from thinmap_ros.files.safe import read_text
 from thinmap_ros.logs.log import Log
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import Replay, Watcher, replay, write_outputs

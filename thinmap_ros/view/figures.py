@@ -10,7 +10,7 @@ import numpy as np
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
-from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.view import palette
 
 if TYPE_CHECKING:

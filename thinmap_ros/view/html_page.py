@@ -4,7 +4,7 @@ import html
 from dataclasses import dataclass
 from pathlib import Path
 
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 
 _STYLE = """
 :root { color-scheme: light; }

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.view.figures import DPI, draw_graph, draw_map
 
 _PANEL_IN = 5.0

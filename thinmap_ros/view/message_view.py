@@ -14,7 +14,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.core.topology.regions import RegionKind
-from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.frames.laser_mount import StaticTransforms

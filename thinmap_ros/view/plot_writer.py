@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.view import palette
 from thinmap_ros.view.figures import DPI, draw_graph, draw_map
 from thinmap_ros.view.plots import (

@@ -14,7 +14,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.regions import membership_of
 from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
-from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.safe import write_text
 from thinmap_ros.view import report_page
 from thinmap_ros.view.summary import summary_figure
 

@@ -12,7 +12,7 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.regions import RegionKind, RegionMap
-from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.view import cell_blocks, palette
 from thinmap_ros.view.cell_blocks import DrawnCells
 from thinmap_ros.view.figures import draw_graph, draw_hidden_areas

@@ -21,7 +21,7 @@ from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.topology.graph import topology_from_msg
-from thinmap_ros.files.snapshots import write_snapshot
+from thinmap_ros.files.safe import write_snapshot
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.sim.robot import after_arc
 

@@ -14,7 +14,7 @@ from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.evaluation import peers
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.evaluation.trajectory_errors import RelationErrors, read_columns, relation_errors
-from thinmap_ros.files.yaml import read_mapping
+from thinmap_ros.files.safe import read_mapping
 from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.laser_options import LaserOptions
 from thinmap_ros.pipeline import PipelineConfig

@@ -11,8 +11,7 @@ from rclpy.node import Node
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.files.atomic import write_text
-from thinmap_ros.files.yaml import read_mapping
+from thinmap_ros.files.safe import read_mapping, write_text
 
 _WARN_PERIOD_S = 60.0
 _KEYS = ('x', 'y', 'yaw')

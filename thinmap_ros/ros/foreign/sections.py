@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.files.yaml import parse_yaml, read_mapping
+from thinmap_ros.files.safe import parse_yaml, read_mapping
 from thinmap_ros.ros.foreign.tables import PACKAGES
 
 EXPECTED = 'a parameter file: NODE: ros__parameters: NAME: VALUE'
