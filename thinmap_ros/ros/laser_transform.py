@@ -10,7 +10,7 @@ from tf2_msgs.msg import TFMessage
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.logs.frames.laser_mount import Mount, StaticTransforms, parse_laser_pose
+from thinmap_ros.logs.transforms import Mount, StaticTransforms, parse_laser_pose
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

@@ -17,7 +17,7 @@ from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
-from thinmap_ros.logs.frames.laser_mount import StaticTransforms
+from thinmap_ros.logs.transforms import StaticTransforms
 from thinmap_ros.view import palette
 from thinmap_ros.view.apart_scans import ApartScans
 from thinmap_ros.view.null_view import NullView

@@ -10,7 +10,7 @@ from support.slam_room import RANGE_MAX_M, ROOM, ranges_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import AT_END, LaserConfig, Scan
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer, SweepTiming, deskewed
-from thinmap_ros.logs.frames.laser_mount import Mount
+from thinmap_ros.logs.transforms import Mount
 
 SECOND = 1_000_000_000
 PERIOD_S = 0.2

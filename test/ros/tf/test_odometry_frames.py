@@ -5,7 +5,7 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.logs.frames.odometry_frames import OdometryFrames
+from thinmap_ros.logs.transforms import OdometryFrames
 from thinmap_ros.ros import messages
 
 T_ODOM_BASE = se2.pose(3.0, -1.0, 0.7)

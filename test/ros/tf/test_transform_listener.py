@@ -8,7 +8,7 @@ from geometry_msgs.msg import TransformStamped
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.logs.frames.transforms import TransformBuffer
+from thinmap_ros.logs.transforms import TransformBuffer
 from thinmap_ros.ros import messages
 
 SECOND_NS = 10**9

@@ -9,7 +9,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.logs.frames.transforms import TransformBuffer
+from thinmap_ros.logs.transforms import TransformBuffer
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.tf.transform_reader import TransformReader
 

@@ -9,11 +9,9 @@ from typing import Any, Protocol
 from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.logs.frames.laser_mount import Mount, StaticTransforms
-from thinmap_ros.logs.frames.odometry_frames import OdometryFrames
-from thinmap_ros.logs.frames.transforms import TransformOdometry
 from thinmap_ros.logs.log import SkippedRecords
 from thinmap_ros.logs.storage import RawMessage
+from thinmap_ros.logs.transforms import Mount, OdometryFrames, StaticTransforms, TransformOdometry
 
 _TF = 'tf2_msgs/msg/TFMessage'
 _BASE = 'base_link'

@@ -9,9 +9,8 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.frames.bag_frames import BagFrames
-from thinmap_ros.logs.frames.odometry_frames import OdometryFrames
-from thinmap_ros.logs.frames.transforms import TransformOdometry
 from thinmap_ros.logs.log import OdometryEvent
+from thinmap_ros.logs.transforms import OdometryFrames, TransformOdometry
 
 TOPIC = 'topic'
 TF = 'tf'

@@ -12,8 +12,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs.frames.bag_odometry import NONE, SOURCES, TF, TOPIC
-from thinmap_ros.logs.frames.odometry_frames import OdometryFrames
-from thinmap_ros.logs.frames.transforms import TransformOdometry
+from thinmap_ros.logs.transforms import OdometryFrames, TransformOdometry
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded

@@ -9,7 +9,7 @@ from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.logs.frames.transforms import TransformBuffer
+from thinmap_ros.logs.transforms import TransformBuffer
 from thinmap_ros.ros import qos
 from thinmap_ros.ros.tf.transform_reader import TransformReader
 
