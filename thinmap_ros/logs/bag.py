@@ -17,11 +17,12 @@ from thinmap_ros.files.safe import LOGS, require_regular_file
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag_directory import DecompressedFile, bag_files
 from thinmap_ros.logs.formats import is_bag, is_ros1, is_sqlite
-from thinmap_ros.logs.frames.bag_frames import BagFrames, FrameOptions
-from thinmap_ros.logs.frames.bag_odometry import (
+from thinmap_ros.logs.frames import (
     NONE,
     TF,
+    BagFrames,
     BagOdometry,
+    FrameOptions,
     NoOdometry,
     OdometryByTransforms,
     OdometryOnTopic,

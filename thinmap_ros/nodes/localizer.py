@@ -40,7 +40,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.files.sessions import LOCALIZER, save_localizer
 from thinmap_ros.kernels import warm_up
-from thinmap_ros.logs.frames.bag_odometry import NONE
+from thinmap_ros.logs.frames import NONE
 from thinmap_ros.nodes.localization.given_map import GivenMap, config_at
 from thinmap_ros.nodes.localization.initial_poses import InitialPoses
 from thinmap_ros.nodes.localization.keyframe_output import KeyframeOutput

@@ -18,7 +18,7 @@ from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.logs import decode
-from thinmap_ros.logs.frames.bag_odometry import NONE
+from thinmap_ros.logs.frames import NONE
 from thinmap_ros.nodes.navigation.base_watch import BaseWatch
 from thinmap_ros.nodes.navigation.map_input import MapInput, MapTimeoutConfig
 from thinmap_ros.nodes.navigation.robot_state import RobotState

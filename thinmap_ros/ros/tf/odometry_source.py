@@ -11,7 +11,7 @@ from tf2_msgs.msg import TFMessage
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.logs.frames.bag_odometry import NONE, SOURCES, TF, TOPIC
+from thinmap_ros.logs.frames import NONE, SOURCES, TF, TOPIC
 from thinmap_ros.logs.transforms import OdometryFrames, TransformOdometry
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

@@ -1,1 +1,0 @@
-"""Frames of a robot: static and moving transforms, mounts of lasers, frames of odometry."""
