@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.files.occupancy_maps import read_map, write_map
     from thinmap_ros.files.package_data import world_path
     from thinmap_ros.files.worlds import read_world
-    from thinmap_ros.logs.laser_options import LaserOptions
+    from thinmap_ros.logs.log import LaserOptions
     from thinmap_ros.logs.reading import open_log, paired_scans
     from thinmap_ros.pipeline import Pipeline, PipelineConfig
     from thinmap_ros.sim.laser import LaserScannerConfig
@@ -92,7 +92,7 @@ _PLACES = {
     # logs
     'open_log': 'logs.reading.open_log',
     'LaserConfig': 'core.scan.LaserConfig',
-    'LaserOptions': 'logs.laser_options.LaserOptions',
+    'LaserOptions': 'logs.log.LaserOptions',
     'paired_scans': 'logs.reading.paired_scans',
     # maps
     'GridPatch': 'core.grid.patch.GridPatch',

@@ -18,7 +18,7 @@ from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import TopologyBuilder
-from thinmap_ros.logs.laser_options import LaserOptions
+from thinmap_ros.logs.log import LaserOptions
 from thinmap_ros.view.message_view import MessageView
 from thinmap_ros.view.null_view import NullView
 

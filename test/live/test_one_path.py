@@ -26,8 +26,7 @@ from thinmap_ros.files import occupancy_maps, package_data, sessions
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.bag import BagLog
 from thinmap_ros.logs.carmen import CarmenLog
-from thinmap_ros.logs.laser_options import LaserOptions
-from thinmap_ros.logs.log import OdometryEvent, ScanEvent, SkippedRecords
+from thinmap_ros.logs.log import LaserOptions, OdometryEvent, ScanEvent, SkippedRecords
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import replay
 from thinmap_ros.ros import messages, qos

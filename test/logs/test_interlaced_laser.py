@@ -11,8 +11,7 @@ from thinmap_ros.core.config import with_values
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.logs.bag import BagLog
 from thinmap_ros.logs.carmen import CarmenLog
-from thinmap_ros.logs.laser_options import LaserOptions
-from thinmap_ros.logs.log import ScanEvent
+from thinmap_ros.logs.log import LaserOptions, ScanEvent
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import replay
 from thinmap_ros.tools.carmen_to_bag import convert

@@ -10,14 +10,14 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs import readers
 from thinmap_ros.logs.bag import BagLog
 from thinmap_ros.logs.carmen import CarmenLog
-from thinmap_ros.logs.log_format import known_formats
+from thinmap_ros.logs.log import known_formats
 from thinmap_ros.logs.reading import open_log, paired_scans
 
 NEW_FORMAT = '''
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import pose
 from thinmap_ros.logs.log import OdometryEvent, ScanEvent, SkippedRecords
-from thinmap_ros.logs.log_format import LogFormat
+from thinmap_ros.logs.log import LogFormat
 
 
 class CsvLog:

@@ -24,7 +24,7 @@ from thinmap_ros.files import occupancy_maps
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog
-from thinmap_ros.logs.laser_options import LaserOptions
+from thinmap_ros.logs.log import LaserOptions
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import replay
 from thinmap_ros.tools.carmen_to_bag import convert

@@ -26,9 +26,9 @@ from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import LATEST_S, SECOND_NS, Array
 from thinmap_ros.files.safe import LOGS, open_regular_file
 from thinmap_ros.logs.formats import is_mcap, refuse_foreign
-from thinmap_ros.logs.laser_options import LaserOptions
 from thinmap_ros.logs.log import (
     Event,
+    LaserOptions,
     OdometryEvent,
     ScanEvent,
     SkippedRecords,

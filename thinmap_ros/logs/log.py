@@ -1,14 +1,21 @@
-"""Events of a log or bag, in the order of writing."""
+"""Logs as events, and the formats that open them."""
 
+import importlib
+import pkgutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.logs import readers
 
 _MAX_REASONS = 20
+
 _OTHER = 'other reasons'
 
 
@@ -85,3 +92,83 @@ class Log(Protocol):
     def events(self) -> Iterator[Event]:
         """Odometry and scans in the order of the file."""
         ...
+
+
+# Properties of a laser that a CARMEN log does not contain.
+
+
+@dataclass(frozen=True)
+class LaserOptions(Config):
+    """Properties of the laser that FLASER lines do not contain.
+
+    ROBOTLASER1 lines contain them; an offset given here takes precedence.
+    """
+
+    start_angle_deg: float = parameter(
+        -90.0, 'bearing of the first beam, degrees', low=-360.0, high=360.0
+    )
+    step_deg: float = parameter(
+        0.0,
+        'angle between beams, degrees; 0: 1 for 180 beams, else 180 over the intervals',
+        low=-10.0,
+        high=10.0,
+    )
+    offset_m: float = parameter(0.0, 'laser ahead of the robot centre, m', low=-5.0, high=5.0)
+    range_min_m: float = parameter(0.02, 'nearest valid range, m', low=0.0, high=10.0)
+    range_max_m: float = parameter(
+        80.0, 'ranges from here on are "no return", m', low=0.1, high=1000.0
+    )
+
+
+# Formats of logs: what a module of `logs.readers` defines, and which one opens a file.
+
+
+@dataclass(frozen=True, eq=False)
+class LogOptions:
+    """What a user states about a log; empty or None: as in the log. A format ignores the others'.
+
+    carmen: laser of a CARMEN log; T_base_laser (3,): the laser on the robot; laser: parameters of
+    the laser. The others are topics, frames and the source of odometry of a bag (see `BagLog`).
+    """
+
+    carmen: LaserOptions = field(default_factory=LaserOptions)
+    scan_topic: str = ''
+    odometry_topic: str = ''
+    T_base_laser: Array | None = None
+    base_frame: str = ''
+    odometry_source: str = ''
+    odom_frame: str = ''
+    laser: LaserConfig = field(default_factory=LaserConfig)
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """A format of logs: name as in "expected ..."; whether it opens a path; and its log.
+
+    opens reads the first bytes at most, and is False for what it cannot read.
+    """
+
+    name: str
+    opens: Callable[[Path], bool]
+    log: Callable[[Path, LogOptions], Log]
+
+
+def log_formats() -> list[LogFormat]:
+    """Formats of all modules in `logs.readers`, in the order of the names of the modules."""
+    names = sorted(module.name for module in pkgutil.iter_modules(readers.__path__))
+    modules = [importlib.import_module(f'{readers.__name__}.{name}') for name in names]
+    return [module.FORMAT for module in modules]
+
+
+def known_formats() -> str:
+    """Names of all formats, as the end of "expected ..."."""
+    return ', or '.join(known.name for known in log_formats())
+
+
+def format_of(path: Path) -> LogFormat:
+    """Return the first format that opens a path. Raises InputError if there is none."""
+    for known in log_formats():
+        if known.opens(path):
+            return known
+    found = 'unknown format of a log' if path.exists() else 'no such file or folder'
+    raise InputError(f'{path}: {found}: expected {known_formats()}')

@@ -10,9 +10,7 @@ from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.files.safe import path_of
-from thinmap_ros.logs.laser_options import LaserOptions
-from thinmap_ros.logs.log import Event, Log, OdometryEvent
-from thinmap_ros.logs.log_format import LogOptions, format_of
+from thinmap_ros.logs.log import Event, LaserOptions, Log, LogOptions, OdometryEvent, format_of
 from thinmap_ros.logs.order.clock_jumps import ClockJumpError, ClockJumps
 from thinmap_ros.logs.order.stamp_order import by_stamp
 

@@ -7,8 +7,7 @@ from thinmap_ros.core.errors import counted
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.encode import BagObjects
-from thinmap_ros.logs.laser_options import LaserOptions
-from thinmap_ros.logs.log import Event, OdometryEvent
+from thinmap_ros.logs.log import Event, LaserOptions, OdometryEvent
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser
 

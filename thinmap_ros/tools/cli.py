@@ -18,8 +18,7 @@ from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.logs import reading
 from thinmap_ros.logs.frames import SOURCES
-from thinmap_ros.logs.laser_options import LaserOptions
-from thinmap_ros.logs.log import Log
+from thinmap_ros.logs.log import LaserOptions, Log
 from thinmap_ros.logs.transforms import parse_laser_pose
 from thinmap_ros.tools.arguments import BAD_INPUT
 from thinmap_ros.tools.parameter_file import NodeParameters

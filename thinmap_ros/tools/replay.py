@@ -20,8 +20,7 @@ from thinmap_ros.core.stage import Estimate, StartConfig
 from thinmap_ros.evaluation.batch import jobs_of, run_batch
 from thinmap_ros.evaluation.parallel_jobs import add_run_options
 from thinmap_ros.files.safe import atomic_write
-from thinmap_ros.logs.log import Event, Log, SkippedRecords
-from thinmap_ros.logs.log_format import known_formats
+from thinmap_ros.logs.log import Event, Log, SkippedRecords, known_formats
 from thinmap_ros.pipeline import Pipeline
 from thinmap_ros.replaying import Replay
 from thinmap_ros.tools import cli

@@ -4,8 +4,7 @@ from pathlib import Path
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.carmen import CarmenLog, is_carmen
-from thinmap_ros.logs.log import Log
-from thinmap_ros.logs.log_format import LogFormat, LogOptions
+from thinmap_ros.logs.log import Log, LogFormat, LogOptions
 
 
 def _log(path: Path, options: LogOptions) -> Log:
