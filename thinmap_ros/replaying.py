@@ -18,8 +18,7 @@ from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.segmentation import RegionConfig
 from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.logs.log import Log
-from thinmap_ros.logs.order.unused_scans import UnusedScans
-from thinmap_ros.logs.reading import WAITING_SCANS, complete_scans, recording_events
+from thinmap_ros.logs.reading import WAITING_SCANS, UnusedScans, complete_scans, recording_events
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.run_folder import RunResult, Trajectory, write_report, write_run

@@ -24,9 +24,7 @@ from thinmap_ros.logs.log import (
     ScanEvent,
     SkippedRecords,
 )
-from thinmap_ros.logs.order.clock_jumps import ClockJumpError
-from thinmap_ros.logs.order.unused_scans import UnusedScans
-from thinmap_ros.logs.reading import open_log, recording_events
+from thinmap_ros.logs.reading import ClockJumpError, UnusedScans, open_log, recording_events
 from thinmap_ros.tools.parameter_file import read_parameter_file
 
 _PRESETS = sorted((Path(__file__).resolve().parents[3] / 'config').glob('*/*.yaml'))

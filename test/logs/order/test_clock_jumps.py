@@ -9,8 +9,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, SkippedRecords
-from thinmap_ros.logs.order.clock_jumps import ClockJumpError, ClockJumps, stamp_of
-from thinmap_ros.logs.reading import paired_scans
+from thinmap_ros.logs.reading import ClockJumpError, ClockJumps, paired_scans, stamp_of
 
 PERIOD_NS = SECOND_NS // 20
 SCANS_EVERY = 3

@@ -9,8 +9,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
-from thinmap_ros.logs.order.clock_jumps import ClockJumpError, stamp_of
-from thinmap_ros.logs.order.stamp_order import by_stamp
+from thinmap_ros.logs.reading import ClockJumpError, by_stamp, stamp_of
 
 
 def drive() -> list[Event]:

@@ -6,7 +6,7 @@ import pytest
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.logs.log import OdometryEvent, ScanEvent
-from thinmap_ros.logs.order.unused_scans import UnusedScans
+from thinmap_ros.logs.reading import UnusedScans
 
 YEAR_S = 365.25 * 86400.0
 
