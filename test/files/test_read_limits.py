@@ -38,8 +38,14 @@ from thinmap_ros.files.safe import LOGS
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog
-from thinmap_ros.logs.mcap_reader import Damage, intact_records
-from thinmap_ros.logs.mcap_records import DamagedError, Section, decompress, plain_records
+from thinmap_ros.logs.mcap import (
+    Damage,
+    DamagedError,
+    Section,
+    decompress,
+    intact_records,
+    plain_records,
+)
 from thinmap_ros.logs.storage import own_typestore, typestore_of
 from thinmap_ros.tools.carmen_to_bag import convert
 

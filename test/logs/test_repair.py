@@ -25,8 +25,7 @@ from support.forks import forked
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.mcap_reader import Damage, McapFile, intact_records
-from thinmap_ros.logs.mcap_records import HEAD, MAGIC
+from thinmap_ros.logs.mcap import HEAD, MAGIC, Damage, McapFile, intact_records
 
 STRING = 'std_msgs/msg/String'
 COUNT = 200

@@ -32,7 +32,7 @@ from thinmap_ros.logs.log import (
     ScanEvent,
     SkippedRecords,
 )
-from thinmap_ros.logs.mcap_records import DamagedError, decompress
+from thinmap_ros.logs.mcap import DamagedError, decompress
 from thinmap_ros.logs.ros1_storage import Ros1Storage
 from thinmap_ros.logs.storage import McapStorage, RawMessage, SqliteStorage, Storage
 

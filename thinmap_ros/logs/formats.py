@@ -4,7 +4,7 @@ from pathlib import Path
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.safe import open_regular_file
-from thinmap_ros.logs.mcap_records import MAGIC as _MCAP
+from thinmap_ros.logs.mcap import MAGIC as _MCAP
 
 _ROS1 = b'#ROSBAG V'
 _SQLITE = b'SQLite format 3\0'

@@ -12,8 +12,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.safe import LOGS, write_text
 from thinmap_ros.logs import qos
-from thinmap_ros.logs.mcap_reader import Damage, Definitions, intact_records
-from thinmap_ros.logs.mcap_records import DamagedError, decompress
+from thinmap_ros.logs.mcap import Damage, DamagedError, Definitions, decompress, intact_records
 from thinmap_ros.logs.storage import own_typestore
 
 

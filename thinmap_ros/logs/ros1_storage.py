@@ -15,8 +15,7 @@ from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.files.safe import LOGS
-from thinmap_ros.logs.mcap_reader import Damage
-from thinmap_ros.logs.mcap_records import DamagedError, decompress
+from thinmap_ros.logs.mcap import Damage, DamagedError, decompress
 from thinmap_ros.logs.storage import RawMessage, own_typestore
 
 _HEADER = 'std_msgs/msg/Header'

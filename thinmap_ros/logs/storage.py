@@ -18,7 +18,7 @@ from rosbags.typesys.store import Typestore
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.safe import LOGS
 from thinmap_ros.logs import qos
-from thinmap_ros.logs.mcap_reader import Damage, McapFile
+from thinmap_ros.logs.mcap import Damage, McapFile
 
 _IDL_SEPARATOR = '=' * 80 + '\n'
 
