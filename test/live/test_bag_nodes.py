@@ -18,7 +18,7 @@ from support.timeouts import PATIENCE_S
 
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.qos import recorded
+from thinmap_ros.logs.storage import recorded
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live

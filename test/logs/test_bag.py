@@ -25,9 +25,9 @@ from support.bag_maker import (
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.bag import Bag, BagLog
-from thinmap_ros.logs.bag_directory import bag_files
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
+from thinmap_ros.logs.storage import bag_files
 
 
 def read(path: Path, **options: Any) -> list[Event]:

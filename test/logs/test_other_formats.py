@@ -14,7 +14,7 @@ from support.ros1_bag import NEW_TF, OLD_TF, converted, ros1_bag
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.safe import LOGS
-from thinmap_ros.logs import ros1_storage
+from thinmap_ros.logs import storage
 from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
@@ -70,7 +70,7 @@ def test_a_chunk_of_a_ros1_bag_that_expands_too_far_ends_it(
     source = write(tmp_path / 'bag.mcap', lambda writer, make: drive(writer, make, 40))
     old = converted(source, tmp_path / 'old.bag', compression)
 
-    monkeypatch.setattr(ros1_storage, 'LOGS', replace(LOGS, chunk_bytes=1000))
+    monkeypatch.setattr(storage, 'LOGS', replace(LOGS, chunk_bytes=1000))
     bag = Bag(old)
     assert list(bag.messages()) == []
     assert bag.is_truncated

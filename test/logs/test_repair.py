@@ -22,7 +22,7 @@ from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 from support.forks import forked
 
-from thinmap_ros.logs import qos
+from thinmap_ros.logs import storage
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.mcap import HEAD, MAGIC, Damage, McapFile, intact_records
@@ -35,8 +35,8 @@ PER_CHUNK = 10
 def write(path: Path, count: int = COUNT) -> Path:
     """A bag of numbered messages, ten per chunk."""
     writer = BagWriter(path, live=True)
-    writer.add_topic('/said', STRING, [qos.recorded(7, False, False)])
-    writer.add_topic('/map', STRING, [qos.recorded(1, True, True)])
+    writer.add_topic('/said', STRING, [storage.recorded(7, False, False)])
+    writer.add_topic('/map', STRING, [storage.recorded(1, True, True)])
     for i in range(count):
         writer.write('/map' if i % 20 == 0 else '/said', STRING, 10**9 + i, text(writer, i))
         if i % PER_CHUNK == PER_CHUNK - 1:
@@ -79,7 +79,7 @@ def test_a_topic_that_is_defined_before_its_first_message_is_read_without_a_summ
     topics = ['/map', '/map', '/said', '/map', '/said']
     for i, topic in enumerate(topics):
         if i == 1:  # as a recorder that subscribes
-            writer.add_topic('/said', STRING, [qos.recorded(7, False, False)])
+            writer.add_topic('/said', STRING, [storage.recorded(7, False, False)])
         writer.write(topic, STRING, 10**9 + i, text(writer, i))
         writer.flush()
     bag = Bag(tmp_path / 'bag')
@@ -140,9 +140,9 @@ def test_a_cut_off_bag_gets_index_metadata_and_its_qualities_back(tmp_path: Path
     assert metadata['starting_time']['nanoseconds_since_epoch'] == 10**9
     assert metadata['duration']['nanoseconds'] == len(found) - 1
     offers = Bag(good).offers
-    assert qos.is_latched('/map', offers['/map'])
-    assert not qos.is_latched('/said', offers['/said'])
-    assert not qos.is_reliable(offers['/said']) and qos.depth(offers['/said']) == 7
+    assert storage.is_latched('/map', offers['/map'])
+    assert not storage.is_latched('/said', offers['/said'])
+    assert not storage.is_reliable(offers['/said']) and storage.depth(offers['/said']) == 7
 
 
 def cut_file(tmp_path: Path, compression: CompressionType) -> Path:

@@ -15,8 +15,6 @@ from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.safe import LOGS, require_regular_file
 from thinmap_ros.logs import decode
-from thinmap_ros.logs.bag_directory import DecompressedFile, bag_files
-from thinmap_ros.logs.formats import is_bag, is_ros1, is_sqlite
 from thinmap_ros.logs.frames import (
     NONE,
     TF,
@@ -33,8 +31,18 @@ from thinmap_ros.logs.log import (
     SkippedRecords,
 )
 from thinmap_ros.logs.mcap import DamagedError, decompress
-from thinmap_ros.logs.ros1_storage import Ros1Storage
-from thinmap_ros.logs.storage import McapStorage, RawMessage, SqliteStorage, Storage
+from thinmap_ros.logs.storage import (
+    DecompressedFile,
+    McapStorage,
+    RawMessage,
+    Ros1Storage,
+    SqliteStorage,
+    Storage,
+    bag_files,
+    is_bag,
+    is_ros1,
+    is_sqlite,
+)
 
 _SCAN = 'sensor_msgs/msg/LaserScan'
 _ODOMETRY = 'nav_msgs/msg/Odometry'

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.logs.qos import recorded
+from thinmap_ros.logs.storage import recorded
 
 
 class BagWriter:

@@ -25,7 +25,6 @@ from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import LATEST_S, SECOND_NS, Array
 from thinmap_ros.files.safe import LOGS, open_regular_file
-from thinmap_ros.logs.formats import is_mcap, refuse_foreign
 from thinmap_ros.logs.log import (
     Event,
     LaserOptions,
@@ -33,6 +32,7 @@ from thinmap_ros.logs.log import (
     ScanEvent,
     SkippedRecords,
 )
+from thinmap_ros.logs.storage import is_mcap, refuse_foreign
 
 _SCAN_KEYWORDS = (b'FLASER', b'ROBOTLASER1')
 _KEYWORDS = (b'ODOM', *_SCAN_KEYWORDS)  # other lines are not read

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.logs import qos
+from thinmap_ros.logs import storage
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.storage import RawMessage
 
@@ -94,7 +94,7 @@ class Playback:
         self.played_ns = 0 if self._next is None else self._next.log_ns
 
     def _read_known(self, start_offset_s: float) -> list[RawMessage]:
-        latched = {t for t in self._topics if qos.is_latched(t, self._bag.offers.get(t, []))}
+        latched = {t for t in self._topics if storage.is_latched(t, self._bag.offers.get(t, []))}
         static = {topic for topic in latched if topic.endswith('tf_static')}
         known = list(self._bag.messages(static)) if static else []
         last: dict[str, RawMessage] = {}

@@ -11,7 +11,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.safe import LOGS, write_text
-from thinmap_ros.logs import qos
+from thinmap_ros.logs import storage
 from thinmap_ros.logs.mcap import Damage, DamagedError, Definitions, decompress, intact_records
 from thinmap_ros.logs.storage import own_typestore
 
@@ -99,9 +99,9 @@ class _Copy:
                 schema.name, schema.encoding, schema.data
             )
         if channel.topic not in self._channel_ids:
-            if not qos.of_channel(channel):
+            if not storage.of_channel(channel):
                 # Players refuse a bag with messages that cannot be decompressed.
-                kept = {key: value for key, value in channel.metadata.items() if key != qos.KEY}
+                kept = {key: value for key, value in channel.metadata.items() if key != storage.KEY}
                 channel = replace(channel, metadata=kept)
             self._channel_ids[channel.topic] = self.writer.register_channel(
                 channel.topic,
@@ -149,7 +149,7 @@ def _metadata(
                 'name': topic,
                 'type': schemas[topic].name,
                 'serialization_format': channel.message_encoding,
-                'offered_qos_profiles': dump_qos_v9(qos.of_channel(channel)),
+                'offered_qos_profiles': dump_qos_v9(storage.of_channel(channel)),
                 'type_description_hash': channel.metadata.get('topic_type_hash')
                 or _hash(schemas[topic]),
             },

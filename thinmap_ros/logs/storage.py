@@ -1,24 +1,278 @@
-"""Storage of a bag: MCAP files, read within limits, and SQLite files, read by rosbags.
+"""Storage of a bag: its folder, its kind, and messages of MCAP, SQLite and ROS 1 files.
 
 Also the message types that a file defines.
 """
 
-from collections.abc import Iterator
+import bz2
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, Protocol, cast
+from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory, TemporaryFile
+from typing import IO, Any, Protocol, cast
 
-from mcap.records import Schema
+import zstandard
+from mcap.records import Channel, Schema
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import ConnectionExtRosbag2, Nodetype, Qos
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    Nodetype,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag1 import Reader
+from rosbags.rosbag1.reader import decompressors
+from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from thinmap_ros.core.errors import InputError
-from thinmap_ros.files.safe import LOGS
-from thinmap_ros.logs import qos
-from thinmap_ros.logs.mcap import Damage, McapFile
+from thinmap_ros.core.errors import InputError, one_line_reason
+from thinmap_ros.files.safe import (
+    FILES,
+    LOGS,
+    PIECE_BYTES,
+    open_regular_file,
+    parse_yaml,
+    read_text,
+)
+from thinmap_ros.logs.mcap import MAGIC as _MCAP
+from thinmap_ros.logs.mcap import Damage, DamagedError, McapFile, decompress
+
+# rosbag2 folders: their files, and how these are compressed (metadata.yaml).
+
+
+@dataclass(frozen=True)
+class BagFiles:
+    """The files of a bag in the order of recording.
+
+    compressed_messages: whether messages are compressed individually; without_metadata: why
+    metadata.yaml was not used, empty if it was, or if nothing is missed with it; note: the same for
+    files that need none.
+    """
+
+    files: list[Path]
+    compressed_messages: bool = False
+    without_metadata: str = ''
+    note: str = ''
+
+
+def bag_files(path: Path) -> BagFiles:
+    """Files of a bag: the given file, or those of a folder.
+
+    Files are found even if metadata.yaml is missing or unreadable: a killed recorder does not write
+    it. Raises InputError if there are no files, or those of several bags.
+    """
+    if not path.is_dir():
+        is_sqlite = path.suffixes[:1] == ['.db3']
+        return BagFiles([path], note=f'{path}: read without metadata.yaml' if is_sqlite else '')
+    metadata = path / 'metadata.yaml'
+    found = mcap_files_in(path)
+    try:
+        return _listed(path, _information(metadata))
+    except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
+        reason = f'{metadata}: {one_line_reason(error).removeprefix(f"{metadata}: ")}'
+    bare = sorted([*path.glob('*.db3'), *path.glob('*.db3.zstd')], key=_number)
+    _require_one_bag(path, found or bare)
+    if found:
+        return BagFiles(found, without_metadata=reason)
+    if bare:
+        return BagFiles(bare, note=f'{reason}: its SQLite files are read without it')
+    raise InputError(
+        f'{path}: expected a rosbag2 folder, with metadata.yaml and MCAP or SQLite files'
+    )
+
+
+def mcap_files_in(folder: Path) -> list[Path]:
+    """MCAP files of a folder in the order of recording."""
+    return sorted(folder.glob('*.mcap'), key=_number)
+
+
+def _require_one_bag(folder: Path, files: list[Path]) -> None:
+    """Raises InputError where files have other names than the parts of one bag."""
+    if len({_bag_name(file) for file in files}) > 1:
+        first, second = (file.name for file in files[:2])
+        raise InputError(
+            f'{folder}: {len(files)} files of several bags ({first}, {second}, ...): expected one '
+            f'bag, or the names of the files: {folder}/*{files[0].suffix}'
+        )
+
+
+def _bag_name(file: Path) -> str:
+    """Name of the bag that a file is a part of: rosbag2 names them name_0, name_1, ..."""
+    stem = Path(file.name.removesuffix('.zstd')).stem
+    name, _, number = stem.rpartition('_')
+    return name if number.isdecimal() else stem
+
+
+def _number(file: Path) -> tuple[int, str]:
+    """Number of a file of a bag: rosbag2 names them name_0, name_1, ... name_10."""
+    number = Path(file.name.removesuffix('.zstd')).stem.rpartition('_')[2]
+    return (int(number) if number.isdecimal() and len(number) < 10 else -1, file.name)
+
+
+def _information(metadata: Path) -> Any:
+    """Raises InputError, KeyError or TypeError if it is missing, or exceeds the YAML limits."""
+    content: Any = parse_yaml(read_text(metadata, FILES.yaml_bytes))
+    return content['rosbag2_bagfile_information']
+
+
+def _listed(folder: Path, information: Any) -> BagFiles:
+    """Raises KeyError, TypeError, ValueError or AttributeError if the information is invalid."""
+    files = [folder / PurePath(name).name for name in information['relative_file_paths']]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing or not files:
+        raise ValueError(
+            f'expected the file {missing[0][:80]}' if missing else 'expected the names of files'
+        )
+    mode = (information.get('compression_mode') or '').lower()
+    return BagFiles(files, compressed_messages=mode == 'message')
+
+
+class DecompressedFile:
+    """A file that is compressed as a whole, decompressed for as long as this object exists.
+
+    An MCAP file has no name, so that nothing of it is left, however the program ends. SQLite opens
+    files by name only: that one is in a temporary folder.
+    """
+
+    def __init__(self, file: Path) -> None:
+        """Raises InputError if a file is invalid, or expands to more than it may."""
+        self._folder: TemporaryDirectory[str] | None = None
+        if file.stem.endswith('.db3'):
+            self._folder = TemporaryDirectory(prefix='thinmap_')
+            self.path = Path(self._folder.name) / file.stem
+            self._stream: IO[bytes] = self.path.open('w+b')
+        else:
+            self._stream = TemporaryFile()  # noqa: SIM115
+            self.path = Path(f'/proc/self/fd/{self._stream.fileno()}')
+        _unpack(file, self._stream)
+        self._stream.flush()
+
+
+def _unpack(file: Path, out: IO[bytes]) -> None:
+    limit = LOGS.unpacked_bytes(file.stat().st_size)
+    try:
+        with open_regular_file(file) as packed:
+            reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            while piece := reader.read(PIECE_BYTES):
+                if out.tell() + len(piece) > limit:
+                    raise InputError(f'{file}: expected at most {limit} bytes decompressed')
+                out.write(piece)
+    except zstandard.ZstdError as error:
+        raise InputError(f'{file}: no zstd file: {str(error)[:120]}') from error
+
+
+# Formats of log files, told by their first bytes.
+
+_ROS1 = b'#ROSBAG V'
+
+_SQLITE = b'SQLite format 3\0'
+
+
+def refuse_foreign(path: Path, expected: str) -> None:
+    """Raise InputError, with a command for conversion, for a ROS 1 bag or an SQLite file."""
+    kinds = ((is_ros1, 'a ROS 1 bag'), (is_sqlite, 'an SQLite file of a rosbag2 bag'))
+    for is_kind, name in kinds:
+        if is_kind(path):
+            convert = f'rosbags-convert --src {path} --dst {path.stem} --dst-storage mcap'
+            raise InputError(
+                f'{path}: {name}: expected {expected}: it is converted by '
+                f'`{convert} --dst-typestore ros2_jazzy`'
+            )
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a folder, or a file of a bag by its name or its first bytes."""
+    if path.is_dir() or path.suffix in ('.mcap', '.db3', '.bag', '.zstd'):
+        return True
+    return is_mcap(path) or is_ros1(path) or is_sqlite(path)
+
+
+def is_mcap(path: Path) -> bool:
+    """Whether a file begins with the magic bytes of MCAP."""
+    return _begin(path).startswith(_MCAP)
+
+
+def is_ros1(path: Path) -> bool:
+    """Whether a file begins as a ROS 1 bag."""
+    return _begin(path).startswith(_ROS1)
+
+
+def is_sqlite(path: Path) -> bool:
+    """Whether a file begins as an SQLite database."""
+    return _begin(path).startswith(_SQLITE)
+
+
+def _begin(path: Path) -> bytes:
+    """First bytes of a file; empty if it cannot be read: opening it reports the error."""
+    try:
+        with open_regular_file(path) as stream:
+            return stream.read(16)
+    except OSError:
+        return b''
+
+
+# QoS profiles in bags, stored with each topic so that players can offer the same.
+
+KEY = 'offered_qos_profiles'
+
+"""Key of a channel's metadata in an MCAP file; its value is YAML."""
+
+_FOREVER = QosTime(2147483647, 4294967295)
+
+
+def of_channel(channel: Channel) -> list[Qos]:
+    """QoS of the publishers of a channel; empty if missing or unreadable."""
+    text = channel.metadata.get(KEY, '')
+    try:
+        content: Any = parse_yaml(text) if text else []
+        offers = parse_qos(content) if content else []
+        depths = [offer.depth for offer in offers]
+    except (InputError, KeyError, TypeError, ValueError, AttributeError):
+        return []
+    good = all(isinstance(depth, int) and 0 <= depth < LOGS.queue_depth for depth in depths)
+    return offers if good else []
+
+
+def recorded(depth: int, reliable: bool, latched: bool) -> Qos:
+    """Stored QoS of a topic: depth, reliability, durability."""
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=depth,
+        reliability=QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
+        durability=QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        deadline=_FOREVER,
+        lifespan=_FOREVER,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=_FOREVER,
+        avoid_ros_namespace_conventions=False,
+    )
+
+
+def is_latched(topic: str, offers: list[Qos]) -> bool:
+    """Whether late subscribers receive the last message of a topic: all publishers offered it.
+
+    Converted bags have no QoS of static transforms, which are always latched.
+    """
+    if not offers:
+        return topic.endswith('tf_static')
+    return all(offer.durability is QosDurability.TRANSIENT_LOCAL for offer in offers)
+
+
+def is_reliable(offers: list[Qos]) -> bool:
+    """Whether to offer a topic as reliable; the default if no QoS was recorded."""
+    return all(offer.reliability is not QosReliability.BEST_EFFORT for offer in offers)
+
+
+def depth(offers: list[Qos]) -> int:
+    """Total queue depth of the publishers of a topic; the graph does not always report it."""
+    return sum(max(offer.depth, 1) for offer in offers)
+
 
 _IDL_SEPARATOR = '=' * 80 + '\n'
 
@@ -74,7 +328,7 @@ class McapStorage:
             known = self._file.definitions.of(number)
             if known is not None:
                 self.topics[channel.topic] = known[0].name
-                self.offers.setdefault(channel.topic, []).extend(qos.of_channel(channel))
+                self.offers.setdefault(channel.topic, []).extend(of_channel(channel))
                 self._schemas[known[0].name] = known[0]
 
     def typestore(self, type_name: str) -> Typestore:
@@ -206,3 +460,127 @@ def _parsed(name: str, encoding: str, text: str) -> Typestore:
         unknown = types.keys() - typestore.types.keys()
         typestore.register({name: types[name] for name in unknown})
     return typestore
+
+
+# ROS 1 bags, read by rosbags; their messages are converted to those of ROS 2.
+
+_HEADER = 'std_msgs/msg/Header'
+
+_TIMES = ('builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
+
+# Types of ROS 1 that have another name in ROS 2.
+_RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
+
+
+class Ros1Storage:
+    """A ROS 1 bag. Topics whose types ROS 2 does not have, or defines otherwise, are left out."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError if it cannot be opened."""
+        self._path = path
+        self.damage = Damage()
+        self.topics: dict[str, str] = {}
+        self.offers: dict[str, list[Qos]] = {}
+        self.message_counts: dict[str, int] = {}
+        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        try:
+            with Reader(path) as reader:
+                for connection in reader.connections:
+                    type_name = _type_of(connection)
+                    if type_name:
+                        topic = connection.topic
+                        self.topics[topic] = type_name
+                        count = self.message_counts.get(topic, 0) + connection.msgcount
+                        self.message_counts[topic] = count
+        except Exception as error:  # rosbags raises many types for corrupt files
+            raise InputError(
+                f'{path}: ROS 1 bag: {one_line_reason(error)}: `rosbag reindex` of ROS 1 repairs a '
+                'bag that was cut off'
+            ) from error
+
+    @property
+    def has_messages(self) -> bool:
+        """Whether it has messages."""
+        return any(self.message_counts.values())
+
+    def typestore(self, type_name: str) -> Typestore:
+        """Types of ROS 2 Jazzy."""
+        return self._typestore
+
+    def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
+        """Messages in the order of the log; up to the first damaged chunk."""
+        try:
+            with Reader(self._path) as reader:
+                for position, chunk in reader.chunks.items():
+                    unpack = _bounded(chunk.decompressor)
+                    reader.chunks[position] = chunk._replace(decompressor=unpack)
+                chosen = [c for c in reader.connections if self._is_chosen(c, topics)]
+                for connection, log_ns, data in reader.messages(chosen) if chosen else ():
+                    yield self._converted(connection, log_ns, data)
+        except Exception:  # as above; earlier messages are kept
+            self.damage.is_truncated = True
+
+    def _is_chosen(self, connection: Connection, topics: set[str] | None) -> bool:
+        is_wanted = topics is None or connection.topic in topics
+        return is_wanted and _type_of(connection) == self.topics.get(connection.topic, '')
+
+    def _converted(self, connection: Connection, log_ns: int, data: bytes) -> RawMessage:
+        type_name = _type_of(connection)
+        try:
+            cdr = bytes(self._typestore.ros1_to_cdr(data, type_name))
+        except Exception:  # rosbags raises many types for invalid bytes
+            cdr = b''  # it is counted when it is decoded
+        return RawMessage(connection.topic, type_name, log_ns, cdr)
+
+
+def _type_of(connection: Connection) -> str:
+    return _type_name(connection.msgtype, connection.msgdef.data)
+
+
+def _bounded(unpack: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """A decompressor that does not expand a chunk beyond LOGS.chunk_bytes."""
+    own = {decompressors['bz2']: _unpack_bz2, decompressors['lz4']: _unpack_lz4}
+    return own.get(unpack, unpack)
+
+
+def _unpack_bz2(packed: bytes) -> bytes:
+    unpacked = bz2.BZ2Decompressor().decompress(packed, max_length=LOGS.chunk_bytes + 1)
+    if len(unpacked) > LOGS.chunk_bytes:
+        raise DamagedError(f'chunk: expected at most {LOGS.chunk_bytes} bytes uncompressed')
+    return unpacked
+
+
+def _unpack_lz4(packed: bytes) -> bytes:
+    return decompress('lz4', packed, LOGS.chunk_bytes)
+
+
+@lru_cache(maxsize=1024)
+def _type_name(name: str, definition: str) -> str:
+    """Type of ROS 2 for one of ROS 1 with its definition; empty if none has the same fields."""
+    new_name = _RENAMED.get(name, name)
+    try:
+        own = own_typestore(Schema(0, definition.encode(), 'ros1msg', name))
+    except Exception:  # rosbags raises many types for invalid definitions
+        return ''
+    return new_name if _is_equal(own, name, new_name) else ''
+
+
+def _is_equal(own: Typestore, name: str, new_name: str) -> bool:
+    """Whether a type has the fields of one of ROS 2, but for the number of a header."""
+    known = get_typestore(Stores.ROS2_JAZZY).fielddefs
+    if new_name not in known:
+        return False
+    fields = [field for field in own.fielddefs[name][1] if (name, field[0]) != (_HEADER, 'seq')]
+    kinds = [kind for _, kind in fields]
+    if kinds != [kind for _, kind in known[new_name][1]]:
+        return False
+    return all(_is_equal(own, inner, inner) for inner in _nested(kinds))
+
+
+def _nested(kinds: list[Any]) -> Iterator[str]:
+    """Names of the types of fields and of their elements."""
+    for kind, value in kinds:
+        is_list = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+        element, name = value[0] if is_list else (kind, value)
+        if element == Nodetype.NAME and name not in _TIMES:
+            yield name

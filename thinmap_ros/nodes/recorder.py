@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.files import package_data
-from thinmap_ros.logs import qos
+from thinmap_ros.logs import storage
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.ros import node_main, parameters
 from thinmap_ros.ros.clocks.time_jumps import STEADY
@@ -84,7 +84,7 @@ class RecorderNode(Node):
                 package_data.message_definitions(type_name.partition('/')[0])
             )
             self._writer.add_topic(
-                topic, type_name, [qos.recorded(o.depth, reliable, latched) for o in offers]
+                topic, type_name, [storage.recorded(o.depth, reliable, latched) for o in offers]
             )
         except InputError as error:
             self.get_logger().warning(f'{topic} is not recorded: {error}')

@@ -9,7 +9,7 @@ from rclpy.qos import (
 )
 from rosbags.interfaces import Qos
 
-from thinmap_ros.logs.qos import depth, is_latched, is_reliable
+from thinmap_ros.logs.storage import depth, is_latched, is_reliable
 
 SENSOR = qos_profile_sensor_data
 STREAM = QoSProfile(

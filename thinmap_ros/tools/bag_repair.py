@@ -4,10 +4,9 @@ import argparse
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, counted
-from thinmap_ros.logs.bag_directory import bag_files, mcap_files_in
 from thinmap_ros.logs.bag_writer import temporary_bag
-from thinmap_ros.logs.formats import is_mcap, refuse_foreign
 from thinmap_ros.logs.repair import RepairReport, repair
+from thinmap_ros.logs.storage import bag_files, is_mcap, mcap_files_in, refuse_foreign
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser
 

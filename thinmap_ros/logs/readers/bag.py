@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from thinmap_ros.logs.bag import EXPECTED, BagLog
-from thinmap_ros.logs.formats import is_bag
 from thinmap_ros.logs.log import Log, LogFormat, LogOptions
+from thinmap_ros.logs.storage import is_bag
 
 
 def _log(path: Path, options: LogOptions) -> Log:
