@@ -146,7 +146,7 @@ class _Listener:
 
 
 def _traffic(bag: Path) -> Iterator[Row]:
-    from thinmap_ros.logs.bag import Bag
+    from thinmap_ros.logs.readers.bag import Bag
 
     sizes: dict[str, list[int]] = {}
     first = None

@@ -23,8 +23,8 @@ from thinmap_ros.experiments import drives
 from thinmap_ros.experiments.drives import RECIPES, Source, samples_of_bag
 from thinmap_ros.experiments.exploration.thinning_stages import stages
 from thinmap_ros.experiments.slam import logs, office
-from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.log import LaserOptions
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.tools.experiment import EXPERIMENTS, main, write_outcome
 from thinmap_ros.tools.record_bags import record
 

@@ -35,7 +35,6 @@ from support.carmen_log import carmen_lines
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.safe import LOGS
-from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.mcap import (
@@ -46,6 +45,7 @@ from thinmap_ros.logs.mcap import (
     intact_records,
     plain_records,
 )
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.logs.storage import own_typestore, typestore_of
 from thinmap_ros.tools.carmen_to_bag import convert
 
@@ -372,7 +372,7 @@ def bag_of_unread_chunks(path: Path, indexed: bool, kind: tuple[int, int], chunk
 
 READER = """
 import pathlib, sys, time
-from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.readers.bag import Bag
 begun = time.process_time()
 bag = Bag(pathlib.Path(sys.argv[1]))
 found = [message.data.decode() for message in bag.messages({'/said'})]

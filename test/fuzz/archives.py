@@ -16,8 +16,8 @@ from fuzz.saved_states import check as check_state
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.files import sessions
 from thinmap_ros.files.safe import VERSION
-from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.ros.checkpoint import Checkpoint
 
 _PARTS = {part.name: part for part in sessions.PARTS}

@@ -16,8 +16,8 @@ from support.bag_maker import Maker
 from support.doctor import Doctor
 from support.timeouts import PATIENCE_S
 
-from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.logs.storage import recorded
 from thinmap_ros.ros import messages, qos
 

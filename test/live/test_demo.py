@@ -18,7 +18,7 @@ from support.hidden_library import hide
 from support.timeouts import PATIENCE_S, PROGRAM_S
 
 from thinmap_ros.files import occupancy_maps
-from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.readers.bag import Bag
 
 pytestmark = pytest.mark.live
 REPORT = {

@@ -15,7 +15,7 @@ from tf2_msgs.msg import TFMessage
 from thinmap_msgs.msg import LocalGrid, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.files import occupancy_maps
-from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live

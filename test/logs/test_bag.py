@@ -24,9 +24,9 @@ from support.bag_maker import (
 )
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
+from thinmap_ros.logs.readers.bag import Bag, BagLog
 from thinmap_ros.logs.storage import bag_files
 
 

@@ -11,9 +11,9 @@ from support.bag_maker import ODOMETRY, RANGES, SCAN, TF, UPRIGHT, Maker, Quater
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import LaserConfig
-from thinmap_ros.logs.bag import BagLog
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.log import OdometryEvent, ScanEvent
+from thinmap_ros.logs.readers.bag import BagLog
 
 LEFT: Quaternion = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 STEP_NS = 2 * 10**8

@@ -11,8 +11,8 @@ from support.forks import forked
 from support.ros1_bag import ros1_bag
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.readers.bag import Bag
 
 PROGRAMS = {'carmen_to_bag': ['out'], 'bag_repair': ['-o', 'out']}
 

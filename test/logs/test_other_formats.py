@@ -15,9 +15,9 @@ from support.ros1_bag import NEW_TF, OLD_TF, converted, ros1_bag
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.safe import LOGS
 from thinmap_ros.logs import storage
-from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent
+from thinmap_ros.logs.readers.bag import Bag, BagLog
 from thinmap_ros.logs.reading import open_log
 
 

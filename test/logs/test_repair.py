@@ -23,9 +23,9 @@ from rosbags.typesys import Stores, get_typestore
 from support.forks import forked
 
 from thinmap_ros.logs import storage
-from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.mcap import HEAD, MAGIC, Damage, McapFile, intact_records
+from thinmap_ros.logs.readers.bag import Bag
 
 STRING = 'std_msgs/msg/String'
 COUNT = 200

@@ -21,8 +21,8 @@ from thinmap_ros.core.topology.graph import (
     flat_topology,
 )
 from thinmap_ros.files.package_data import message_definitions
-from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.ros import messages
 
 NAME = 'thinmap_msgs/msg/TopologicalMap'

@@ -6,7 +6,7 @@ import numpy as np
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.readers.bag import Bag
 
 _TF = 'geometry_msgs/TransformStamped[] transforms\n'
 NEW_TF = 'tf2_msgs/msg/TFMessage'

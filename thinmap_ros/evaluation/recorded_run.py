@@ -25,7 +25,7 @@ from thinmap_ros.evaluation.exploration_metrics import (
 )
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs import decode
-from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World

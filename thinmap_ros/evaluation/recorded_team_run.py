@@ -16,7 +16,7 @@ from thinmap_ros.evaluation.exploration_metrics import MILESTONES, exploration_t
 from thinmap_ros.evaluation.recorded_run import Recording
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs import decode
-from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS, RobotConfig
 from thinmap_ros.sim.world import World

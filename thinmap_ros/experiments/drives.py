@@ -17,8 +17,8 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_tour, read_world
 from thinmap_ros.logs import decode
-from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.log import OdometryEvent
+from thinmap_ros.logs.readers.bag import Bag, BagLog
 from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.drives import DriveConfig, DriveSample, drive, random_drive, tour_paths
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig

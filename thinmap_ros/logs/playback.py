@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs import storage
-from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.logs.storage import RawMessage
 
 _SCAN = 'sensor_msgs/msg/LaserScan'

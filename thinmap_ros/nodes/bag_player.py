@@ -16,8 +16,8 @@ from std_srvs.srv import SetBool, Trigger
 from thinmap_ros.core import errors
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError, InputError, counted
-from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.playback import Playback, is_scan
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.logs.storage import RawMessage
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.clocks.time_jumps import STEADY

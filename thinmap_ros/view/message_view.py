@@ -16,7 +16,7 @@ from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.logs import decode
-from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.logs.transforms import StaticTransforms
 from thinmap_ros.view import palette
 from thinmap_ros.view.apart_scans import ApartScans

@@ -17,13 +17,13 @@ from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.slam.localizer import default_config
 from thinmap_ros.core.stage import StartConfig
-from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.log import (
     Event,
     OdometryEvent,
     ScanEvent,
     SkippedRecords,
 )
+from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.logs.reading import ClockJumpError, UnusedScans, open_log, recording_events
 from thinmap_ros.tools.parameter_file import read_parameter_file
 

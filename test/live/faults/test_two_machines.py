@@ -8,7 +8,7 @@ from support.halls import AT_START, START
 from support.machines import Cable, Machines, Weakness
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.readers.bag import Bag
 
 pytestmark = pytest.mark.live
 WEAK = Weakness(loss=0.05, delay_s=0.05, seed=7)
