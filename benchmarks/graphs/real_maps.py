@@ -22,7 +22,7 @@ from thinmap_ros.core.topology.thinning import select_free_space
 from thinmap_ros.core.topology.topology import build_along
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.files.occupancy_maps import read_map, write_map
-from thinmap_ros.logs.carmen import CarmenLog
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import replay
 

@@ -17,8 +17,8 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.evaluation.trajectory_errors import between_paths
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import OdometryEvent
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.pipeline import Pipeline
 from thinmap_ros.sim.drives import DriveSample
 

@@ -25,8 +25,8 @@ from support.timeouts import PATIENCE_S
 from docs import commands
 from thinmap_ros.files import occupancy_maps, package_data
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import LaserOptions
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.nodes.thinmap import chosen_nodes
 from thinmap_ros.tools.carmen_to_bag import convert
 

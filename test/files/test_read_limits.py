@@ -36,7 +36,6 @@ from support.carmen_log import carmen_lines
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.safe import LOGS
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.mcap import (
     Damage,
     DamagedError,
@@ -46,6 +45,7 @@ from thinmap_ros.logs.mcap import (
     plain_records,
 )
 from thinmap_ros.logs.readers.bag import Bag
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.logs.storage import own_typestore, typestore_of
 from thinmap_ros.tools.carmen_to_bag import convert
 

@@ -11,8 +11,8 @@ import pytest
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.files import occupancy_maps, safe, sessions, trajectories, worlds
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.readers.bag import Bag
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.logs.reading import open_log
 from thinmap_ros.logs.storage import bag_files
 from thinmap_ros.tools.bag_repair import files_of

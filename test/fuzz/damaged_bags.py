@@ -15,9 +15,9 @@ from mcap.writer import CompressionType, Writer
 
 from thinmap_ros.core.errors import counted
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import LaserOptions
 from thinmap_ros.logs.readers.bag import Bag
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.tools import bag_repair, cli
 from thinmap_ros.tools.carmen_to_bag import convert
 

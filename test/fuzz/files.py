@@ -15,8 +15,8 @@ from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.trajectories import read_tum, write_tum
 from thinmap_ros.files.worlds import read_tour, read_world
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import LaserOptions, OdometryEvent
+from thinmap_ros.logs.readers.carmen import CarmenLog
 
 WORLDS = Path(__file__).resolve().parents[2] / 'worlds'
 _MAX_WORLD = 4_000

@@ -21,7 +21,7 @@ from fuzz.runner import Runner, rng_of
 from fuzz.sources import SOURCES
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.logs import carmen
+from thinmap_ros.logs.readers import carmen
 from thinmap_ros.nodes import grid_mapper
 from thinmap_ros.nodes.mapping.scan_queue import ScanQueue
 

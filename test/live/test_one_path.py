@@ -24,9 +24,9 @@ from thinmap_ros.core.slam.joining.pieces import ReceivedKeyframes
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.files import occupancy_maps, package_data, sessions
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import LaserOptions, OdometryEvent, ScanEvent, SkippedRecords
 from thinmap_ros.logs.readers.bag import BagLog
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import replay
 from thinmap_ros.ros import messages, qos

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import LATEST_S
-from thinmap_ros.logs import carmen
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import Event, LaserOptions, OdometryEvent, ScanEvent
+from thinmap_ros.logs.readers import carmen
+from thinmap_ros.logs.readers.carmen import CarmenLog
 
 FLASER = 'FLASER 3 1.00 2.50 81.83 9 9 9 0.5 -0.25 1.5 976052857.337530 host 0.1\n'
 ODOM = 'ODOM 1.5 2.5 -3.0 0.1 0.2 0.0 976052857.437530 host 0.2\n'

@@ -9,9 +9,9 @@ from support.slam_room import ROOM, drive, mixed, ranges_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import with_values
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import LaserOptions, ScanEvent
 from thinmap_ros.logs.readers.bag import BagLog
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import replay
 from thinmap_ros.tools.carmen_to_bag import convert

@@ -8,9 +8,9 @@ from support.bag_maker import drive, write
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs import readers
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import known_formats
 from thinmap_ros.logs.readers.bag import BagLog
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.logs.reading import open_log, paired_scans
 
 NEW_FORMAT = '''

@@ -9,9 +9,9 @@ from support.forks import forked
 from support.timeouts import PROGRAM_S
 
 from thinmap_ros.core import se2
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import Event, LaserOptions, OdometryEvent
 from thinmap_ros.logs.readers.bag import Bag, BagLog
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.tools.carmen_to_bag import convert
 
 LOGS = Path(__file__).parents[3] / 'shared' / 'data' / 'logs'

@@ -22,9 +22,9 @@ from thinmap_ros.core.errors import one_line_reason
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.files import occupancy_maps
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import LaserOptions
 from thinmap_ros.logs.readers.bag import Bag
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import replay
 from thinmap_ros.tools.carmen_to_bag import convert

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from thinmap_ros.files.safe import PIECE_BYTES
-from thinmap_ros.logs.carmen import open_unpacked
+from thinmap_ros.logs.readers.carmen import open_unpacked
 
 
 @dataclass(frozen=True)

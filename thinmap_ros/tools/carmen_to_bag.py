@@ -5,9 +5,9 @@ from pathlib import Path
 
 from thinmap_ros.core.errors import counted
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.encode import BagObjects
 from thinmap_ros.logs.log import Event, LaserOptions, OdometryEvent
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.files.safe import atomic_write, write_text
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import OdometryEvent
 from thinmap_ros.logs.published_logs import PUBLISHED, PublishedLog, unpacked_sha256
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser
 

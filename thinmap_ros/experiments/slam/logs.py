@@ -15,8 +15,8 @@ from thinmap_ros.evaluation import peers
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.evaluation.trajectory_errors import RelationErrors, read_columns, relation_errors
 from thinmap_ros.files.safe import read_mapping
-from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import LaserOptions
+from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import Replay, replay, write_outputs
 from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot
