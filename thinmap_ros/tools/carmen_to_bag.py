@@ -4,8 +4,7 @@ import argparse
 from pathlib import Path
 
 from thinmap_ros.core.errors import counted
-from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.encode import BagObjects
+from thinmap_ros.logs.bag_writer import BagObjects, BagWriter
 from thinmap_ros.logs.log import Event, LaserOptions, OdometryEvent
 from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.tools import cli

@@ -15,8 +15,7 @@ from thinmap_ros.core.stage import Estimate
 from thinmap_ros.experiments.drives import RECIPES, TRUTH_TOPIC, Source
 from thinmap_ros.files import package_data
 from thinmap_ros.files.safe import write_text
-from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.encode import BagObjects
+from thinmap_ros.logs.bag_writer import BagObjects, BagWriter
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.tools import cli
