@@ -10,7 +10,7 @@ import pytest
 from support.carmen_log import carmen_lines
 
 from thinmap_ros.__main__ import main
-from thinmap_ros.logs.published_logs import PUBLISHED
+from thinmap_ros.tools.fetch_logs import PUBLISHED
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = '\n'.join(carmen_lines(scans=4)) + '\n'
