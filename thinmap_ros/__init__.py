@@ -144,7 +144,7 @@ def _load(name: str) -> Any:
 def _report_compilation() -> None:
     """Report the compilation of kernels, as programs do: with no word it looks like a fault."""
     if f'{__name__}.jit' in sys.modules:
-        from thinmap_ros.kernels.progress import report_compilation
+        from thinmap_ros.kernels import report_compilation
 
         report_compilation()
 

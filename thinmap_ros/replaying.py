@@ -16,7 +16,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.segmentation import RegionConfig
-from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
+from thinmap_ros.kernels import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.logs.log import Log
 from thinmap_ros.logs.reading import WAITING_SCANS, UnusedScans, complete_scans, recording_events
 from thinmap_ros.pipeline import Pipeline, PipelineConfig

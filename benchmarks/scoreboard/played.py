@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.time_and_memory import CpuTimedPipeline, resident_mb
+from thinmap_ros import kernels
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.trajectory_errors import aligned_rms
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.pipeline import PipelineConfig, PipelineResult
 
 Numbers = dict[str, Any]
@@ -94,9 +94,9 @@ class PlayedPipeline(CpuTimedPipeline):
 
 def rehearse() -> None:
     """Load the compiled kernels before anything is timed."""
-    warm_up.localizer()
-    warm_up.grid_mapper()
-    warm_up.topology_builder()
+    kernels.localizer()
+    kernels.grid_mapper()
+    kernels.topology_builder()
 
 
 def simulated_numbers(played: Played, truth: Array) -> Numbers:

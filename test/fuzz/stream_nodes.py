@@ -20,10 +20,10 @@ from sensor_msgs.msg import LaserScan
 from fuzz.cases import Source, chosen, finite, nothing, tried
 from fuzz.strange_messages import numbers
 from fuzz.streams import START_NS, STEP_NS, Stream
+from thinmap_ros import kernels
 from thinmap_ros.core.odometry import OdometryIncrements
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.grid_mapper import GridMapperNode
 from thinmap_ros.nodes.localizer import LocalizerNode
 from thinmap_ros.nodes.navigator import NavigatorNode
@@ -269,8 +269,8 @@ _thin = _node_case(TopologyBuilderNode, ('local_grid',), 'local_topology')
 
 SOURCES = (
     Source('stream_odometry', nothing, pair_by_stamp),
-    Source('stream_localizer', _loaded(warm_up.localizer), _localize),
-    Source('stream_mapper', _loaded(warm_up.grid_mapper), _map),
-    Source('stream_topology', _loaded(warm_up.topology_builder), _thin),
-    Source('stream_navigator', _loaded(warm_up.navigator), drive_to_a_goal),
+    Source('stream_localizer', _loaded(kernels.localizer), _localize),
+    Source('stream_mapper', _loaded(kernels.grid_mapper), _map),
+    Source('stream_topology', _loaded(kernels.topology_builder), _thin),
+    Source('stream_navigator', _loaded(kernels.navigator), drive_to_a_goal),
 )

@@ -51,7 +51,7 @@ def amplified(value):
     return quotient(Pair(first=value, second=2.0))
 """
 PROGRAM = """
-from thinmap_ros.kernels.progress import report_compilation
+from thinmap_ros.kernels import report_compilation
 report = report_compilation()
 from thinmap_ros.core.amplifier import amplified
 from thinmap_ros.jit import cache

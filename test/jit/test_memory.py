@@ -3,7 +3,7 @@
 import os
 import resource
 
-from thinmap_ros.kernels import memory
+from thinmap_ros import kernels
 
 
 def test_without_a_file_that_may_be_opened_nothing_is_released_and_nothing_raised():
@@ -12,10 +12,10 @@ def test_without_a_file_that_may_be_opened_nothing_is_released_and_nothing_raise
     os.close(lowest)
     resource.setrlimit(resource.RLIMIT_NOFILE, (lowest, limits[1]))
     try:
-        release = memory.compiler_memory_releaser(period_s=-1.0)
+        release = kernels.compiler_memory_releaser(period_s=-1.0)
         release()
-        memory.release_compiler_pages()
-        assert memory._shared_bytes() == 0
+        kernels.release_compiler_pages()
+        assert kernels._shared_bytes() == 0
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
-    assert memory._shared_bytes() > 0
+    assert kernels._shared_bytes() > 0

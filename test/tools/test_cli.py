@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.kernels.progress import report_compilation
+from thinmap_ros.kernels import report_compilation
 from thinmap_ros.logs.log import LaserOptions, Log
 from thinmap_ros.logs.readers.bag import BagLog
 from thinmap_ros.logs.readers.carmen import CarmenLog

@@ -5,6 +5,7 @@ from dataclasses import replace
 from std_srvs.srv import Trigger
 
 from thinmap_msgs.action import Explore
+from thinmap_ros import kernels
 from thinmap_ros.core.exploration.mission import (
     Action,
     DriveTo,
@@ -18,7 +19,6 @@ from thinmap_ros.core.exploration.mission import (
 from thinmap_ros.core.exploration.strategy import FinishCode, Observation, Strategy
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.sessions import EXPLORATION
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.exploration.checkpoint_state import ExplorerState
 from thinmap_ros.nodes.exploration.driver import Driver, ForeignDriver
 from thinmap_ros.nodes.exploration.mission_publishers import MissionPublishers
@@ -67,7 +67,7 @@ class ExplorerNode(ThinmapNode):
         self._session = parameters.declare_session(self)
         offer_saving(self, SaveDirectory(self), EXPLORATION, self._save)
         parameters.reject_unknown(self)
-        warm_up.explorer()
+        kernels.explorer()
         radius_m = self._strategies.config.robot_radius_m
         self._source = ObservationSource(
             self, self._settings, frames, radius_m, self._on_observation

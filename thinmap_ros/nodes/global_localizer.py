@@ -9,6 +9,7 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import LocalizationStatus, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import LocalizeGlobally
+from thinmap_ros import kernels
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
@@ -30,7 +31,6 @@ from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.core.topology.graph import TopologyConfig, topology_from_msg
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.files import occupancy_maps
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
 from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
@@ -298,9 +298,9 @@ class GlobalLocalizerNode(ThinmapNode):
             file = Path(self._settings.node.map_path)
             self._patch = occupancy_maps.read_map(file, report=self.get_logger().warning)
             self._topology = build(self._patch, None, TopologyConfig())
-        warm_up.global_localizer()
+        kernels.global_localizer()
         if self._settings.node.drive:
-            warm_up.active_search()
+            kernels.active_search()
         self._output = _LocalizationPublishers(self, self._settings.map_frame)
         self._driver = self._create_driver()
         self.reset_state()

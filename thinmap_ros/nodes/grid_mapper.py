@@ -14,6 +14,7 @@ from rclpy.timer import Timer
 from thinmap_msgs.msg import LocalizedScan as LocalizedScanMsg
 from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import LoadMap, SaveMap
+from thinmap_ros import kernels
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ThinmapError
@@ -24,7 +25,6 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import LOCALIZATION, MAPPING, Destination, Trajectory
 from thinmap_ros.files import sessions
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.mapping.map_editing import MapEditing
 from thinmap_ros.nodes.mapping.map_output import MapPublishers
 from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
@@ -108,7 +108,7 @@ class GridMapperNode(ThinmapNode):
         self._save_directory = SaveDirectory(self)
         save_on_exit(self, self._save_directory, sessions.GRID, self._save_at_end)
         parameters.reject_unknown(self)
-        warm_up.grid_mapper()
+        kernels.grid_mapper()
         self._stamp = StateStamp()
         self._mapper = Mapper(self._settings.grid, window_m=self._settings.local_map_size_m)
         self._editing = MapEditing(

@@ -17,6 +17,7 @@ from thinmap_msgs.msg import (
     SlamStatus,
     TopologicalMap,
 )
+from thinmap_ros import kernels
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
@@ -39,7 +40,6 @@ from thinmap_ros.core.stage import SCAN_MATCHING, Correction, Estimate, StartCon
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.files.sessions import LOCALIZER, save_localizer
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.logs.frames import NONE
 from thinmap_ros.nodes.localization.given_map import GivenMap, config_at
 from thinmap_ros.nodes.localization.initial_poses import InitialPoses
@@ -196,9 +196,9 @@ class LocalizerNode(ThinmapNode):
         self._save_directory = SaveDirectory(self)
         save_on_exit(self, self._save_directory, LOCALIZER, self._save_at_end)
         parameters.reject_unknown(self, parameters_elsewhere(slam))
-        warm_up.localizer()
+        kernels.localizer()
         if slam != SCAN_MATCHING:
-            warm_up.ekf_localizer()
+            kernels.ekf_localizer()
         self._map_ids: _MapIds | None = _MapIds() if self._config.is_mapping else None
         self._begin()
         self.enable_checkpoint(self._state, self._restore, self._map_state)

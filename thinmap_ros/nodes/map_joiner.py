@@ -3,11 +3,11 @@
 import time
 
 from thinmap_msgs.srv import JoinMaps, SeparateMaps
+from thinmap_ros import kernels
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.team import WORLD, LinkSearch, MapLink, RobotMap, Team
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.joining.joint_map import JointMap
 from thinmap_ros.nodes.joining.robot_maps import RobotMaps
 from thinmap_ros.nodes.joining.settings import (
@@ -45,7 +45,7 @@ class MapJoinerNode(ThinmapNode):
         self._config = parameters.declare_config(self, MapJoinerConfig)
         self._initial = declare_initial_poses(self)
         parameters.reject_unknown(self)
-        warm_up.map_joiner()
+        kernels.map_joiner()
         config = self._config
         self._output = TeamPublishers(self, config.merged_map_topic, config.world_frame)
         self._robots = RobotMaps(self, config, self._on_map, self._on_other_map)

@@ -7,6 +7,7 @@ from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import KeepOut, SlamStatus, TopologicalMap
+from thinmap_ros import kernels
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.planning.navigator import (
     CONTROL_PERIOD_S,
@@ -16,7 +17,6 @@ from thinmap_ros.core.planning.navigator import (
 )
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import topology_from_msg
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.frames import NONE
 from thinmap_ros.nodes.navigation.base_watch import BaseWatch
@@ -133,7 +133,7 @@ class NavigatorNode(ThinmapNode):
         self._odometry = OdometrySource(self, base_frame, self._on_odometry)
         self._team = TeamDriving(self)
         parameters.reject_unknown(self)
-        warm_up.navigator()
+        kernels.navigator()
         self.reset_state()
         self._odometry.subscribe()
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)

@@ -11,10 +11,10 @@ from time import monotonic
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMsg
 
+from thinmap_ros import kernels
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.simulation.robot_interface import RobotInterface
 from thinmap_ros.nodes.simulation.starts import robot_starts
 from thinmap_ros.ros import messages, node_main, parameters, qos
@@ -82,7 +82,7 @@ class SimNode(Node):
         parameters.reject_unknown(self)
         self._diagnostics = NodeDiagnostics(self)
         self._simulations = _simulations(self._config, laser)
-        warm_up.sim()
+        kernels.sim()
         self._time = self.create_publisher(ClockMsg, '/clock', qos.STREAM)
         prefixes = _prefixes(self._config.robots)
         self._robots = [

@@ -8,6 +8,7 @@ from rclpy.node import Node
 
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
+from thinmap_ros import kernels
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import counted
 from thinmap_ros.core.snapshot import State
@@ -16,7 +17,6 @@ from thinmap_ros.core.topology.segmentation import FIELDS as REGION_FIELDS
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import Topology, TopologyBuilder
 from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.mapping.region_naming import RegionNaming
 from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
 from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
@@ -102,7 +102,7 @@ class TopologyBuilderNode(ThinmapNode):
         )
         self._naming = RegionNaming(self, self._regions)
         parameters.reject_unknown(self)
-        warm_up.topology_builder()
+        kernels.topology_builder()
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(self, LocalGrid, 'local_grid', self._on_local_grid, qos.STREAM)
         offer_saving(self, self._save_directory, TOPOLOGY, self._save_and_route)

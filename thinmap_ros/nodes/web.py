@@ -18,11 +18,11 @@ from thinmap_msgs.msg import (
     SlamStatus,
     TopologicalMap,
 )
+from thinmap_ros import kernels
 from thinmap_ros.core.config import SAFE_LOWER, Config, parameter
 from thinmap_ros.core.errors import counted
 from thinmap_ros.core.planning.path_follower import MESSAGE_PERIOD_S, moved_on
 from thinmap_ros.core.topology.graph import topology_from_msg
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.steering.steering import Steering
 from thinmap_ros.nodes.steering.teleoperation import TopSpeeds
 from thinmap_ros.ros import messages, node_main, parameters, qos
@@ -95,7 +95,7 @@ class WebNode(ThinmapNode):
         self._steering = Steering(self, self._picture, (map_frame, self._laser.base_frame), top)
         self._team = heard_robots(self)
         parameters.reject_unknown(self)
-        warm_up.topology_builder()  # a merged session is read and saved in this process
+        kernels.topology_builder()  # a merged session is read and saved in this process
         self._pages = Pages(self._picture.board, access.Gate(self._tokens), self._steering)
         self._server: server.Server | None = None
         self._subscribe()

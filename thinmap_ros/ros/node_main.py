@@ -15,8 +15,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, T
 from rclpy.node import Node
 
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
-from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
-from thinmap_ros.kernels.progress import report_compilation
+from thinmap_ros.kernels import compiler_memory_releaser, release_compiler_pages, report_compilation
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.command_line import (
     init_ros,

@@ -15,7 +15,7 @@ import numpy as np
 from thinmap_ros.core.config import Config, is_parameter
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.scan import LaserConfig
-from thinmap_ros.kernels.progress import report_compilation
+from thinmap_ros.kernels import report_compilation
 from thinmap_ros.logs import reading
 from thinmap_ros.logs.frames import SOURCES
 from thinmap_ros.logs.log import LaserOptions, Log

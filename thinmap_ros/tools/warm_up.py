@@ -3,12 +3,12 @@
 import argparse
 import gc
 
+from thinmap_ros import kernels
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.jit import cache
-from thinmap_ros.kernels import warm_up
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser
@@ -29,7 +29,7 @@ def work(arguments: argparse.Namespace) -> None:
     """Run every algorithm once, and an exploration in the simulator."""
     # Compilers make many objects and few cycles: looking for these takes a seventh of the time.
     gc.disable()
-    for rehearse in warm_up.ALL:
+    for rehearse in kernels.ALL:
         rehearse()
     world = World.from_patch(*read_world(package_data.world_path('office')))
     # A complete exploration reaches the kernels that need several targets.

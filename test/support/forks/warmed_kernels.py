@@ -7,9 +7,8 @@ from typing import Any
 
 from numba.core.dispatcher import Dispatcher
 
-from thinmap_ros import jit
-from thinmap_ros.kernels import warm_up
-from thinmap_ros.kernels.progress import CompilationReport
+from thinmap_ros import jit, kernels
+from thinmap_ros.kernels import CompilationReport
 
 # Begins the line on a kernel that a node compiles or loads in operation: its warm-up lacks it.
 LATE = 'late kernel: '
@@ -25,7 +24,7 @@ class WarmedKernels:
     """The kernels of each warm-up; a process that begins has all."""
 
     def __init__(self) -> None:
-        self._loaded = {rehearse.__name__: _loaded_by(rehearse) for rehearse in warm_up.ALL}
+        self._loaded = {rehearse.__name__: _loaded_by(rehearse) for rehearse in kernels.ALL}
         for loaded in self._loaded.values():
             _add(loaded)
 
@@ -37,14 +36,14 @@ class WarmedKernels:
         if module.startswith(_NODES):
             _forget_all()
             for name, loaded in self._loaded.items():
-                setattr(warm_up, name, partial(_add, loaded))
+                setattr(kernels, name, partial(_add, loaded))
             _report_late_kernels()
 
 
 def _loaded_by(rehearse: Callable[[], None]) -> _Loaded:
     """What a warm-up loads or compiles if it is the first."""
     _forget_all()
-    for other in warm_up.ALL:
+    for other in kernels.ALL:
         other.cache_clear()
     loaded: _Loaded = []
 

@@ -13,7 +13,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.regions import RegionMap, membership_of
 from thinmap_ros.core.topology.segmentation import RegionConfig, RegionTracker
-from thinmap_ros.kernels.memory import release_free_pages
+from thinmap_ros.kernels import release_free_pages
 from thinmap_ros.nodes.mapping.region_messages import region_array_msg
 from thinmap_ros.ros import parameters, qos
 from thinmap_ros.ros.clocks.time_jumps import STEADY

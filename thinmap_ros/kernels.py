@@ -1,23 +1,159 @@
-"""Warm-up of each algorithm in a small room, so that kernels are loaded before the first step.
+"""Kernels that are compiled before they are needed, with progress and within memory."""
 
-A node warms up before it subscribes: otherwise a robot loses its first seconds, and a simulation
-faster than real time many more. Each warm-up imports its own modules only, so that a node does not
-load the kernels of others, and is done once in a process.
-"""
-
-from collections.abc import Iterator
+import ctypes
+import gc
+import mmap
+import sys
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
+from functools import cache as cache_of_results
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numba.core import event
 from numpy.typing import NDArray
 
+from thinmap_ros import jit
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.jit import cache as kernel_cache
+
+# Releases memory pages that are no longer needed.
+
+
+def compiler_memory_releaser(
+    period_s: float = 3.0, threshold_bytes: float = 4e6
+) -> Callable[[], None]:
+    """Return a function that releases the pages of the compiler, to be called repeatedly.
+
+    Kernels that are loaded later, with the first message, load the compiler again.
+    """
+    looked_at = monotonic()
+    least = _shared_bytes()
+
+    def look() -> None:
+        nonlocal looked_at, least
+        if monotonic() - looked_at > period_s:
+            if _shared_bytes() > least + threshold_bytes:
+                release_compiler_pages()
+                least = _shared_bytes()
+            looked_at = monotonic()
+
+    return look
+
+
+def _shared_bytes() -> int:
+    """File-backed memory of the process, such as libraries; 0 without /proc."""
+    try:
+        return int(Path('/proc/self/statm').read_text().split()[2]) * mmap.PAGESIZE
+    except OSError:  # no /proc, or no further file may be opened now
+        return 0
+
+
+def release_free_pages() -> None:
+    """Return what was freed to the system, which the allocator would keep; where it can."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, 'malloc_trim'):
+        libc.malloc_trim(0)
+
+
+def release_compiler_pages() -> None:
+    """Release the memory pages of the kernel compiler.
+
+    Its library, some 100 MB, is idle once all kernels are loaded. Only unmodified mappings are
+    released: the system reads them again from the library when needed. Without /proc, nothing
+    happens.
+    """
+    gc.collect()
+    try:
+        smaps = Path('/proc/self/smaps').read_text()
+    except OSError:
+        return
+    release_free_pages()
+    libc = ctypes.CDLL(None)
+    for first, last in _clean_mappings(smaps, 'llvmlite'):
+        libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), mmap.MADV_DONTNEED)
+
+
+def _clean_mappings(smaps: str, name: str) -> Iterator[tuple[int, int]]:
+    """Address ranges of the unmodified mappings of a file."""
+    header = ''
+    for line in smaps.splitlines():
+        key = line.split(maxsplit=1)[0]
+        if not key.endswith(':'):
+            header = line
+        elif key == 'Anonymous:' and name in header and int(line.split()[1]) == 0:
+            first, last = header.split(maxsplit=1)[0].split('-')
+            yield int(first, 16), int(last, 16)
+
+
+# Reports the compilation of kernels, which delays the first start of a program.
+
+_COMPILATION = 'numba:compile'
+
+
+class CompilationReport(event.Listener):
+    """Reports on stderr how many kernels are compiled."""
+
+    def __init__(self, period_s: float = 5.0) -> None:
+        self._period_s = period_s
+        self._depth = 0
+        self._seconds = 0.0
+        self._began_at = 0.0
+        self._told_at = -period_s
+
+    def on_start(self, event: Any) -> None:
+        """Handle the start of a compilation, possibly nested in another one."""
+        now = time.monotonic()
+        if self._depth == 0:
+            self._began_at = now
+        self._depth += 1
+        if now - self._told_at >= self._period_s:
+            self._told_at = now
+            # Kernels that are compiled for further types count once.
+            there = sum(1 for kernel in jit.KERNELS if kernel.signatures)
+            number = min(there + 1, len(jit.KERNELS))
+            _tell(f'compiling kernels, once ({number} of {len(jit.KERNELS)})')
+
+    def on_end(self, event: Any) -> None:
+        """Handle the end of a compilation."""
+        self._depth -= 1
+        if self._depth == 0:
+            self._seconds += time.monotonic() - self._began_at
+
+    def end(self) -> None:
+        """Report duration and cache folder, if any kernels were compiled."""
+        if self._seconds:
+            kept = kernel_cache.folder()
+            where = f'cached in {kept}' if kept else 'not cached'
+            _tell(f'kernels compiled in {self._seconds:.0f} s, {where}')
+            self._seconds = 0.0
+
+
+@cache_of_results
+def report_compilation() -> CompilationReport:
+    """Report compilation until the process ends; called again, it is the same report."""
+    report = CompilationReport()
+    event.register(_COMPILATION, report)
+    return report
+
+
+def _tell(what: str) -> None:
+    print(f'thinmap: {what}', file=sys.stderr, flush=True)
+
+
+# Warm-up of each algorithm in a small room, so that kernels are loaded before the first step.
+#
+# A node warms up before it subscribes: otherwise a robot loses its first seconds, and a simulation
+# faster than real time many more. Each warm-up imports its own modules only, so that a node does
+# not load the kernels of others, and is done once in a process.
 
 if TYPE_CHECKING:
     from thinmap_ros.core.topology.graph import TopologicalMap
@@ -297,6 +433,7 @@ ALL = (
     map_joiner,
     sim,
 )
+
 """Warm-ups of all nodes."""
 
 

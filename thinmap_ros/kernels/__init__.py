@@ -1,1 +1,0 @@
-"""Compiled kernels: warm-up, progress of compilation, memory of the compiler."""
