@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from thinmap_ros import jit
-from thinmap_ros.jit.cache import PACKAGE
-from thinmap_ros.jit.fingerprint import OPTIONS, fingerprint
+from thinmap_ros.jit.cache import OPTIONS, PACKAGE, fingerprint
 
 # Of all kernels of the core and of the simulator, by module and name.
 FINGERPRINTS = """
@@ -19,7 +18,7 @@ import pkgutil
 from importlib import import_module
 import thinmap_ros
 from thinmap_ros import jit
-from thinmap_ros.jit.fingerprint import fingerprint
+from thinmap_ros.jit.cache import fingerprint
 for room in ('baselines', 'core', 'sim'):
     package = import_module(f'thinmap_ros.{room}')
     for module in pkgutil.walk_packages(package.__path__, f'thinmap_ros.{room}.'):

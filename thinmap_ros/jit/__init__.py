@@ -6,7 +6,7 @@ from typing import Any, TypeVar, cast
 import numba
 
 from thinmap_ros.jit import cache
-from thinmap_ros.jit.fingerprint import OPTIONS
+from thinmap_ros.jit.cache import OPTIONS
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 # Kernels of all imported modules.

@@ -16,7 +16,7 @@ from thinmap_ros.files.safe import (
     read_snapshot,
     write_snapshot,
 )
-from thinmap_ros.jit.private_folder import private_folder, temporary_folder
+from thinmap_ros.jit.cache import private_folder, temporary_folder
 
 _FOLDER = 'THINMAP_STATE_DIR'
 _KIND = 'checkpoint'

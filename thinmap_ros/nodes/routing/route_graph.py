@@ -13,7 +13,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.files.graphs import write_geojson
-from thinmap_ros.jit.private_folder import private_folder, temporary_folder
+from thinmap_ros.jit.cache import private_folder, temporary_folder
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
