@@ -19,8 +19,8 @@ from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.logs.log import LaserOptions
+from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.message_view import MessageView
-from thinmap_ros.view.null_view import NullView
 
 _COUNT = 10
 _KINDS = sorted(CHECKS, key=lambda kind: kind.__name__)

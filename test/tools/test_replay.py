@@ -30,7 +30,7 @@ from thinmap_ros.replaying import replay
 from thinmap_ros.tools.carmen_to_bag import convert
 from thinmap_ros.tools.replay import ReplayView, main
 from thinmap_ros.view import rerun_sinks
-from thinmap_ros.view.null_view import NullView
+from thinmap_ros.view.interface import NullView
 
 TRAJECTORIES = {'trajectory.tum', 'trajectory_final.tum'}
 FILES = TRAJECTORIES | {'map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'report.json'}

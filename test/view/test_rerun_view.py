@@ -16,8 +16,8 @@ from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.view import palette, rerun_blueprint, rerun_sinks
+from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.message_view import MessageView, recording_from_bag
-from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
 ROOT = Path(__file__).resolve().parents[2]

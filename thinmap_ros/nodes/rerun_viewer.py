@@ -29,8 +29,8 @@ from thinmap_ros.ros.decoding.map_updates import updates_topic
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
+from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.message_view import MessageView
-from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
 _TOPICS = {

@@ -26,7 +26,7 @@ from thinmap_ros.replaying import Replay
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser, add_out, check_place, out_folder
 from thinmap_ros.tools.replay_run import BATCH, options_of, replay_log
-from thinmap_ros.view.null_view import NullView
+from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.rerun_view import View
 
 # Large data are converted once a second: a view does not draw them more often.

@@ -19,10 +19,8 @@ from thinmap_ros.logs import decode
 from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.logs.transforms import StaticTransforms
 from thinmap_ros.view import palette
-from thinmap_ros.view.apart_scans import ApartScans
-from thinmap_ros.view.null_view import NullView
+from thinmap_ros.view.interface import ApartScans, NullView, StampMatcher
 from thinmap_ros.view.rerun_view import View
-from thinmap_ros.view.stamp_matcher import StampMatcher
 
 _TF_STATIC = '/tf_static'
 _MEDIAN = re.compile(r'median (\d+\.\d+) ms')

@@ -13,7 +13,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.view import palette, rerun_blueprint
-from thinmap_ros.view.null_view import NullView
+from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.palette import rgb
 from thinmap_ros.view.rerun_sinks import RecordingSinks, library
 

@@ -15,8 +15,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs import decode
 from thinmap_ros.view import palette
-from thinmap_ros.view.apart_scans import ApartScans
-from thinmap_ros.view.stamp_matcher import StampMatcher
+from thinmap_ros.view.interface import ApartScans, StampMatcher
 from thinmap_ros.web import key, words
 from thinmap_ros.web.board import Board
 from thinmap_ros.web.diagnostics_table import DiagnosticsTable
