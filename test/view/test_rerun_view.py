@@ -15,7 +15,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, flat_topology
 from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.view import palette, rerun_blueprint, rerun_sinks
+from thinmap_ros.view import palette, rerun_sinks, rerun_view
 from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.message_view import MessageView, recording_from_bag
 from thinmap_ros.view.rerun_view import View
@@ -438,7 +438,7 @@ def test_the_camera_looks_straight_down_on_the_middle_of_the_map():
     import rerun.blueprint
 
     patch = GridPatch(GridFrame(-2.0, 1.0, 0.1), np.zeros((40, 80), dtype=np.int8))
-    eye = rerun_blueprint._eye(rr.blueprint, patch)
+    eye = rerun_view._eye(rr.blueprint, patch)
     position, target, up = (
         np.array(batch.as_arrow_array().to_pylist()[0])
         for batch in (eye.position, eye.look_target, eye.eye_up)

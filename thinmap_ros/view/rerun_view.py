@@ -1,6 +1,7 @@
 """Shows core values in rerun, live or in an .rrd file."""
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,27 +13,169 @@ from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
-from thinmap_ros.view import palette, rerun_blueprint
+from thinmap_ros.view import palette
 from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.palette import rgb
-from thinmap_ros.view.rerun_sinks import RecordingSinks, library
+from thinmap_ros.view.rerun_sinks import TIMELINE, RecordingSinks, library
+
+# Layout of a view in rerun: the map, curves beside it, and a legend below them.
+
+UNKNOWN_GREY = 205
+
+_WIDTHS = (5, 3)  # of the map, and of curves and legends
+
+_PLOT_WIDTHS = (3, 1)  # of curves, and of their legend
+
+_COLOURS = ('blue', 'orange', 'green', 'pink', 'amber', 'light blue', 'grey')  # of the palette
+
+LEGEND = """
+- **orange** end node with its position probability, **grey** it will stay;
+  **dark blue** branch, **amber** corner, **green** skeleton
+- **pink** estimated path, pose and its 95 %; **indigo** true path; **grey** odometry;
+  **yellow** planned path and target; **purple** samples
+- **red** scan; **pale pink** scans of a piece of map whose place is unknown;
+  **blue** features of the local area, its nodes ringed; **pale blue** other features
+- **pale outlines** on the walls: rooms (blue), corridors (sand), halls (green)
+"""
+
+# Each curve: name in the legend and colour, by plot.
+_PLOTS = {
+    'error': ('pose: error, 2 sigma', ('position, cm', 'heading, deg', '2 sigma, cm')),
+    'progress': ('progress', ('seen, m2', 'distance, m')),
+    'count': ('counts', ('features', 'local features', 'matched lines', 'nodes', 'end nodes left')),
+    'step': (
+        'step times, ms',
+        ('localizer', 'map update', 'graph update', 'explorer', 'global localization'),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """The camera above the map, which looks straight down: all parts of the map have one scale.
+
+    aspect: width over height of the map's part of the window, or less. half_view_rad: half of the
+    vertical field of view of rerun's camera. margin: size of the picture over that of the map.
+    """
+
+    aspect: float
+    half_view_rad: float
+    margin: float
+
+
+_CAMERA = _Camera(aspect=1.3, half_view_rad=math.radians(27.5), margin=1.1)
+
+
+def entity(plot: str, curve: str) -> str:
+    """Entity path of a curve."""
+    return f'plots/{plot}/{curve.replace(",", "").replace("%", "percent").replace(" ", "_")}'
+
+
+def styles(rr: Any) -> dict[str, Any]:
+    """Names and colours of all curves, by entity."""
+    return {
+        entity(plot, curve): rr.SeriesLines(
+            colors=[palette.rgb(colour)], names=[curve], widths=[1.5]
+        )
+        for plot, (_, curves) in _PLOTS.items()
+        for curve, colour in zip(curves, palette.PALETTE, strict=False)
+    }
+
+
+def curve_legend(plot: str, curves: Collection[str]) -> str:
+    """Legend of the curves that a plot has so far."""
+    known = zip(_PLOTS[plot][1], _COLOURS, strict=False)
+    return '\n'.join(f'- **{colour}** {curve}' for curve, colour in known if curve in curves)
+
+
+def legend_entity(plot: str) -> str:
+    """Entity path of the legend of a plot."""
+    return f'legends/{plot}'
+
+
+def blueprint(rr: Any, patch: GridPatch, trails: list[str]) -> Any:
+    """Layout in which the whole map is in view; trajectories (entities) are shown in full."""
+    rrb = rr.blueprint
+    past = {
+        'start': rrb.TimeRangeBoundary.infinite(),
+        'end': rrb.TimeRangeBoundary.cursor_relative(),
+    }
+    scene = rrb.Spatial3DView(
+        origin='map',
+        name='map',
+        eye_controls=_eye(rrb, patch),
+        background=rrb.Background(color=[UNKNOWN_GREY] * 3),
+        line_grid=rrb.LineGrid3D(visible=False),
+        overrides={name: rrb.VisibleTimeRanges(timeline=TIMELINE, **past) for name in trails},
+    )
+    # rerun's own legend covers the curves.
+    inside = rrb.PlotLegend(visible=False)
+    everything = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+    )
+    axis = rrb.TimeAxis(view_range=everything)
+    curves = [
+        rrb.Horizontal(
+            rrb.TimeSeriesView(origin=f'plots/{plot}', name=name, plot_legend=inside, axis_x=axis),
+            rrb.TextDocumentView(origin=legend_entity(plot), name='curves'),
+            column_shares=_PLOT_WIDTHS,
+        )
+        for plot, (name, _) in _PLOTS.items()
+    ]
+    legend = rrb.TextDocumentView(origin='legend', name='colours')
+    beside = rrb.Vertical(*curves, legend)
+    layout = rrb.Horizontal(scene, beside, column_shares=_WIDTHS)
+    # At the newest time: a live view follows, and a file opens at its end.
+    time = rrb.TimePanel(state='collapsed', play_state='following')
+    panels = rrb.BlueprintPanel(state='hidden'), rrb.SelectionPanel(state='hidden'), time
+    return rrb.Blueprint(layout, *panels)
+
+
+def size_m(patch: GridPatch) -> float:
+    """Size of a map that determines the distance of the camera."""
+    rows, cols = patch.shape
+    return patch.frame.resolution * max(rows, cols / _CAMERA.aspect)
+
+
+def _eye(rrb: Any, patch: GridPatch) -> Any:
+    """Camera at the zenith of the map's centre; y points up in the picture."""
+    rows, cols = patch.shape
+    frame = patch.frame
+    x = frame.origin_x + frame.resolution * cols / 2.0
+    y = frame.origin_y + frame.resolution * rows / 2.0
+    height = _CAMERA.margin * size_m(patch) / (2.0 * math.tan(_CAMERA.half_view_rad))
+    return rrb.EyeControls3D(
+        position=(x, y, height), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
+    )
+
 
 _ODOMETRY = '#777777'
+
 _SCAN = '#CC0000'
+
 _PLAN = '#F0E442'
+
 _TARGET = '#F0E442'
+
 _SAMPLE = '#7B3FA0'
+
 _LOCAL_LINE = '#0072B2'
+
 _LINE = '#8FBEDB'
+
 _LOCAL_NODE = '#0072B2'
+
 _STAYS = '#7D7D7D'  # an end node with position probability 1
+
 _LABEL = '#000000'
+
 # Colour and radius in pixels: the estimated path is visible below the true one.
 _TRAILS = {
     'estimate': (palette.ESTIMATE, 2.4),
     'truth': (palette.TRUTH, 0.9),
     'odometry': (_ODOMETRY, 1.2),
 }
+
 # Heights above the map, m, in the order of importance.
 _Z = {
     'apart': 0.005,
@@ -81,6 +224,7 @@ class _Confidence:
 
 
 _DRAWN = _Thresholds(period_ns=1_000_000_000, trail_step_m=0.05, growth=1.4)
+
 _CONFIDENCE = _Confidence(chi_square=5.991, points=33, sigmas=1.96, wedge_m=1.0)
 
 
@@ -139,7 +283,7 @@ class View(NullView):
 
         self._patch = patch
         self._throttled('grid', ns, draw)
-        if rerun_blueprint.size_m(patch) > _DRAWN.growth * self._framed_m:
+        if size_m(patch) > _DRAWN.growth * self._framed_m:
             self._frame(patch)
 
     def scan(self, ns: int, scan: Scan) -> None:
@@ -329,17 +473,15 @@ class View(NullView):
         """Name a curve in the legend of its plot, and show its first value if that was zero."""
         known = self._curves.setdefault(plot, {})
         known[curve] = None
-        text = self._rr.TextDocument(
-            rerun_blueprint.curve_legend(plot, known), media_type='text/markdown'
-        )
-        self._log(rerun_blueprint.legend_entity(plot), text, static=True)
+        text = self._rr.TextDocument(curve_legend(plot, known), media_type='text/markdown')
+        self._log(legend_entity(plot), text, static=True)
         first_ns = self._zeros.pop((plot, curve), None)
         if first_ns is not None:
             self._log_value(first_ns, plot, curve, 0.0)
 
     def _log_value(self, ns: int, plot: str, curve: str, value: float) -> None:
         self._at(ns)
-        self._log(rerun_blueprint.entity(plot, curve), self._rr.Scalars([value]))
+        self._log(entity(plot, curve), self._rr.Scalars([value]))
 
     def wait_until_closed(self) -> None:
         """Show all pending data, and wait until the viewer is closed."""
@@ -371,17 +513,17 @@ class View(NullView):
         self._log('map/robot/body', body, static=True)
         self._log(
             'legend',
-            rr.TextDocument(rerun_blueprint.LEGEND, media_type='text/markdown'),
+            rr.TextDocument(LEGEND, media_type='text/markdown'),
             static=True,
         )
-        for entity, style in rerun_blueprint.style(rr).items():
+        for entity, style in styles(rr).items():
             self._log(entity, style, static=True)
 
     def _frame(self, patch: GridPatch) -> None:
         """Move the camera so that the whole map is in view."""
-        self._framed_m = rerun_blueprint.size_m(patch)
+        self._framed_m = size_m(patch)
         self._streams.send_blueprint(
-            rerun_blueprint.blueprint(self._rr, patch, [f'map/{name}' for name in _TRAILS])
+            blueprint(self._rr, patch, [f'map/{name}' for name in _TRAILS])
         )
 
     def _px(self, pixels: float) -> Any:
@@ -411,7 +553,7 @@ class View(NullView):
 def _shade(patch: GridPatch) -> NDArray[np.uint8]:
     """Grey value of each cell (H, W): lighter if more likely free."""
     grey = np.round(2.55 * (100.0 - np.clip(patch.cells, 0, 100)))
-    return np.where(patch.cells == UNKNOWN, rerun_blueprint.UNKNOWN_GREY, grey).astype(np.uint8)
+    return np.where(patch.cells == UNKNOWN, UNKNOWN_GREY, grey).astype(np.uint8)
 
 
 def _faded(colour: str, share: float) -> list[int]:
