@@ -35,7 +35,7 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.pipeline import Pipeline, PipelineConfig
     from thinmap_ros.sim.laser import LaserScannerConfig
     from thinmap_ros.sim.world import World
-    from thinmap_ros.view.plotting import plot
+    from thinmap_ros.view.summary import plot
 
 __all__ = [
     'ConfigError',
@@ -87,7 +87,7 @@ _PLACES = {
     'PipelineConfig': 'pipeline.PipelineConfig',
     'LocalizerConfig': 'core.slam.track.LocalizerConfig',
     'EkfConfig': 'core.ekf_slam.ekf_localizer.EkfConfig',
-    'plot': 'view.plotting.plot',
+    'plot': 'view.summary.plot',
     'Scan': 'core.scan.Scan',
     # logs
     'open_log': 'logs.reading.open_log',

@@ -81,7 +81,7 @@ class Pipeline:
 
     def _repr_png_(self) -> bytes:
         """Picture of map and graph, for notebooks."""
-        from thinmap_ros.view.plotting import plot  # matplotlib takes its time
+        from thinmap_ros.view.summary import plot  # matplotlib takes its time
 
         return plot(self).png()
 

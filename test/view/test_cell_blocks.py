@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from thinmap_ros.view.cell_blocks import DrawnCells, block_maximum, reduced, reduction
+from thinmap_ros.view.summary import DrawnCells, block_maximum, reduced, reduction
 
 
 def test_a_large_map_is_reduced_so_that_walls_stay():

@@ -20,8 +20,8 @@ from thinmap_ros.files.merging import (
 from thinmap_ros.files.sessions import GRID, maps_in, require_own_files, stem_of
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser, check_place
-from thinmap_ros.view.merged_figure import merged_figure
 from thinmap_ros.view.progress_bar import ProgressBar
+from thinmap_ros.view.summary import merged_figure
 
 _NOT_THE_SAME_PLACE = 1
 

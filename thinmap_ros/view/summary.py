@@ -1,21 +1,58 @@
 """The summary picture of a run: map, regions, graph and paths, with legend and scale bar."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.errors import InputError, require_type
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.regions import RegionKind, RegionMap
 from thinmap_ros.files.safe import atomic_write
-from thinmap_ros.view import cell_blocks, palette
-from thinmap_ros.view.cell_blocks import DrawnCells
-from thinmap_ros.view.figures import draw_graph, draw_hidden_areas
+from thinmap_ros.view import palette
+from thinmap_ros.view.figures import DPI, draw_graph, draw_hidden_areas, draw_map
+
+# Cells of a map as they are drawn: one by one, or in blocks where the map is large.
+
+# The largest side of a drawn map, cells: a cell of a smaller size than a pixel may vanish.
+_MAX_CELLS = 1100
+
+Cell = TypeVar('Cell', np.bool_, np.int32)
+
+
+class DrawnCells(NamedTuple):
+    """Free and occupied cells (H, W); the others are unknown."""
+
+    free: NDArray[np.bool_]
+    occupied: NDArray[np.bool_]
+
+
+def reduction(shape: tuple[int, int]) -> int:
+    """Cells of a map per side of a drawn cell."""
+    return -(-max(shape) // _MAX_CELLS)
+
+
+def reduced(cells: DrawnCells, factor: int) -> DrawnCells:
+    """Cells in blocks: a block is occupied if any of its cells is, and else free if any is."""
+    occupied = block_maximum(cells.occupied, factor)
+    return DrawnCells(block_maximum(cells.free, factor) & ~occupied, occupied)
+
+
+def block_maximum(cells: NDArray[Cell], factor: int) -> NDArray[Cell]:
+    """Greatest value in each block of factor x factor cells."""
+    if factor == 1:
+        return cells
+    rows, cols = (-(-count // factor) for count in cells.shape)
+    padded = np.zeros((rows * factor, cols * factor), dtype=cells.dtype)
+    padded[: cells.shape[0], : cells.shape[1]] = cells
+    blocks: NDArray[Cell] = padded.reshape(rows, factor, cols, factor).max(axis=(1, 3))
+    return blocks
+
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,13 +61,20 @@ if TYPE_CHECKING:
     from thinmap_ros.view.map_figure import MapFigure
 
 _UNKNOWN = '#CCCCCC'
+
 _FREE = '#FFFFFF'
+
 _WALL = '#000000'
+
 _BOUNDARY = '#777777'
+
 _KINDS = {RegionKind.ROOM: 'room', RegionKind.CORRIDOR: 'corridor', RegionKind.HALL: 'hall'}
+
 # Free cells this near to a region are drawn as part of it: regions end before the walls, m.
 _REGION_MARGIN_M = 0.5
+
 _NO_POINTS = np.empty((0, 2))
+
 _ELLIPSIS = '…'
 
 
@@ -180,9 +224,9 @@ def _map_inches(area: tuple[float, float, float, float]) -> tuple[float, float]:
 
 def _draw_cells(axes: 'Axes', patch: GridPatch, regions: RegionMap | None) -> dict[str, str]:
     """Draw the cells; returns the colour of each kind of surface by its name in the legend."""
-    factor = cell_blocks.reduction(patch.shape)
+    factor = reduction(patch.shape)
     cell_m = factor * patch.frame.resolution
-    cells = cell_blocks.reduced(DrawnCells(patch.free, patch.occupied), factor)
+    cells = reduced(DrawnCells(patch.free, patch.occupied), factor)
     shade = np.empty((*cells.free.shape, 3), dtype=np.uint8)
     shade[:] = palette.rgb(_UNKNOWN)
     shade[cells.free] = palette.rgb(_FREE)
@@ -190,7 +234,7 @@ def _draw_cells(axes: 'Axes', patch: GridPatch, regions: RegionMap | None) -> di
     surfaces['unknown'] = _UNKNOWN
     labels = None
     if regions is not None and regions.regions:
-        labels = cell_blocks.block_maximum(regions.labels, factor)
+        labels = block_maximum(regions.labels, factor)
         labels = _spread_labels(labels, cells.free, round(_REGION_MARGIN_M / cell_m))
         for kind, name in _KINDS.items():
             ids = [region.id for region in regions.regions.values() if region.kind == kind]
@@ -330,3 +374,50 @@ def _draw_legend(
         frameon=False,
         handlelength=1.6,
     )
+
+
+# Picture of maps, and of the map that they were merged into.
+
+_PANEL_IN = 5.0
+
+_NODE_PT = 2.5
+
+
+def merged_figure(path: Path, maps: Sequence[tuple[str, GridPatch, TopologicalMap]]) -> None:
+    """Write a PNG: maps side by side, each with a title and its topological map."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    size = (_PANEL_IN * len(maps), _PANEL_IN)
+    figure = Figure(figsize=size, dpi=DPI, layout='constrained')
+    FigureCanvasAgg(figure)
+    for number, (title, patch, topology) in enumerate(maps, 1):
+        axes = figure.add_subplot(1, len(maps), number)
+        draw_map(axes, patch)
+        draw_graph(axes, topology, _NODE_PT)
+        axes.set(xlabel='x (m)', ylabel='y (m)', aspect='equal')
+        axes.set_title(title, parse_math=False)
+    with atomic_write(path) as aside:
+        figure.savefig(aside, format='png', metadata={'Software': None})
+
+
+# Pictures for notebooks and programs: of a pipeline, or of a map with a graph.
+
+if TYPE_CHECKING:
+    from thinmap_ros.view.map_figure import MapFigure
+
+
+def plot(shown: Any, topology: TopologicalMap | None = None, title: str = '') -> 'MapFigure':
+    """A matplotlib figure of a Pipeline, with its graph and path, or of a GridPatch with a graph.
+
+    `figure.savefig(path)` saves it; a notebook shows it. Raises InputError for anything else.
+    """
+    if topology is not None:
+        require_type('topology', topology, TopologicalMap)
+    if isinstance(shown, GridPatch):
+        return make_figure(shown, topology or TopologicalMap(), title=title)
+    if not (hasattr(shown, 'grid') and hasattr(shown, 'localizer')):
+        raise InputError(f'plot: a {type(shown).__name__}: expected a Pipeline or a GridPatch')
+    _, path = shown.localizer.keyframe_trajectory()
+    graph = topology or shown.topology.map
+    return make_figure(shown.grid.known_area(), graph, path, title=title)
