@@ -20,7 +20,7 @@ from thinmap_ros.evaluation.parallel_jobs import (
     run_pending,
 )
 from thinmap_ros.files.safe import write_text
-from thinmap_ros.view import batch_page
+from thinmap_ros.view import report_page
 
 SUMMARY = 'summary.csv'
 REASON = 'reason'  # last column: why a file failed, or what is to be said of its result
@@ -99,8 +99,8 @@ def run_batch(batch: Batch, jobs: Sequence[FileJob], arguments: argparse.Namespa
         rows.append([str(job.path), *cells])
     columns = ['file', *batch.columns, REASON]
     write_text(arguments.out / SUMMARY, _csv(columns, rows))
-    pages = [batch_page.Entry(job.folder, row) for job, row in zip(jobs, rows, strict=True)]
-    batch_page.write(arguments.out, batch.title, columns, pages, arguments.command)
+    pages = [report_page.Entry(job.folder, row) for job, row in zip(jobs, rows, strict=True)]
+    report_page.write_batch(arguments.out, batch.title, columns, pages, arguments.command)
     resumed = f', {len(done)} of them before' if done else ''
     print(f'{arguments.out}: {len(jobs) - len(failures)} of {len(jobs)} done{resumed}')
     if failures:

@@ -5,16 +5,90 @@ The page needs no other file: pictures are part of it.
 
 import base64
 import html
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2
-from thinmap_ros.view import html_page
+from thinmap_ros.files.safe import write_text
+
+# An HTML page that needs no other file, loads nothing from elsewhere and runs no script.
+
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff;
+  max-width: 56rem; margin: 0 auto; padding: 1rem; overflow-wrap: anywhere; }
+h1 { font-size: 1.4rem; line-height: 1.25; }
+h2 { font-size: 1.1rem; margin: 1.6rem 0 .4rem; }
+table { border-collapse: collapse; width: 100%; }
+td, th { text-align: left; vertical-align: top; padding: .25rem .6rem .25rem 0;
+  border-bottom: 1px solid #ddd; font-weight: normal; }
+th { color: #555; }
+td:first-child code { white-space: nowrap; }
+code, pre { font: 0.9em/1.5 ui-monospace, monospace; background: #f3f3f3; border-radius: 3px; }
+code { padding: .1em .3em; }
+pre { padding: .6rem; white-space: pre-wrap; margin: 0; }
+.picture { overflow-x: auto; }
+.picture input { position: absolute; opacity: 0; }
+.picture img { max-width: 100%; cursor: zoom-in; }
+.picture input:checked + label img { max-width: none; cursor: zoom-out; }
+.picture input:focus-visible + label img { outline: 2px solid #0072B2; }
+small { color: #555; }
+"""
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; img-src {images}; style-src 'unsafe-inline'">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body class="{kind}">
+<h1>{title}</h1>
+{content}
+</body>
+</html>
+"""
+
+
+@dataclass(frozen=True)
+class Page:
+    """Title, as text, and content, as HTML.
+
+    images: sources from which the browser takes pictures (Content-Security-Policy); style, kind:
+    rules of CSS beyond the common ones, and the class of the body that they name.
+    """
+
+    title: str
+    content: str
+    images: str
+    style: str = ''
+    kind: str = 'run'
+
+
+def write_page(path: Path, page: Page) -> Path:
+    """Write a page as a whole or not at all; returns its path."""
+    text = _PAGE.format(
+        title=html.escape(page.title),
+        images=page.images,
+        style=_STYLE + page.style,
+        kind=page.kind,
+        content=page.content,
+    )
+    write_text(path, text)
+    return path
+
 
 NAME = 'report.html'
+
 _PICTURE = 'summary.png'
+
 _MAX_PLACES = 20
 
 
@@ -66,6 +140,7 @@ _FIGURES = (
     _Figure(('wall_s',), 'Elapsed time', 's', 1.0, 1),
     _Figure(('peak_mb',), 'Peak memory', 'MB'),
 )
+
 _FILES = {
     'summary.png': 'this picture',
     'map.yaml': 'occupancy map for map_server: resolution, origin and thresholds',
@@ -96,7 +171,7 @@ def write(folder: Path, title: str, report: Mapping[str, Any], command: str) -> 
         for heading, content in sections
         if content
     )
-    return html_page.write(folder / NAME, html_page.Page(title, text, images='data:'))
+    return write_page(folder / NAME, Page(title, text, images='data:'))
 
 
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -173,3 +248,63 @@ def _file_table(names: set[str]) -> str:
         if name in names
     ]
     return '<table>\n' + '\n'.join(lines) + '\n</table>'
+
+
+# Results of many files as one HTML page: a table, and the picture of each with its own page.
+
+_TABLE_STYLE = """
+.many { max-width: none; }
+.many th, .many td { white-space: nowrap; }
+.many td:last-child { white-space: normal; }
+figure { display: inline-block; width: 18rem; margin: .5rem; vertical-align: top; }
+figure img { width: 100%; }
+"""
+
+_CONTENT = """<table>
+<tr>{head}</tr>
+{rows}
+</table>
+{figures}
+<h2>Command</h2>
+<pre>{command}</pre>"""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Folder of the results of a file, and its row of the table."""
+
+    folder: Path
+    row: Sequence[Any]
+
+
+def write_batch(
+    folder: Path, title: str, columns: Sequence[str], entries: Sequence[Entry], command: str
+) -> Path:
+    """Write report.html over folders of results beside it; returns its path."""
+    content = _CONTENT.format(
+        head=''.join(f'<th>{html.escape(column)}</th>' for column in columns),
+        rows='\n'.join(_table_row(folder, entry) for entry in entries),
+        figures='\n'.join(_figure(folder, e) for e in entries if (e.folder / _PICTURE).exists()),
+        command=html.escape(command),
+    )
+    page = Page(title, content, images="'self' file:", style=_TABLE_STYLE, kind='many')
+    return write_page(folder / NAME, page)
+
+
+def _table_row(folder: Path, entry: Entry) -> str:
+    first, *others = (html.escape(str(value)) for value in entry.row)
+    page = entry.folder / NAME
+    linked = f'<a href="{_url(folder, page)}">{first}</a>' if page.exists() else first
+    return f'<tr><td>{linked}</td>{"".join(f"<td>{value}</td>" for value in others)}</tr>'
+
+
+def _figure(folder: Path, entry: Entry) -> str:
+    name = html.escape(entry.folder.name)
+    picture = _url(folder, entry.folder / _PICTURE)
+    image = f'<img src="{picture}" alt="Map of {name}" loading="lazy">'
+    return f'<figure><a href="{picture}">{image}</a><figcaption>{name}</figcaption></figure>'
+
+
+def _url(folder: Path, file: Path) -> str:
+    """Address of a file, relative to the page in a folder."""
+    return html.escape(quote(os.path.relpath(file, folder.absolute())))
