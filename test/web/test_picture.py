@@ -10,10 +10,13 @@ import pytest
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.web.board import Board
-from thinmap_ros.web.diagnostics_table import DiagnosticsTable
-from thinmap_ros.web.driven_path import DrivenPath
-from thinmap_ros.web.picture import Picture
-from thinmap_ros.web.words import exploration_words, slam_words
+from thinmap_ros.web.picture import (
+    DiagnosticsTable,
+    DrivenPath,
+    Picture,
+    exploration_words,
+    slam_words,
+)
 
 
 def items_of(board):

@@ -9,7 +9,7 @@ import pytest
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.web.board import Board
-from thinmap_ros.web.map_tiles import MapTiles
+from thinmap_ros.web.picture import MapTiles
 
 SIDE = 128
 

@@ -1,30 +1,308 @@
 """Messages of the robot as items of the page."""
 
-from collections.abc import Iterable
+import base64
+import math
+import zlib
+from collections.abc import Iterable, Iterator
+from time import monotonic
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import errors
 from thinmap_ros.core.errors import InputError, one_line
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs import decode
 from thinmap_ros.view import palette
 from thinmap_ros.view.interface import ApartScans, StampMatcher
-from thinmap_ros.web import key, words
 from thinmap_ros.web.board import Board
-from thinmap_ros.web.diagnostics_table import DiagnosticsTable
-from thinmap_ros.web.driven_path import DrivenPath
-from thinmap_ros.web.map_tiles import MapTiles
+
+# The newest diagnostics of each node as a table, the worst first.
+
+_LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
+
+_STALE = 3
+
+_SILENT_S = 5.0
+
+_MAX_ROWS = 100
+
+
+class DiagnosticsTable:
+    """Rows of level, name and message, by name; a node that is silent is stale."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, tuple[float, int, str]] = {}
+
+    def update(self, statuses: Iterable[Any], now_s: float | None = None) -> None:
+        """Replace the rows of some diagnostic_msgs/DiagnosticStatus; now_s: monotonic time, s."""
+        now_s = monotonic() if now_s is None else now_s
+        for status in statuses:
+            name = one_line(status.name)
+            if name in self._rows or len(self._rows) < _MAX_ROWS:
+                level = min(_level(status.level), _STALE)
+                self._rows[name] = (now_s, level, one_line(status.message))
+
+    def rows(self, now_s: float | None = None) -> list[list[str]]:
+        """Level, name and message of each row, the worst first; now_s: monotonic time, s."""
+        now_s = monotonic() if now_s is None else now_s
+        rows = [
+            (_STALE, name, 'silent') if now_s - heard_s > _SILENT_S else (level, name, message)
+            for name, (heard_s, level, message) in self._rows.items()
+        ]
+        rows.sort(key=lambda row: (-row[0], row[1]))
+        return [[_LEVELS[level], name, message] for level, name, message in rows]
+
+
+def _level(level: bytes | int) -> int:
+    return level[0] if isinstance(level, bytes) else int(level)
+
+
+# The driven path in pieces, of which the last one grows.
+
+_STEP_M = 0.2
+
+_PIECE = 100  # points
+
+
+class DrivenPath:
+    """Puts the path of the robot on a board: a correction replaces it up to its stamp."""
+
+    def __init__(self, board: Board) -> None:
+        self._board = board
+        self._points: list[tuple[int, float, float]] = []
+
+    @property
+    def start(self) -> tuple[float, float] | None:
+        """Where the path begins, m; None without a path."""
+        return self._points[0][1:] if self._points else None
+
+    def add(self, stamp_ns: int, x: float, y: float) -> None:
+        """Add a place, m, unless the robot has hardly moved."""
+        if self._points:
+            last_ns, last_x, last_y = self._points[-1]
+            if math.hypot(x - last_x, y - last_y) < _STEP_M:
+                return
+            if stamp_ns < last_ns:
+                self._points = []  # time was set back
+        self._points.append((stamp_ns, x, y))
+        # The piece before ends with the first point of the next one.
+        self._show(first=max((len(self._points) - 2) // _PIECE, 0))
+
+    def correct(self, stamps_ns: NDArray[np.int64], poses: Array) -> None:
+        """Replace the path up to the last of the stamps (N,) by poses (N, 3)."""
+        places = poses[:, :2].tolist()
+        corrected = [
+            (stamp_ns, x, y) for stamp_ns, (x, y) in zip(stamps_ns.tolist(), places, strict=True)
+        ]
+        end_ns = corrected[-1][0] if corrected else 0
+        self._points = corrected + [point for point in self._points if point[0] > end_ns]
+        self._show()
+
+    def _show(self, first: int = 0) -> None:
+        """Show the pieces from the first that has changed on."""
+        starts = range(0, len(self._points), _PIECE)
+        self._board.keep('path/', {f'path/{start // _PIECE}' for start in starts})
+        for start in starts[first:]:
+            # A point more, so that no gap is between two pieces.
+            part = self._points[start : start + _PIECE + 1]
+            xy = [round(number, 2) for _, x, y in part for number in (x, y)]
+            self._board.put(f'path/{start // _PIECE}', xy)
+        self._board.put('path', len(starts))
+
+
+# Colours of the page with what they mean: those of summary.png.
+
+
+def colours() -> dict[str, str]:
+    """Colour of each thing that is drawn, by its name on the page."""
+    return {
+        'end node': palette.NODES[NodeKind.END],
+        'branch node': palette.NODES[NodeKind.BRANCH],
+        'corner node': palette.NODES[NodeKind.CORNER],
+        'edge': palette.EDGE,
+        'robot and its path': palette.ESTIMATE,
+        'other robots': palette.ROBOTS[4],
+        'laser': palette.PALETTE[5],
+        'mapped apart': palette.APART,
+        'room': palette.REGIONS[RegionKind.ROOM][0],
+        'corridor': palette.REGIONS[RegionKind.CORRIDOR][0],
+        'hall': palette.REGIONS[RegionKind.HALL][0],
+        'plan and goal': palette.TRUTH,
+        'keep out': palette.KEEP_OUT,
+        'limit of the exploration': palette.HIDDEN,
+    }
+
+
+# The map as tiles: a page receives those in which cells have changed.
+
+_SIDE = 128  # cells
+
+_UNKNOWN = 0
+
+_FREE = 1
+
+_OCCUPIED = 2
+
+_LEVEL = 1  # of compression: the fastest
+
+Classes = NDArray[np.uint8]
+
+
+class MapTiles:
+    """Puts the tiles of a map on a board.
+
+    Tiles lie on the lattice of the cells whatever the origin of the map, which moves as it grows.
+    """
+
+    def __init__(self, board: Board) -> None:
+        self._board = board
+        self._lattice: tuple[float, float, float] | None = None
+        self._generation = 0
+        self._tiles: dict[tuple[int, int], bytes] = {}
+
+    def show(self, patch: GridPatch) -> None:
+        """Show a map: tiles that it no longer has, or another lattice, begin a new map."""
+        row, col, lattice = _place(patch.frame)
+        tiles = dict(_tiles(_classes(patch), row, col))
+        if lattice != self._lattice or self._tiles.keys() - tiles.keys():
+            self._lattice = lattice
+            self._generation += 1
+            self._tiles = {}
+            self._board.keep('tile/', set())
+            self._board.put('map', self._head(lattice))
+        for place, classes in tiles.items():
+            content = classes.tobytes()
+            if self._tiles.get(place) != content:
+                self._tiles[place] = content
+                packed = base64.b64encode(zlib.compress(content, _LEVEL)).decode()
+                self._board.put(f'tile/{place[0]}/{place[1]}', packed)
+
+    def _head(self, lattice: tuple[float, float, float]) -> dict[str, float]:
+        resolution, x, y = lattice
+        return {
+            'generation': self._generation,
+            'resolution': resolution,
+            'x': x,
+            'y': y,
+            'side': _SIDE,
+        }
+
+
+def _place(frame: GridFrame) -> tuple[int, int, tuple[float, float, float]]:
+    """Row and column of cell (0, 0) on the lattice, and resolution and origin of that lattice."""
+    resolution = frame.resolution
+    col = round(frame.origin_x / resolution)
+    row = round(frame.origin_y / resolution)
+    x = round(frame.origin_x - col * resolution, 4)
+    y = round(frame.origin_y - row * resolution, 4)
+    return row, col, (resolution, x, y)
+
+
+def _classes(patch: GridPatch) -> Classes:
+    classes = np.full(patch.shape, _UNKNOWN, dtype=np.uint8)
+    classes[patch.free] = _FREE
+    classes[patch.occupied] = _OCCUPIED
+    return classes
+
+
+def _tiles(classes: Classes, row: int, col: int) -> Iterator[tuple[tuple[int, int], Classes]]:
+    """Tiles that hold known cells, by their row and column among the tiles."""
+    rows, cols = classes.shape
+    for tile_row in range(row // _SIDE, -(-(row + rows) // _SIDE)):
+        for tile_col in range(col // _SIDE, -(-(col + cols) // _SIDE)):
+            first_row = tile_row * _SIDE - row
+            first_col = tile_col * _SIDE - col
+            part = classes[
+                max(first_row, 0) : max(first_row + _SIDE, 0),
+                max(first_col, 0) : max(first_col + _SIDE, 0),
+            ]
+            if not part.any():
+                continue
+            tile = np.full((_SIDE, _SIDE), _UNKNOWN, dtype=np.uint8)
+            at_row = max(-first_row, 0)
+            at_col = max(-first_col, 0)
+            tile[at_row : at_row + part.shape[0], at_col : at_col + part.shape[1]] = part
+            yield (tile_row, tile_col), tile
+
+
+# The state of the robot in words.
+
+_STATES = ('TRACKING', 'LOST', 'BLIND', 'NO MAP', 'MISALIGNED', 'MAPPING APART')
+
+_DETAILS = (
+    'the laser confirms the pose',
+    'the place of the robot in the map is unknown',
+    'the laser does not confirm the pose: odometry alone',
+    'no map to match: odometry alone',
+    'the laser is turned on the robot: its scans are not mapped',
+    'lost: a piece of its own is mapped',
+)
+
+_MAPPING_APART = 5
+
+_DOING = ('idle', 'exploring', 'returning', 'finished')
+
+
+def slam_words(message: Any) -> dict[str, Any]:
+    """State of a thinmap_msgs/SlamStatus, and why."""
+    state = min(int(message.state), len(_STATES) - 1)
+    detail = _DETAILS[state]
+    if state == _MAPPING_APART:
+        odds = float(message.join_odds)
+        place = f'best place at odds of {odds:.3g} to 1' if odds > 0.0 else 'no place is found yet'
+        detail = f'{detail}, {message.apart_m:.1f} m so far; {place}'
+    if message.is_contradicted:
+        detail += '; scans contradict the map'
+    return {'state': _STATES[state], 'detail': detail, 'is_well': state == 0}
+
+
+def exploration_words(message: Any) -> dict[str, Any]:
+    """Progress of a thinmap_msgs/ExplorationStatus."""
+    doing = _DOING[min(int(message.state), len(_DOING) - 1)]
+    words = [f'{message.distance_m:.1f} m']
+    if message.has_target:
+        place = message.target_position
+        is_frontier = message.target_id >= FIRST_FRONTIER_ID
+        what = 'a frontier' if is_frontier else f'end node {message.target_id}'
+        words.append(f'to {what} at {place.x:.1f}, {place.y:.1f}')
+    if message.state != 0:
+        words += _missing(message)
+    if message.reason:
+        words.append(message.reason)
+    return {
+        'state': doing,
+        'detail': ', '.join(words),
+        'coverage': _finite(message.coverage_estimate),
+        'distance': _finite(message.distance_m),
+    }
+
+
+def _missing(message: Any) -> list[str]:
+    missing = float(message.missing_area_m2)
+    bound = float(message.missing_area_bound_m2)
+    if not missing >= 0.0:
+        return []
+    return [f'{missing:.0f} m2 missing, with 95 % no more than {bound:.0f} m2']
+
+
+def _finite(number: float) -> float:
+    return round(float(number), 4) if math.isfinite(number) else 0.0
+
 
 _MAX_PATH_POINTS = 500
+
 _MAX_APART_POINTS = 20_000
+
 _EDGE_STEP = 4  # points of an edge are a cell apart
+
 _KINDS = {int(kind): kind for kind in RegionKind}
 
 
@@ -42,7 +320,7 @@ class Picture:
         self._table = DiagnosticsTable()
         self._apart = ApartScans()
         self._pairs: StampMatcher[Array, Array] = StampMatcher()
-        board.put('key', key.colours())
+        board.put('key', colours())
 
     def grid(self, patch: GridPatch) -> None:
         """Show a map."""
@@ -145,7 +423,7 @@ class Picture:
         inliers = float(message.inlier_ratio)
         step_ms = float(message.step_time_ms)
         errors.require_bounded('inlier_ratio, step_time_ms', (inliers, step_ms))
-        shown = words.slam_words(message)
+        shown = slam_words(message)
         self.board.put('slam', {**shown, 'inliers': round(inliers, 3), 'step_ms': round(step_ms)})
 
     def localized_scan(self, message: Any) -> None:
@@ -156,7 +434,7 @@ class Picture:
 
     def exploration(self, message: Any) -> None:
         """Show a thinmap_msgs/ExplorationStatus."""
-        self.board.put('exploration', words.exploration_words(message))
+        self.board.put('exploration', exploration_words(message))
 
     def diagnostics(self, message: Any) -> None:
         """Take a diagnostic_msgs/DiagnosticArray into the table."""
