@@ -4,9 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thinmap_ros.web.access import Tokens
-from thinmap_ros.web.links import links, reached_host
-from thinmap_ros.web.qr_code import qr_code
+from thinmap_ros.web.access import Tokens, links, qr_code, reached_host
 
 # Of each character, whether its upper and its lower half are light.
 HALVES = {'█': (1, 1), '▀': (1, 0), '▄': (0, 1), ' ': (0, 0)}

@@ -33,11 +33,12 @@ from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.team.heard_robots import heard_robots
-from thinmap_ros.web import access, links, server
+from thinmap_ros.web import access, server
+from thinmap_ros.web import access as links
+from thinmap_ros.web.access import qr_code
 from thinmap_ros.web.board import Board
 from thinmap_ros.web.pages import Pages
 from thinmap_ros.web.picture import Picture
-from thinmap_ros.web.qr_code import qr_code
 
 _PERIOD_S = 0.1
 _TICKS = 10  # between two tables of diagnostics

@@ -1,8 +1,10 @@
-"""Who may open the page: tokens, origins and addresses."""
+"""Who may open the page, and links to it."""
 
 import hmac
+import io
 import os
 import secrets
+import socket
 import stat
 from dataclasses import dataclass
 from enum import Enum
@@ -13,8 +15,11 @@ from urllib.parse import urlsplit
 from thinmap_ros.core.errors import InputError, quoted
 
 _TOKEN_BYTES = 16
+
 _MIN_TOKEN_LENGTH = 16
+
 _MAX_FILE_BYTES = 4096
+
 _OWNER_ONLY = 0o600
 
 
@@ -132,3 +137,58 @@ def is_loopback(name: str) -> bool:
         return ip_address(name).is_loopback
     except ValueError:
         return False
+
+
+# Links to the page, as another device opens them.
+
+# Addresses that documents use: a route to them is that of the network, and nothing is sent there.
+_ELSEWHERE = {4: (socket.AF_INET, '192.0.2.1'), 6: (socket.AF_INET6, '2001:db8::1')}
+
+_PORT = 9
+
+
+def links(url: str, tokens: Tokens) -> dict[str, str]:
+    """Links to steer and to watch at the address of the page."""
+    return {'steer': f'{url}#{tokens.steer}', 'watch': f'{url}#{tokens.watch}'}
+
+
+def reached_host(host: str) -> str:
+    """The address by which others reach a server: of one at all addresses, that of the network.
+
+    The host itself where there is no network.
+    """
+    address = ip_address(host)
+    if not address.is_unspecified:
+        return host
+    family, elsewhere = _ELSEWHERE[address.version]
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((elsewhere, _PORT))
+        except OSError:
+            return host
+        return str(probe.getsockname()[0])
+
+
+# QR codes of links in a terminal. Segno is part of the extra `web`; without it there is none.
+
+_LIGHT_ON_DARK = '\033[97;40m'
+
+_PLAIN = '\033[0m'
+
+
+def qr_code(link: str, has_colours: bool = False) -> str:
+    """QR code of a link, two modules a character, with its quiet zone; '' without segno.
+
+    has_colours: light on dark, whatever the colours of the terminal are. Without, the terminal has
+    to be dark.
+    """
+    try:
+        import segno
+    except ImportError:
+        return ''
+    text = io.StringIO()
+    segno.make_qr(link, error='l').terminal(text, compact=True)
+    lines = text.getvalue().splitlines()
+    if has_colours:
+        lines = [f'{_LIGHT_ON_DARK}{line}{_PLAIN}' for line in lines]
+    return '\n'.join(lines)
