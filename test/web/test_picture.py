@@ -9,7 +9,7 @@ import pytest
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.web.board import Board
+from thinmap_ros.web.pages import Board
 from thinmap_ros.web.picture import (
     DiagnosticsTable,
     DrivenPath,

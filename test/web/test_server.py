@@ -13,8 +13,7 @@ from support.web_client import WebClient
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.web import handlers
 from thinmap_ros.web.access import Gate, Role, Tokens
-from thinmap_ros.web.board import Board
-from thinmap_ros.web.pages import MAX_PAGES, MAX_STRANGERS, Pages
+from thinmap_ros.web.pages import MAX_PAGES, MAX_STRANGERS, Board, Pages
 from thinmap_ros.web.requests import beat
 from thinmap_ros.web.server import Address, Server
 

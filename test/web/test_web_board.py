@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from thinmap_ros.web.board import Board
+from thinmap_ros.web.pages import Board
 
 
 def sent(board, change):

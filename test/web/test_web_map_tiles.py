@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.web.board import Board
+from thinmap_ros.web.pages import Board
 from thinmap_ros.web.picture import MapTiles
 
 SIDE = 128

@@ -36,8 +36,7 @@ from thinmap_ros.ros.team.heard_robots import heard_robots
 from thinmap_ros.web import access, server
 from thinmap_ros.web import access as links
 from thinmap_ros.web.access import qr_code
-from thinmap_ros.web.board import Board
-from thinmap_ros.web.pages import Pages
+from thinmap_ros.web.pages import Board, Pages
 from thinmap_ros.web.picture import Picture
 
 _PERIOD_S = 0.1

@@ -22,7 +22,7 @@ from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs import decode
 from thinmap_ros.view import palette
 from thinmap_ros.view.interface import ApartScans, StampMatcher
-from thinmap_ros.web.board import Board
+from thinmap_ros.web.pages import Board
 
 # The newest diagnostics of each node as a table, the worst first.
 
