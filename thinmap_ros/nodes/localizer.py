@@ -57,8 +57,7 @@ from thinmap_ros.ros.localized_scan import localized_scan_msg
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.session_services import offer_loading, offer_saving, save_on_exit
 from thinmap_ros.ros.subscription import subscribe_guarded
-from thinmap_ros.ros.tf.map_broadcaster import MapBroadcaster
-from thinmap_ros.ros.tf.odometry_source import OdometrySource
+from thinmap_ros.ros.tf import MapBroadcaster, OdometrySource
 
 _HEALTH = {
     SlamStatus.TRACKING: (OK, 'tracking'),

@@ -14,7 +14,7 @@ from thinmap_ros.logs.transforms import Mount, StaticTransforms, parse_laser_pos
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.tf.transform_reader import TransformReader
+from thinmap_ros.ros.tf import TransformReader
 
 
 class _FirstScans:

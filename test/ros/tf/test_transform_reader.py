@@ -11,7 +11,7 @@ from tf2_msgs.msg import TFMessage
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.transforms import TransformBuffer
 from thinmap_ros.ros import messages
-from thinmap_ros.ros.tf.transform_reader import TransformReader
+from thinmap_ros.ros.tf import TransformReader
 
 FLOOD = 2000  # frames
 names = st.text(st.characters(exclude_characters='\0', codec='utf-8'), max_size=12)

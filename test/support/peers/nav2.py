@@ -27,7 +27,7 @@ from thinmap_ros.core.planning.navigator import Navigator
 from thinmap_ros.core.planning.obstacles import StuckDetector
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.laser_transform import LaserTransform
-from thinmap_ros.ros.tf.transform_listener import TransformListener
+from thinmap_ros.ros.tf import TransformListener
 
 PACED = 'paced'
 FAILED = 9000

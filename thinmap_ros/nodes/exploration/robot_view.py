@@ -13,7 +13,7 @@ from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.tf.transform_listener import TransformListener
+from thinmap_ros.ros.tf import TransformListener
 
 _MAX_SCANS = 50
 _MAX_SCAN_AGE_NS = 2 * SECOND_NS

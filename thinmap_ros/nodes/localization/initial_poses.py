@@ -11,7 +11,7 @@ from thinmap_ros.core.se2 import Array, rotated_covariance
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
-from thinmap_ros.ros.tf.transform_listener import TransformListener
+from thinmap_ros.ros.tf import TransformListener
 
 
 class InitialPoses:

@@ -16,7 +16,7 @@ from thinmap_ros.nodes.navigation.map_input import MapInput
 from thinmap_ros.ros import messages, parameters
 from thinmap_ros.ros.action_server import InvalidGoalError
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.tf.transform_listener import TransformListener
+from thinmap_ros.ros.tf import TransformListener
 
 _MAX_POSES = 10_000
 _LOOKUP_STEP_NS = 20_000_000

@@ -1,1 +1,0 @@
-"""Transforms between the frames of the robot (TF)."""
