@@ -32,7 +32,7 @@ from thinmap_ros.core.topology.graph import FIELDS, Edge, Node, NodeKind, topolo
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.localized_scan import localized_scan_from_msg
-from thinmap_ros.ros.team.team_messages import claim_from_msg, tiles_from_msg, tiles_msg
+from thinmap_ros.ros.team import claim_from_msg, tiles_from_msg, tiles_msg
 
 STRANGE = st.sampled_from(
     [

@@ -8,7 +8,7 @@ from thinmap_ros.core.exploration.team import Claim
 from thinmap_ros.core.grid.shared import TileSender
 from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.team.team_messages import RobotClaim, RobotState, claim_msg, tiles_msg
+from thinmap_ros.ros.team import RobotClaim, RobotState, claim_msg, tiles_msg
 
 ME = '/robot1'
 OTHER = '/robot2'

@@ -32,7 +32,7 @@ from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
-from thinmap_ros.ros.team.heard_robots import heard_robots
+from thinmap_ros.ros.team import heard_robots
 from thinmap_ros.web import access, server
 from thinmap_ros.web import access as links
 from thinmap_ros.web.access import qr_code

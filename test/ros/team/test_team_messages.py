@@ -16,7 +16,7 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.shared import TileSender
 from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.ros import messages
-from thinmap_ros.ros.team.team_messages import (
+from thinmap_ros.ros.team import (
     RobotClaim,
     RobotState,
     claim_from_msg,

@@ -21,10 +21,17 @@ from thinmap_ros.ros import parameters, qos
 from thinmap_ros.ros.decoding.map_identity import new_map_id
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
-from thinmap_ros.ros.team.heard_robots import CLAIMS, HeardRobots
-from thinmap_ros.ros.team.membership import JoinedPlaces, MembershipConfig, declare_membership
-from thinmap_ros.ros.team.received_tiles import TileReceiver
-from thinmap_ros.ros.team.team_messages import RobotClaim, RobotState, claim_msg
+from thinmap_ros.ros.team import (
+    CLAIMS,
+    HeardRobots,
+    JoinedPlaces,
+    MembershipConfig,
+    RobotClaim,
+    RobotState,
+    TileReceiver,
+    claim_msg,
+    declare_membership,
+)
 
 _NEAR_PERIOD_S = 0.1
 _NEAR_STEP_M = 0.05  # near to another robot the pose is sent after each cell, not at standstill

@@ -7,8 +7,7 @@ from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.decoding.map_identity import new_map_id
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
-from thinmap_ros.ros.team.received_tiles import REQUESTS, TILES
-from thinmap_ros.ros.team.team_messages import tiles_msg
+from thinmap_ros.ros.team import REQUESTS, TILES, tiles_msg
 
 
 class TileOutput:

@@ -8,7 +8,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.beams import without_robots
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.team.heard_robots import heard_robots
+from thinmap_ros.ros.team import heard_robots
 
 
 @dataclass(frozen=True)

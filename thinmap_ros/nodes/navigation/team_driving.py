@@ -11,8 +11,7 @@ from thinmap_ros.core.planning.path_follower import Motion, as_heard, must_stop
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.team.heard_robots import heard_robots
-from thinmap_ros.ros.team.received_tiles import TileReceiver
+from thinmap_ros.ros.team import TileReceiver, heard_robots
 
 
 @dataclass(frozen=True)

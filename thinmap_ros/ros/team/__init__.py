@@ -1,1 +1,0 @@
-"""What robots that explore together send each other."""
