@@ -40,7 +40,7 @@ from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.tf import OdometrySource
-from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
+from thinmap_ros.ros.velocity import VelocityPublisher, declare_stamped
 
 _SAMPLES_PERIOD_NS = 1_000_000_000
 # Margins added to the radius of the robot: for paths, and for stops in front of obstacles.

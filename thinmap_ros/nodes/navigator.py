@@ -36,7 +36,7 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.tf import OdometrySource
-from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
+from thinmap_ros.ros.velocity import VelocityPublisher, declare_stamped
 
 # As in Nav2, there is no estimate of the remaining time below this speed or distance.
 _MIN_SPEED_M_S = 0.01

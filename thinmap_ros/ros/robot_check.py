@@ -17,8 +17,8 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.ros import messages, qos, stop_topic
+from thinmap_ros.ros import velocity as velocity
 from thinmap_ros.ros.diagnostics import full_name, publisher_names, subscriber_names
-from thinmap_ros.ros.velocity import commands as velocity
 
 _MAX_DELAY_S = 1.0  # of a stamp against the clock, beyond which clocks differ
 _MIN_RATE_HZ = 2.0

@@ -10,7 +10,7 @@ from support.live_graph import graph as graph
 
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.velocity.commands import TOPIC, VelocityPublisher
+from thinmap_ros.ros.velocity import TOPIC, VelocityPublisher
 
 pytestmark = pytest.mark.live
 

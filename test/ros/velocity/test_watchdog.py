@@ -4,7 +4,7 @@ from threading import Event
 
 import pytest
 
-from thinmap_ros.ros.velocity.watchdog import CommandTimeout, CommandWatchdog
+from thinmap_ros.ros.velocity import CommandTimeout, CommandWatchdog
 
 
 @pytest.mark.parametrize(('is_simulated', 'limit_s'), [(False, 0.5), (True, 2.0)])

@@ -3,10 +3,9 @@
 from thinmap_ros.core.planning.navigator import NavigatorConfig
 from thinmap_ros.core.planning.supervision import BaseSupervisor
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.ros import parameters
+from thinmap_ros.ros import parameters, velocity
 from thinmap_ros.ros.diagnostics import ERROR
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.velocity import commands
 
 _RELEASE = 'no goal is driven before ~/reset, or a stop that is released'
 
@@ -29,10 +28,10 @@ class BaseWatch:
             'navigator and base: its output. The motion of the robot is compared with them. Empty: '
             'the base obeys this node.',
         )
-        self._own_topic = node.resolve_topic_name(commands.TOPIC)
+        self._own_topic = node.resolve_topic_name(velocity.TOPIC)
         self._is_behind = bool(topic)
         if topic:
-            commands.VelocitySubscription(node, node.diagnostics, self._add_command, str(topic))
+            velocity.VelocitySubscription(node, node.diagnostics, self._add_command, str(topic))
         node.diagnostics.add_check(ERROR, lambda: self.fault)
 
     @property

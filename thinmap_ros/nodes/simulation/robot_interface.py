@@ -13,8 +13,8 @@ from tf2_msgs.msg import TFMessage
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
-from thinmap_ros.ros.velocity.commands import TOPIC as COMMANDS
-from thinmap_ros.ros.velocity.commands import VelocitySubscription
+from thinmap_ros.ros.velocity import TOPIC as COMMANDS
+from thinmap_ros.ros.velocity import VelocitySubscription
 from thinmap_ros.sim.simulation import SensorReadings, Simulation
 
 _COMMAND_TIMEOUT_NS = 500_000_000

@@ -6,8 +6,12 @@ from typing import NamedTuple
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.velocity.commands import CommandPublisher, declare_stamped
-from thinmap_ros.ros.velocity.watchdog import CommandTimeout, CommandWatchdog
+from thinmap_ros.ros.velocity import (
+    CommandPublisher,
+    CommandTimeout,
+    CommandWatchdog,
+    declare_stamped,
+)
 
 # With the period of the watchdog, 0.1 s, the robot is stopped 0.3 s after the last request.
 _TIMEOUT_S = 0.2

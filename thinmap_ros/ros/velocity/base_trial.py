@@ -14,7 +14,7 @@ from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.diagnostics import publisher_names
 from thinmap_ros.ros.robot_check import Finding
-from thinmap_ros.ros.velocity.commands import KINDS, TOPIC
+from thinmap_ros.ros.velocity import KINDS, TOPIC
 
 TURN_RAD_S = 0.3
 _PERIOD_S = 0.1
