@@ -24,8 +24,7 @@ def _work(arguments: argparse.Namespace) -> None:
         _confirm(arguments.yes)
     require_ros()
     # Only now: the help needs no ROS.
-    from thinmap_ros.ros.robot_check import RobotNames, check_robot
-    from thinmap_ros.ros.velocity.base_trial import try_watchdog
+    from thinmap_ros.ros.robot_check import RobotNames, check_robot, try_watchdog
 
     names = RobotNames(
         arguments.scan_topic,

@@ -1,1 +1,0 @@
-"""Velocity commands as messages."""
