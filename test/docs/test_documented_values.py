@@ -11,7 +11,7 @@ from support.node_list import ROOT
 
 from thinmap_ros.files.safe import parse_yaml
 from thinmap_ros.nodes import thinmap
-from thinmap_ros.ros.foreign.values import is_known
+from thinmap_ros.ros.foreign import is_known
 
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 SOURCES = [*sorted((ROOT / 'thinmap_ros').rglob('*.py')), *sorted((ROOT / 'config').rglob('*.*'))]

@@ -15,7 +15,7 @@ from support.node_list import ROOT, node_class
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.files.occupancy_maps import write_map
-from thinmap_ros.ros.foreign.tables import PACKAGES
+from thinmap_ros.ros.foreign import PACKAGES
 
 PAGE = ROOT / 'docs' / 'reference' / 'parameters_of_other_packages.md'
 MIGRATION = ROOT / 'docs' / 'migration'

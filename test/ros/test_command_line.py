@@ -10,7 +10,7 @@ from support.node_list import ROOT
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros.command_line import init_ros
-from thinmap_ros.ros.foreign.translation import translate
+from thinmap_ros.ros.foreign import translate
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures('ros_domain')]
 PRESETS = sorted((ROOT / 'config').glob('*/*.yaml'))

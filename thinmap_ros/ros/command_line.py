@@ -14,7 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from thinmap_ros.core.errors import InputError, one_line, quoted
 from thinmap_ros.files.package_data import config_file
-from thinmap_ros.ros.foreign.sections import (
+from thinmap_ros.ros.foreign import (
     given_files,
     given_values,
     is_for,

@@ -17,7 +17,7 @@ from thinmap_ros.ros import parameters
 from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint
 from thinmap_ros.ros.clocks.time_jumps import STEADY, ElapsedTime, TimeJumps
 from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
-from thinmap_ros.ros.foreign.translation import translate
+from thinmap_ros.ros.foreign import translate
 from thinmap_ros.ros.private_rclpy import RCLError
 from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.sole_source import follow_one_clock

@@ -23,7 +23,7 @@ from thinmap_ros.ros.command_line import (
     show_help,
     warn_of_unused,
 )
-from thinmap_ros.ros.foreign.sections import split_arguments
+from thinmap_ros.ros.foreign import split_arguments
 from thinmap_ros.ros.private_rclpy import RCLError
 
 _SECURITY = 'ROS_SECURITY_ENABLE'

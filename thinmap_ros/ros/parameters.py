@@ -26,7 +26,7 @@ from thinmap_ros.core.config import (
     with_values,
 )
 from thinmap_ros.core.errors import ConfigError
-from thinmap_ros.ros.foreign.values import is_known
+from thinmap_ros.ros.foreign import is_known
 from thinmap_ros.ros.private_rclpy import declared_names, given_parameters
 
 STRICT = 'strict_parameters'

@@ -9,8 +9,15 @@ from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.slam.localizer import default_config, parameters_elsewhere
 from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.files.package_data import config_file
-from thinmap_ros.ros.foreign.sections import EXPECTED, WILDCARDS, bare, is_foreign, sections
-from thinmap_ros.ros.foreign.values import is_known, translated
+from thinmap_ros.ros.foreign import (
+    EXPECTED,
+    WILDCARDS,
+    bare,
+    is_foreign,
+    is_known,
+    sections,
+    translated,
+)
 
 _LOCALIZER = 'localizer'
 _STRICT = 'strict_parameters'

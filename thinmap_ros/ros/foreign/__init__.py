@@ -1,1 +1,0 @@
-"""Parameters of slam_toolbox, AMCL, explore_lite and Nav2 that thinmap's nodes understand."""
