@@ -38,7 +38,7 @@ from thinmap_ros.evaluation.ros_domains import use_free_domain
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.decoding.map_updates import received_map, received_update
+from thinmap_ros.ros.maps import received_map, received_update
 from thinmap_ros.sim.coverage import ObservableCells, observable_cells
 from thinmap_ros.sim.drives import random_start
 from thinmap_ros.sim.other_robots import starts_side_by_side

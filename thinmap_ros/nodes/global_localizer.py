@@ -33,9 +33,9 @@ from thinmap_ros.core.topology.topology import build
 from thinmap_ros.files import occupancy_maps
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
-from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.maps import subscribe_to_map
 from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded

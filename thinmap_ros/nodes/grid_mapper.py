@@ -32,10 +32,10 @@ from thinmap_ros.nodes.mapping.scan_queue import ScanQueue
 from thinmap_ros.nodes.mapping.team_in_scans import TeamInScans
 from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
-from thinmap_ros.ros.decoding.map_identity import FollowedMap, Origin
 from thinmap_ros.ros.diagnostics import ERROR
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import ReceivedScan, localized_scan_from_msg
+from thinmap_ros.ros.maps import FollowedMap, Origin
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.session_services import SessionClient, save_on_exit

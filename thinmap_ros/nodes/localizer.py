@@ -49,11 +49,11 @@ from thinmap_ros.nodes.localization.living_map import LivingMap
 from thinmap_ros.nodes.localization.map_source import load_localizer
 from thinmap_ros.nodes.localization.recovery import Recovery, restored, saved_pose
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.decoding.map_identity import UNKNOWN, new_map_id
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_msg
+from thinmap_ros.ros.maps import UNKNOWN, new_map_id
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.session_services import offer_loading, offer_saving, save_on_exit
 from thinmap_ros.ros.subscription import subscribe_guarded

@@ -25,9 +25,9 @@ from thinmap_msgs.msg import (
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros import node_main, parameters, qos
-from thinmap_ros.ros.decoding.map_updates import updates_topic
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
 from thinmap_ros.ros.laser_transform import LaserTransform
+from thinmap_ros.ros.maps import updates_topic
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
 from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.message_view import MessageView

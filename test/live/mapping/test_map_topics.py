@@ -14,7 +14,7 @@ from support.office_mapping import Mapping
 from thinmap_ros.core.grid.patch import UNKNOWN
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.decoding.map_updates import received_map, received_update
+from thinmap_ros.ros.maps import received_map, received_update
 
 pytestmark = pytest.mark.live
 # By then each cell that the scan shows is as free or as occupied as cells can be.

@@ -1,6 +1,6 @@
 """Which map a message belongs to."""
 
-from thinmap_ros.ros.decoding.map_identity import UNKNOWN, FollowedMap, Origin, new_map_id
+from thinmap_ros.ros.maps import UNKNOWN, FollowedMap, Origin, new_map_id
 
 
 def test_a_node_follows_the_first_map_that_it_hears_of():

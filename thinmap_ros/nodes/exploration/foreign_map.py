@@ -12,8 +12,8 @@ from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.logs import decode
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.decoding.map_updates import updates_topic
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.maps import updates_topic
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 

@@ -23,11 +23,11 @@ from thinmap_ros.nodes.exploration.publishers import PublisherCheck
 from thinmap_ros.nodes.exploration.robot_view import RobotView
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.decoding.map_identity import UNKNOWN, FollowedMap, Origin
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_from_msg
+from thinmap_ros.ros.maps import UNKNOWN, FollowedMap, Origin
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 _LOOK_PERIOD_S = 0.5

@@ -18,8 +18,8 @@ from thinmap_ros.core.planning.path_follower import MESSAGE_PERIOD_S, NEAR_ROBOT
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.nodes.exploration.tile_output import TileOutput
 from thinmap_ros.ros import parameters, qos
-from thinmap_ros.ros.decoding.map_identity import new_map_id
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.maps import new_map_id
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
 from thinmap_ros.ros.team import (
     CLAIMS,

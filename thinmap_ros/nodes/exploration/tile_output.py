@@ -4,8 +4,8 @@ from thinmap_msgs.msg import MapTiles, TileRequest
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import TileSender
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.decoding.map_identity import new_map_id
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.maps import new_map_id
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.team import REQUESTS, TILES, tiles_msg
 

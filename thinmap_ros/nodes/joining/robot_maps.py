@@ -15,9 +15,8 @@ from thinmap_ros.core.slam.joining.team import RobotMap
 from thinmap_ros.core.topology.graph import TopologicalMap, topology_from_msg
 from thinmap_ros.nodes.joining.settings import MapJoinerConfig
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.decoding.map_identity import UNKNOWN
-from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 _TYPE = 'nav_msgs/msg/OccupancyGrid'

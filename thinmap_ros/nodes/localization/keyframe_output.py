@@ -6,7 +6,7 @@ from thinmap_msgs.msg import Keyframe, KeyframePoses
 from thinmap_ros.core.slam.joining.messages import KeyframeSender
 from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.decoding.map_identity import new_map_id
+from thinmap_ros.ros.maps import new_map_id
 
 
 class KeyframeOutput:

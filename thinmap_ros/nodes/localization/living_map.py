@@ -8,7 +8,7 @@ from thinmap_msgs.msg import ProbabilityGrid
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.decoding.map_identity import UNKNOWN
+from thinmap_ros.ros.maps import UNKNOWN
 
 
 class LivingMap:

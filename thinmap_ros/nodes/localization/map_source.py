@@ -13,8 +13,8 @@ from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import Report, read_map
 from thinmap_ros.nodes.localization.config import LocalizationConfig
-from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.maps import subscribe_to_map
 
 
 class MapSource:

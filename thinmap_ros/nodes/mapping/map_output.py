@@ -9,8 +9,8 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.nodes.mapping.map_topic import MapTopic
 from thinmap_ros.nodes.mapping.map_values import MapIdentity, MapOutputConfig, MapVersion
 from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros.decoding.map_identity import FollowedMap
 from thinmap_ros.ros.localized_scan import ReceivedScan
+from thinmap_ros.ros.maps import FollowedMap
 
 
 class MapPublishers:

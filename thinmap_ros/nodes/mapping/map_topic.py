@@ -10,7 +10,7 @@ from rclpy.node import Node
 from thinmap_ros.core.grid.patch import Bounds, GridPatch, Margins
 from thinmap_ros.nodes.mapping.map_values import MapVersion
 from thinmap_ros.ros import diagnostics, messages, qos
-from thinmap_ros.ros.decoding.map_updates import updates_topic
+from thinmap_ros.ros.maps import updates_topic
 
 # Calls after which a whole map follows an update: one that was lost, for a reason that no
 # publisher knows, is missing for so long. That of a large map is rarer, so that it is no more

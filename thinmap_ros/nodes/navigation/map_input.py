@@ -11,10 +11,9 @@ from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.sensing.synchronizer import InputStream
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
-from thinmap_ros.ros.decoding.map_identity import UNKNOWN
-from thinmap_ros.ros.decoding.map_updates import subscribe_to_map
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import map_update_from_msg
+from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 # grid_mapper answers each scan: several of the slowest laser that a robot drives by, at 2.5 Hz.

@@ -19,7 +19,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.nodes.exploration.goal_result import GoalResult
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.decoding.map_updates import received_map, received_update, updates_topic
+from thinmap_ros.ros.maps import received_map, received_update, updates_topic
 
 # Without an answer for this time, the goal is sent again: an explorer that has just been discovered
 # may be unable to answer.

@@ -1,1 +1,0 @@
-"""What messages tell of their maps."""
