@@ -21,7 +21,7 @@ from thinmap_ros.files.worlds import read_world
 from thinmap_ros.nodes.simulation.requested_exploration import RequestedExploration
 from thinmap_ros.nodes.simulation.starts import poses_from
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.clocks.time_jumps import STEADY
+from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.other_robots import MAX_ROBOTS
 from thinmap_ros.sim.robot import PRESETS

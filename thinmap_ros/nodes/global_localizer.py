@@ -32,7 +32,6 @@ from thinmap_ros.core.topology.graph import TopologyConfig, topology_from_msg
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.files import occupancy_maps
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.maps import subscribe_to_map
@@ -40,6 +39,7 @@ from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.tf import OdometrySource
+from thinmap_ros.ros.time_jumps import ElapsedTime
 from thinmap_ros.ros.velocity import VelocityPublisher, declare_stamped
 
 _SAMPLES_PERIOD_NS = 1_000_000_000

@@ -19,10 +19,10 @@ from thinmap_ros.nodes.joining.settings import (
 from thinmap_ros.nodes.joining.team_publishers import TeamPublishers
 from thinmap_ros.nodes.joining.worker import Result, Turns, Worker
 from thinmap_ros.ros import messages, node_main, parameters
-from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.services import offer
+from thinmap_ros.ros.time_jumps import STEADY
 
 _POLL_S = 0.1
 _MERGE = 'merge'

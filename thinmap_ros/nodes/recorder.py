@@ -14,9 +14,9 @@ from thinmap_ros.files import package_data
 from thinmap_ros.logs import storage
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.ros import node_main, parameters
-from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
 from thinmap_ros.ros.messages import message_class
+from thinmap_ros.ros.time_jumps import STEADY
 
 _DISCOVERY_PERIOD_S = 0.25
 _FLUSH_S = 0.5

@@ -26,13 +26,13 @@ from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.nodes.steering.steering import Steering
 from thinmap_ros.nodes.steering.teleoperation import TopSpeeds
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.maps import subscribe_to_map
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.team import heard_robots
+from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.web import access, server
 from thinmap_ros.web import access as links
 from thinmap_ros.web.access import qr_code

@@ -19,7 +19,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from thinmap_ros.core.errors import counted, one_line_reason
 from thinmap_ros.ros import qos
-from thinmap_ros.ros.clocks.time_jumps import STEADY
+from thinmap_ros.ros.time_jumps import STEADY
 
 _PERIOD_S = 1.0
 # For which a failed step is reported, unless another fails: five times what is published.

@@ -15,12 +15,12 @@ from thinmap_ros.core.errors import ThinmapError, one_line_reason
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint
-from thinmap_ros.ros.clocks.time_jumps import STEADY, ElapsedTime, TimeJumps
 from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
 from thinmap_ros.ros.foreign import translate
 from thinmap_ros.ros.private_rclpy import RCLError
 from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.sole_source import follow_one_clock
+from thinmap_ros.ros.time_jumps import STEADY, ElapsedTime, TimeJumps
 
 _CHECKPOINT_PERIOD_S = 0.5
 _DEAR_INTERVAL = 200.0  # half a percent of the time

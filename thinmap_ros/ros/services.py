@@ -9,7 +9,7 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 
 from thinmap_ros.core.errors import ThinmapError, one_line_reason
-from thinmap_ros.ros.clocks.time_jumps import STEADY
+from thinmap_ros.ros.time_jumps import STEADY
 
 _TIMEOUT_S = 10.0
 

@@ -23,10 +23,10 @@ from thinmap_ros.files.sessions import (
     stem_of,
 )
 from thinmap_ros.ros import parameters
-from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import call, offer
+from thinmap_ros.ros.time_jumps import STEADY
 
 Part = SessionPart[Any, Any]
 _SAVED: tuple[Part, ...] = (TOPOLOGY, LOCALIZER, EXPLORATION)

@@ -26,10 +26,10 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.msg import LocalizedScan, SlamStatus, TeamClaim
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import SECOND_NS
-from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.sole_source import SourceByFrame
+from thinmap_ros.ros.time_jumps import STEADY
 
 WARN_PERIOD_S = 5.0  # between two warnings of the same kind
 _TIMEOUT_S = 3.0

@@ -15,7 +15,6 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from thinmap_ros.ros import messages, parameters, qos, stop_topic
-from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.diagnostics import (
     ERROR,
     WARN,
@@ -26,6 +25,7 @@ from thinmap_ros.ros.diagnostics import (
 )
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.private_rclpy import RCLError
+from thinmap_ros.ros.time_jumps import STEADY
 
 # Stops a robot whose next command does not come.
 

@@ -9,7 +9,7 @@ from support.localized import local_grid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.nodes.navigation.map_input import MapInput, MapTimeoutConfig
 from thinmap_ros.ros import messages
-from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
+from thinmap_ros.ros.time_jumps import ElapsedTime
 
 S = 1_000_000_000
 SCAN_NS = S // 5

@@ -7,7 +7,7 @@ from rclpy.time import Time
 
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.nodes.navigation.robot_state import RobotState
-from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
+from thinmap_ros.ros.time_jumps import ElapsedTime
 
 S = 1_000_000_000
 STEP_NS = S // 20

@@ -6,7 +6,7 @@ import pytest
 from rclpy.clock import ClockType, ROSClock
 from rclpy.time import Time
 
-from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
+from thinmap_ros.ros.time_jumps import ElapsedTime
 
 S = 1_000_000_000
 

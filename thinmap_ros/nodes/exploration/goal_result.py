@@ -8,7 +8,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from thinmap_ros.nodes.exploration.goal_monitor import action_servers
-from thinmap_ros.ros.clocks.time_jumps import STEADY
+from thinmap_ros.ros.time_jumps import STEADY
 
 _PERIOD_S = 1.0
 # A request before the new server has discovered its client is lost.

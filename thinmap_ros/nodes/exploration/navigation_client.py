@@ -15,9 +15,9 @@ from thinmap_ros.nodes.exploration.driver import OnResult
 from thinmap_ros.nodes.exploration.goal_monitor import GoalMonitor, action_servers
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages
-from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
+from thinmap_ros.ros.time_jumps import STEADY
 
 _PERIOD_S = 0.1
 # Time after a failure in which a goal that has replaced ours becomes known.

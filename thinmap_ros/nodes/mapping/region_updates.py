@@ -16,8 +16,8 @@ from thinmap_ros.core.topology.segmentation import RegionConfig, RegionTracker
 from thinmap_ros.kernels import release_free_pages
 from thinmap_ros.nodes.mapping.region_messages import region_array_msg
 from thinmap_ros.ros import parameters, qos
-from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.time_jumps import STEADY
 
 _POLL_S = 0.1
 # Of a core, that is used for regions at most: on a map of 100 x 100 m they take more than a second.

@@ -10,11 +10,11 @@ from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.sensing.synchronizer import InputStream
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import map_update_from_msg
 from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
 from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.time_jumps import ElapsedTime
 
 # grid_mapper answers each scan: several of the slowest laser that a robot drives by, at 2.5 Hz.
 _WARN_S = 2.0

@@ -7,7 +7,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.sensing.beams import LaserMonitor
 from thinmap_ros.core.sensing.synchronizer import InputStream
-from thinmap_ros.ros.clocks.time_jumps import ElapsedTime
+from thinmap_ros.ros.time_jumps import ElapsedTime
 
 # Without a new pose the last correction of the odometry holds for a while; without odometry, the
 # robot does not know its pose meanwhile.

@@ -15,9 +15,9 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.files.graphs import write_geojson
 from thinmap_ros.jit.cache import private_folder, temporary_folder
 from thinmap_ros.ros import parameters
-from thinmap_ros.ros.clocks.time_jumps import STEADY
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
+from thinmap_ros.ros.time_jumps import STEADY
 
 _SERVICE = 'route_server/set_route_graph'
 

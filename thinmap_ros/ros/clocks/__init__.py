@@ -1,1 +1,0 @@
-"""Clocks of a node: jumps of its time, and time that does not jump."""
