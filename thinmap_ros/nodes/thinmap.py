@@ -56,8 +56,8 @@ def main() -> None:
         return
     # Only now: the help needs no ROS.
     from thinmap_ros.ros import node_main
-    from thinmap_ros.ros.command_line import refusal
     from thinmap_ros.ros.foreign import split_arguments
+    from thinmap_ros.ros.node_main import refusal
 
     names = chosen_nodes(split_arguments(sys.argv)[0])
     unknown = [name for name in names if name not in (*_NODES, *_OTHERS)]
