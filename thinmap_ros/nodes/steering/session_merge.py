@@ -13,7 +13,7 @@ from thinmap_ros.core.errors import InputError, ThinmapError, one_line, one_line
 from thinmap_ros.files.merging import MergedMap
 from thinmap_ros.files.sessions import GRID, PARTS, REGIONS, load_edits, load_grid, load_topology
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.save_directory import SaveDirectory
+from thinmap_ros.ros.services import SaveDirectory
 from thinmap_ros.web.pages import Board
 from thinmap_ros.web.requests import is_name
 
