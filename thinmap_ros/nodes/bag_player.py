@@ -21,7 +21,7 @@ from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.logs.storage import RawMessage
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
-from thinmap_ros.ros.lockstep import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep
+from thinmap_ros.ros.localized_scan import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep
 from thinmap_ros.ros.messages import message_class
 from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.time_jumps import STEADY

@@ -19,7 +19,7 @@ from thinmap_ros.nodes.simulation.robot_interface import RobotInterface
 from thinmap_ros.nodes.simulation.starts import robot_starts
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
-from thinmap_ros.ros.lockstep import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep
+from thinmap_ros.ros.localized_scan import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep
 from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.other_robots import MAX_ROBOTS, simulations_in
