@@ -41,13 +41,16 @@ from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.files.sessions import LOCALIZER, save_localizer
 from thinmap_ros.logs.frames import NONE
-from thinmap_ros.nodes.localization.given_map import GivenMap, config_at
-from thinmap_ros.nodes.localization.initial_poses import InitialPoses
 from thinmap_ros.nodes.localization.keyframe_output import KeyframeOutput
 from thinmap_ros.nodes.localization.known_area import require_near_map
-from thinmap_ros.nodes.localization.living_map import LivingMap
-from thinmap_ros.nodes.localization.map_source import load_localizer
 from thinmap_ros.nodes.localization.recovery import Recovery, restored, saved_pose
+from thinmap_ros.nodes.parts.given_map import (
+    GivenMap,
+    InitialPoses,
+    LivingMap,
+    config_at,
+    load_localizer,
+)
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thinmap_ros.nodes.localization.last_pose import LastPose
+from thinmap_ros.nodes.parts.given_map import LastPose
 
 pytestmark = pytest.mark.live
 POSE = np.array([1.25, -2.5, 0.75])

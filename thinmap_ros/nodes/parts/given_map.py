@@ -1,0 +1,487 @@
+"""A map that a localizer is given: from a file or topic, with poses in it, and saved again."""
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from nav2_msgs.msg import Particle, ParticleCloud
+from nav2_msgs.srv import SetInitialPose
+from rclpy.node import Node
+from std_srvs.srv import Empty
+
+from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
+from thinmap_msgs.srv import LocalizeGlobally
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import ConfigError, InputError, quoted
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array, rotated_covariance
+from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_class
+from thinmap_ros.core.slam.track import LocalizerConfig
+from thinmap_ros.core.stage import Estimate, StartConfig
+from thinmap_ros.files import sessions
+from thinmap_ros.files.occupancy_maps import Report, read_map
+from thinmap_ros.files.safe import read_mapping, write_text
+from thinmap_ros.nodes.localization.config import GIVEN_COVARIANCE, LocalizationConfig
+from thinmap_ros.nodes.localization.known_area import require_near_map
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
+from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.tf import TransformListener
+
+# The topics and services of AMCL, in mode localization.
+
+_SAMPLES = 200
+
+_SHOWN = 1000  # hypotheses of the global localizer
+
+
+class AmclInterface:
+    """amcl_pose and particle_cloud out; AMCL's services.
+
+    amcl_pose: the last known pose: none is published while the robot is lost. particle_cloud:
+    samples of the posterior; while the robot is lost, the samples of the global localizer.
+    request_nomotion_update publishes both again; scans are matched while the robot stands, too.
+    """
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        map_frame: str,
+        set_pose: Callable[[PoseWithCovarianceStamped], None],
+    ) -> None:
+        """set_pose: takes an initial pose in any frame; raises InputError."""
+        self._node = node
+        self._map_frame = map_frame
+        self._set_pose = set_pose
+        self._last: tuple[int, Estimate] | None = None
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', qos.LATCHED)
+        self._cloud = node.create_publisher(ParticleCloud, 'particle_cloud', qos.SENSOR)
+        self._search = node.create_client(LocalizeGlobally, 'localize_globally')
+        subscribe_guarded(node, PoseArray, 'localization_samples', self._on_samples, qos.LATCHED)
+        node.create_service(SetInitialPose, 'set_initial_pose', self._on_set_pose)
+        node.create_service(Empty, 'reinitialize_global_localization', self._on_search)
+        node.create_service(Empty, 'request_nomotion_update', self._on_update)
+
+    @property
+    def has_published(self) -> bool:
+        """Whether there was an estimate in a map."""
+        return self._last is not None
+
+    def publish(self, stamp_ns: int, estimate: Estimate) -> None:
+        """Publish the estimate of a scan."""
+        self._last = (stamp_ns, estimate)
+        if estimate.is_lost:
+            return
+        self._pose.publish(messages.estimate_msg(estimate, self._map_frame, stamp_ns))
+        if self._cloud.get_subscription_count():
+            self._cloud.publish(self._posterior(stamp_ns, estimate))
+
+    def _posterior(self, stamp_ns: int, estimate: Estimate) -> ParticleCloud:
+        rng = np.random.default_rng(stamp_ns)
+        samples = rng.multivariate_normal(
+            estimate.T_map_base, estimate.covariance, _SAMPLES, check_valid='ignore'
+        )
+        weight = 1.0 / _SAMPLES
+        return ParticleCloud(
+            header=messages.header(self._map_frame, stamp_ns),
+            particles=[Particle(pose=messages.pose_msg(T), weight=weight) for T in samples],
+        )
+
+    def _on_samples(self, message: PoseArray) -> None:
+        is_lost = self._last is None or self._last[1].is_lost
+        if not (is_lost and message.poses and self._cloud.get_subscription_count()):
+            return
+        poses = message.poses[:: -(-len(message.poses) // _SHOWN)]
+        weight = 1.0 / len(poses)
+        self._cloud.publish(
+            ParticleCloud(
+                header=message.header,
+                particles=[Particle(pose=pose, weight=weight) for pose in poses],
+            )
+        )
+
+    def _on_set_pose(
+        self, request: SetInitialPose.Request, response: SetInitialPose.Response
+    ) -> SetInitialPose.Response:
+        try:
+            self._set_pose(request.pose)
+        except InputError as error:
+            self._node.diagnostics.message_rejected('set_initial_pose', str(error))
+            self._node.get_logger().warning(f'set_initial_pose: {error}')
+        return response
+
+    def _on_search(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
+        if self._search.service_is_ready():
+            self._search.call_async(LocalizeGlobally.Request(discard_hypotheses=True))
+        else:
+            self._node.get_logger().warning(
+                'reinitialize_global_localization: global_localizer is not running'
+            )
+        return response
+
+    def _on_update(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
+        if self._last is not None:
+            self.publish(*self._last)
+        return response
+
+
+# The last pose in a map, which survives a restart of the machine.
+
+_SAVE_WARN_PERIOD_S = 60.0
+
+_KEYS = ('x', 'y', 'yaw')
+
+
+class LastPose:
+    """A small YAML file with the map and the last pose of the robot in it."""
+
+    def __init__(self, node: Node, path: str, rate: float, map_name: str) -> None:
+        """path: '' for the default; rate: of saving, 1/s; map_name: the pose belongs to it."""
+        self._node = node
+        self._path = Path(path) if path else _default_path(node)
+        self._period_s = 1.0 / rate if rate > 0.0 else math.inf
+        self._map_name = map_name
+        self._saved_at_s = -math.inf
+        self._unsaved: Array | None = None
+
+    def load(self) -> Array | None:
+        """The pose (3,) in this map; None without one: no file, a broken one, or another map."""
+        if math.isinf(self._period_s) or not self._path.exists():
+            return None
+        try:
+            content = read_mapping(self._path, 'the last pose of a localizer')
+            pose = self._pose_of(content)
+        except InputError as error:
+            self._node.get_logger().warning(f'{error}: starting without a last pose')
+            return None
+        named = content.get('map')
+        if named == self._map_name:
+            return pose
+        self._node.get_logger().info(
+            f'{self._path}: pose in map {quoted(named)}, not in {quoted(self._map_name)}: '
+            'starting without a last pose'
+        )
+        return None
+
+    def save(self, T_map_base: Array) -> None:
+        """Save a pose (3,), unless the last one was saved recently."""
+        if math.isinf(self._period_s):
+            return
+        self._unsaved = T_map_base
+        if time.monotonic() - self._saved_at_s >= self._period_s:
+            self.save_latest()
+
+    def save_latest(self) -> None:
+        """Save the pose that was given last, if it is not saved: at the end of the node."""
+        if self._unsaved is None:
+            return
+        self._saved_at_s = time.monotonic()
+        values = zip(_KEYS, (round(value, 4) for value in self._unsaved.tolist()), strict=True)
+        self._unsaved = None
+        try:
+            write_text(self._path, yaml.safe_dump({'map': self._map_name, **dict(values)}))
+        except OSError as error:
+            self._node.get_logger().warning(
+                f'pose_file: {error.filename or self._path}: {error.strerror}: '
+                'last pose not saved: expected a file that can be written',
+                throttle_duration_sec=_SAVE_WARN_PERIOD_S,
+            )
+
+    def _pose_of(self, content: dict[str, object]) -> Array:
+        values = [content.get(key) for key in _KEYS]
+        numbers = [float(value) for value in values if isinstance(value, int | float)]
+        if len(numbers) != len(_KEYS) or not se2.is_bounded_pose(se2.pose(*numbers)):
+            raise InputError(f'{self._path}: expected x, y (m) and yaw (rad)')
+        return se2.pose(*numbers)
+
+
+def _default_path(node: Node) -> Path:
+    chosen = os.environ.get('XDG_STATE_HOME')
+    state = Path(chosen) if chosen else Path.home() / '.local' / 'state'
+    name = node.get_fully_qualified_name().strip('/').replace('/', '.')
+    return state / 'thinmap' / f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}.pose.yaml'
+
+
+# The map of a mapper that has outlived the localizer: its successor finds it.
+
+
+class LivingMap:
+    """Subscribes to grid until there is a map of a known id, and calls `found` with both."""
+
+    def __init__(self, node: Node, found: Callable[[int, GridPatch], None]) -> None:
+        self._node = node
+        self._found = found
+        self._grid = node.create_subscription(ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
+
+    def _on_grid(self, message: ProbabilityGrid) -> None:
+        if message.map_id == UNKNOWN:
+            return
+        try:
+            patch = messages.grid_from_msg(message)
+        except InputError as error:
+            self._node.get_logger().warning(f'grid: {error}')
+            return
+        self._node.destroy_subscription(self._grid)
+        self._found(message.map_id, patch)
+
+
+# The map that a localizer localizes in: of a file, a session, or a topic.
+
+
+class MapSource:
+    """Creates localizers in the given map.
+
+    patch: None until topic map is received, where no other map is given. name: of the map, to which
+    a saved pose belongs.
+    """
+
+    def __init__(
+        self,
+        config: StartConfig,
+        localization: LocalizationConfig,
+        session: str,
+        report: Report,
+    ) -> None:
+        """report: receives lines on the map that is read.
+
+        Raises ConfigError where the parameters contradict each other, InputError for a file.
+        """
+        self._report = report
+        self._session = session
+        self._is_mapping = config.is_mapping
+        self._first_map_only = localization.first_map_only
+        self.patch: GridPatch | None = None
+        self._has_loaded = False
+        file = localization.map_file_name
+        self.name = file or session or 'topic map'
+        if self._is_mapping:
+            if file:
+                raise ConfigError('map_file_name is given: expected mode = localization')
+            return
+        if not session and not isinstance(config, LocalizerConfig):
+            raise ConfigError(
+                f'mode = localization with slam = {config.slam}: expected a session_path with its '
+                'line features'
+            )
+        if file:
+            self.patch = read_map(Path(file), report=report)
+
+    @property
+    def has_map(self) -> bool:
+        """Whether there is a map, or none is needed."""
+        return self._is_mapping or bool(self._session or self._has_loaded) or self.patch is not None
+
+    @property
+    def _is_topic(self) -> bool:
+        return not self._is_mapping and self.name == 'topic map'
+
+    def create_localizer(self, config: StartConfig) -> AnyLocalizer:
+        """A localizer at the configured pose, delocalized if in a given map."""
+        if self.patch is not None and isinstance(config, LocalizerConfig):
+            return Localizer.in_occupancy_map(self.patch, config)
+        if self._session:
+            loaded = load_localizer(self._session, config, report=self._report)
+            if loaded is not None:
+                return loaded
+        return localizer_class(config)(config)
+
+    def replace(self, patch: GridPatch) -> bool:
+        """Take another map; returns whether it is different."""
+        if self.patch is not None and (
+            self.patch.frame == patch.frame and np.array_equal(self.patch.cells, patch.cells)
+        ):
+            return False
+        self.patch = patch
+        return True
+
+    def replaced(self) -> None:
+        """A service has loaded another map: there is one."""
+        self._has_loaded = True
+
+    def subscribe(self, node: ThinmapNode, changed: Callable[[], None]) -> None:
+        """Subscribe to topic map if the map is to come from there; changed: there is a new one."""
+        if not self._is_topic:
+            return
+
+        def on_map(patch: GridPatch) -> None:
+            if self.patch is not None and self._first_map_only:
+                return
+            if self.replace(patch):
+                changed()
+
+        subscribe_to_map(node, 'map', on_map)
+
+
+def load_localizer(
+    path: str, config: StartConfig, folder: Path | None = None, *, report: Report
+) -> AnyLocalizer | None:
+    """Localizer in the map of a session, or in its grid: any map_server map.
+
+    folder, report: as in `read_map`. None: no map that this localizer can use.
+    Raises InputError where a file is broken, or the path names no map.
+    """
+    loaded = sessions.load_localizer(path, config)
+    if loaded is not None or not isinstance(config, LocalizerConfig):
+        return loaded
+    grid = sessions.load_grid(path, None, folder, report)
+    return Localizer.in_occupancy_map(grid.known_area(), config)
+
+
+# Initial poses of a user, in any frame.
+
+
+class InitialPoses:
+    """Subscribes to initialpose; calls `process` with pose (3,) and covariance (3, 3), map frame.
+
+    Poses in other frames are transformed by the newest transforms.
+    """
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        map_frame: str,
+        process: Callable[[Array, Array], None],
+        transform_received: Callable[[Any, bool], None],
+    ) -> None:
+        """transform_received: is called with each transform, and whether it is static."""
+        self._map_frame = map_frame
+        self._process = process
+        self._transforms = TransformListener(node, transform_received)
+        subscribe_guarded(node, PoseWithCovarianceStamped, 'initialpose', self.add_pose, qos.STREAM)
+
+    def add_pose(self, message: PoseWithCovarianceStamped) -> None:
+        """Process a message. Raises InputError where it is invalid, or its frame unknown."""
+        pose = messages.pose_from_msg(message.pose.pose)
+        covariance = messages.covariance_from_msg(message)
+        frame = message.header.frame_id.lstrip('/')
+        if frame not in ('', self._map_frame):
+            T_map_frame = self._lookup(frame)
+            pose = se2.compose(T_map_frame, pose)
+            covariance = rotated_covariance(covariance, float(T_map_frame[2]))
+        self._process(pose, covariance)
+
+    def _lookup(self, frame: str) -> Array:
+        try:
+            return self._transforms.lookup(self._map_frame, frame)
+        except InputError as error:
+            expected = f'expected a frame connected to {quoted(self._map_frame)}'
+            raise InputError(f'frame {quoted(frame)}: {error}: {expected}') from error
+
+
+_WARN_PERIOD_S = 30.0
+
+
+class GivenMap:
+    """The given map, the poses to start from, and AMCL's interface; in mode mapping, a session.
+
+    config: of the next localizer.
+    """
+
+    def __init__(self, node: ThinmapNode, config: StartConfig) -> None:
+        """Declare the parameters. Raises ConfigError or InputError as `MapSource`."""
+        self._node = node
+        self.config = config
+        self._settings = parameters.declare_config(node, LocalizationConfig)
+        report = node.get_logger().warning
+        session = parameters.declare_session(node)
+        self.source = MapSource(config, self._settings, session, report)
+        self._last_pose = LastPose(
+            node, self._settings.pose_file, self._settings.save_pose_rate, self.source.name
+        )
+        node.add_end_callback(self._last_pose.save_latest)
+        self._amcl: AmclInterface | None = None
+        self._given_covariance: Array | None = None  # of an initial pose without a map
+
+    def create_interface(self, map_frame: str, poses: InitialPoses) -> None:
+        """Offer AMCL's topics and services in mode localization."""
+        if not self.config.is_mapping:
+            self._amcl = AmclInterface(self._node, map_frame, poses.add_pose)
+
+    def create_localizer(self) -> AnyLocalizer:
+        """A localizer at the start pose.
+
+        It is initial_pose where set, else the start pose where it is not 0, else the last pose.
+        """
+        self._given_covariance = None
+        config = self.config
+        if config.is_mapping:
+            return self.source.create_localizer(config)
+        if self._settings.set_initial_pose:
+            T_map_base = self._settings.initial_pose.pose
+            return self._placed(T_map_base, GIVEN_COVARIANCE)
+        if config.is_start_given:
+            return self.source.create_localizer(config)
+        last = self._last_pose.load()
+        if last is None:
+            return self.source.create_localizer(config)
+        x, y, yaw = last.tolist()
+        self._node.get_logger().info(f'last pose: {x:.2f}, {y:.2f} m, {yaw:.2f} rad')
+        return self.create_localizer_at(last)
+
+    def create_localizer_at(self, T_map_base: Array) -> AnyLocalizer:
+        """A localizer at a pose (3,); in a given map it is delocalized until scans fit."""
+        return self.source.create_localizer(config_at(self.config, T_map_base))
+
+    def with_new_map(self, localizer: AnyLocalizer) -> AnyLocalizer:
+        """The localizer that follows another one in a map from its topic."""
+        settings = self._settings
+        covariance = self._given_covariance
+        self._given_covariance = None
+        if covariance is not None:
+            placed = self._placed(localizer.pose, covariance)
+            if self._is_near_map(placed):
+                return placed
+        is_first = self._amcl is None or not self._amcl.has_published
+        if is_first or (settings.set_initial_pose and settings.always_reset_initial_pose):
+            return self.create_localizer()
+        return self.create_localizer_at(localizer.pose)
+
+    def pose_set(self, covariance: Array) -> None:
+        """A user has given a pose, with a covariance (3, 3)."""
+        if not self.source.has_map:
+            self._given_covariance = covariance
+
+    def publish(self, stamp_ns: int, estimate: Estimate, state: int) -> None:
+        """Publish the estimate of a scan with AMCL's interface, and save the pose if known."""
+        if self._amcl is None:
+            return
+        logger = self._node.get_logger()
+        if state == SlamStatus.NO_MAP:
+            text = 'no map: waits for topic map'
+            logger.warning(text, throttle_duration_sec=_WARN_PERIOD_S)
+            return
+        self._amcl.publish(stamp_ns, estimate)
+        if state == SlamStatus.TRACKING:
+            self._last_pose.save(estimate.T_map_base)
+        elif state == SlamStatus.LOST:
+            text = 'lost: waits for initialpose, a global localization, or a scan that matches'
+            logger.warning(text, throttle_duration_sec=_WARN_PERIOD_S)
+
+    def _is_near_map(self, placed: AnyLocalizer) -> bool:
+        """Whether the pose that a user gave before there was a map lies near it."""
+        try:
+            require_near_map(placed.pose, placed)
+        except InputError as error:
+            self._node.diagnostics.message_rejected('initialpose', str(error))
+            self._node.get_logger().warning(f'initialpose: {error}')
+            return False
+        return True
+
+    def _placed(self, T_map_base: Array, covariance: Array) -> AnyLocalizer:
+        localizer = self.create_localizer_at(T_map_base)
+        localizer.set_pose(T_map_base, covariance)
+        return localizer
+
+
+def config_at(config: StartConfig, T_map_base: Array) -> StartConfig:
+    """The configuration with a start pose (3,)."""
+    x, y, yaw = T_map_base.tolist()
+    return replace(config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
