@@ -41,15 +41,19 @@ from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.files.sessions import LOCALIZER, save_localizer
 from thinmap_ros.logs.frames import NONE
-from thinmap_ros.nodes.localization.keyframe_output import KeyframeOutput
-from thinmap_ros.nodes.localization.known_area import require_near_map
-from thinmap_ros.nodes.localization.recovery import Recovery, restored, saved_pose
 from thinmap_ros.nodes.parts.given_map import (
     GivenMap,
     InitialPoses,
     LivingMap,
     config_at,
     load_localizer,
+)
+from thinmap_ros.nodes.parts.localization import (
+    KeyframeOutput,
+    Recovery,
+    require_near_map,
+    restored,
+    saved_pose,
 )
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN

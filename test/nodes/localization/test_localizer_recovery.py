@@ -12,7 +12,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.track import LocalizerConfig
-from thinmap_ros.nodes.localization.recovery import Recovery, restored, saved_pose
+from thinmap_ros.nodes.parts.localization import Recovery, restored, saved_pose
 
 CONFIG = LocalizerConfig(initial_x_m=3.0, initial_y_m=1.2)
 KILLED_AT = 520

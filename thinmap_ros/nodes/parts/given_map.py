@@ -28,8 +28,11 @@ from thinmap_ros.core.stage import Estimate, StartConfig
 from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import Report, read_map
 from thinmap_ros.files.safe import read_mapping, write_text
-from thinmap_ros.nodes.localization.config import GIVEN_COVARIANCE, LocalizationConfig
-from thinmap_ros.nodes.localization.known_area import require_near_map
+from thinmap_ros.nodes.parts.localization import (
+    GIVEN_COVARIANCE,
+    LocalizationConfig,
+    require_near_map,
+)
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
