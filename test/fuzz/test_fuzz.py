@@ -23,7 +23,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.logs.readers import carmen
 from thinmap_ros.nodes import grid_mapper
-from thinmap_ros.nodes.mapping.scan_queue import ScanQueue
+from thinmap_ros.nodes.parts.mapping import ScanQueue
 
 ROOT = Path(__file__).resolve().parents[2]
 HOURS_S = 1e9

@@ -25,11 +25,13 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, WindowConfig
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import LOCALIZATION, MAPPING, Destination, Trajectory
 from thinmap_ros.files import sessions
-from thinmap_ros.nodes.mapping.map_editing import MapEditing
-from thinmap_ros.nodes.mapping.map_output import MapPublishers
-from thinmap_ros.nodes.mapping.map_values import MapOutputConfig
-from thinmap_ros.nodes.mapping.scan_queue import ScanQueue
-from thinmap_ros.nodes.mapping.team_in_scans import TeamInScans
+from thinmap_ros.nodes.parts.mapping import (
+    MapEditing,
+    MapOutputConfig,
+    MapPublishers,
+    ScanQueue,
+    TeamInScans,
+)
 from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.diagnostics import ERROR

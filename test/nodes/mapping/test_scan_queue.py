@@ -5,7 +5,7 @@ import pytest
 from support.localized import localized
 
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.nodes.mapping.scan_queue import ScanQueue
+from thinmap_ros.nodes.parts.mapping import ScanQueue
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.localized_scan import localized_scan_from_msg
 
