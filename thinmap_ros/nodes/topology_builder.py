@@ -17,9 +17,7 @@ from thinmap_ros.core.topology.segmentation import FIELDS as REGION_FIELDS
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import Topology, TopologyBuilder
 from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
-from thinmap_ros.nodes.mapping.region_naming import RegionNaming
-from thinmap_ros.nodes.mapping.region_updates import RegionUpdates
-from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
+from thinmap_ros.nodes.parts.topology import RegionNaming, RegionUpdates, RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

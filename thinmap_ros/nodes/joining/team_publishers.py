@@ -12,7 +12,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.team import Team, TeamMap
 from thinmap_ros.core.stage import MAX_ODDS
 from thinmap_ros.core.topology.regions import RegionMap, membership_of
-from thinmap_ros.nodes.mapping.region_messages import region_array_msg
+from thinmap_ros.nodes.parts.topology import region_array_msg
 from thinmap_ros.ros import messages, qos
 
 

@@ -1,1 +1,0 @@
-"""Parts of the grid mapper: its input and its output."""

@@ -1,1 +1,0 @@
-"""The graph for route servers; a part of the node topology_builder."""
