@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.nodes.exploration.checkpoint_state import ExplorerState
+from thinmap_ros.nodes.parts.mission import ExplorerState
 
 GOAL_ID = bytes(range(16))
 PREFIX = bytes(range(8))

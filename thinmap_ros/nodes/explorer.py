@@ -19,15 +19,19 @@ from thinmap_ros.core.exploration.mission import (
 from thinmap_ros.core.exploration.strategy import FinishCode, Observation, Strategy
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.sessions import EXPLORATION
-from thinmap_ros.nodes.exploration.checkpoint_state import ExplorerState
-from thinmap_ros.nodes.exploration.driver import Driver, ForeignDriver
-from thinmap_ros.nodes.exploration.mission_publishers import MissionPublishers
 from thinmap_ros.nodes.exploration.navigation_client import NavigationClient
 from thinmap_ros.nodes.exploration.observation_source import ObservationSource, RobotFrames
-from thinmap_ros.nodes.exploration.settings import ExplorationSettings
-from thinmap_ros.nodes.exploration.starts import ACTION, Starts
-from thinmap_ros.nodes.exploration.strategy_source import StrategySource
 from thinmap_ros.nodes.exploration.team_member import Progress, declare_team
+from thinmap_ros.nodes.parts.mission import (
+    ACTION,
+    Driver,
+    ExplorationSettings,
+    ExplorerState,
+    ForeignDriver,
+    MissionPublishers,
+    Starts,
+    StrategySource,
+)
 from thinmap_ros.ros import node_main, parameters
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.checkpoint import StateStamp

@@ -10,7 +10,7 @@ from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.patch import GridPatch, occupancy_from_costs
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.logs import decode
-from thinmap_ros.nodes.exploration.settings import ExplorationSettings
+from thinmap_ros.nodes.parts.mission import ExplorationSettings
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.maps import updates_topic

@@ -7,7 +7,7 @@ from rclpy.action.client import ClientGoalHandle
 from rclpy.node import Node
 from rclpy.task import Future
 
-from thinmap_ros.nodes.exploration.goal_monitor import action_servers
+from thinmap_ros.nodes.parts.mission import action_servers
 from thinmap_ros.ros.time_jumps import STEADY
 
 _PERIOD_S = 1.0

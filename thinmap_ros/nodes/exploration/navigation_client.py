@@ -11,9 +11,12 @@ from rclpy.task import Future
 
 from thinmap_ros.core.exploration.mission import DriveProgress, DriveRequest, Retries
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.nodes.exploration.driver import OnResult
-from thinmap_ros.nodes.exploration.goal_monitor import GoalMonitor, action_servers
-from thinmap_ros.nodes.exploration.settings import ExplorationSettings
+from thinmap_ros.nodes.parts.mission import (
+    ExplorationSettings,
+    GoalMonitor,
+    OnResult,
+    action_servers,
+)
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S

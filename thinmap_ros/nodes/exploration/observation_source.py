@@ -21,7 +21,7 @@ from thinmap_ros.logs import decode
 from thinmap_ros.nodes.exploration.foreign_map import ForeignMap
 from thinmap_ros.nodes.exploration.publishers import PublisherCheck
 from thinmap_ros.nodes.exploration.robot_view import RobotView
-from thinmap_ros.nodes.exploration.settings import ExplorationSettings
+from thinmap_ros.nodes.parts.mission import ExplorationSettings
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.laser_transform import LaserTransform

@@ -9,7 +9,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch, scan_in_map
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
-from thinmap_ros.nodes.exploration.settings import ExplorationSettings
+from thinmap_ros.nodes.parts.mission import ExplorationSettings
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
