@@ -19,9 +19,9 @@ from thinmap_ros.core.exploration.mission import (
 from thinmap_ros.core.exploration.strategy import FinishCode, Observation, Strategy
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.sessions import EXPLORATION
-from thinmap_ros.nodes.exploration.navigation_client import NavigationClient
 from thinmap_ros.nodes.exploration.observation_source import ObservationSource, RobotFrames
 from thinmap_ros.nodes.exploration.team_member import Progress, declare_team
+from thinmap_ros.nodes.parts.drives import NavigationClient
 from thinmap_ros.nodes.parts.mission import (
     ACTION,
     Driver,

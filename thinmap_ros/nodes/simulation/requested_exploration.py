@@ -17,7 +17,7 @@ from thinmap_msgs.msg import ExplorationStatus
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import MapReceiver
-from thinmap_ros.nodes.exploration.goal_result import GoalResult
+from thinmap_ros.nodes.parts.drives import GoalResult
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.maps import received_map, received_update, updates_topic
 
