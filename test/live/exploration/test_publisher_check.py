@@ -4,7 +4,7 @@ import pytest
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from thinmap_ros.nodes.exploration.publishers import PublisherCheck
+from thinmap_ros.nodes.parts.observation import PublisherCheck
 
 pytestmark = pytest.mark.live
 

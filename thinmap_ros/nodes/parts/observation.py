@@ -1,41 +1,237 @@
-"""Inputs of an exploration: those of thinmap's nodes, or the map of any publisher and TF."""
+"""What an explorer observes: map, graph, pose and scan, of thinmap or of other packages."""
 
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from time import monotonic
 
+from map_msgs.msg import OccupancyGridUpdate
+from nav_msgs.msg import OccupancyGrid
+from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import KeepOut as KeepOutMsg
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid, TopologicalMap
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.exploration.mission import InputWatchdog
 from thinmap_ros.core.exploration.strategy import Observation
 from thinmap_ros.core.grid.edits import KeepOut
+from thinmap_ros.core.grid.patch import GridPatch, occupancy_from_costs, scan_in_map
 from thinmap_ros.core.grid.shared import MapReceiver
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.sensing.synchronizer import InputStream
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.core.topology.graph import TopologyConfig, topology_from_msg
 from thinmap_ros.core.topology.topology import MapGraph
 from thinmap_ros.logs import decode
-from thinmap_ros.nodes.exploration.foreign_map import ForeignMap
-from thinmap_ros.nodes.exploration.publishers import PublisherCheck
-from thinmap_ros.nodes.exploration.robot_view import RobotView
 from thinmap_ros.nodes.parts.mission import ExplorationSettings
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_from_msg
-from thinmap_ros.ros.maps import UNKNOWN, FollowedMap, Origin
+from thinmap_ros.ros.maps import UNKNOWN, FollowedMap, Origin, updates_topic
 from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.tf import TransformListener
+
+# The map of any publisher: a SLAM, a map server or a costmap.
+
+
+class ForeignMap:
+    """Newest map of a topic, with its updates.
+
+    is_changed: whether it has changed since somebody set this to False.
+    """
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        settings: ExplorationSettings,
+        map_frame: str,
+        is_used: Callable[[], bool],
+    ) -> None:
+        """is_used: whether this map is needed; else its messages are only kept."""
+        self.is_changed = False
+        self._settings = settings
+        self._map_frame = map_frame
+        self._is_used = is_used
+        self._unread: OccupancyGrid | None = None
+        self._map = MapReceiver()
+        updates = settings.costmap_updates_topic or updates_topic(node, self.topic)
+        subscribe_guarded(node, OccupancyGrid, self.topic, self._on_map, qos.LATCHED)
+        subscribe_guarded(node, OccupancyGridUpdate, updates, self._on_update, qos.STREAM)
+
+    @property
+    def topic(self) -> str:
+        """Name of the topic."""
+        return self._settings.costmap_topic
+
+    def reset(self) -> None:
+        """Discard the map."""
+        self._unread = None
+        self._map = MapReceiver()
+        self.is_changed = False
+
+    def patch(self) -> GridPatch | None:
+        """The map as occupancy; None before the first. Raises InputError where it is invalid."""
+        self._read_kept()
+        patch = self._map.patch
+        if patch is None:
+            return None
+        patch = occupancy_from_costs(patch) if self._settings.is_costmap else patch
+        return replace(patch, is_replaced=True)
+
+    def _on_map(self, message: OccupancyGrid) -> None:
+        self._unread = message
+        if self._is_used():
+            self._read_kept()
+        self.is_changed = True
+
+    def _on_update(self, message: OccupancyGridUpdate) -> None:
+        self._read_kept()
+        self._check_frame(message.header.frame_id)
+        # Stamps of costmaps and of their updates are times of different clocks, or 0.
+        if self._map.update(0, *decode.map_update(message)):
+            self.is_changed = True
+
+    def _read_kept(self) -> None:
+        message = self._unread
+        self._unread = None
+        if message is not None:
+            self._check_frame(message.header.frame_id)
+            self._map.replace(messages.grid_from_msg(message))
+
+    def _check_frame(self, frame_id: str) -> None:
+        if frame_id.lstrip('/') not in ('', self._map_frame):
+            raise InputError(
+                f'map in frame {quoted(frame_id)}: expected that of the parameter map_frame, '
+                f'{quoted(self._map_frame)}'
+            )
+
+
+# What a robot sees of a map that somebody else makes, and from where: by TF and scans.
+
+_MAX_SCANS = 50
+
+_MAX_SCAN_AGE_NS = 2 * SECOND_NS
+
+_LOOKUP_STEP_NS = 20_000_000
+
+
+class RobotView:
+    """Newest scan whose pose in the map TF knows, and that pose.
+
+    Without scans, what the map shows around the robot stands for one.
+    """
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        settings: ExplorationSettings,
+        map_frame: str,
+        laser_transform: LaserTransform,
+    ) -> None:
+        self._settings = settings
+        self._map_frame = map_frame
+        self._laser_transform = laser_transform
+        self._node = node
+        self._scans: deque[LaserScan] = deque(maxlen=_MAX_SCANS)
+
+    def reset(self) -> None:
+        """Discard the scans."""
+        self._scans.clear()
+
+    def add_scan(self, message: LaserScan) -> None:
+        """Keep a scan until its pose is known."""
+        self._scans.append(message)
+
+    def look(self, patch: GridPatch, now_ns: int) -> tuple[Scan, Array]:
+        """Scan and pose (3,) in a map. Raises InputError where TF does not know the pose."""
+        for message in reversed(self._scans):
+            found = self._scan_at(message, now_ns)
+            if found is not None:
+                return found
+        T_map_base = self.newest_pose(now_ns)
+        return scan_in_map(patch, T_map_base, self._settings.view_range_m, now_ns), T_map_base
+
+    @cached_property
+    def _transforms(self) -> TransformListener:
+        """From the first look on: each transform costs time, and most explorations need none."""
+        return TransformListener(self._node)
+
+    def _scan_at(self, message: LaserScan, now_ns: int) -> tuple[Scan, Array] | None:
+        try:
+            stamp_ns = messages.stamp_ns(message.header.stamp)
+            if abs(now_ns - stamp_ns) > _MAX_SCAN_AGE_NS:
+                return None
+            T_map_base = self._lookup(stamp_ns)
+            scan = self._laser_transform.to_scan(message)
+        except InputError:
+            return None
+        return None if scan.is_blind else (scan, T_map_base)
+
+    def newest_pose(self, now_ns: int) -> Array:
+        """Newest pose (3,) that is not too old. Raises InputError where TF knows none."""
+        reason: InputError | None = None
+        tolerance_ns = round(self._settings.transform_tolerance * SECOND_NS)
+        for age_ns in range(0, tolerance_ns + 1, _LOOKUP_STEP_NS):
+            try:
+                return self._lookup(now_ns - age_ns)
+            except InputError as error:
+                reason = reason or error
+        raise reason or InputError('transform_tolerance: expected at least 0 s')
+
+    def _lookup(self, stamp_ns: int) -> Array:
+        return self._transforms.lookup(self._map_frame, self._laser_transform.base_frame, stamp_ns)
+
+
+# Whether somebody publishes a topic.
+
+_PERIOD_S = 1.0
+
+
+class PublisherCheck:
+    """Whether somebody publishes one of some topics; looked up once a second."""
+
+    def __init__(self, node: Node, *topics: str) -> None:
+        self._node = node
+        self._topics = topics
+        self._is_found = False
+        self._checked_s = -_PERIOD_S
+
+    def is_found(self) -> bool:
+        """Whether there is a publisher."""
+        if monotonic() - self._checked_s >= _PERIOD_S:
+            self._set(any(self._count(topic) > 0 for topic in self._topics))
+        return self._is_found
+
+    def message_received(self) -> None:
+        """Register a message: its publisher may not be discovered yet."""
+        self._set(True)
+
+    def _count(self, topic: str) -> int:
+        # rclpy counts the publishers of a name as it is, without the node's remapping rules.
+        return int(self._node.count_publishers(self._node.resolve_topic_name(topic)))
+
+    def _set(self, is_found: bool) -> None:
+        self._is_found = is_found
+        self._checked_s = monotonic()
+
+
+# Inputs of an exploration: those of thinmap's nodes, or the map of any publisher and TF.
 
 _LOOK_PERIOD_S = 0.5
+
 # A publisher that is silent because its map does not change: the old one holds.
 _UNCHANGED_S = 10.0
+
 _AWAITED = 'scan that shows anything on local_grid of grid_mapper'
+
 # As of the map of navigator: a mapper answers each scan.
 _SILENT_NS = 2 * SECOND_NS
+
 # A robot that was not localized for so long is somewhere else, perhaps.
 _POSE_TIMEOUT_S = 3.0
 
