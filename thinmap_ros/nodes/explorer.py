@@ -19,7 +19,6 @@ from thinmap_ros.core.exploration.mission import (
 from thinmap_ros.core.exploration.strategy import FinishCode, Observation, Strategy
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.sessions import EXPLORATION
-from thinmap_ros.nodes.exploration.team_member import Progress, declare_team
 from thinmap_ros.nodes.parts.drives import NavigationClient
 from thinmap_ros.nodes.parts.mission import (
     ACTION,
@@ -32,6 +31,7 @@ from thinmap_ros.nodes.parts.mission import (
     StrategySource,
 )
 from thinmap_ros.nodes.parts.observation import ObservationSource, RobotFrames
+from thinmap_ros.nodes.parts.team_member import Progress, declare_team
 from thinmap_ros.ros import node_main, parameters
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.checkpoint import StateStamp

@@ -7,22 +7,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thinmap_msgs.msg import TeamClaim
+from thinmap_msgs.msg import MapTiles, TeamClaim, TileRequest
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.mission import Mission, MissionState
 from thinmap_ros.core.exploration.strategy import Observation, Strategy
 from thinmap_ros.core.exploration.team import Claim, Place, Team, TeamConfig
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.shared import TileSender
 from thinmap_ros.core.planning.path_follower import MESSAGE_PERIOD_S, NEAR_ROBOT_M, Motion, moved_on
 from thinmap_ros.core.se2 import SECOND_NS, Array
-from thinmap_ros.nodes.exploration.tile_output import TileOutput
-from thinmap_ros.ros import parameters, qos
+from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.maps import new_map_id
-from thinmap_ros.ros.subscription import WARN_PERIOD_S
+from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.team import (
     CLAIMS,
+    REQUESTS,
+    TILES,
     HeardRobots,
     JoinedPlaces,
     MembershipConfig,
@@ -31,10 +34,60 @@ from thinmap_ros.ros.team import (
     TileReceiver,
     claim_msg,
     declare_membership,
+    tiles_msg,
 )
 
+# The tiles of a robot's own map, for the other robots of its team.
+
+
+class TileOutput:
+    """Publishes the tiles that have changed since the last message, or since what is asked for."""
+
+    def __init__(self, node: ThinmapNode, name: str, frame_id: str) -> None:
+        """name: of the robot; frame_id: of its map."""
+        self._node = node
+        self._name = name
+        self._frame_id = frame_id
+        self._publisher = node.create_publisher(MapTiles, TILES, qos.LATCHED)
+        self.reset()
+        subscribe_guarded(node, TileRequest, REQUESTS, self._on_request, qos.STREAM)
+
+    def reset(self) -> None:
+        """Begin again with another map."""
+        self._session = new_map_id()
+        self._sender: TileSender | None = None
+        self._next_after = 0
+
+    def send(self, patch: GridPatch) -> None:
+        """Publish what has changed in the map, if anything has."""
+        sender = self._sender_of(patch)
+        sender.update(patch)
+        if sender.version == self._next_after:
+            return
+        tiles = sender.changes_after(self._next_after)
+        header = messages.header(self._frame_id, int(self._node.get_clock().now().nanoseconds))
+        self._publisher.publish(tiles_msg(header, self._name, self._session, tiles))
+        self._next_after = sender.version
+
+    def _sender_of(self, patch: GridPatch) -> TileSender:
+        """The sender of the lattice of a map: another lattice is another map."""
+        sender = self._sender
+        if sender is not None:
+            if GridPatch(sender.frame, patch.cells[:0, :0]).is_aligned_with(patch):
+                return sender
+            self.reset()
+        self._sender = TileSender(patch.frame)
+        return self._sender
+
+    def _on_request(self, message: TileRequest) -> None:
+        if message.robot == self._name and message.session == self._session:
+            self._next_after = min(self._next_after, message.after)
+
+
 _NEAR_PERIOD_S = 0.1
+
 _NEAR_STEP_M = 0.05  # near to another robot the pose is sent after each cell, not at standstill
+
 _TILE_PERIOD_S = 5.0
 
 
@@ -52,6 +105,7 @@ class Progress(NamedTuple):
 
 
 GetProgress = Callable[[Observation | None], Progress]
+
 """Progress after the newest observation."""
 
 
