@@ -19,15 +19,16 @@ from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.frames import NONE
-from thinmap_ros.nodes.navigation.base_watch import BaseWatch
-from thinmap_ros.nodes.navigation.map_input import MapInput, MapTimeoutConfig
-from thinmap_ros.nodes.navigation.robot_state import RobotState
-from thinmap_ros.nodes.navigation.tasks import (
+from thinmap_ros.nodes.parts.driving import (
+    BaseWatch,
     ErrorCode,
+    MapInput,
+    MapTimeoutConfig,
     NavigationTask,
+    RobotState,
     TaskReader,
+    TeamDriving,
 )
-from thinmap_ros.nodes.navigation.team_driving import TeamDriving
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.diagnostics import ERROR, OK, WARN

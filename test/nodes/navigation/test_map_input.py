@@ -7,7 +7,7 @@ from rclpy.time import Time
 from support.localized import local_grid
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.nodes.navigation.map_input import MapInput, MapTimeoutConfig
+from thinmap_ros.nodes.parts.driving import MapInput, MapTimeoutConfig
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.time_jumps import ElapsedTime
 

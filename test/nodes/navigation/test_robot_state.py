@@ -6,7 +6,7 @@ from rclpy.clock import ROSClock
 from rclpy.time import Time
 
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.nodes.navigation.robot_state import RobotState
+from thinmap_ros.nodes.parts.driving import RobotState
 from thinmap_ros.ros.time_jumps import ElapsedTime
 
 S = 1_000_000_000

@@ -1,0 +1,512 @@
+"""Parts of the navigator: map and robot in, goals, the team, and the watch on the base."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
+
+from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.errors import InputError, quoted
+from thinmap_ros.core.grid.edits import KeepOut
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.shared import MapReceiver
+from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, OdometryBuffer
+from thinmap_ros.core.planning.navigator import (
+    SENSOR_DELAY_NS,
+    SENSOR_TIMEOUT_NS,
+    Command,
+    Navigator,
+    NavigatorConfig,
+)
+from thinmap_ros.core.planning.path_follower import Motion, as_heard, must_stop
+from thinmap_ros.core.planning.supervision import BaseSupervisor
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.sensing.beams import LaserMonitor
+from thinmap_ros.core.sensing.synchronizer import InputStream
+from thinmap_ros.ros import messages, parameters, qos, velocity
+from thinmap_ros.ros.action_server import InvalidGoalError
+from thinmap_ros.ros.diagnostics import ERROR
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.localized_scan import map_update_from_msg
+from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
+from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.team import TileReceiver, heard_robots
+from thinmap_ros.ros.tf import TransformListener
+from thinmap_ros.ros.time_jumps import ElapsedTime
+
+# Whether the base moves as commanded.
+
+_RELEASE = 'no goal is driven before ~/reset, or a stop that is released'
+
+
+class BaseWatch:
+    """Compares commands and odometry; reports at level ERROR what is wrong.
+
+    Where others publish cmd_vel too, or nobody hears it, any motion is allowed.
+    """
+
+    def __init__(self, node: ThinmapNode, config: NavigatorConfig) -> None:
+        """Declare the parameter `base_velocity_topic`."""
+        self._node = node
+        self._supervisor = BaseSupervisor(config)
+        topic = parameters.declare_parameter(
+            node,
+            'base_velocity_topic',
+            '',
+            'Topic of the commands that the base obeys, where a multiplexer (twist_mux) is between '
+            'navigator and base: its output. The motion of the robot is compared with them. Empty: '
+            'the base obeys this node.',
+        )
+        self._own_topic = node.resolve_topic_name(velocity.TOPIC)
+        self._is_behind = bool(topic)
+        if topic:
+            velocity.VelocitySubscription(node, node.diagnostics, self._add_command, str(topic))
+        node.diagnostics.add_check(ERROR, lambda: self.fault)
+
+    @property
+    def fault(self) -> str:
+        """Why no goal may be driven; '' for no reason."""
+        fault = self._supervisor.fault
+        return f'{fault}: {_RELEASE}' if self._supervisor.is_fast else fault
+
+    @property
+    def is_creeping(self) -> bool:
+        """Whether the robot moves though it is to stand."""
+        return self._supervisor.is_creeping
+
+    def set_config(self, config: NavigatorConfig) -> None:
+        """Continue with other limits."""
+        self._supervisor.set_config(config)
+
+    def release(self) -> None:
+        """Drive goals again."""
+        self._supervisor.release()
+
+    def add_sent(self, v: float, w: float) -> None:
+        """Add a command of this node, m/s and rad/s."""
+        if not self._is_behind:
+            self._add_command(v, w)
+
+    def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
+        """Add a sample of the odometry, T_odom_base (3,)."""
+        now_s = self._node.elapsed_time.now_s()
+        self._supervisor.set_unheard(now_s, not (self._is_behind or self.is_obeyed))
+        self._supervisor.add_odometry(now_s, stamp_ns, T_odom_base)
+
+    @property
+    def subscribers(self) -> int:
+        """Number of subscriptions of cmd_vel."""
+        return int(self._node.count_subscribers(self._own_topic))
+
+    @property
+    def is_obeyed(self) -> bool:
+        """Whether somebody hears cmd_vel, and nobody else publishes it."""
+        return self.subscribers > 0 and int(self._node.count_publishers(self._own_topic)) == 1
+
+    def _add_command(self, v: float, w: float) -> None:
+        self._supervisor.add_command(self._node.elapsed_time.now_s(), v, w)
+
+
+# The map that the navigator plans on: thinmap's grid, or the map of another node.
+
+# grid_mapper answers each scan: several of the slowest laser that a robot drives by, at 2.5 Hz.
+_WARN_S = 2.0
+
+
+@dataclass(frozen=True)
+class MapTimeoutConfig(Config):
+    """How old the map of grid_mapper may be."""
+
+    map_timeout_s: float = parameter(
+        5.0,
+        'Time without a message on local_grid after which the robot stands, until the next (s): '
+        'grid_mapper has ended, or hangs. 0: it drives on with the last map. Raise it if a slow '
+        'machine makes the robot stop. Maps of other nodes have no time-out.',
+        low=0.0,
+        high=1000.0,
+    )
+
+
+class MapInput:
+    """The newest map: grid and local_grid of grid_mapper, or else map, of whatever SLAM.
+
+    grid is published where it changes, local_grid for each scan: it shows that grid_mapper lives.
+
+    pose_map_id: id of the map that the pose of the robot is in; keep_out: where it must not drive.
+    """
+
+    def __init__(self, time: ElapsedTime, timeout_s: float) -> None:
+        """timeout_s: as `MapTimeoutConfig`."""
+        self.keep_out = KeepOut()
+        self._time = time
+        self._timeout_s = timeout_s
+        self.reset()
+
+    @property
+    def patch(self) -> GridPatch | None:
+        """The map, or None before one is received."""
+        return self._map.patch
+
+    def subscribe(self, node: ThinmapNode) -> None:
+        """Start to receive maps."""
+        subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
+        subscribe_guarded(node, LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
+        subscribe_to_map(node, 'map', self._on_map)
+
+    def reset(self) -> None:
+        """Discard the map, and not the keep-out areas: they are published where they change."""
+        self._map = MapReceiver()
+        self._has_grid = False
+        self._map_id = UNKNOWN
+        self.pose_map_id = UNKNOWN
+        timeouts_s = [_WARN_S, self._timeout_s] if self._timeout_s > 0.0 else [_WARN_S]
+        self._streams = [_mapper_stream(seconds) for seconds in timeouts_s]
+
+    @property
+    def warning(self) -> str:
+        """Why the map is older than the pose; '' where it is not."""
+        return self._streams[0].fault(self._time.now_ns())
+
+    def has_two_mappers(self) -> bool:
+        """Whether local_grid comes from two sources."""
+        return self._streams[0].is_mixed(self._time.now_ns())
+
+    @property
+    def fault(self) -> str:
+        """Why the robot must not drive on this map; '' for no reason."""
+        if UNKNOWN in (self._map_id, self.pose_map_id) or self._map_id == self.pose_map_id:
+            return self._streams[-1].fault(self._time.now_ns()) if self._timeout_s > 0.0 else ''
+        return 'the pose is in another map than the one on grid (was the localizer restarted?)'
+
+    def _on_grid(self, message: ProbabilityGrid) -> None:
+        self._has_grid = True
+        self._map_id = message.map_id
+        self._map.replace(messages.grid_from_msg(message))
+
+    def _on_local_grid(self, message: LocalGrid) -> None:
+        window = map_update_from_msg(message).changes
+        stamp_ns = messages.stamp_ns(message.header.stamp)
+        for stream in self._streams:
+            stream.add(stamp_ns, self._time.now_ns(), self._time.age_ns(stamp_ns))
+        map_id = message.grid.map_id
+        if UNKNOWN not in (map_id, self._map_id) and map_id != self._map_id:
+            self._map = MapReceiver()
+        self._map_id = map_id
+        if window is not None:
+            self._map.paste(window)
+
+    def _on_map(self, patch: GridPatch) -> None:
+        if not self._has_grid:
+            self._map.replace(patch)
+
+
+def _mapper_stream(timeout_s: float) -> InputStream:
+    timeout_ns = round(timeout_s * SECOND_NS)
+    return InputStream('grid_mapper', timeout_ns, timeout_ns)
+
+
+# Pose and view of the robot, by the last scan, odometry and pose received.
+
+# Without a new pose the last correction of the odometry holds for a while; without odometry, the
+# robot does not know its pose meanwhile.
+_POSE_TIMEOUT_NS = 3_000_000_000
+
+_POSE_ONLY_TIMEOUT_NS = SECOND_NS
+
+
+class RobotState:
+    """Pose and view of the robot now, and whether they are recent.
+
+    scan: the last one that is not blind; pose_fault: why the localizer does not trust its pose, ''
+    where it does.
+    """
+
+    def __init__(self, time: ElapsedTime, has_odometry: bool) -> None:
+        """has_odometry: False where the odometry says that the robot never moves."""
+        self.scan: Scan | None = None
+        self.pose_fault = ''
+        self._time = time
+        pose_timeout_ns = _POSE_TIMEOUT_NS if has_odometry else _POSE_ONLY_TIMEOUT_NS
+        self._streams = {
+            'laser': InputStream('laser', SENSOR_TIMEOUT_NS, SENSOR_DELAY_NS),
+            'odometry': InputStream('odometry', SENSOR_TIMEOUT_NS, SENSOR_DELAY_NS),
+            # A late pose corrects the odometry as well as a new one: they are as late as silent.
+            'localizer': InputStream('localizer', pose_timeout_ns, pose_timeout_ns),
+        }
+        self._laser = LaserMonitor()
+        self._blind_reason = ''
+        self._scan_offset_ns = 0  # from the odometry, when the last scan was received
+        self._pose_fault = ''  # why the last pose was not used
+        self._odometry = OdometryBuffer(max_gap_ns=MAX_ODOMETRY_GAP_NS)
+        self._T_map_odom: Array | None = None
+        self._T_odom_base: Array | None = None
+
+    def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
+        """Add the odometry, T_odom_base (3,), at a stamp."""
+        self._T_odom_base = T_odom_base
+        self._record('odometry', stamp_ns)
+        self._odometry.add(stamp_ns, T_odom_base)
+
+    def add_pose(self, stamp_ns: int, T_map_base: Array) -> None:
+        """Add the pose that the localizer found, T_map_base (3,), at the stamp of its scan."""
+        T_odom_base = self._odometry.interpolate(stamp_ns)
+        if T_odom_base is None:
+            self._pose_fault = _offset_fault('pose', self._offset_ns(stamp_ns))
+            return
+        self._pose_fault = ''
+        self._record('localizer', stamp_ns)
+        self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
+
+    def add_scan(self, scan: Scan) -> None:
+        """Add a scan; a blind one is not kept, and is a reason to stop."""
+        if self._T_odom_base is not None:
+            scan = self._laser.checked(scan, self._T_odom_base)
+        self._blind_reason = scan.blind_reason
+        if not scan.is_blind:
+            self.scan = scan
+            self._scan_offset_ns = self._offset_ns(scan.stamp_ns)
+            self._record('laser', scan.stamp_ns)
+
+    @property
+    def odometry_fault(self) -> str:
+        """Why the odometry is not that of now; '' for no reason."""
+        return self._streams['odometry'].fault(self._time.now_ns())
+
+    def has_two_localizers(self) -> bool:
+        """Whether poses come from two sources."""
+        return self._streams['localizer'].is_mixed(self._time.now_ns())
+
+    def pose(self) -> Array | None:
+        """T_map_base (3,) now; None before a pose and odometry are received."""
+        if self._T_map_odom is None or self._T_odom_base is None:
+            return None
+        return se2.compose(self._T_map_odom, self._T_odom_base)
+
+    def stop_reason(self) -> str:
+        """Why the robot must not drive on, the cause before its consequences; '' for no reason."""
+        if self._blind_reason:
+            return f'laser blind ({self._blind_reason})'
+        return self._sensor_fault() or self.pose_fault or self._localizer_fault()
+
+    def _sensor_fault(self) -> str:
+        now_ns = self._time.now_ns()
+        for source in ('laser', 'odometry'):
+            if fault := self._streams[source].fault(now_ns):
+                return fault
+        if fault := _offset_fault('scan', self._scan_offset_ns):
+            return fault
+        # Also where the clock stands.
+        silent_ns = 0 if self.scan is None else -self._offset_ns(self.scan.stamp_ns)
+        return f'laser silent for {silent_ns / 1e9:.1f} s' if silent_ns > SENSOR_TIMEOUT_NS else ''
+
+    def _localizer_fault(self) -> str:
+        fault = self._streams['localizer'].fault(self._time.now_ns())
+        is_waiting = fault or self._T_map_odom is None
+        return (self._pose_fault if is_waiting else '') or fault
+
+    def _offset_ns(self, stamp_ns: int) -> int:
+        """Time by which a stamp is ahead of the last one of the odometry; 0 without odometry."""
+        latest_ns = self._odometry.latest_stamp_ns
+        return 0 if latest_ns is None else stamp_ns - latest_ns
+
+    def _record(self, source: str, stamp_ns: int) -> None:
+        time = self._time
+        self._streams[source].add(stamp_ns, time.now_ns(), time.age_ns(stamp_ns))
+
+
+def _offset_fault(source: str, offset_ns: int) -> str:
+    """What is wrong with stamps that are ahead of those of the odometry; '' for nothing."""
+    if abs(offset_ns) <= SENSOR_TIMEOUT_NS:
+        return ''
+    side = 'ahead of' if offset_ns > 0 else 'behind'
+    return (
+        f"{source} stamps are {abs(offset_ns) / SECOND_NS:.1f} s {side} odometry's: expected at "
+        f'most {SENSOR_TIMEOUT_NS / SECOND_NS:.1f} s'
+    )
+
+
+# Goals of Nav2's actions as poses in the map frame.
+
+_MAX_POSES = 10_000
+
+_LOOKUP_STEP_NS = 20_000_000
+
+
+class ErrorCode(IntEnum):
+    """Codes of the results, as in Nav2 from Kilted on: Jazzy's messages do not name them."""
+
+    NONE = 0
+    UNKNOWN = 9000
+    TF_ERROR = 9002
+    TIMEOUT = 9003
+
+
+@dataclass(frozen=True)
+class NavigationTask:
+    """Poses (3,) in the map frame: all but the last one are passed on the way.
+
+    action: the one that the goal came by, with the types of its feedback and result; start_ns: time
+    at which the goal was accepted, by the node's `elapsed_time`.
+    """
+
+    action: Any
+    poses: tuple[Array, ...]
+    start_ns: int
+
+    def result(self, code: ErrorCode, text: str) -> Any:
+        """Result of the action."""
+        return self.action.Result(error_code=int(code), error_msg=text)
+
+
+class _TransformError(InputError):
+    """The frame of a goal is unknown, or was not known at the time of its stamp."""
+
+
+class TaskReader:
+    """Reads goals in any frame that is connected to the map by transforms.
+
+    stop_reason: why it refuses all of them, '' if it does not.
+    """
+
+    def __init__(self, node: ThinmapNode, map_frame: str, map_input: MapInput) -> None:
+        """Declare the parameter `transform_tolerance`; map_input: has the keep-out areas."""
+        self.stop_reason = ''
+        self._node = node
+        self._map_frame = map_frame
+        self._map = map_input
+        self._transforms = TransformListener(node)
+        tolerance_s = parameters.declare_parameter(
+            node,
+            'transform_tolerance',
+            0.3,
+            'Age up to which a transform is used for a goal in another frame than the map, before '
+            'the stamp of the goal (s). Raise it if goals are aborted because transforms are late, '
+            'lower it if the robot moves far in this time.',
+            low=0.0,
+        )
+        self._tolerance_ns = round(float(tolerance_s) * SECOND_NS)
+
+    def reset(self) -> None:
+        """Forget the transforms that are not static: the time was set back."""
+        self._transforms.clear()
+
+    def to_pose(self, request: NavigateToPose.Goal) -> NavigationTask:
+        """Task of a goal of navigate_to_pose. Raises InvalidGoalError."""
+        return self._read(NavigateToPose, request, lambda: (self.pose(request.pose),))
+
+    def through_poses(self, request: NavigateThroughPoses.Goal) -> NavigationTask:
+        """Task of a goal of navigate_through_poses. Raises InvalidGoalError."""
+
+        def poses() -> tuple[Array, ...]:
+            if not 0 < len(request.poses) <= _MAX_POSES:
+                raise InputError(f'{len(request.poses)} poses: expected 1 to {_MAX_POSES}')
+            return tuple(self.pose(message) for message in request.poses)
+
+        return self._read(NavigateThroughPoses, request, poses)
+
+    def pose(self, message: PoseStamped) -> Array:
+        """Pose (3,) of a message in the map frame.
+
+        Raises InputError where it is invalid, or its frame unknown.
+        """
+        pose = messages.pose_from_msg(message.pose)
+        frame = message.header.frame_id.lstrip('/')
+        if frame in ('', self._map_frame):
+            return pose
+        return se2.compose(self._lookup(frame, messages.stamp_ns(message.header.stamp)), pose)
+
+    def require_open(self, poses: tuple[Array, ...]) -> None:
+        """Raise InputError where one of the poses (3,) is in a keep-out area."""
+        self._map.keep_out.require_open(np.array([pose[:2] for pose in poses]))
+
+    def _lookup(self, frame: str, stamp_ns: int) -> Array:
+        """T_map_frame (3,) at a stamp, or shortly before it; the newest for stamp 0, as in tf2."""
+        reason = ''
+        tolerance_ns = self._tolerance_ns if stamp_ns else 0
+        for age_ns in range(0, tolerance_ns + 1, _LOOKUP_STEP_NS):
+            at_ns = max(stamp_ns - age_ns, 0)
+            try:
+                return self._transforms.lookup(self._map_frame, frame, at_ns or None)
+            except InputError as error:
+                reason = reason or str(error)
+        raise _TransformError(
+            f'frame {quoted(frame)}: {reason}: expected a frame connected to "{self._map_frame}"'
+        )
+
+    def _read(
+        self, action: Any, request: Any, poses: Callable[[], tuple[Array, ...]]
+    ) -> NavigationTask:
+        logger = self._node.get_logger()
+        if request.behavior_tree:
+            logger.warning(f'behavior_tree {quoted(request.behavior_tree)} ignored: there is none')
+        start_ns = self._node.elapsed_time.now_ns()
+        try:
+            if self.stop_reason:
+                raise InputError(self.stop_reason)
+            task = NavigationTask(action, poses(), start_ns)
+            self.require_open(task.poses)
+            return task
+        except InputError as error:
+            is_frame = isinstance(error, _TransformError)
+            code = ErrorCode.TF_ERROR if is_frame else ErrorCode.UNKNOWN
+            text = f'goal: {error}'
+            logger.warning(text)
+            result = NavigationTask(action, (), start_ns).result(code, text)
+            raise InvalidGoalError(result) from error
+
+
+# Driving beside other robots of a team: over the ground that they know, and with right of way.
+
+
+@dataclass(frozen=True)
+class GiveWayConfig(Config):
+    """How near another robot may come."""
+
+    give_way_m: float = parameter(
+        0.61,
+        'The robot does not drive nearer to another robot of the team than this, from centre to '
+        'centre (m). Set it to the sum of the radii of both and 0.11.',
+        low=0.0,
+        high=10.0,
+    )
+
+
+class TeamDriving:
+    """What a navigator knows of the other robots; without a team, nothing."""
+
+    def __init__(self, node: ThinmapNode) -> None:
+        """Declare the parameters."""
+        self._heard = heard_robots(node)
+        self._distance_m = parameters.declare_config(node, GiveWayConfig).give_way_m
+        self._tiles: TileReceiver | None = None
+        if self._heard is not None:
+            self._tiles = TileReceiver(node, self._heard.places, self._heard.name)
+
+    def completed(self, own: GridPatch) -> GridPatch:
+        """The map of this robot, and what others know where it is undecided."""
+        return own if self._tiles is None else self._tiles.completed(own)
+
+    def allowed(
+        self, navigator: Navigator, T_map_base: Array, command: Command, dt_s: float
+    ) -> Command:
+        """The command, or one that gives way where the robot would come too near to another one.
+
+        T_map_base (3,): pose of the robot; dt_s: time between two commands.
+        """
+        if self._heard is None or command.v <= 0.0:
+            return command
+        own = Motion(self._heard.name, T_map_base, command.v, command.w)
+        others = [each for heard in self._heard.motions() for each in as_heard(*heard)]
+        controller = navigator.config.controller
+        brakes_s = controller.max_speed_m_s / controller.max_acceleration_m_s2
+        if not must_stop(own, others, self._distance_m, brakes_s):
+            return command
+        places = np.array([other.pose[:2] for other in others])
+        return navigator.give_way(command, dt_s, places, self._distance_m)
