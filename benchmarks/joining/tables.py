@@ -16,7 +16,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.team import WORLD, Team, TeamGraph
 from thinmap_ros.evaluation.outcome import Table
-from thinmap_ros.nodes.joining.joint_map import JointMap
+from thinmap_ros.nodes.parts.joining import JointMap
 
 _RIGHT_M = 0.5  # where the maps overlap
 _ROBOTS = 5

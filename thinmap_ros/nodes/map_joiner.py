@@ -8,16 +8,18 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.team import WORLD, LinkSearch, MapLink, RobotMap, Team
-from thinmap_ros.nodes.joining.joint_map import JointMap
-from thinmap_ros.nodes.joining.robot_maps import RobotMaps
-from thinmap_ros.nodes.joining.settings import (
+from thinmap_ros.nodes.parts.joining import (
+    JointMap,
     MapJoinerConfig,
+    Result,
+    RobotMaps,
+    TeamPublishers,
+    Turns,
+    Worker,
     declare_initial_poses,
     odds_text,
     warn_of_confidence,
 )
-from thinmap_ros.nodes.joining.team_publishers import TeamPublishers
-from thinmap_ros.nodes.joining.worker import Result, Turns, Worker
 from thinmap_ros.ros import messages, node_main, parameters
 from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

@@ -2,7 +2,7 @@
 
 import pytest
 
-from thinmap_ros.nodes.joining.worker import Turns, Worker
+from thinmap_ros.nodes.parts.joining import Turns, Worker
 
 
 def test_kinds_that_are_always_ready_take_turns():
