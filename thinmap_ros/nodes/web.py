@@ -23,8 +23,7 @@ from thinmap_ros.core.config import SAFE_LOWER, Config, parameter
 from thinmap_ros.core.errors import counted
 from thinmap_ros.core.planning.path_follower import MESSAGE_PERIOD_S, moved_on
 from thinmap_ros.core.topology.graph import topology_from_msg
-from thinmap_ros.nodes.steering.steering import Steering
-from thinmap_ros.nodes.steering.teleoperation import TopSpeeds
+from thinmap_ros.nodes.parts.page import Steering, TopSpeeds
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.laser_transform import LaserTransform

@@ -1,0 +1,726 @@
+"""What pages ask for, done by the node."""
+
+import base64
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Lock
+from time import monotonic
+from typing import Any, NamedTuple
+
+import numpy as np
+from action_msgs.msg import GoalStatus, GoalStatusArray
+from action_msgs.srv import CancelGoal
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav2_msgs.action import NavigateToPose
+from rclpy.action import ActionClient
+from rclpy.client import Client
+from rclpy.task import Future as AnswerFuture
+from std_msgs.msg import Bool, String
+
+from thinmap_msgs.action import Explore
+from thinmap_msgs.srv import AddKeepOut, EraseArea, LoadMap, NameRegion, RemoveKeepOut, SaveMap
+from thinmap_ros.core.errors import InputError, ThinmapError, one_line, one_line_reason
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.files.merging import MergedMap
+from thinmap_ros.files.sessions import GRID, PARTS, REGIONS, load_edits, load_grid, load_topology
+from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.services import SaveDirectory
+from thinmap_ros.ros.stop_topic import StopTopic
+from thinmap_ros.ros.velocity import (
+    CommandPublisher,
+    CommandTimeout,
+    CommandWatchdog,
+    declare_stamped,
+)
+from thinmap_ros.web.pages import Board
+from thinmap_ros.web.picture import Picture
+from thinmap_ros.web.requests import Request, is_name
+
+# Work that other threads leave for the thread of the node.
+
+
+class NodeQueue:
+    """Does in the node's thread, in turn, what other threads put."""
+
+    def __init__(self, node: ThinmapNode, on_error: Callable[[str], None]) -> None:
+        """on_error: receives the words of an InputError of some work."""
+        self._on_error = on_error
+        self._works: deque[Callable[[], None]] = deque()
+        self._bell = node.create_guard_condition(self._work)
+
+    def put(self, work: Callable[[], None]) -> None:
+        """Have the node do something soon; from any thread."""
+        self._works.append(work)
+        self._bell.trigger()
+
+    def _work(self) -> None:
+        while self._works:
+            try:
+                self._works.popleft()()
+            except InputError as error:
+                self._on_error(str(error))
+
+
+# Two saved sessions merged on trial: a page sees the joint map before it is saved.
+
+_MERGE_TIMEOUT_S = 600.0
+
+_MAX_SESSIONS = 200
+
+_MAX_PICTURE_BYTES = 4 << 20
+
+_ITEM = 'merge'
+
+
+class _Trial:
+    """The program merge_sessions at work, in a folder of its own, which `drop` deletes."""
+
+    def __init__(self, maps: list[str]) -> None:
+        self._folder = TemporaryDirectory(prefix='thinmap-merge-')
+        folder = Path(self._folder.name)
+        self.stem = str(folder / 'merged')
+        self._picture = folder / 'merged.png'
+        self._log = folder / 'log'
+        self._began_s = time.monotonic()
+        program = ['nice', sys.executable, '-m', 'thinmap_ros.tools.merge_sessions', '--quiet']
+        words = [*maps, '-o', self.stem, '--picture', str(self._picture)]
+        with self._log.open('wb') as log:
+            self._process = subprocess.Popen(
+                [*program, *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log
+            )
+
+    @property
+    def code(self) -> int | None:
+        """Exit code; None while it works."""
+        return self._process.poll()
+
+    @property
+    def is_overdue(self) -> bool:
+        """Whether it takes too long."""
+        return self.code is None and time.monotonic() - self._began_s > _MERGE_TIMEOUT_S
+
+    def lines(self) -> list[str]:
+        """What it has said."""
+        return self._log.read_text(errors='replace').splitlines()
+
+    def picture(self) -> str:
+        """The maps and the joint one, PNG in base64; '' where there is none, or a huge one."""
+        try:
+            content = self._picture.read_bytes()
+        except FileNotFoundError:
+            return ''
+        return base64.b64encode(content).decode() if len(content) < _MAX_PICTURE_BYTES else ''
+
+    def drop(self) -> None:
+        """End the program, and delete what it has made."""
+        self._process.kill()
+        self._process.wait()
+        self._folder.cleanup()
+
+
+class SessionMerge:
+    """Shows what two sessions of save_directory make together; saves it where it is wanted.
+
+    The program runs in a process of its own and what it makes is saved in a thread, so that the
+    node does not wait. One merge at a time.
+    """
+
+    def __init__(self, node: ThinmapNode, board: Board, tell: Callable[[str], None]) -> None:
+        """Declare save_directory; tell: shows what has happened."""
+        self._board = board
+        self._tell = tell
+        self._directory = SaveDirectory(node)
+        self._trial: _Trial | None = None
+        self._is_shown = False
+        self._saver = ThreadPoolExecutor(1, thread_name_prefix='merge')
+        self._saving: Future[str] | None = None
+
+    def list_sessions(self) -> None:
+        """Show the names of the sessions in the directory."""
+        files = sorted(self._directory.path.glob(f'*{GRID.ending}'))
+        names = [file.name.removesuffix(GRID.ending) for file in files]
+        self._board.put('sessions', [name for name in names if is_name(name)][:_MAX_SESSIONS])
+
+    def begin(self, first: str, second: str) -> None:
+        """Merge two sessions on trial. Raises InputError where that is not possible now."""
+        if self._trial is not None:
+            raise InputError('merge: expected the last one to be saved or dropped')
+        if first == second:
+            raise InputError(f'merge: {first}: expected two sessions')
+        paths = [self._directory.resolve(name) for name in (first, second)]
+        for name, path in zip((first, second), paths, strict=True):
+            if not GRID.exists(path):
+                raise InputError(f'merge: {name}: expected a session of {self._directory.path}')
+        self._trial = _Trial(paths)
+        self._is_shown = False
+        self._show('working', [f'{first} and {second} are merged'])
+
+    def save(self, name: str) -> None:
+        """Save the joint map. Raises InputError where there is none, or the name is taken."""
+        trial = self._trial
+        if trial is None or trial.code != 0 or self._saving is not None:
+            raise InputError('merge: expected a joint map that is shown')
+        path = self._directory.resolve_for_saving(name, GRID)
+        if any(part.exists(path) for part in PARTS):
+            raise InputError(f'merge: {name}: exists: expected a new name')
+        self._saving = self._saver.submit(_save, trial.stem, path)
+
+    def drop(self) -> None:
+        """Forget the joint map, or the work on it."""
+        if self._saving is not None:
+            raise InputError('merge: is being saved')
+        self._forget('', [])
+
+    def tick(self) -> None:
+        """Show what is done; called ten times a second."""
+        if self._saving is not None and self._saving.done():
+            self._end_saving(self._saving)
+        elif self._trial is not None and not self._is_shown:
+            self._watch(self._trial)
+
+    def close(self) -> None:
+        """End the work."""
+        self._saver.shutdown()
+        if self._trial is not None:
+            self._trial.drop()
+
+    def _watch(self, trial: _Trial) -> None:
+        if trial.is_overdue:
+            self._forget('failed', [f'not merged within {_MERGE_TIMEOUT_S:.0f} s'])
+        elif trial.code == 0:
+            # Lines on the maps, without those on the files that are still to be saved.
+            own = f'{self._directory.path}/'
+            words = [line for line in trial.lines() if line.startswith(own)]
+            self._show('shown', words, trial.picture())
+            self._is_shown = True
+        elif trial.code is not None:
+            self._forget('failed', trial.lines()[-1:] or [f'ended with {trial.code}'])
+
+    def _end_saving(self, saving: Future[str]) -> None:
+        self._saving = None
+        try:
+            said = saving.result()
+        except (ThinmapError, OSError) as error:
+            self._tell(f'merge: {one_line_reason(error)}')
+            return
+        self._forget('saved', [said])
+        self.list_sessions()
+
+    def _forget(self, state: str, words: list[str]) -> None:
+        if self._trial is not None:
+            self._trial.drop()
+        self._trial = None
+        self._show(state, words)
+
+    def _show(self, state: str, words: list[str], picture: str = '') -> None:
+        own = f'{self._directory.path}/'
+        shown = [one_line(line.replace(own, '')) for line in words]
+        self._board.put(_ITEM, {'state': state, 'words': shown, 'picture': picture})
+
+
+def _save(stem: str, path: str) -> str:
+    """Save a merged session under another name, all files or none; returns what was written."""
+    keep_out = load_edits(stem).keep_out
+    merged = MergedMap(load_grid(stem), load_topology(stem), REGIONS.load(stem), keep_out, {}, [])
+    return '; '.join(merged.save(path))
+
+
+# Goals of navigate_to_pose and explore, of a page; cancelled with those of everybody.
+
+NAVIGATE = 'navigate_to_pose'
+
+EXPLORE = 'explore'
+
+_PAUSED = 'exploration_paused'  # as explore_lite has it, on explore/status
+
+_DRIVING = (NAVIGATE, 'navigate_through_poses')
+
+_ACTIVE = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING)
+
+_OUTCOMES = {
+    GoalStatus.STATUS_SUCCEEDED: 'done',
+    GoalStatus.STATUS_CANCELED: 'cancelled',
+    GoalStatus.STATUS_ABORTED: 'failed',
+}
+
+
+class RobotTasks:
+    """Sends goals, and cancels all goals of the robot, of all clients."""
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        map_frame: str,
+        on_news: Callable[[str], None],
+        on_goal: Callable[[Array | None], None],
+    ) -> None:
+        """on_news: receives how a goal ends, in words; on_goal: the place (3,) of it, or None."""
+        self._node = node
+        self._map_frame = map_frame
+        self._on_news = on_news
+        self._on_goal = on_goal
+        self._navigate = ActionClient(node, NavigateToPose, NAVIGATE)
+        self._explore = ActionClient(node, Explore, EXPLORE)
+        self._cancels = {
+            name: node.create_client(CancelGoal, f'{name}/_action/cancel_goal')
+            for name in (EXPLORE, *_DRIVING)
+        }
+        self._is_held = False
+        self._cancels_asked = 0
+        self._active = {name: False for name in self._cancels}
+        self._word = ''
+        node.create_subscription(String, 'explore/status', self._on_word, qos.LATCHED)
+        self._newest: AnswerFuture | None = None
+        for name in self._cancels:
+            node.create_subscription(
+                GoalStatusArray,
+                f'{name}/_action/status',
+                lambda message, name=name: self._on_status(name, message),
+                qos.LATCHED,
+            )
+
+    def hold(self, is_held: bool) -> None:
+        """While the robot is held, each goal of anybody is cancelled."""
+        self._is_held = is_held
+        if is_held:
+            self.cancel_all()
+
+    def cancel_all(self) -> None:
+        """Cancel all goals of all clients, and those of the page that are on their way."""
+        self._cancels_asked += 1
+        for name in self._cancels:
+            self._cancel(name)
+
+    def drive_to(self, pose: Array) -> None:
+        """Send a goal (3,), map frame. Raises InputError where no navigator runs."""
+        self._require(self._navigate, NAVIGATE, 'navigator')
+        now_ns = int(self._node.get_clock().now().nanoseconds)
+        target = messages.pose_stamped_msg(pose, self._map_frame, now_ns)
+        self._on_goal(pose)
+        self._send(self._navigate, NavigateToPose.Goal(pose=target), 'goal')
+
+    def require_paused(self) -> None:
+        """Raise InputError unless there is an exploration that waits to be continued."""
+        if not self._active[EXPLORE] or self._word != _PAUSED:
+            raise InputError('resume: no exploration is paused: expected one, or Explore to start')
+
+    def explore(self, area: list[tuple[float, float]], return_home: bool) -> None:
+        """Start an exploration inside a polygon, m. Raises InputError where no explorer runs."""
+        self._require(self._explore, EXPLORE, 'explorer')
+        goal = Explore.Goal(area=messages.polygon_msg(area), return_home=return_home)
+        self._send(self._explore, goal, 'exploration')
+
+    def _require(self, client: ActionClient, name: str, node: str) -> None:
+        if not client.server_is_ready():
+            raise InputError(f'no server of {name}: expected {node} to run')
+
+    def _send(self, client: ActionClient, goal: Any, what: str) -> None:
+        sent = client.send_goal_async(goal)
+        if what == 'goal':
+            self._newest = sent
+        cancels = self._cancels_asked
+        sent.add_done_callback(lambda future: self._on_answer(future, what, cancels))
+
+    def _on_answer(self, sent: AnswerFuture, what: str, cancels: int) -> None:
+        handle = sent.result()
+        if handle is None or not handle.accepted:
+            self._end(sent, f'{what} rejected')
+            return
+        self._on_news(f'{what} accepted')
+        if cancels != self._cancels_asked:
+            handle.cancel_goal_async()  # all goals were cancelled before this one was known
+        handle.get_result_async().add_done_callback(
+            lambda future: self._on_result(sent, future.result(), what)
+        )
+
+    def _on_result(self, sent: AnswerFuture, answer: Any, what: str) -> None:
+        outcome = _OUTCOMES.get(answer.status, 'ended')
+        result = answer.result
+        reason = result.error_msg if what == 'goal' else result.status.reason
+        self._end(sent, f'{what} {outcome}: {reason}' if reason else f'{what} {outcome}')
+
+    def _end(self, sent: AnswerFuture, news: str) -> None:
+        if sent is self._newest:
+            self._on_goal(None)
+        self._on_news(news)
+
+    def _cancel(self, name: str) -> None:
+        """Cancel all goals of an action: as its service has it, by an id and a time of zero."""
+        if self._cancels[name].service_is_ready():
+            self._cancels[name].call_async(CancelGoal.Request())
+
+    def _on_status(self, name: str, message: GoalStatusArray) -> None:
+        self._active[name] = any(status.status in _ACTIVE for status in message.status_list)
+        if self._is_held and self._active[name]:
+            self._cancel(name)
+
+    def _on_word(self, message: String) -> None:
+        self._word = message.data
+
+
+# Driving by hand: a velocity holds only while a page asks for it again and again.
+
+# With the period of the watchdog, 0.1 s, the robot is stopped 0.3 s after the last request.
+_HOLD_S = 0.2
+
+# After the last command the publisher stays as long as a stop may need to be received.
+_LINGER_S = 2.0
+
+
+class TopSpeeds(NamedTuple):
+    """Velocity of a joystick that is pushed to its end: ahead m/s, turn rad/s."""
+
+    ahead: float
+    turn: float
+
+
+class HoldTimeout(CommandTimeout):
+    """Whether a velocity is no longer asked for, whatever the clock of the node."""
+
+    def __init__(self) -> None:
+        super().__init__(is_simulated=False)
+
+    @property
+    def limit_s(self) -> float:
+        """Longest time without a request."""
+        return _HOLD_S
+
+
+class Teleoperation:
+    """Publishes the velocity that one page at a time asks for.
+
+    The publisher exists while somebody drives, or the robot is held: another one of cmd_vel is
+    reported by the navigator.
+    """
+
+    def __init__(self, node: ThinmapNode, base_frame: str, top: TopSpeeds) -> None:
+        self._top = top
+        self._output = CommandPublisher(node, base_frame, declare_stamped(node))
+        self._lock = Lock()
+        self._sent_s = 0.0
+        self._holder: int | None = None
+        self._watchdog = CommandWatchdog(self._send, lambda seconds: None, HoldTimeout())
+
+    def take(self, page: int) -> bool:
+        """Let a page drive; returns whether it begins to. Raises InputError where another does."""
+        with self._lock:
+            is_free = self._holder is None or monotonic() - self._sent_s > _LINGER_S
+            if not is_free and self._holder != page:
+                raise InputError('drive: another page drives: expected it to let go')
+            self._holder = page
+            self._sent_s = monotonic()
+        return is_free
+
+    def let_go(self, page: int) -> None:
+        """Stop the robot if this page drives: it is gone."""
+        if self._holder == page:
+            self.halt()
+            self._holder = None
+
+    def drive(self, ahead: float, left: float) -> None:
+        """Publish a velocity, as shares of the top speeds; it holds for 0.3 s."""
+        self._output.open()
+        self._watchdog.send(ahead * self._top.ahead, left * self._top.turn)
+
+    def halt(self) -> None:
+        """Stop the robot, if somebody drives; from any thread."""
+        self._watchdog.send(0.0, 0.0)
+
+    def keep_standing(self) -> None:
+        """Stop the robot, whatever drives it."""
+        self._output.hold(True)
+        self._watchdog.send(0.0, 0.0)
+
+    def tidy(self) -> None:
+        """Destroy the publisher when nobody has driven for a while."""
+        self._output.hold(False)
+        if monotonic() - self._sent_s > _LINGER_S:
+            self._output.close()
+
+    def close(self) -> None:
+        """Stop the robot, if somebody drives, and wait until that is received."""
+        self._watchdog.close()
+        self.halt()
+        self._output.wait_until_received()
+
+    def _send(self, v: float, w: float) -> None:
+        if self._output.send(v, w):
+            self._sent_s = monotonic()
+
+
+_RESUME = 'explore/resume'
+
+# Standard deviations of a pose that a person has drawn, as of RViz: 0.5 m, 15 degrees.
+_DRAWN = np.diag([0.25, 0.25, 0.0685])
+
+# What a robot that is held may be asked for.
+_ALWAYS = (
+    'cancel',
+    'pause',
+    'save',
+    'initial_pose',
+    'name_region',
+    'sessions',
+    'merge',
+    'merge_save',
+    'merge_drop',
+    'keep_out',
+    'remove_keep_out',
+    'erase',
+)
+
+
+class Hold:
+    """Whether the robot is held, and by which stop: a page ends the one that it shows.
+
+    topic: where the pages and others stop the robot.
+    """
+
+    topic: StopTopic
+
+    def __init__(self) -> None:
+        self._is_own = False  # of a page
+        self._is_others = False
+        self._stops = 0
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the robot is held."""
+        return self._is_own or self._is_others
+
+    @property
+    def last(self) -> int:
+        """Number of the last stop, ended or not; 0: none."""
+        return self._stops
+
+    @property
+    def number(self) -> int:
+        """Number of the stop that holds the robot; 0: none."""
+        return self._stops if self.is_on else 0
+
+    def begin(self) -> None:
+        """Hold the robot; one that is held, by a later stop."""
+        self._stops += 1
+        self._is_own = True
+
+    def end(self, stop: int) -> None:
+        """End the stop of a page. Raises InputError where there was a later one."""
+        if self.is_on and stop != self._stops:
+            raise InputError('release: the robot was stopped again')
+        self._is_own = False
+
+    def set_by_others(self, is_stopped: bool) -> None:
+        """Whether another node stops the robot: no page ends that."""
+        if is_stopped and not self.is_on:
+            self._stops += 1
+        self._is_others = is_stopped
+
+
+class Steering:
+    """Does what pages ask for, in the node's thread; stop and release at once, in the server's."""
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        picture: Picture,
+        frames: tuple[str, str],
+        top: TopSpeeds,
+    ) -> None:
+        """frames: of the map and of the robot."""
+        self._node = node
+        self._picture = picture
+        self._map_frame, base_frame = frames
+        self._held = Hold()
+        self._drive = Teleoperation(node, base_frame, top)
+        self._tasks = RobotTasks(node, self._map_frame, self.tell, self._show_goal)
+        self._publishers = {
+            _RESUME: node.create_publisher(Bool, _RESUME, qos.STREAM),
+            'initialpose': node.create_publisher(
+                PoseWithCovarianceStamped, 'initialpose', qos.STREAM
+            ),
+        }
+        self._clients = {
+            'save': node.create_client(SaveMap, 'save_map'),
+            'load': node.create_client(LoadMap, 'load_map'),
+            'name': node.create_client(NameRegion, 'name_region'),
+            'keep out': node.create_client(AddKeepOut, 'add_keep_out'),
+            'remove': node.create_client(RemoveKeepOut, 'remove_keep_out'),
+            'erase': node.create_client(EraseArea, 'erase_area'),
+        }
+        self._merge = SessionMerge(node, picture.board, self.tell)
+        self._works = self._works_by_action()
+        self._later = NodeQueue(node, self.tell).put
+        self._news = 0
+        self._show_held()
+        self._held.topic = StopTopic(node, self._stop_changed)
+        self._held.topic.prepare()
+
+    # In the server's thread.
+
+    def requested(self, page: int, request: Request) -> None:
+        """Take a request of a page. Raises InputError where it cannot be done now."""
+        action = request.action
+        if action == 'stop':
+            self.stop()
+            return
+        if action == 'release':
+            self._release(**request.values)
+            return
+        if self._held.is_on and action not in _ALWAYS:
+            raise InputError(f'{action}: the robot is stopped: expected it to be released first')
+        if action == 'drive' and self._drive.take(page):
+            self._later(self._tasks.cancel_all)
+        stops = self._held.last
+        self._later(lambda: self._do(request, stops))
+
+    def page_closed(self, page: int) -> None:
+        """Stop the robot if this page drives it."""
+        self._drive.let_go(page)
+
+    def stop(self) -> None:
+        """Stop the robot, and hold it: it is published, and no goal is followed."""
+        self._held.begin()
+        self._held.topic.publish(True)
+        self._drive.halt()
+        # Also where the release comes before the node has had the time to hold the robot.
+        self._later(self._tasks.cancel_all)
+        self._later(self._hold)
+
+    def _release(self, stop: int) -> None:
+        """End a stop, at once as it begins: a queued release could end a later one."""
+        self._held.end(stop)
+        self._held.topic.publish(False)
+        self._later(self._released)
+
+    # In the node's thread.
+
+    def tell(self, news: str) -> None:
+        """Show what has happened on all pages."""
+        self._news += 1
+        self._picture.board.put('news', [self._news, news])
+
+    def tick(self) -> None:
+        """Keep a robot that is held standing; called ten times a second."""
+        self._merge.tick()
+        if self._held.is_on:
+            self._drive.keep_standing()
+        else:
+            self._drive.tidy()
+
+    def close(self) -> None:
+        """Stop the robot, if a page drives it, and a merge."""
+        self._drive.close()
+        self._merge.close()
+
+    def _stop_changed(self, stop: StopTopic) -> None:
+        """Follow what others say; a page's own stop and release hold at once."""
+        was_on = self._held.is_on
+        self._held.set_by_others(bool(stop.others))
+        self._picture.board.put('held_by', stop.reason)
+        if self._held.is_on != was_on:
+            self._hold()
+
+    def _released(self) -> None:
+        """Release, too, what earlier processes of this node have left; not what others say."""
+        self._held.topic.release(self._node.get_fully_qualified_name())
+        if others := self._held.topic.others:
+            self.tell(f'released; still stopped by {others}')
+        self._hold()
+
+    def _hold(self) -> None:
+        self._tasks.hold(self._held.is_on)
+        self._show_held()
+
+    def _show_held(self) -> None:
+        self._picture.board.put('held', self._held.number)
+
+    def _show_goal(self, pose: Array | None) -> None:
+        self._picture.board.put('goal', None if pose is None else pose.tolist())
+
+    def _do(self, request: Request, stops: int) -> None:
+        """Do a request; stops: number of the last stop when it was taken."""
+        is_stopped = self._held.is_on or self._held.last != stops
+        if is_stopped and request.action not in _ALWAYS:
+            return  # stopped since it was taken, and perhaps released
+        request.require_recent()  # it may have waited for the node
+        self._works[request.action](**request.values)
+
+    def _works_by_action(self) -> dict[str, Callable[..., None]]:
+        """What does each action of a page, with the values of the request."""
+        merge = self._merge
+        tasks = self._tasks
+        call = self._call
+        area_of = messages.polygon_msg
+        return {
+            'goal': lambda x, y, theta: tasks.drive_to(np.array([x, y, theta])),
+            'go_to_region': self._go_to_region,
+            'home': self._go_home,
+            'initial_pose': self._set_initial_pose,
+            'explore': tasks.explore,
+            'pause': self._pause,
+            'resume': self._resume,
+            'cancel': tasks.cancel_all,
+            'drive': self._drive.drive,
+            'save': lambda name: call('save', SaveMap.Request(path=name)),
+            'load': lambda name: call('load', LoadMap.Request(path=name)),
+            'name_region': lambda region, name: call(
+                'name', NameRegion.Request(id=region, name=name)
+            ),
+            'sessions': merge.list_sessions,
+            'merge': merge.begin,
+            'merge_save': merge.save,
+            'merge_drop': merge.drop,
+            'keep_out': lambda corners, is_wall: call(
+                'keep out', AddKeepOut.Request(corners=area_of(corners), is_wall=is_wall)
+            ),
+            'remove_keep_out': lambda area: call('remove', RemoveKeepOut.Request(id=area)),
+            'erase': lambda corners: call('erase', EraseArea.Request(corners=area_of(corners))),
+        }
+
+    def _go_to_region(self, region: int) -> None:
+        centre = self._picture.centres.get(region)
+        if centre is None:
+            raise InputError(f'region {region}: expected one of the map')
+        self._tasks.drive_to(np.array([*centre, 0.0]))
+
+    def _go_home(self) -> None:
+        start = self._picture.path.start
+        if start is None:
+            raise InputError('home: no pose of the robot yet')
+        self._tasks.drive_to(np.array([*start, 0.0]))
+
+    def _set_initial_pose(self, x: float, y: float, theta: float) -> None:
+        now_ns = int(self._node.get_clock().now().nanoseconds)
+        pose = np.array([x, y, theta])
+        self._publishers['initialpose'].publish(
+            messages.pose_with_covariance_msg(pose, _DRAWN, self._map_frame, now_ns)
+        )
+        self.tell(f'initial pose {x:.2f}, {y:.2f}')
+
+    def _pause(self) -> None:
+        self._publishers[_RESUME].publish(Bool(data=False))
+        self.tell('exploration paused')
+
+    def _resume(self) -> None:
+        self._tasks.require_paused()
+        self._publishers[_RESUME].publish(Bool(data=True))
+        self.tell('exploration continues')
+
+    def _call(self, name: str, request: Any) -> None:
+        client: Client = self._clients[name]
+        if not client.service_is_ready():
+            owner = 'topology_builder' if name == 'name' else 'grid_mapper'
+            raise InputError(f'no service {client.srv_name}: expected {owner} to run')
+
+        def answered(future: AnswerFuture) -> None:
+            answer = future.result()
+            self.tell(f'{name}: {answer.message if answer else "no answer"}')
+
+        client.call_async(request).add_done_callback(answered)

@@ -1,1 +1,0 @@
-"""Requests of a page as goals, calls, poses and velocities."""
