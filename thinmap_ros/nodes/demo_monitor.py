@@ -18,8 +18,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.files import package_data
 from thinmap_ros.files.safe import write_text
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.nodes.simulation.requested_exploration import RequestedExploration
-from thinmap_ros.nodes.simulation.starts import poses_from
+from thinmap_ros.nodes.parts.simulation import RequestedExploration, poses_from
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.sim.coverage import robot_observable_cells

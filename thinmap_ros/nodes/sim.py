@@ -15,8 +15,7 @@ from thinmap_ros import kernels
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.nodes.simulation.robot_interface import RobotInterface
-from thinmap_ros.nodes.simulation.starts import robot_starts
+from thinmap_ros.nodes.parts.simulation import RobotInterface, robot_starts
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
 from thinmap_ros.ros.localized_scan import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep

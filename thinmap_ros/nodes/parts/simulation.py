@@ -1,0 +1,325 @@
+"""Parts of the simulator: robots on topics, their starts, and an exploration on request."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped
+from map_msgs.msg import OccupancyGridUpdate
+from nav_msgs.msg import OccupancyGrid, Odometry
+from rclpy.action import ActionClient
+from rclpy.node import Node
+from rclpy.task import Future
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import UInt32
+from tf2_msgs.msg import TFMessage
+
+from thinmap_msgs.action import Explore
+from thinmap_msgs.msg import ExplorationStatus
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import ConfigError, InputError, quoted
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.shared import MapReceiver
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.files.worlds import read_starts
+from thinmap_ros.nodes.parts.drives import GoalResult
+from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.diagnostics import NodeDiagnostics
+from thinmap_ros.ros.maps import received_map, received_update, updates_topic
+from thinmap_ros.ros.velocity import TOPIC as COMMANDS
+from thinmap_ros.ros.velocity import VelocitySubscription
+from thinmap_ros.sim.other_robots import starts_in, starts_side_by_side
+from thinmap_ros.sim.simulation import SensorReadings, Simulation
+from thinmap_ros.sim.world import World
+
+# The exploration of a robot, as the demo requests it: its goal, map, progress and result.
+
+# Without an answer for this time, the goal is sent again: an explorer that has just been discovered
+# may be unable to answer.
+_RESEND_S = 10.0
+
+
+class RequestedExploration:
+    """Client of the action explore of a robot; its names begin with a prefix, '' or 'robot1/'.
+
+    status: the newest one, None before; result: ready for JSON, None before the end.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        prefix: str,
+        time_limit_s: float,
+        on_map: Callable[[GridPatch], None],
+        on_progress: Callable[[], None],
+    ) -> None:
+        """time_limit_s: simulated time after which the exploration ends; 0: none.
+
+        on_map: receives each map; on_progress: called for each new status.
+        """
+        self.status: ExplorationStatus | None = None
+        self.result: dict[str, Any] | None = None
+        self._node = node
+        self._goal = Explore.Goal(time_limit_s=time_limit_s)
+        self._action = f'{prefix}explore'
+        self._on_progress = on_progress
+        self._sent: Any = None
+        self._sent_at = 0.0
+        self._accepted = False
+        self._client = ActionClient(node, Explore, self._action)
+        self._subscribe(f'{prefix}map', on_map)
+
+    def _subscribe(self, topic: str, on_map: Callable[[GridPatch], None]) -> None:
+        receiver = MapReceiver()
+
+        def on_update(message: OccupancyGridUpdate) -> None:
+            with suppress(InputError):  # of a map that has not come yet
+                patch = received_update(receiver, message)
+                if patch is not None:
+                    on_map(patch)
+
+        def on_whole(message: OccupancyGrid) -> None:
+            on_map(received_map(receiver, message))
+
+        node = self._node
+        node.create_subscription(OccupancyGrid, topic, on_whole, qos.LATCHED)
+        updates = updates_topic(node, topic)
+        node.create_subscription(OccupancyGridUpdate, updates, on_update, qos.STREAM)
+
+    def request(self) -> None:
+        """Send the goal, again if there is no answer for a while."""
+        if self._accepted or not self._client.server_is_ready():
+            return
+        if self._sent is not None and monotonic() - self._sent_at < _RESEND_S:
+            return
+        self._sent_at = monotonic()
+        self._sent = self._client.send_goal_async(self._goal, self._on_feedback)
+        self._sent.add_done_callback(self._on_accepted)
+
+    @property
+    def doing(self) -> str:
+        """What the robot does, in words; '' before the first status."""
+        status = self.status
+        if status is None:
+            return ''
+        if status.state != ExplorationStatus.EXPLORING:
+            return str(status.reason)
+        position = status.target_position
+        return (
+            f'to the end node at {position.x:.1f}, {position.y:.1f}'
+            if status.has_target
+            else 'looking around'
+        )
+
+    def _on_accepted(self, future: Future) -> None:
+        if future is not self._sent:
+            return  # replaced by a newer goal
+        self._accepted = True
+        GoalResult(self._node, self._action, future.result(), self._on_result)
+
+    def _on_feedback(self, message: Explore.Impl.FeedbackMessage) -> None:
+        self.status = message.feedback.status
+        self._on_progress()
+
+    def _on_result(self, ended: Any) -> None:
+        status: ExplorationStatus = ended.result.status
+        if ended.status == GoalStatus.STATUS_UNKNOWN:
+            status.reason = 'the explorer was started again, and does not know the exploration'
+        end_ns = messages.stamp_ns(status.header.stamp)
+        self.result = {
+            'finished': ended.status == GoalStatus.STATUS_SUCCEEDED
+            and status.reason_code != ExplorationStatus.BUDGET_EXHAUSTED,
+            'reason': status.reason,
+            'start_ns': end_ns - round(1e9 * messages.seconds(status.elapsed)),
+            'end_ns': end_ns,
+        }
+        self.status = status
+        self._on_progress()
+
+
+# The topics of a simulated robot: its sensors and true pose out, commands in.
+
+_COMMAND_TIMEOUT_NS = 500_000_000
+
+
+class _Publishers:
+    """Publishes what a simulated robot senses, and the ground truth."""
+
+    def __init__(self, node: Node, prefix: str, scan_time_s: float, publish_tf: bool) -> None:
+        """prefix: of the topics of one of several robots, with a slash; ''.
+
+        scan_time_s: time between two scans. publish_tf: also publish the transforms.
+        """
+        self._scan_time_s = scan_time_s
+        self._scan = node.create_publisher(LaserScan, f'{prefix}scan', qos.STREAM)
+        self._odom = node.create_publisher(Odometry, f'{prefix}odom', qos.STREAM)
+        self._truth = node.create_publisher(PoseStamped, f'{prefix}ground_truth', qos.STREAM)
+        self._collisions = node.create_publisher(UInt32, f'{prefix}collisions', qos.LATCHED)
+        # Frames of several robots have the same names: each robot has transforms of its own.
+        below = prefix or '/'
+        self._tf = node.create_publisher(TFMessage, f'{below}tf', qos.STREAM)
+        self._tf_static = node.create_publisher(
+            TFMessage, f'{below}tf_static', qos.STATIC_TRANSFORMS
+        )
+        self._publish_tf = publish_tf
+        self._last_collisions = -1
+        self._last_scan: LaserScan | None = None
+
+    def publish_laser_pose(self, simulation: Simulation) -> None:
+        if self._publish_tf:
+            T_base_laser = simulation.laser.T_base_laser
+            transform = messages.transform_msg(T_base_laser, 'base_link', 'laser', 0)
+            self._tf_static.publish(TFMessage(transforms=[transform]))
+
+    def publish(self, moment: SensorReadings, simulation: Simulation) -> None:
+        """Publish a moment; the scan, if there is one, comes last."""
+        robot = simulation.robot
+        self._publish_odometry(moment, simulation)
+        truth = messages.pose_stamped_msg(robot.T_world_base, 'world', moment.stamp_ns)
+        self._truth.publish(truth)
+        if robot.collisions != self._last_collisions:
+            self._last_collisions = robot.collisions
+            self._collisions.publish(UInt32(data=robot.collisions))
+        if moment.scan is not None:
+            self._last_scan = messages.scan_msg(moment.scan, 'laser', self._scan_time_s)
+            self._scan.publish(self._last_scan)
+
+    def repeat_scan(self, simulation: Simulation) -> None:
+        """Publish the last scan again, with the present odometry."""
+        if self._last_scan is not None:
+            self._scan.publish(self._last_scan)
+            self._publish_odometry(simulation.read_sensors(), simulation)
+
+    def _publish_odometry(self, moment: SensorReadings, simulation: Simulation) -> None:
+        velocity = (simulation.robot.v, simulation.robot.w)
+        frames = ('odom', 'base_link')
+        self._odom.publish(
+            messages.odometry_msg(moment.T_odom_base, velocity, frames, moment.stamp_ns)
+        )
+        if self._publish_tf:
+            transform = messages.transform_msg(moment.T_odom_base, *frames, moment.stamp_ns)
+            self._tf.publish(TFMessage(transforms=[transform]))
+
+
+@dataclass(frozen=True)
+class _VelocityCommand:
+    """A velocity command, m/s and rad/s, with the time at which it was received."""
+
+    v: float = 0.0
+    w: float = 0.0
+    received_ns: int = 0
+
+    def at(self, now_ns: int) -> tuple[float, float]:
+        """The velocity at a time; as a robot's controller, it stops without a recent command."""
+        is_recent = now_ns - self.received_ns <= _COMMAND_TIMEOUT_NS
+        return (self.v, self.w) if is_recent else (0.0, 0.0)
+
+
+class RobotInterface:
+    """A simulated robot on the graph; its topics begin with a prefix, '' or 'robot1/'."""
+
+    def __init__(
+        self,
+        node: Node,
+        prefix: str,
+        simulation: Simulation,
+        diagnostics: NodeDiagnostics,
+        publish_tf: bool,
+    ) -> None:
+        """publish_tf: whether odom -> base_link and base_link -> laser are published."""
+        scan_time_s = 1.0 / simulation.laser.config.scan_rate_hz
+        self._node = node
+        self._prefix = prefix
+        self._simulation = simulation
+        self._diagnostics = diagnostics
+        self._output = _Publishers(node, prefix, scan_time_s, publish_tf)
+        self._command = _VelocityCommand()
+        VelocitySubscription(node, diagnostics, self._on_command, f'{prefix}{COMMANDS}')
+        self._teleports = f'~/{prefix}set_pose'
+        node.create_subscription(PoseStamped, self._teleports, self._on_teleport, qos.STREAM)
+        self._output.publish_laser_pose(simulation)
+
+    @property
+    def scan_subscribers(self) -> int:
+        """Number of subscribers of the scans."""
+        return int(self._node.count_subscribers(f'{self._prefix}scan'))
+
+    def move(self) -> None:
+        """Drive for one step as commanded."""
+        self._simulation.move(*self._command.at(self._simulation.stamp_ns))
+
+    def publish(self) -> bool:
+        """Publish the present sensor readings; returns whether there was a scan."""
+        moment = self._simulation.read_sensors()
+        self._output.publish(moment, self._simulation)
+        return moment.scan is not None
+
+    def repeat_scan(self) -> None:
+        """Publish the last scan again."""
+        self._output.repeat_scan(self._simulation)
+
+    def _on_command(self, v: float, w: float) -> None:
+        if not np.isfinite((v, w)).all():
+            reason = f'command {(v, w)}: expected finite numbers'
+            self._diagnostics.message_rejected(f'{self._prefix}{COMMANDS}', reason)
+            return
+        self._command = _VelocityCommand(v, w, self._simulation.stamp_ns)
+
+    def _on_teleport(self, message: PoseStamped) -> None:
+        """Teleport the robot, for kidnapping tests: the odometry does not change."""
+        self._diagnostics.message_received(self._teleports)
+        try:
+            self._simulation.teleport(messages.pose_from_msg(message.pose))
+        except InputError as error:
+            self._diagnostics.message_rejected(self._teleports, str(error))
+
+
+# Where the simulated robots start: as given, as in the file of the world, or side by side.
+
+
+def robot_starts(
+    world: World, file: Path, count: int, given: tuple[str, str], radius_m: float
+) -> list[Array]:
+    """Start (3,) of each robot of a radius.
+
+    file: of the world; given: the parameters start and starts.
+    Raises ConfigError where these are wrong, InputError where there is no room.
+    """
+    start, starts = given
+    if start and starts:
+        raise ConfigError('start and starts: expected one of the two')
+    if starts:
+        poses = poses_from('starts', starts)
+        if len(poses) != count:
+            raise ConfigError(
+                f'starts = {quoted(starts)}: expected as many as robots ({count}), found '
+                f'{len(poses)}'
+            )
+        return poses
+    if start:
+        return starts_side_by_side(world, _pose('start', start), count, radius_m)
+    listed = read_starts(file)
+    if not se2.is_finite(world.start) and not len(listed) >= count > 1:
+        raise ConfigError(f'start: world {world.name} has none: expected "x,y,theta"')
+    return starts_in(world, world.start, listed, count, radius_m)
+
+
+def poses_from(name: str, text: str) -> list[Array]:
+    """Poses (3,) of a parameter like "x,y,theta; x,y,theta". Raises ConfigError."""
+    return [_pose(name, part) for part in text.split(';')]
+
+
+def _pose(name: str, text: str) -> Array:
+    try:
+        x, y, theta = (float(part) for part in text.split(','))
+        start = se2.pose(x, y, theta)
+    except ValueError:
+        start = se2.pose(0.0, 0.0, float('nan'))
+    if not se2.is_finite(start):
+        raise ConfigError(f'{name} = {quoted(text)}: expected "x,y,theta" in m, m, rad')
+    return start
