@@ -8,7 +8,7 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import SECOND_NS
-from thinmap_ros.evaluation.trajectory_comparison import associated
+from thinmap_ros.evaluation.trajectory_errors import associated
 from thinmap_ros.files.trajectories import write_tum
 from thinmap_ros.tools import evaluate
 

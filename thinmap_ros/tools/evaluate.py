@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.trajectory_comparison import (
+from thinmap_ros.evaluation.trajectory_errors import (
     MAX_TIME_DIFFERENCE_S,
     Comparison,
     compare_with_relations,
