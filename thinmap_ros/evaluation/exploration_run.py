@@ -1,27 +1,164 @@
 """Exploration of a simulated world, with a report."""
 
+import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from thinmap_ros.baselines.exploration import NearestFrontier
 from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
+from thinmap_ros.core import se2
 from thinmap_ros.core.config import config_or_default
-from thinmap_ros.core.errors import pose_of, require_type
-from thinmap_ros.core.exploration.strategy import Decision
+from thinmap_ros.core.errors import InputError, pose_of, require_type
+from thinmap_ros.core.exploration.strategy import Decision, Strategy
+from thinmap_ros.core.places.global_localizer import GlobalLocalization
+from thinmap_ros.core.planning.navigator import Navigator
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.evaluation.exploration_metrics import (
     EndNodeCensus,
     TargetLog,
     exploration_report,
     missing_area_report,
 )
-from thinmap_ros.evaluation.kidnapping import Kidnapping
+from thinmap_ros.pipeline import Pipeline
 from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
+
+# Kidnaps the robot during exploration, and measures detection and recovery.
+
+
+@dataclass(frozen=True)
+class _Criteria:
+    """Where a robot is put, and which pose is right.
+
+    far_m: distance from its place, or more. margin_m: between robot and walls. right_m, right_rad:
+    largest errors of a right pose.
+    """
+
+    far_m: float
+    margin_m: float
+    right_m: float
+    right_rad: float
+
+
+_CRITERIA = _Criteria(far_m=3.0, margin_m=0.1, right_m=0.5, right_rad=math.radians(10.0))
+
+
+class Kidnapping:
+    """Teleports the robot of a closed loop once to a random place of its map.
+
+    When its localizer is lost, global localization starts. Meanwhile the robot explores its
+    surroundings with a separate pipeline and map.
+    """
+
+    def __init__(self, at_s: float, seed: int) -> None:
+        self._at_s = at_s
+        self._seed = seed
+        self._carried_s: float | None = None
+        self._detected_s: float | None = None
+        self._found_s: float | None = None
+        self._off: Array | None = None
+        self._travelled_m = 0.0
+        self._own: tuple[Pipeline, Strategy, Navigator] | None = None
+        self._finder: GlobalLocalization | None = None
+
+    def report(self) -> dict[str, Any]:
+        """Results for the report: times in s, None for events that did not happen."""
+
+        def after(since: float | None, until: float | None) -> float | None:
+            return None if since is None or until is None else round(until - since, 3)
+
+        off = self._off
+        right: bool | None = None
+        if off is not None:
+            is_near = math.hypot(off[0], off[1]) <= _CRITERIA.right_m
+            right = bool(is_near and abs(off[2]) <= _CRITERIA.right_rad)
+        return {
+            'kidnapped_at_s': self._carried_s,
+            'detected_after_s': after(self._carried_s, self._detected_s),
+            'found_after_s': after(self._detected_s, self._found_s),
+            'found_after_m': None if self._found_s is None else round(self._travelled_m, 3),
+            'found_error_m': None if off is None else round(math.hypot(off[0], off[1]), 3),
+            'found_right': right,
+        }
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether global localization is running."""
+        return self._finder is not None
+
+    def intercepts(self, loop: ClosedLoop, scan: Scan, T_odom_base: Array) -> bool:
+        """Whether the loop must ignore a scan: before the robot is placed, or while it is lost."""
+        if self._carried_s is None and scan.stamp_ns >= 1e9 * self._at_s:
+            self._kidnap(loop, scan.stamp_ns / 1e9)
+            return True
+        if self._finder is None:
+            return False
+        self._search(loop, self._finder, scan, T_odom_base)
+        return True
+
+    def add_estimate(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
+        """Start global localization when the robot is lost."""
+        if (
+            estimate.is_lost
+            and self._finder is None
+            and self._carried_s is not None
+            and self._found_s is None
+        ):
+            self._detected_s = scan.stamp_ns / 1e9
+            self._finder = GlobalLocalization(
+                loop.pipeline.grid.known_area(), loop.pipeline.topology.map, seed=self._seed
+            )
+            self._own = loop.pipeline, loop.strategy, loop.navigator
+            loop.replace_strategy(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
+
+    def _kidnap(self, loop: ClosedLoop, seconds: float) -> None:
+        """Teleport the robot to a random mapped place far from its position."""
+        world = loop.simulation.world
+        robot = loop.simulation.robot
+        patch = loop.pipeline.grid.known_area()
+        at = patch.frame.centres_of(np.argwhere(patch.free))
+        at = at[np.hypot(*(at - robot.T_world_base[:2]).T) >= _CRITERIA.far_m]
+        clearance_m = robot.config.radius_m + _CRITERIA.margin_m
+        fits = [world.is_clear(x, y, clearance_m) for x, y in at.tolist()]
+        if not any(fits):
+            raise InputError(
+                f'--kidnap-at-s={self._at_s:g}: no mapped place is {_CRITERIA.far_m:g} m away: '
+                'expected a later time'
+            )
+        rng = np.random.default_rng(self._seed)
+        x, y = rng.choice(at[fits])
+        loop.simulation.teleport(
+            se2.pose(float(x), float(y), float(rng.uniform(-math.pi, math.pi)))
+        )
+        self._carried_s = seconds
+
+    def _search(
+        self, loop: ClosedLoop, finder: GlobalLocalization, scan: Scan, T_odom_base: Array
+    ) -> None:
+        """Process a scan of a lost robot, with all of its localizers."""
+        assert self._own is not None
+        localizer = self._own[0].localizer
+        T_world_base = loop.simulation.robot.T_world_base
+        estimate = self._own[0].step(scan, T_odom_base).estimate
+        self._travelled_m += float(np.hypot(*(T_world_base - loop.log.true_poses[-1])[:2]))
+        loop.log_poses(scan, estimate)
+        found = finder.step(scan, T_odom_base).pose
+        if found is not None:
+            localizer.set_pose(found.T_map_base, found.covariance)
+        if found is not None or not estimate.is_lost:
+            self._found_s = scan.stamp_ns / 1e9
+            self._off = se2.between(T_world_base, localizer.pose)
+            self._finder = None
+            loop.replace_strategy(*self._own)
+        else:
+            loop.decide(scan, loop.pipeline.step(scan, T_odom_base).estimate)
 
 
 def explore(
