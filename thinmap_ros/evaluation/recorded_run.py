@@ -1,6 +1,7 @@
 """Results of a run of the live graph, from its bag."""
 
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,9 +18,11 @@ from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap, topology_from_msg
 from thinmap_ros.evaluation.exploration_metrics import (
+    MILESTONES,
     EndNodeCensus,
     exploration_report,
     exploration_title,
+    first_time,
     hidden_places,
     missing_area_report,
 )
@@ -27,7 +30,7 @@ from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
-from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.robot import PRESETS, RobotConfig
 from thinmap_ros.sim.world import World
 from thinmap_ros.view import rerun_sinks
 from thinmap_ros.view.message_view import recording_from_bag
@@ -43,6 +46,7 @@ FILES = (
     'summary.png',
     'recording.rrd',
 )
+
 _TOPICS = (
     'ground_truth',
     'pose',
@@ -198,3 +202,187 @@ def _census(recording: Recording) -> EndNodeCensus:
         if ns in recording.estimated:
             census.add(nodes, recording.estimated[ns])
     return census
+
+
+# Results of a run of several robots on the live graph, from its bag.
+
+_TEAM_TOPICS = {'/merged_map', '/merged_topology', '/join_status'}
+
+
+@dataclass(eq=False)
+class _Joint:
+    """What map_joiner has published: the last map and graph, and the places of the maps.
+
+    joined_ns: since when the map of each robot has been joined; places: its pose (3,) now.
+    """
+
+    patch: GridPatch | None = None
+    topology: TopologicalMap = field(default_factory=TopologicalMap)
+    joined_ns: dict[str, int] = field(default_factory=dict)
+    places: dict[str, Array] = field(default_factory=dict)
+
+    def add_status(self, ns: int, message: Any) -> None:
+        """Add a JoinStatus of a time."""
+        joined = {each.name.strip('/'): each for each in message.maps if each.is_joined}
+        self.joined_ns = {name: self.joined_ns.get(name, ns) for name in joined}
+        self.places = {name: decode.pose(each.pose) for name, each in joined.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class RobotRun:
+    """The run of a robot: its name, what was recorded, and the result of its exploration.
+
+    T_world_map (3,): pose of the frame of its map in the world.
+    """
+
+    name: str
+    T_world_map: Array
+    recording: Recording
+    result: dict[str, Any]
+
+    @property
+    def true(self) -> Array:
+        """The driven path (N, 3), world frame, of the exploration."""
+        first_ns = int(self.result['start_ns'])
+        last_ns = int(self.result['end_ns'])
+        true = self.recording.true
+        return np.array([true[ns] for ns in true if first_ns <= ns <= last_ns])
+
+    @property
+    def distance_m(self) -> float:
+        """Length of this path."""
+        return float(np.hypot(*np.diff(self.true[:, :2], axis=0).T).sum())
+
+
+def write_team(
+    out: Path,
+    world_file: Path,
+    robot: str,
+    result: dict[str, Any],
+    map_poses: Sequence[Array],
+    command: str = '',
+) -> dict[str, Any]:
+    """Write map, graph, trajectories, picture and report of a run of several robots in out/bag.
+
+    The map is the joint one, or that of the first robot where none is joined. robot: preset of all;
+    result: of demo_monitor; map_poses: pose (3,) in the world of the frame of each map.
+    Returns the report.
+    """
+    bag = out / 'bag'
+    robots = [
+        RobotRun(each['name'], pose, read(bag, f'/{each["name"]}/'), each)
+        for each, pose in zip(result['robots'], map_poses, strict=True)
+    ]
+    joint = _read_joint(bag)
+    world = World.from_patch(*read_world(world_file))
+    report = {'world': world.name, **_team_report(robots, joint, world, PRESETS[robot])}
+    first = robots[0].recording
+    patch = first.maps[-1][1] if joint.patch is None else joint.patch
+    topology = first.topology if joint.patch is None else joint.topology
+    T_merged_world = _world_pose(robots, joint)
+    title = exploration_title(report)
+    estimated = {f'trajectory_{each.name}': each.recording.estimated for each in robots}
+    poses = {name: (list(found), list(found.values())) for name, found in estimated.items()}
+    paths = {each.name: se2.transform_points(T_merged_world, each.true[:, :2]) for each in robots}
+    write_run(out, RunResult(patch, topology, title, poses, shown={'robots': paths}))
+    write_report(out, title, report, command)
+    return report
+
+
+def _read_joint(path: Path) -> _Joint:
+    bag = Bag(path)
+    joint = _Joint()
+    for raw in bag.messages(_TEAM_TOPICS):
+        message = bag.decode(raw)
+        if raw.topic == '/merged_map':
+            joint.patch = decode.patch(message)
+        elif raw.topic == '/merged_topology':
+            joint.topology = recorded_topology(path, raw.topic, message)
+        else:
+            joint.add_status(decode.stamp_ns(message), message)
+    if not joint.places:
+        joint.patch = None
+    return joint
+
+
+def _world_pose(robots: Sequence[RobotRun], joint: _Joint) -> Array:
+    """Pose (3,) of the world in the frame of the map that is written.
+
+    By the map that lies in it without a search: its own frame, or the first one there.
+    """
+    reference = next((each for each in robots if each.name in joint.places), robots[0])
+    place = joint.places.get(reference.name, np.zeros(3))
+    return se2.compose(place, se2.invert(reference.T_world_map))
+
+
+def _team_report(
+    robots: Sequence[RobotRun], joint: _Joint, world: World, robot: RobotConfig
+) -> dict[str, Any]:
+    start_ns = min(int(each.result['start_ns']) for each in robots)
+    end_ns = max(int(each.result['end_ns']) for each in robots)
+    curve = _coverage(robots, world, robot, start_ns)
+    T_merged_world = _world_pose(robots, joint)
+    reports = [_robot_report(each, joint, T_merged_world, start_ns) for each in robots]
+    reasons = dict.fromkeys(str(each.result['reason']) for each in robots)
+    return {
+        'finished': all(each.result['finished'] for each in robots),
+        'reason': '; '.join(reasons),
+        'coverage': round(float(curve[-1, 1]), 5),
+        'distance': round(sum(each.distance_m for each in robots), 3),
+        'time': round((end_ns - start_ns) / 1e9, 3),
+        'time_at': {f'{share:.2f}': first_time(curve, share) for share in MILESTONES},
+        'collisions': sum(each.recording.collisions for each in robots),
+        'robots': reports,
+        'joins': [_join_text(each) for each in reports],
+        'curve': [[round(float(at), 2), round(float(share), 4)] for at, share in curve],
+    }
+
+
+def _robot_report(
+    robot: RobotRun, joint: _Joint, T_merged_world: Array, start_ns: int
+) -> dict[str, Any]:
+    """Figures of a robot; joined_at: of its map, s; join_error: m and deg against the truth."""
+    recording = robot.recording
+    shared = [ns for ns in recording.true if ns in recording.estimated]
+    estimated = np.array([se2.compose(robot.T_world_map, recording.estimated[ns]) for ns in shared])
+    errors = np.hypot(*(estimated - [recording.true[ns] for ns in shared])[:, :2].T)
+    joined_ns = joint.joined_ns.get(robot.name)
+    error = None
+    if joined_ns is not None:
+        expected = se2.compose(T_merged_world, robot.T_world_map)
+        x, y, turn = se2.between(expected, joint.places[robot.name]).tolist()
+        error = [round(float(np.hypot(x, y)), 4), round(abs(float(np.degrees(turn))), 3)]
+    return {
+        'name': robot.name,
+        'finished': robot.result['finished'],
+        'reason': robot.result['reason'],
+        'distance': round(robot.distance_m, 3),
+        'time': round((int(robot.result['end_ns']) - int(robot.result['start_ns'])) / 1e9, 3),
+        'collisions': recording.collisions,
+        'pose_rmse': round(float(np.sqrt(np.mean(errors**2))), 5),
+        'joined_at': None if joined_ns is None else round((joined_ns - start_ns) / 1e9, 3),
+        'join_error': error,
+    }
+
+
+def _join_text(robot: dict[str, Any]) -> str:
+    """When the map of a robot was joined, and with which error, in words."""
+    if robot['join_error'] is None:
+        return f'{robot["name"]}: not joined'
+    off_m, off_deg = robot['join_error']
+    after = f'{robot["name"]}: after {robot["joined_at"]:.0f} s'
+    return f'{after}, off by {off_m:.2f} m, {off_deg:.1f} deg'
+
+
+def _coverage(robots: Sequence[RobotRun], world: World, robot: RobotConfig, start_ns: int) -> Array:
+    """Time, s, and share of the area that one of the maps holds, for each map (N, 2)."""
+    range_m = max(each.recording.range_max_m for each in robots)
+    start = next(iter(robots[0].recording.true.values()))
+    seen = robot_observable_cells(world, start, robot, range_m)
+    maps = [(ns, patch, each) for each in robots for ns, patch in each.recording.maps]
+    known = {}
+    curve = []
+    for ns, patch, each in sorted(maps, key=lambda entry: entry[0]):
+        known[each.name] = seen.known(patch, each.T_world_map)
+        curve.append(((ns - start_ns) / 1e9, seen.share(list(known.values()))))
+    return np.array(curve)

@@ -21,7 +21,8 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation import recorded_run, recorded_team_run
+from thinmap_ros.evaluation import recorded_run
+from thinmap_ros.evaluation import recorded_run as recorded_team_run
 from thinmap_ros.evaluation.processes import end_with_parent
 from thinmap_ros.evaluation.ros_domains import use_free_domain
 from thinmap_ros.files import package_data
@@ -261,7 +262,7 @@ def _work(arguments: argparse.Namespace) -> None:
     if len(starts) == 1:
         report = recorded_run.write(*run, command)
     else:
-        report = recorded_team_run.write(*run, map_poses(starts), command)
+        report = recorded_team_run.write_team(*run, map_poses(starts), command)
     print(
         f'{report["reason"]}: {100.0 * report["coverage"]:.1f} % seen, '
         f'{report["distance"]:.1f} m, {report["time"]:.1f} s, {report["collisions"]} collisions; '
