@@ -27,8 +27,8 @@ from benchmarks.speed import (
 )
 from benchmarks.time_and_memory import machine
 from benchmarks.worlds import WORLDS
-from thinmap_ros.evaluation.machine import write_provenance
 from thinmap_ros.evaluation.outcome import Row, show
+from thinmap_ros.evaluation.parallel_jobs import write_provenance
 
 _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'thinning': thinning.run,

@@ -11,7 +11,7 @@ from pathlib import Path
 from benchmarks.charts import DOCS, OTHERS, OURS, Mark, Panel, chart_path, draw, picture
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.results_page import made_lines, read_reports
-from thinmap_ros.evaluation.machine import provenance
+from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.evaluation.peers import INTEL, PEERS, Origin, PeerRun, runs, shown
 from thinmap_ros.files.safe import read_text, write_text
 

@@ -13,8 +13,8 @@ from benchmarks.scoreboard.board_rows import board_table
 from benchmarks.scoreboard.results_page import made_lines, read_reports
 from benchmarks.speed.page import sections as speed_sections
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.machine import provenance
 from thinmap_ros.evaluation.outcome import VERDICTS
+from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.files.safe import write_text
 
 _HEAD = """\

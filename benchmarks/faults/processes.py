@@ -13,7 +13,7 @@ import psutil
 
 from benchmarks.faults.kinds import NODES
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.processes import end_with_parent
+from thinmap_ros.evaluation.parallel_jobs import end_with_parent
 
 _STOP_S = 10.0
 _LAST_LINES = 300

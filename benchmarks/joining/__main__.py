@@ -12,8 +12,8 @@ from pathlib import Path
 from benchmarks.joining import tables
 from benchmarks.places.tables import lines
 from benchmarks.worlds import WORLDS, Floor, floors
-from thinmap_ros.evaluation.machine import write_provenance
 from thinmap_ros.evaluation.outcome import Table
+from thinmap_ros.evaluation.parallel_jobs import write_provenance
 
 # Three floors and three dungeons; five robots; six buildings.
 _SIX = (

@@ -11,8 +11,8 @@ from benchmarks.charts import BAD, DOCS, OURS, Mark, Panel, chart_path, draw, pi
 from benchmarks.kidnapped.__main__ import read
 from benchmarks.kidnapped.summary import Written, by_group, summary
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.machine import provenance
 from thinmap_ros.evaluation.outcome import Row
+from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.files.safe import write_text
 
 _CHART = 'localization'

@@ -15,8 +15,8 @@ from benchmarks.places.cases import recorded
 from benchmarks.places.generators import generators
 from benchmarks.places.recorded import RecordedPiece
 from benchmarks.worlds import WORLDS
-from thinmap_ros.evaluation.machine import write_provenance
 from thinmap_ros.evaluation.outcome import Table
+from thinmap_ros.evaluation.parallel_jobs import write_provenance
 
 _TABLES: dict[str, Callable[[list[RecordedPiece]], Table]] = {
     'shared': tables.shared,

@@ -13,7 +13,7 @@ from benchmarks.release.state import State, read_state
 from benchmarks.release.steps import MAX_MINUTES, Folders, Step, steps
 from benchmarks.worlds import WORLDS
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.evaluation.machine import commit, provenance
+from thinmap_ros.evaluation.parallel_jobs import commit, provenance
 from thinmap_ros.tools import cli
 
 _ROOT = Path(__file__).resolve().parents[2]

@@ -22,13 +22,14 @@ from thinmap_ros.core.config import parameters_of, suggestion
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.slam.localizer import default_config, parameters_elsewhere
 from thinmap_ros.core.stage import StartConfig
-from thinmap_ros.evaluation.machine import provenance, write_provenance
 from thinmap_ros.evaluation.parallel_jobs import (
     Failure,
     add_run_options,
     failure_summary,
+    provenance,
     read_report,
     run_pending,
+    write_provenance,
 )
 from thinmap_ros.files.safe import read_text, write_text
 from thinmap_ros.tools import cli

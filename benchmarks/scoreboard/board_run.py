@@ -17,8 +17,14 @@ from benchmarks.scoreboard.page import COLUMN_NOTES, case_tables
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.reports import report_file, report_of, reports_there
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.machine import provenance, write_provenance
-from thinmap_ros.evaluation.parallel_jobs import Failure, failure_summary, read_report, run_pending
+from thinmap_ros.evaluation.parallel_jobs import (
+    Failure,
+    failure_summary,
+    provenance,
+    read_report,
+    run_pending,
+    write_provenance,
+)
 from thinmap_ros.files.safe import write_text
 
 FOLDER = 'board'  # of the results; a case of the complete scoreboard may have the same name

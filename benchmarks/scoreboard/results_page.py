@@ -17,7 +17,7 @@ from benchmarks.scoreboard.stamps import NAME as STAMPS
 from benchmarks.scoreboard.stamps import THINNED
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation import peers
-from thinmap_ros.evaluation.machine import provenance
+from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.evaluation.peers import CARTOGRAPHER, COMPLETE, INTEL, LAMA, Origin, shown
 from thinmap_ros.files.safe import read_text, write_text
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.charts import DOCS, OTHERS, Mark, Panel, chart_path, draw, picture
 from benchmarks.scoreboard.results_page import read_reports
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.machine import provenance
+from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.evaluation.peers import INTEL, Origin, runs
 from thinmap_ros.files.safe import write_text
 

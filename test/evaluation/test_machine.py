@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from thinmap_ros.evaluation.machine import commit, provenance, write_provenance
+from thinmap_ros.evaluation.parallel_jobs import commit, provenance, write_provenance
 
 IDENTITY = {
     f'GIT_{who}_{what}': 'x' for who in ('AUTHOR', 'COMMITTER') for what in ('NAME', 'EMAIL')

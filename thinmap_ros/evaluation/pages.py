@@ -5,7 +5,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from thinmap_ros.evaluation.machine import provenance
+from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.files.safe import read_text, write_text
 from thinmap_ros.view.figures import write_small_png
 

@@ -1,9 +1,12 @@
 """Runs jobs in separate processes, on local cores or a Dask cluster; resumable."""
 
 import argparse
+import ctypes
 import json
 import os
+import platform
 import signal
+import subprocess
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -192,3 +195,70 @@ def _attempted(work: Callable[[AnyJob], Report], job: AnyJob) -> Report | Failur
 
 def _named(error: Exception) -> str:
     return f'{type(error).__name__}: {one_line_reason(error)}'
+
+
+# Child processes that end with their parent.
+
+_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
+
+
+def end_with_parent() -> None:
+    """Send SIGTERM to this process when its parent ends (Linux)."""
+    ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGTERM)
+
+
+# Machine and commit of a measurement.
+
+_ROOT = Path(__file__).resolve().parents[2]
+
+_PROVENANCE = 'provenance.txt'
+
+_GIT_S = 10.0
+
+
+def provenance(folder: Path | None = None) -> str:
+    """One line of commit, processor, cores and Python: of a folder of results, else of this run."""
+    if folder is not None and (folder / _PROVENANCE).exists():
+        return read_text(folder / _PROVENANCE).strip()
+    known = commit(_ROOT)
+    words = [
+        *([f'Commit {known}'] if known else []),
+        _processor(),
+        f'{os.cpu_count()} cores',
+        f'Python {platform.python_version()}',
+    ]
+    return ', '.join(words)
+
+
+def write_provenance(folder: Path) -> None:
+    """Write the line of this run to a folder of results, for pages that are made of it later."""
+    write_text(folder / _PROVENANCE, f'{provenance()}\n')
+
+
+def commit(root: Path) -> str:
+    """Short hash of the commit of a source tree; empty outside of git.
+
+    Changes that are not committed are marked, but for those of docs, to which pages are written.
+    """
+    try:
+        # The tree may be installed inside the repository of another project.
+        if not _git(root, 'ls-files', 'thinmap_ros/evaluation'):
+            return ''
+        changes = _git(root, 'status', '--porcelain', '-uno', '--', '.', ':(exclude)docs')
+        return _git(root, 'rev-parse', '--short', 'HEAD') + (
+            ' with local changes' if changes else ''
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ''
+
+
+def _git(root: Path, *words: str) -> str:
+    command = ['git', '-C', str(root), *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=_GIT_S, check=True)
+    return done.stdout.strip()
+
+
+def _processor() -> str:
+    lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
+    names = [line.partition(':')[2].strip() for line in lines if line.startswith('model name')]
+    return names[0] if names else platform.processor()

@@ -15,13 +15,13 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_run import explore
-from thinmap_ros.evaluation.machine import write_provenance
 from thinmap_ros.evaluation.parallel_jobs import (
     Report,
     add_run_options,
     failure_summary,
     read_report,
     run_pending,
+    write_provenance,
 )
 from thinmap_ros.evaluation.strategy_comparison import markdown
 from thinmap_ros.files import package_data

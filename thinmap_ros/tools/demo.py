@@ -23,7 +23,7 @@ from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation import recorded_run
 from thinmap_ros.evaluation import recorded_run as recorded_team_run
-from thinmap_ros.evaluation.processes import end_with_parent
+from thinmap_ros.evaluation.parallel_jobs import end_with_parent
 from thinmap_ros.evaluation.ros_domains import use_free_domain
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_starts, read_world

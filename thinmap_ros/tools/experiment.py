@@ -11,9 +11,9 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.machine import write_provenance
 from thinmap_ros.evaluation.outcome import Outcome
 from thinmap_ros.evaluation.pages import write_markdown, write_page
+from thinmap_ros.evaluation.parallel_jobs import write_provenance
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.exploration import (
     end_nodes,
