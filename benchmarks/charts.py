@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter
 
-from thinmap_ros.evaluation.peers import Origin, Range
+from thinmap_ros.evaluation.slam_run import Origin, Range
 
 OURS = '#0072B2'
 OTHERS = {Origin.TEAM: '#555555', Origin.PUBLISHED: '#E69F00'}

@@ -12,7 +12,7 @@ from benchmarks.charts import DOCS, OTHERS, OURS, Mark, Panel, chart_path, draw,
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.results_page import made_lines, read_reports
 from thinmap_ros.evaluation.parallel_jobs import provenance
-from thinmap_ros.evaluation.peers import INTEL, PEERS, Origin, PeerRun, runs, shown
+from thinmap_ros.evaluation.slam_run import INTEL, PEERS, Origin, PeerRun, runs, shown
 from thinmap_ros.files.safe import read_text, write_text
 
 _CHART = 'peers'

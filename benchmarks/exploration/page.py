@@ -14,7 +14,7 @@ from benchmarks.charts import DOCS, OTHERS, Mark, Panel, chart_path, draw, pictu
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.parallel_jobs import provenance
-from thinmap_ros.evaluation.peers import Origin
+from thinmap_ros.evaluation.slam_run import Origin
 from thinmap_ros.evaluation.strategy_comparison import (
     OURS,
     by_strategy,

@@ -16,9 +16,9 @@ from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.stamps import NAME as STAMPS
 from benchmarks.scoreboard.stamps import THINNED
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation import peers
+from thinmap_ros.evaluation import slam_run
 from thinmap_ros.evaluation.parallel_jobs import provenance
-from thinmap_ros.evaluation.peers import CARTOGRAPHER, COMPLETE, INTEL, LAMA, Origin, shown
+from thinmap_ros.evaluation.slam_run import CARTOGRAPHER, COMPLETE, INTEL, LAMA, Origin, shown
 from thinmap_ros.files.safe import read_text, write_text
 
 _CHART = 'slam'
@@ -146,8 +146,8 @@ def _by_name(reports: Sequence[Numbers]) -> dict[str, Numbers]:
     return {report['name']: report for report in reports if 'live_m' in report}
 
 
-def _peer(system: str, log: str, origin: Origin) -> peers.PeerRun | None:
-    found = [run for run in peers.runs(log) if (run.system, run.origin) == (system, origin)]
+def _peer(system: str, log: str, origin: Origin) -> slam_run.PeerRun | None:
+    found = [run for run in slam_run.runs(log) if (run.system, run.origin) == (system, origin)]
     return found[0] if found else None
 
 
@@ -189,7 +189,7 @@ def _intel_table(reports: Sequence[Numbers]) -> list[str]:
         f'| **thinmap** | {ours["live_m"]:.3f} | {ours["final_m"]:.3f} | {ours["ms_mean"]:.2f} '
         f'| {ours["mb"]:.0f} | this page |',
     ]
-    for run in sorted(peers.runs(INTEL), key=_error):
+    for run in sorted(slam_run.runs(INTEL), key=_error):
         name = run.system + (f', {run.note}' if run.note else '')
         costs = [f'{cost:g}' if cost is not None else '' for cost in (run.cpu_ms, run.peak_mb)]
         cells = [name, shown(run.live_m), shown(run.final_m), *costs, run.origin.value]
@@ -197,7 +197,7 @@ def _intel_table(reports: Sequence[Numbers]) -> list[str]:
     return ['\n'.join(lines), '\n\n', _INTEL_NOTES]
 
 
-def _error(run: peers.PeerRun) -> float:
+def _error(run: slam_run.PeerRun) -> float:
     assert run.live_m is not None
     return run.live_m[0]
 
@@ -259,7 +259,7 @@ def _marks(ours: Numbers, log: str) -> list[Mark]:
         Mark('thinmap', ours['live_m']),
         Mark('thinmap', ours['final_m'], is_filled=False),
     ]
-    for run in peers.runs(log):
+    for run in slam_run.runs(log):
         colour = OTHERS[run.origin]
         for metres, is_live in ((run.live_m, True), (run.final_m, False)):
             if metres is not None:

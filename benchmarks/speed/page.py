@@ -13,7 +13,7 @@ from benchmarks.charts import DOCS, OTHERS, Mark, Panel, chart_path, draw, pictu
 from benchmarks.scoreboard.results_page import read_reports
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.parallel_jobs import provenance
-from thinmap_ros.evaluation.peers import INTEL, Origin, runs
+from thinmap_ros.evaluation.slam_run import INTEL, Origin, runs
 from thinmap_ros.files.safe import write_text
 
 _CHART = 'speed'

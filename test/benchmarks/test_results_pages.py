@@ -12,7 +12,7 @@ from benchmarks.exploration import page as exploration_page
 from benchmarks.scoreboard import results_page, stamps
 from benchmarks.speed import page as speed_page
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.peers import INTEL, PEERS, Origin, runs, shown
+from thinmap_ros.evaluation.slam_run import INTEL, PEERS, Origin, runs, shown
 from thinmap_ros.evaluation.strategy_comparison import half_interval_95
 
 MADE = 'Commit 1234567, a processor, 2 cores, Python 3.12.3'

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from thinmap_ros.evaluation.peers import CARTOGRAPHER, LAMA, runs, shown
+from thinmap_ros.evaluation.slam_run import CARTOGRAPHER, LAMA, runs, shown
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / 'README.md').read_text()

@@ -11,7 +11,7 @@ import numpy as np
 
 from thinmap_ros.core.errors import ConfigError, InputError, one_line_reason
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
-from thinmap_ros.evaluation import peers
+from thinmap_ros.evaluation import slam_run
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.evaluation.trajectory_errors import RelationErrors, read_columns, relation_errors
 from thinmap_ros.files.safe import read_mapping
@@ -78,7 +78,7 @@ def run(folder: Path, out: Path) -> Outcome:
         'The column *paper* has errors of other programs: [Peers](peers.md).',
         [
             Table('logs', _COLUMNS, rows),
-            Table('others', _OTHER_COLUMNS, [_other(run) for run in peers.runs(peers.INTEL)]),
+            Table('others', _OTHER_COLUMNS, [_other(run) for run in slam_run.runs(slam_run.INTEL)]),
             Table('times', _TIMED, [result.timed for result in results], timed=True),
         ],
         [result.plot for result in results],
@@ -184,21 +184,21 @@ def _comparisons(row: list[Any]) -> list[Comparison]:
         f'odometry {values["odometry_m"]:.2f} m'
     )
     rows = [Comparison(f'{name}: mean error', '', ours, remark=degrees)]
-    if name == peers.INTEL:
-        rows += [_against(run, values) for run in peers.runs(name)]
+    if name == slam_run.INTEL:
+        rows += [_against(run, values) for run in slam_run.runs(name)]
     return rows
 
 
-def _other(run: peers.PeerRun) -> list[Any]:
-    errors = [peers.shown(run.live_m), peers.shown(run.final_m)]
+def _other(run: slam_run.PeerRun) -> list[Any]:
+    errors = [slam_run.shown(run.live_m), slam_run.shown(run.final_m)]
     return [run.system, run.log, *errors, run.cpu_ms, run.peak_mb, run.origin.value]
 
 
-def _against(run: peers.PeerRun, values: dict[str, Any]) -> Comparison:
+def _against(run: slam_run.PeerRun, values: dict[str, Any]) -> Comparison:
     """Errors beside those of another program: ours are as good if each is at most its lowest."""
     pairs = [('final', run.final_m), ('live', run.live_m)]
     known = [(name, metres) for name, metres in pairs if metres is not None]
-    theirs = ', '.join(f'{peers.shown(metres)} m {name}' for name, metres in known)
+    theirs = ', '.join(f'{slam_run.shown(metres)} m {name}' for name, metres in known)
     ours = ', '.join(f'{values[f"{name}_m"]:.3f} m {name}' for name, _ in known)
     better = all(values[f'{name}_m'] <= metres[0] for name, metres in known)
     what = f'intel, against {run.system}' + (f' ({run.note})' if run.note else '')
