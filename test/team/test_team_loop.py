@@ -14,7 +14,7 @@ from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
 from thinmap_ros.sim.world import World
 from thinmap_ros.team import loop as team_loop
-from thinmap_ros.team.own_maps import TILE_PERIOD_S
+from thinmap_ros.team.maps import TILE_PERIOD_S
 from thinmap_ros.team.radio import Trouble
 
 START = se2.pose(5.0, 2.5, 0.5 * math.pi)

@@ -17,8 +17,7 @@ from thinmap_ros.sim.other_robots import SharedWorld
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.team.loop import TeamLoop
-from thinmap_ros.team.maps import SharedMap, TeamMaps
-from thinmap_ros.team.own_maps import OwnMaps
+from thinmap_ros.team.maps import OwnMaps, SharedMap, TeamMaps
 from thinmap_ros.team.radio import Trouble
 
 
