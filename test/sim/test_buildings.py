@@ -13,8 +13,7 @@ from thinmap_ros.sim.floor_plan import FloorPlanConfig, Kind, generate_floor_pla
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
 from thinmap_ros.sim.robot import RobotConfig
-from thinmap_ros.sim.surfaces import inside_of
-from thinmap_ros.sim.world import World
+from thinmap_ros.sim.world import World, inside_of
 
 SEEDS = range(24)
 EXACT = LaserScannerConfig(range_noise_m=0.0, range_resolution_m=0.0, mixed_pixel_ratio=0.0)

@@ -16,8 +16,7 @@ from thinmap_ros.sim.drives import DriveConfig, drive, tour_paths
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
-from thinmap_ros.sim.surfaces import surfaces
-from thinmap_ros.sim.world import World
+from thinmap_ros.sim.world import World, surfaces
 
 WORLDS = Path(__file__).parents[2] / 'worlds'
 SHORTEST_M = 0.8

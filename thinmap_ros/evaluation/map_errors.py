@@ -7,8 +7,7 @@ from scipy import ndimage
 
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.surfaces import surfaces
-from thinmap_ros.sim.world import World
+from thinmap_ros.sim.world import World, surfaces
 from thinmap_ros.view.plots import MapLayer, Panel, Raster, Segments
 
 

@@ -8,8 +8,7 @@ from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.experiments.drives import world_of
 from thinmap_ros.sim.drives import DriveSample
-from thinmap_ros.sim.surfaces import inside_of
-from thinmap_ros.sim.world import World
+from thinmap_ros.sim.world import World, inside_of
 
 CELL_M = PAPER_GRID.resolution_m
 

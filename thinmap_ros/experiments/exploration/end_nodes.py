@@ -12,7 +12,7 @@ from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyCo
 from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.experiments.drives import Source, world_of
-from thinmap_ros.sim.surfaces import surfaces
+from thinmap_ros.sim.world import surfaces
 from thinmap_ros.view.plots import (
     Curve,
     GraphLayer,
