@@ -9,13 +9,13 @@ import pytest
 from thinmap_ros.baselines.exploration import (
     BoundedTour,
     ExploreLite,
+    Frontier,
     FrontierExplorer,
     InformationGain,
     NearestFrontier,
     VisitAllEndNodes,
     shortest_rest,
 )
-from thinmap_ros.baselines.frontier_map import Frontier
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
