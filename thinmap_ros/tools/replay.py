@@ -24,7 +24,7 @@ from thinmap_ros.logs.log import Event, Log, SkippedRecords, known_formats
 from thinmap_ros.pipeline import Pipeline
 from thinmap_ros.replaying import Replay
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.arguments import Parser, add_out, check_place, out_folder
+from thinmap_ros.tools.cli import Parser, add_out, check_place, out_folder
 from thinmap_ros.tools.replay_run import BATCH, options_of, replay_log
 from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.rerun_view import View
