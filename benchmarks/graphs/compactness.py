@@ -12,8 +12,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Row, at_least
-from thinmap_ros.experiments.drives import Source
-from thinmap_ros.experiments.maps import grid_of
+from thinmap_ros.experiments.drives import Source, grid_of
 from thinmap_ros.files.occupancy_maps import read_map
 
 

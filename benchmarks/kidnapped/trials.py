@@ -23,8 +23,7 @@ from thinmap_ros.core.places.global_localizer import (
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
-from thinmap_ros.experiments.drives import Source
-from thinmap_ros.experiments.maps import grid_of
+from thinmap_ros.experiments.drives import Source, grid_of
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.drives import DriveSample, random_drive, random_start, world_to_grid
 from thinmap_ros.sim.laser import LaserScannerConfig

@@ -16,7 +16,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
-from thinmap_ros.experiments.maps import patch_of_world
+from thinmap_ros.experiments.drives import patch_of_world
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.sim.buildings import BuildingConfig, generate_building
 

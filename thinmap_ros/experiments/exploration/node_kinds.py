@@ -6,8 +6,7 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
-from thinmap_ros.experiments.drives import Source
-from thinmap_ros.experiments.maps import CELL_M, patch_at_rest
+from thinmap_ros.experiments.drives import CELL_M, Source, patch_at_rest
 from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot, Segments
 
 # Free boxes, m: x, y, end x, end y.

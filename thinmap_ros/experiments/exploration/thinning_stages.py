@@ -8,8 +8,7 @@ from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import select_free_space, thin
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
-from thinmap_ros.experiments.drives import Source, world_of
-from thinmap_ros.experiments.maps import patch_of_world
+from thinmap_ros.experiments.drives import Source, patch_of_world, world_of
 from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot
 
 Mask = NDArray[np.bool_]

@@ -11,8 +11,7 @@ from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
-from thinmap_ros.experiments.drives import SETUP, Source
-from thinmap_ros.experiments.maps import grid_of
+from thinmap_ros.experiments.drives import SETUP, Source, grid_of
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.view.plots import Curve, MapLayer, Panel, Plot, RobotMarkers, xy
 

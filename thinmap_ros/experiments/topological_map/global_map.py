@@ -10,8 +10,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import TopologyBuilder, build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
-from thinmap_ros.experiments.drives import Source
-from thinmap_ros.experiments.maps import grid_of
+from thinmap_ros.experiments.drives import Source, grid_of
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot, RobotMarkers
 

@@ -11,8 +11,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
-from thinmap_ros.experiments.drives import Source
-from thinmap_ros.experiments.maps import grid_of, patch_at_rest
+from thinmap_ros.experiments.drives import Source, grid_of, patch_at_rest
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot, RobotMarkers, xy
 

@@ -12,8 +12,7 @@ from thinmap_ros.core.planning.wavefront import (
 )
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
-from thinmap_ros.experiments.drives import Source, tour_of
-from thinmap_ros.experiments.maps import grid_of
+from thinmap_ros.experiments.drives import Source, grid_of, tour_of
 from thinmap_ros.view.plots import Curve, MapLayer, Panel, Plot, Raster
 
 _START = (2.0, 2.0)
