@@ -1,7 +1,7 @@
 """Reads and writes map_server maps: an image and a YAML file.
 
-Images are read within limits (`files/occupancy_maps.py`): at most 67,108,864 pixels, a square of 410 m at
-0.05 m a cell, and 16,384 on a side, 819 m. A rotated map has at most as many cells.
+Images are read within limits: at most 67,108,864 pixels, a square of 410 m at 0.05 m a cell, and
+16,384 on a side, 819 m. A rotated map has at most as many cells.
 """
 
 import math

@@ -403,9 +403,6 @@ def merged_figure(path: Path, maps: Sequence[tuple[str, GridPatch, TopologicalMa
 
 # Pictures for notebooks and programs: of a pipeline, or of a map with a graph.
 
-if TYPE_CHECKING:
-    from thinmap_ros.view.map_figure import MapFigure
-
 
 def plot(shown: Any, topology: TopologicalMap | None = None, title: str = '') -> 'MapFigure':
     """A matplotlib figure of a Pipeline, with its graph and path, or of a GridPatch with a graph.

@@ -1,9 +1,9 @@
 """Scan-to-map matching: maximum a posteriori pose given point-to-wall distances and a motion prior.
 
 The cost is a robust loss of the distance of each point to its nearest wall, plus that of the prior.
-Its minimum near the prior is refined (`matching_cost.py`). If few points are inliers there, or if
+Its minimum near the prior is refined (`minimize`). If few points are inliers there, or if
 the prior is wider than the basin of convergence, the poses within three sigmas of the prior are
-searched (`correlative_search.py`). The lower cost is used.
+searched (`search`). The lower cost is used.
 """
 
 import heapq
