@@ -1,4 +1,4 @@
-"""Allowed imports between packages (docs/development/architecture.md), and limits of the style."""
+"""The layers and concepts of docs/development/architecture.md, and the style of the sources."""
 
 import ast
 import re
@@ -16,7 +16,8 @@ PAGE = ROOT / 'docs' / 'development' / 'architecture.md'
 
 def read_rooms():
     """Allowed imports of each package: itself, those in its row of the page, and all of theirs."""
-    rows = re.findall(r'^\| `([\w.]+)` \| .+ \|(.*)\|$', PAGE.read_text(), re.MULTILINE)
+    layers = PAGE.read_text().partition('## Concepts')[0]
+    rows = re.findall(r'^\| `([\w.]+)` \| .+ \|(.*)\|$', layers, re.MULTILINE)
     direct = {name: set(re.findall('`([^`]+)`', cell)) for name, cell in rows}
     core = {name for name in direct if name.startswith('core')}
 
@@ -180,33 +181,78 @@ def test_no_module_imports_itself_through_others():
     assert list(networkx.simple_cycles(arrows)) == []
 
 
-MAX_ATTRIBUTES = 12
-# Until it is rebuilt.
-LARGE_CLASSES = {'GlobalLocalization'}
+def concepts():
+    """Rows of the concepts of the core: file or folder, and what it must not know."""
+    rows = re.findall(
+        r'^\| `([\w.]+)` \| [^|]+ \| [^|]+ \| ([^|]+) \|$', PAGE.read_text(), re.MULTILINE
+    )
+    return {f'core.{name}': re.findall('`([^`]+)`', cell) for name, cell in rows}
 
 
-def attributes(node):
-    """Names of the attributes that the methods of a class assign to self."""
-    return {
-        target.attr
-        for target in ast.walk(node)
-        if isinstance(target, ast.Attribute)
-        and isinstance(target.ctx, ast.Store)
-        and isinstance(target.value, ast.Name)
-        and target.value.id == 'self'
+CONCEPTS = concepts()
+MODULES = {
+    '.'.join(path.relative_to(PACKAGE).with_suffix('').parts): path
+    for path in SOURCES
+    if path.name != '__init__.py'
+}
+CORE = {name for name in MODULES if name.startswith('core.')}
+
+
+def is_part(module, name):
+    """Whether a module is a file or in the folder of a name."""
+    return module == name or module.startswith(f'{name}.')
+
+
+def reached_by_core():
+    """Modules of the core that each of them imports, also through others."""
+    arrows = networkx.DiGraph()
+    arrows.add_nodes_from(CORE)
+    for name in CORE:
+        for imported in imports(ast.parse(MODULES[name].read_text())):
+            if imported.removeprefix('thinmap_ros.') in CORE:
+                arrows.add_edge(name, imported.removeprefix('thinmap_ros.'))
+    return {name: networkx.descendants(arrows, name) for name in CORE}
+
+
+def test_each_file_of_the_core_is_one_concept_of_the_table():
+    owners = {module: [name for name in CONCEPTS if is_part(module, name)] for module in CORE}
+    assert {module: found for module, found in owners.items() if len(found) != 1} == {}
+    assert [name for name in CONCEPTS if not any(is_part(m, name) for m in CORE)] == []
+
+
+@pytest.mark.parametrize('name', CONCEPTS)
+def test_a_concept_does_not_import_what_it_must_not_know(name):
+    reached = reached_by_core()
+    known = {
+        other
+        for module in CORE
+        if is_part(module, name)
+        for other in reached[module]
+        if not is_part(other, name)
     }
+    for unknown in CONCEPTS[name]:
+        assert any(is_part(module, unknown) for module in CORE), f'{unknown}: no such file'
+        assert [other for other in known if is_part(other, unknown)] == []
 
 
-def test_attributes_are_counted_once_and_in_every_form_of_assignment():
-    source = 'class A:\n def f(self):\n  self.a, self.b = 1, 2\n  self.c: int = 3\n  self.a += 1'
-    assert attributes(ast.parse(source)) == {'a', 'b', 'c'}
+MIN_STATEMENTS = 40
 
 
-def test_a_class_has_few_attributes():
+def small_files():
+    """Files below the limit that the page gives a reason for, without their suffix."""
+    section = PAGE.read_text().partition('## Small files')[2]
+    rows = re.findall(r'^\| (`.+`) \| \w', section, re.MULTILINE)
+    return {name for cell in rows for name in re.findall('`([^`]+)`', cell)}
+
+
+def test_a_file_has_enough_of_a_concept_or_a_reason():
+    """Imports count as statements, as in any measure of size."""
     counts = {
-        f'{path.relative_to(PACKAGE)}: {node.name}': len(attributes(node))
+        path.relative_to(PACKAGE).with_suffix('').as_posix(): sum(
+            isinstance(node, ast.stmt) for node in ast.walk(ast.parse(path.read_text()))
+        )
         for path in SOURCES
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.ClassDef) and node.name not in LARGE_CLASSES
+        if path.name != '__init__.py'
     }
-    assert not {name: count for name, count in counts.items() if count > MAX_ATTRIBUTES}
+    small = {name for name, count in counts.items() if count < MIN_STATEMENTS}
+    assert small == small_files()
