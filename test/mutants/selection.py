@@ -1,10 +1,10 @@
 """Tests of a module: that of its name first, then those that import it."""
 
-import ast
 import itertools
 from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
+
+from support.imports import imported
 
 # Tests that start programs take too long, and check other things.
 _LEFT_OUT = {'live', 'docs', 'fuzz', 'tools', 'ros', 'benchmarks', 'experiments', 'mutants'}
@@ -24,10 +24,10 @@ class Selection:
         self._n_imported: dict[Path, int] = {}
         sources = [*(root / package).rglob('*.py'), *self._tests.rglob('*.py')]
         for source in sources:
-            found = set(self._imported(source))
+            found = set(imported(root, source))
             self._n_imported[source.relative_to(root)] = len(found)
-            for imported in found:
-                self._importers[imported].add(source)
+            for module in found:
+                self._importers[module].add(source)
 
     def tests_of(self, module: Path) -> list[Path]:
         """Test files of a module, relative to the root, the nearest first.
@@ -69,20 +69,3 @@ class Selection:
         if not file.is_relative_to(self._tests) or not file.name.startswith('test_'):
             return False
         return not _LEFT_OUT & set(file.relative_to(self._tests).parts)
-
-    def _imported(self, source: Path) -> Iterator[Path]:
-        for node in ast.walk(ast.parse(source.read_bytes())):
-            if isinstance(node, ast.Import):
-                for alias in node.names:
-                    yield from self._files(alias.name)
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                yield from self._files(node.module)
-                for alias in node.names:
-                    yield from self._files(f'{node.module}.{alias.name}')
-
-    def _files(self, dotted: str) -> Iterator[Path]:
-        """File of a module of the package, or of a helper of the tests."""
-        for base in (self._root, self._tests):
-            path = base.joinpath(*dotted.split('.')).with_suffix('.py')
-            if path.exists():
-                yield path
