@@ -20,6 +20,7 @@ from support.timeouts import limited_cpu_time as limited_cpu_time
 
 from thinmap_ros.evaluation.ros_domains import free_domain
 
+pytest_plugins = ['support.cpu_time']
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = next(
     (up / 'shared' for up in ROOT.parents if (up / 'shared' / 'data').exists()),

@@ -1,0 +1,128 @@
+"""A plugin of pytest: the CPU time of each test, and how much it and its stage may take.
+
+Not the time of the clock, which depends on what else the machine does. The time of a test is that
+of its fixtures, too (what several tests share counts for the first of them), and of all processes
+that it starts and waits for. Kernels that are compiled, as on a machine that is new, do not count,
+and tests that are marked as slow may take what they need.
+"""
+
+import os
+import resource
+import time
+from collections.abc import Generator
+
+import pytest
+from numba.core import event
+
+# Of a test. One that needs more says why: @pytest.mark.cpu_budget(seconds, 'the reason').
+TEST_S = 10.0
+# Variable with the budget of all tests of a run that are not slow, s; without it there is none.
+STAGE = 'THINMAP_STAGE_CPU_S'
+_SHOWN = 10
+_BEGAN = pytest.StashKey[float]()
+
+
+class _Compilation(event.Listener):
+    """CPU time of compiling kernels in this process."""
+
+    def __init__(self) -> None:
+        self.spent_s = 0.0
+        self._depth = 0
+
+    def on_start(self, _: event.Event) -> None:
+        # A kernel is compiled within another one that calls it.
+        if not self._depth:
+            self.spent_s -= time.process_time()
+        self._depth += 1
+
+    def on_end(self, _: event.Event) -> None:
+        self._depth -= 1
+        if not self._depth:
+            self.spent_s += time.process_time()
+
+
+_compilation = _Compilation()
+event.register('numba:compile', _compilation)
+
+
+def _cpu_s() -> float:
+    """CPU time of this process and of those that it has waited for, without compilation."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in used) - _compilation.spent_s
+
+
+def _budget_s(seconds: float, reason: str) -> float:
+    """Budget by a mark: both have to be there."""
+    assert reason
+    return seconds
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption('--cpu', type=int, default=0, metavar='N', help='show N tests by CPU time')
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    mark = 'cpu_budget(seconds, reason): CPU time that the test may take'
+    config.addinivalue_line('markers', mark)
+    if not hasattr(config, 'workerinput'):
+        config.pluginmanager.register(_Stage(config.option.cpu))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    item.stash[_BEGAN] = _cpu_s()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """At the end of a test: note its time, and let it fail above its budget."""
+    report = yield
+    if call.when != 'teardown' or item.get_closest_marker('slow'):
+        return report
+    spent_s = report.cpu_s = _cpu_s() - item.stash[_BEGAN]
+    mark = item.get_closest_marker('cpu_budget')
+    budget_s = _budget_s(*mark.args) if mark else TEST_S
+    if report.passed and spent_s > budget_s:
+        report.outcome = 'failed'
+        report.longrepr = f'{item.nodeid}: {_above(spent_s, budget_s)}'
+    return report
+
+
+def _above(spent_s: float, budget_s: float) -> str:
+    return f'{spent_s:.1f} s of CPU time: expected at most {budget_s:g} s'
+
+
+class _Stage:
+    """The CPU time of all tests of a run. shown: of how many to show it in any case."""
+
+    def __init__(self, shown: int) -> None:
+        self._shown = shown
+        self._budget_s = float(os.environ.get(STAGE) or 'inf')
+        self._spent_s: dict[str, float] = {}
+
+    @property
+    def _sum_s(self) -> float:
+        return sum(self._spent_s.values())
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        # Workers send what their reports hold.
+        if hasattr(report, 'cpu_s'):
+            self._spent_s[report.nodeid] = report.cpu_s
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        if self._sum_s > self._budget_s and session.exitstatus == pytest.ExitCode.OK:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        is_above = self._sum_s > self._budget_s
+        costly = sorted(self._spent_s.items(), key=lambda test: -test[1])
+        for name, spent_s in costly[: max(self._shown, _SHOWN if is_above else 0)]:
+            terminalreporter.write_line(f'{spent_s:6.1f} s  {name}')
+        if is_above:
+            terminalreporter.write_line(f'all tests: {_above(self._sum_s, self._budget_s)}')
+        elif STAGE in os.environ or self._shown:
+            terminalreporter.write_line(f'all tests: {self._sum_s:.0f} s of CPU time')

@@ -1,0 +1,121 @@
+"""`support.cpu_time`: budgets of CPU time for tests and stages."""
+
+import pytest
+from support import cpu_time
+from support.forks import forked
+
+pytest_plugins = ['pytester']
+CONFTEST = f"""
+import sys
+sys.path.insert(0, {str(forked.TESTS)!r})
+pytest_plugins = ['support.cpu_time']
+"""
+TESTS = """
+import subprocess, sys, time
+from pathlib import Path
+
+import numba
+import pytest
+from support.forks import forked
+
+SPINS = 'import time\\nend = time.process_time() + 0.3\\nwhile time.process_time() < end: pass'
+
+def spin(seconds):
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+
+@pytest.fixture
+def costly_end():
+    yield
+    spin(0.3)
+
+@pytest.mark.cpu_budget(0.2, 'planted')
+def test_computes():
+    spin(0.3)
+
+@pytest.mark.cpu_budget(0.2, 'planted')
+def test_ends(costly_end):
+    pass
+
+@pytest.mark.cpu_budget(0.2, 'planted')
+def test_starts():
+    subprocess.run([sys.executable, '-c', SPINS], check=True)
+
+@pytest.mark.cpu_budget(0.2, 'planted')
+def test_forks(tmp_path):
+    (tmp_path / 'spins.py').write_text(SPINS)
+    assert forked.run('spins', folder=tmp_path).returncode == 0
+
+@pytest.mark.cpu_budget(0.2, 'planted')
+def test_waits():
+    time.sleep(0.3)
+
+@pytest.mark.slow
+@pytest.mark.cpu_budget(0.2, 'planted')
+def test_slow():
+    spin(0.3)
+
+@pytest.mark.cpu_budget(0.2, 'planted')
+def test_compiles():
+    @numba.njit
+    def kernel(values):
+        return sorted(values)
+    began = time.process_time()
+    kernel([3.0, 1.0])
+    assert time.process_time() - began > 0.2
+
+def test_default():
+    spin(0.3)
+"""
+
+
+@pytest.fixture
+def run(pytester, monkeypatch):
+    """Run tests by name in a run of their own; returns its lines and its exit code."""
+    monkeypatch.delenv(cpu_time.STAGE, raising=False)
+    pytester.makeconftest(CONFTEST)
+    pytester.makepyfile(TESTS)
+    pytester.makeini('[pytest]\nmarkers = slow: of the project')
+
+    def run_tests(names, *options):
+        done = pytester.runpytest_inprocess('-k', names, *options)
+        return done.outlines, done.ret
+
+    return run_tests
+
+
+@pytest.mark.parametrize('name', ['test_computes', 'test_ends'])
+def test_a_test_above_its_budget_fails_with_one_line(run, name):
+    lines, code = run(name)
+    assert code == pytest.ExitCode.TESTS_FAILED
+    (line,) = [line for line in lines if 'CPU time' in line]
+    assert f'.py::{name}: 0.' in line
+    assert line.endswith(' s of CPU time: expected at most 0.2 s')
+
+
+@pytest.mark.programs
+@pytest.mark.parametrize(
+    ('name', 'options'),
+    [('test_starts', ()), ('test_forks', ()), ('test_computes', ('-n', '1'))],
+)
+def test_processes_of_a_test_count_and_so_do_workers(run, name, options):
+    lines, code = run(name, *options)
+    assert code == pytest.ExitCode.TESTS_FAILED
+    assert any(f'{name}: ' in line and 'at most 0.2 s' in line for line in lines), lines
+
+
+@pytest.mark.parametrize('name', ['test_waits', 'test_slow', 'test_compiles', 'test_default'])
+def test_neither_waiting_nor_compiling_counts_nor_what_is_slow(run, name):
+    lines, code = run(name)
+    assert code == pytest.ExitCode.OK, lines
+
+
+def test_a_stage_above_its_budget_fails_and_shows_the_most_expensive_tests(run, monkeypatch):
+    monkeypatch.setenv(cpu_time.STAGE, '0.2')
+    lines, code = run('test_default or test_waits')
+    assert code == pytest.ExitCode.TESTS_FAILED
+    costly, cheap, last = lines[-4:-1]
+    assert costly.endswith('.py::test_default')
+    assert cheap.endswith('test_waits')
+    assert last.endswith(' s of CPU time: expected at most 0.2 s')
