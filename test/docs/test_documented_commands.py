@@ -75,6 +75,7 @@ MAX_MARKS = 9
 HELP_ONLY = {
     'scripts/demo': 'test/live/test_demo.py runs the demo to its end',
     'scripts/demo --robots 2 --world office': 'as above',
+    'scripts/test': 'what has started this test',
     'thinmap doctor --try-watchdog': 'turns a robot: test/live/test_doctor.py',
     'scripts/endurance': 'hours; scripts/endurance --minutes 10 is for releases',
     'scripts/experiment all': 'test/experiments/test_experiments.py runs each experiment',
@@ -83,10 +84,15 @@ _COMPARE = (
     'thinmap compare_exploration floor_40x10 -o out/compare --speed-m-s 0.5 \\\n'
     '  --strategies position_probability nearest_frontier'
 )
-# Shortened by options that the same lines of the documents name.
+# With a smaller input, or shortened by options that the same lines of the documents name.
 SHORTER = {
-    _COMPARE: f'{_COMPARE} --starts 1',
-    'scripts/test': 'scripts/test test/core/topology/test_thinning.py',
+    _COMPARE: f'{_COMPARE.replace("floor_40x10", "room_10x10")} --starts 1',
+    'thinmap explore_world office -o out/office --robots 2 --speed-m-s 0.5': (
+        'thinmap explore_world room_10x10 -o out/office --robots 2 --speed-m-s 0.5'
+    ),
+    'thinmap replay bags/office.mcap -o out/office': (
+        'thinmap replay bags/dead_end.mcap -o out/office'
+    ),
     'scripts/experiment exploration': 'scripts/experiment exploration --from-bag bags',
 }
 
@@ -325,6 +331,7 @@ def _until(
             pytest.fail(f'{line.text}\n{line.process.poll()}\n{line.said()[-3000:]}')
 
 
+@pytest.mark.cpu_budget(40.0, 'each command of a page in a process of its own')
 @pytest.mark.parametrize('page', PAGES)
 def test_the_commands_of_a_page_run(graph, place, environment, page):
     lines = [c.text for c in COMMANDS if c.document == page and not c.marked]

@@ -13,6 +13,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.cpu_budget(30.0, 'all pages of the documentation')
 def test_the_site_builds_without_a_warning():
     done = subprocess.run([ROOT / 'scripts' / 'docs'], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stdout + done.stderr

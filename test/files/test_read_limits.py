@@ -268,6 +268,7 @@ def test_a_long_line_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.programs
+@pytest.mark.cpu_budget(20.0, 'reads as many lines as a log may have')
 def test_empty_lines_without_end(tmp_path: Path) -> None:
     path = tmp_path / 'log.clf.gz'
     begin = gzip.compress(('\n'.join(carmen_lines()) + '\n').encode())

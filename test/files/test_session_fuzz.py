@@ -37,6 +37,7 @@ def explored() -> Explored:
     return Explored()
 
 
+@pytest.mark.cpu_budget(20.0, 'a saved map for each wrong value of each array')
 @pytest.mark.filterwarnings('ignore::numpy.exceptions.ComplexWarning', 'ignore:invalid value')
 @pytest.mark.parametrize('kind', KINDS)
 def test_each_array_replaced(explored: Explored, kind: str) -> None:

@@ -200,21 +200,23 @@ def in_new_process(*arguments: Any) -> list[str]:
 
 
 @pytest.mark.live
+@pytest.mark.cpu_budget(25.0, 'a case of each source, in a fresh process')
 def test_each_source_makes_and_tests_a_case(tmp_path: Path) -> None:
     assert in_new_process(list(SOURCES), 1, 1, '', tmp_path) == []
 
 
 @pytest.mark.live
+@pytest.mark.cpu_budget(25.0, 'two fresh processes')
 @pytest.mark.parametrize(
-    ('source', 'why'),
+    ('source', 'cases', 'why'),
     [
-        ('stream_odometry', 'not used after the fault'),
-        ('stream_mapper', 'LookupError: planted'),
+        ('stream_odometry', 40, 'not used after the fault'),
+        ('stream_mapper', 20, 'LookupError: planted'),
     ],
 )
-def test_streams_find_a_planted_fault(tmp_path: Path, source: str, why: str) -> None:
+def test_streams_find_a_planted_fault(tmp_path: Path, source: str, cases: int, why: str) -> None:
     assert in_new_process([source], 7, 3, '', tmp_path) == []
-    found = in_new_process([source], 7, 60, source, tmp_path)
+    found = in_new_process([source], 7, cases, source, tmp_path)
     assert any(why in text for text in found)
 
 

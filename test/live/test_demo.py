@@ -14,6 +14,7 @@ from urllib.request import urlopen
 import numpy as np
 import psutil
 import pytest
+from support.forks import forked
 from support.hidden_library import hide
 from support.timeouts import PATIENCE_S, PROGRAM_S
 
@@ -66,8 +67,9 @@ def nodes_of(out):
     return found
 
 
+@pytest.mark.cpu_budget(60.0, 'a whole exploration, by nodes that start as those of a user')
 def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
-    process = demo(tmp_path / 'demo', '--rate', '20', '--seed', '4')
+    process = demo(tmp_path / 'demo', '--rate', '20', '--seed', '4', '--speed-m-s', '0.5')
     stdout, stderr = process.communicate(timeout=PROGRAM_S)
     assert process.returncode == 0, stderr
     out = tmp_path / 'demo'
@@ -92,7 +94,8 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     ]
     # The first two are quick, and need no graph.
     for step in steps[:2]:
-        subprocess.run(step, check=True, timeout=PROGRAM_S)
+        done = forked.run('thinmap_ros', *step[1:], timeout=PROGRAM_S)
+        assert done.returncode == 0, done.stderr
         assert (Path(step[-1]) / 'report.html').exists()
     bag = Bag(out / 'bag')
     assert set(bag.topics) >= TOPICS
@@ -100,6 +103,7 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     assert not nodes_of(out)
 
 
+@pytest.mark.cpu_budget(30.0, 'eight nodes that start as those of a user')
 @pytest.mark.parametrize(('robots', 'nodes'), [pytest.param(1, 9, marks=pytest.mark.slow), (2, 8)])
 def test_ctrl_c_ends_everything(ros_domain, tmp_path, robots, nodes):
     out = tmp_path / 'demo'
@@ -154,6 +158,7 @@ def test_two_robots_join_their_maps_and_nothing_is_left(ros_domain, tmp_path):
     assert not nodes_of(out)
 
 
+@pytest.mark.cpu_budget(20.0, 'six nodes that start as those of a user')
 def test_a_robot_whose_nodes_die_ends_the_demo_and_leaves_nothing(ros_domain, tmp_path):
     out = tmp_path / 'demo'
     process = demo(out, '--robots', '2', '--rate', '5')
@@ -203,10 +208,11 @@ def process_tree(process):
     ],
 )
 def test_wrong_arguments_end_at_once(tmp_path, arguments, said):
-    process = demo(tmp_path / 'demo', *arguments)
-    _, stderr = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 2
-    assert said in stderr and 'Traceback' not in stderr
+    done = forked.run(
+        'thinmap_ros.tools.demo', '-o', tmp_path / 'demo', *arguments, timeout=PATIENCE_S
+    )
+    assert done.returncode == 2
+    assert said in done.stderr and 'Traceback' not in done.stderr
 
 
 def test_without_rerun_a_view_is_refused_before_anything_is_started(

@@ -25,7 +25,8 @@ from support.timeouts import PATIENCE_S
 from thinmap_ros.evaluation.ros_domains import free_domain
 from thinmap_ros.ros import qos
 
-pytestmark = pytest.mark.live
+# The nodes that all share count for the test that ends them.
+pytestmark = [pytest.mark.live, pytest.mark.cpu_budget(25.0, 'one of them ends the nodes')]
 ROOT = Path(__file__).resolve().parents[2]
 ROS2 = ROOT / 'scripts' / 'shim' / 'ros2'
 WAIT = ('--spin-time', str(PATIENCE_S))
@@ -49,7 +50,8 @@ def robot(tmp_path_factory):
             start='2.0,2.0,0.0',
             initial_x_m=2.0,
             initial_y_m=2.0,
-            real_time_factor=1.0,
+            # Each worker has one, for as long as its tests take.
+            real_time_factor=0.4,
         )
         graph.until(lambda: maps, 'a map')
         yield graph

@@ -62,6 +62,7 @@ def velocities(heard):
     return [(twist.linear.x, twist.angular.z) for twist in heard]
 
 
+@pytest.mark.cpu_budget(15.0, 'a robot that explores and drives')
 def test_a_robot_is_seen_sent_and_stopped(graph):
     site = Site(graph, use_sim_time=True)
     page = site.open()

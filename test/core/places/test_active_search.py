@@ -86,6 +86,7 @@ def seconds_roaming(finder, start, seed):
     raise AssertionError
 
 
+@pytest.mark.cpu_budget(25.0, 'drives by two strategies from many starts')
 def test_a_robot_that_drives_where_places_differ_is_sure_sooner_than_one_that_roams(finder):
     itself = [seconds_driven_by_itself(finder, start, seed) for seed, start in enumerate(STARTS)]
     roaming = [seconds_roaming(finder, start, seed) for seed in range(3) for start in STARTS]

@@ -10,6 +10,7 @@ from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient
 from std_msgs.msg import String, UInt32
+from support.niches import START, write_niches
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
@@ -23,7 +24,6 @@ from thinmap_ros.sim.world import World
 
 pytestmark = pytest.mark.live
 PEERS = 'support.peers'
-OFFICE = '1.3,1.2,0.0'
 AT_A_WALL = '0.35,4.0,3.14'
 DUNGEON = '42.05,21.05,-1.238'
 RANGE_M = 8.0
@@ -46,7 +46,9 @@ class Exploration:
         self.mode = graph.node.create_publisher(String, 'nav2_mode', qos.LATCHED)
 
     def start_nav2(self, **values):
-        return self.graph.start('nav2', package=PEERS, use_sim_time=True, **values)
+        return self.graph.start(
+            'nav2', package=PEERS, use_sim_time=True, max_speed_m_s=0.4, **values
+        )
 
     def start_foreign_slam(self):
         """Simulation, SLAM and explorer: none of thinmap's localizer, mapper or graph."""
@@ -131,8 +133,8 @@ class Exploration:
 
 
 @pytest.fixture
-def office(graph):
-    return Exploration(graph, 'office', OFFICE)
+def niches(graph, tmp_path):
+    return Exploration(graph, write_niches(tmp_path), START)
 
 
 def pose_of(text):
@@ -152,39 +154,41 @@ def small_dungeon(shared_data, folder):
     return occupancy_maps.write_map(folder / 'small_dungeon', GridPatch(frame, cells))
 
 
-def test_a_foreign_slam_and_nav2_are_enough(graph, office):
-    office.start_foreign_slam()
-    office.start_nav2()
-    office.start_explorer()
-    status, end = office.ended(return_home=True)
+@pytest.mark.cpu_budget(20.0, 'a whole exploration, and the way home')
+def test_a_foreign_slam_and_nav2_are_enough(graph, niches):
+    niches.start_foreign_slam()
+    niches.start_nav2()
+    niches.start_explorer()
+    status, end = niches.ended(return_home=True)
     assert status == GoalStatus.STATUS_SUCCEEDED
-    office.is_complete(end, pose_of(OFFICE), 0.99)
+    niches.is_complete(end, pose_of(START), 0.99)
     # The result of an action and the topic beside it may come in any order.
-    graph.until(lambda: office.words[-1].data == 'returned_to_origin', 'its last status')
-    assert office.word_list()[-3:] == [
+    graph.until(lambda: niches.words[-1].data == 'returned_to_origin', 'its last status')
+    assert niches.word_list()[-3:] == [
         'exploration_complete',
         'returning_to_origin',
         'returned_to_origin',
     ]
 
 
-def test_nav2_drives_through_an_office_that_our_nodes_map(graph, office):
-    office.start_our_slam()
+@pytest.mark.cpu_budget(20.0, 'a whole exploration')
+def test_nav2_drives_through_rooms_that_our_nodes_map(graph, niches):
+    niches.start_our_slam()
     # The simulation waits for the test as well: it must act before everything is explored.
     graph.paced()
-    office.start_nav2(paced_by='heard_too', mode='refuse')
+    niches.start_nav2(paced_by='heard_too', mode='refuse')
     # From now on the server answers this client. Its first answer can be lost, and it is asked
     # again after a while: an explorer would have given up all targets that are refused meanwhile.
-    assert not office.drive_home().accepted
-    office.start_explorer()
-    handle = graph.send_goal(office.client, Explore.Goal())
-    office.until_logged('goal rejected')
-    office.tell('abort_once')
-    office.until_logged('target not reached: failed to create a plan')
-    office.drive_to_somewhere_else()
+    assert not niches.drive_home().accepted
+    niches.start_explorer()
+    handle = graph.send_goal(niches.client, Explore.Goal())
+    niches.until_logged('goal rejected')
+    niches.tell('abort_once')
+    niches.until_logged('target not reached: failed to create a plan')
+    niches.drive_to_somewhere_else()
     ended = graph.result(handle, 'the exploration')
     assert ended.status == GoalStatus.STATUS_SUCCEEDED
-    office.is_complete(ended.result.status, None, 0.97)
+    niches.is_complete(ended.result.status, None, 0.97)
 
 
 def test_a_robot_that_starts_in_front_of_a_wall_turns_and_explores(graph):

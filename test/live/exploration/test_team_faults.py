@@ -2,6 +2,7 @@
 
 import pytest
 from support.driving_team import DrivingTeam
+from support.niches import write_niches
 
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
@@ -14,17 +15,6 @@ pytestmark = pytest.mark.live
 SPEED = {'controller.max_speed_m_s': 0.5}
 RADIUS_M = PRESETS['2dx'].radius_m
 RANGE_M = 8.0
-# Nobody sees one of the niches from the other.
-NICHES = """
-name: niches
-resolution: 0.02
-wall_thickness: 0.10
-start: [3.6, 1.4, 1.5707963]
-walls:
-  - [[0, 0], [8, 0], [8, 4], [0, 4], [0, 0]]
-  - [[2, 0], [2, 2.6]]
-  - [[6, 0], [6, 2.6]]
-"""
 
 
 class Scene:
@@ -50,9 +40,7 @@ class Scene:
 
 @pytest.fixture
 def niches(tmp_path):
-    path = tmp_path / 'niches.yaml'
-    path.write_text(NICHES)
-    return path
+    return write_niches(tmp_path)
 
 
 def explore_with_one_killed(scene, at_s):
@@ -72,10 +60,12 @@ def explore_with_network_cut(scene, at_s, duration_s):
     assert team.radio.carried['tiles'] > 0
 
 
+@pytest.mark.cpu_budget(35.0, 'two robots explore, with all of their nodes')
 def test_the_other_robot_explores_what_a_killed_one_had_claimed(graph, niches):
     explore_with_one_killed(Scene(graph, niches, 2, claim_timeout_s=3.0), 4.0)
 
 
+@pytest.mark.cpu_budget(45.0, 'two robots explore, with all of their nodes')
 def test_robots_finish_though_messages_are_lost_and_the_network_fails(graph, niches):
     explore_with_network_cut(Scene(graph, niches, 2, loss=0.1, claim_timeout_s=3.0), 4.0, 8.0)
 

@@ -168,13 +168,17 @@ class Exploration:
         )
 
 
-def test_a_laser_without_returns_or_with_frozen_ranges_is_blind(graph):
+@pytest.mark.cpu_budget(20.0, 'an exploration with two faults')
+@pytest.mark.parametrize(
+    'cases',
+    [
+        ((without_returns(np.inf), 'no returns'), (Frozen(), 'same ranges')),
+        pytest.param(((without_returns(8.0), 'no returns'),), marks=pytest.mark.slow),
+    ],
+    ids=['inf and frozen', 'maximum'],
+)
+def test_a_laser_without_returns_or_with_frozen_ranges_is_blind(graph, cases):
     robot = Exploration(graph)
-    cases = (
-        (without_returns(np.inf), 'no returns'),
-        (without_returns(8.0), 'no returns'),
-        (Frozen(), 'same ranges'),
-    )
     for change, reason in cases:
         graph.until(robot.drives_far, 'it drives to a place that is not near')
         walls = robot.walls()

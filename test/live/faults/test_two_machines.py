@@ -36,6 +36,7 @@ def start_mapping(machines, machine):
         )
 
 
+@pytest.mark.cpu_budget(20.0, 'nodes on machines of their own start as those of a user')
 def test_a_robot_here_and_its_map_there_outlive_a_cable_that_is_pulled(machines, tmp_path):
     bag = tmp_path / 'bag'
     machines.start(0, 'recorder', bag=str(bag), use_sim_time=True)

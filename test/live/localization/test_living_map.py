@@ -89,6 +89,7 @@ def test_a_localizer_that_is_reset_takes_mapper_and_graph_along(graph):
     assert [graph.stop(name) for name in NODES] == [0] * 3
 
 
+@pytest.mark.cpu_budget(15.0, 'a robot that is lost searches with each scan')
 def test_a_localizer_without_memory_stays_lost_in_the_living_map_until_a_pose_is_given(graph):
     robot = Robot(graph)
     # From 15.2 to 17.1 s the view is like none near the start pose; at 12.1 s it is like a corner.

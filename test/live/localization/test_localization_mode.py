@@ -116,14 +116,16 @@ def state_home(tmp_path, monkeypatch):
     monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path / 'home'))
 
 
+@pytest.mark.cpu_budget(15.0, 'two hundred poses of a drive')
 def test_it_tracks_in_a_map_of_another_program_and_remembers_the_last_pose(graph, tmp_path):
     path = write_foreign_map(tmp_path, WORLD)
     robot = Robot(graph)
     amcl = graph.heard('amcl_pose', PoseWithCovarianceStamped, qos.LATCHED)
-    clouds = graph.heard('particle_cloud', ParticleCloud, qos.SENSOR)
     start = {f'initial_pose.{key}': v for key, v in zip(('x', 'y', 'yaw'), START, strict=True)}
     robot.localize(map_file_name=str(path), set_initial_pose=True, **start)
-    robot.drive_until(lambda: robot.travelled_m() > 12.0 and clouds, 'a drive')
+    robot.drive_until(lambda: robot.travelled_m() > 12.0, 'a drive')
+    clouds = graph.heard('particle_cloud', ParticleCloud, qos.SENSOR)
+    robot.drive_until(lambda: clouds, 'a cloud')
     assert robot.states() == {SlamStatus.TRACKING}
     errors = robot.errors_m()
     assert len(errors) > 200
@@ -146,12 +148,13 @@ def test_it_tracks_in_a_map_of_another_program_and_remembers_the_last_pose(graph
     graph.until(robot.is_tracking, 'that it finds itself at the last pose')
 
 
+@pytest.mark.cpu_budget(15.0, 'a search of the building with each scan')
 def test_it_is_lost_in_the_wrong_building(graph, tmp_path):
     path = write_foreign_map(tmp_path, 'office')
     robot = Robot(graph)
     robot.localize(map_file_name=str(path))
     robot.send_initial_pose(START)
-    robot.drive_until(lambda: robot.travelled_m() > 20.0, 'twenty metres')
+    robot.drive_until(lambda: robot.travelled_m() > 12.0, 'twelve metres')
     # For three metres, a corner of this building looks like one of the other.
     assert np.mean([status.state == SlamStatus.LOST for status in robot.status]) > 0.7
     assert robot.status[-1].state == SlamStatus.LOST

@@ -23,8 +23,9 @@ from std_msgs.msg import String
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.planning.navigator import Navigator
+from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.planning.obstacles import StuckDetector
+from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.tf import TransformListener
@@ -35,7 +36,7 @@ _POLL_S = 0.002
 
 
 class BtNavigator(LifecycleNode):
-    """Parameters: autostart; mode: at the start; paced_by: see `spin_once`."""
+    """Parameters: autostart; mode: at the start; paced_by: see `spin_once`; max_speed_m_s."""
 
     def __init__(self):
         super().__init__('bt_navigator')
@@ -43,7 +44,11 @@ class BtNavigator(LifecycleNode):
         paced_by = self.declare_parameter('paced_by', '').value
         self._transforms = TransformListener(self)
         self._laser = LaserTransform(self)
-        self._navigator = Navigator()
+        speed_m_s = self.declare_parameter(
+            'max_speed_m_s', PathFollowerConfig().max_speed_m_s
+        ).value
+        controller = PathFollowerConfig(max_speed_m_s=speed_m_s)
+        self._navigator = Navigator(NavigatorConfig(controller=controller))
         self._mode = self.declare_parameter('mode', 'drive').value
         self._patch = None
         self._is_active = False
