@@ -1,5 +1,7 @@
 """`support.cpu_time`: budgets of CPU time for tests and stages."""
 
+import os
+
 import pytest
 from support import cpu_time
 from support.forks import forked
@@ -10,8 +12,9 @@ import sys
 sys.path.insert(0, {str(forked.TESTS)!r})
 pytest_plugins = ['support.cpu_time']
 """
+HOME = os.environ['HOME']
 TESTS = """
-import subprocess, sys, time
+import os, subprocess, sys, time
 from pathlib import Path
 
 import numba
@@ -19,6 +22,13 @@ import pytest
 from support.forks import forked
 
 SPINS = 'import time\\nend = time.process_time() + 0.3\\nwhile time.process_time() < end: pass'
+
+JOBS = (
+    'from multiprocessing import get_context\\n'
+    f'def spin():\\n exec({SPINS!r})\\n'
+    'if __name__ == "__main__":\\n'
+    ' job = get_context("forkserver").Process(target=spin)\\n job.start()\\n job.join()\\n'
+)
 
 def spin(seconds):
     end = time.process_time() + seconds
@@ -44,8 +54,14 @@ def test_starts():
 
 @pytest.mark.cpu_budget(0.2, 'planted')
 def test_forks(tmp_path):
+    assert forked.server().can_start(os.environ)
     (tmp_path / 'spins.py').write_text(SPINS)
     assert forked.run('spins', folder=tmp_path).returncode == 0
+
+@pytest.mark.cpu_budget(0.2, 'planted')
+def test_jobs(tmp_path):
+    (tmp_path / 'jobs.py').write_text(JOBS)
+    assert forked.run('jobs', folder=tmp_path).returncode == 0
 
 @pytest.mark.cpu_budget(0.2, 'planted')
 def test_waits():
@@ -74,6 +90,8 @@ def test_default():
 def run(pytester, monkeypatch):
     """Run tests by name in a run of their own; returns its lines and its exit code."""
     monkeypatch.delenv(cpu_time.STAGE, raising=False)
+    # Which pytester has changed, and for which there would be no forks.
+    monkeypatch.setenv('HOME', HOME)
     pytester.makeconftest(CONFTEST)
     pytester.makepyfile(TESTS)
     pytester.makeini('[pytest]\nmarkers = slow: of the project')
@@ -97,7 +115,12 @@ def test_a_test_above_its_budget_fails_with_one_line(run, name):
 @pytest.mark.programs
 @pytest.mark.parametrize(
     ('name', 'options'),
-    [('test_starts', ()), ('test_forks', ()), ('test_computes', ('-n', '1'))],
+    [
+        ('test_starts', ()),
+        ('test_forks', ()),
+        ('test_jobs', ()),
+        ('test_computes', ('-n', '1')),
+    ],
 )
 def test_processes_of_a_test_count_and_so_do_workers(run, name, options):
     lines, code = run(name, *options)

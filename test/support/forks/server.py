@@ -8,6 +8,7 @@ there, and then falls to the nearest ancestor that asks for orphans (`support.fo
 from support.forks import quick_end  # before what registers functions for the end
 
 # isort: split
+import atexit
 import gc
 import importlib
 import importlib.util
@@ -17,6 +18,8 @@ import pkgutil
 import runpy
 import socket
 import sys
+from contextlib import suppress
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import NamedTuple
 
@@ -109,6 +112,14 @@ def _fork_orphan() -> int:
     os.close(reader)
     os.close(writer)
     return 0
+
+
+@atexit.register
+def _end_jobs() -> None:
+    """Wait for the processes of the program's jobs: the CPU time of a test is theirs, too."""
+    # Its socket may have been removed before.
+    with suppress(FileNotFoundError):
+        forkserver._forkserver._stop()
 
 
 def _run(program: Program) -> None:
