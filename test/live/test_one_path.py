@@ -122,6 +122,10 @@ class LoopLog:
             if number % self.every == 0:
                 yield ScanEvent(scan)
 
+    def count(self):
+        """Number of its scans."""
+        return len(self.steps[:: self.every])
+
 
 def assert_same(one, other):
     assert one.stamps_ns == other.stamps_ns
@@ -216,12 +220,13 @@ def places(topology):
     return sorted(nodes.values()), sorted(edges)
 
 
+@pytest.mark.cpu_budget(25.0, 'a lap that is long enough to drift')
 def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, tmp_path):
     start = {'initial_x_m': 3.0, 'initial_y_m': 1.2}
     config = replace_fields(COARSE, localizer=LocalizerConfig(**start))
-    expected = replay(LoopLog(every=2), config)
+    expected = replay(LoopLog(every=3), config)
     assert 'rebuild' in expected.pipeline.stage_seconds
-    convert(LoopLog(every=2), tmp_path / 'bag')
+    convert(LoopLog(every=3), tmp_path / 'bag')
     trajectories = graph.heard('trajectory', Path, qos.LATCHED)
     assert_live_is_same(graph, tmp_path / 'bag', expected, tmp_path, **start)
     assert len(trajectories) == expected.pipeline.corrections
@@ -263,9 +268,10 @@ def errors(stem, truths):
     return np.hypot(*(np.array(poses[: len(truths)]) - truths).T)
 
 
+@pytest.mark.cpu_budget(35.0, 'a lap that is long enough to drift, in two halves')
 def test_a_loop_that_closes_in_a_loaded_session_corrects_it(graph, tmp_path):
     """The first half of a lap is saved, and the nodes are started again for the second."""
-    halves = LoopLog(end=420), LoopLog(first=420)
+    halves = LoopLog(end=420, every=3), LoopLog(first=420)
     for name, half in zip(('one', 'two'), halves, strict=True):
         convert(half, tmp_path / name)
     stem = str(tmp_path / 'block')
@@ -273,7 +279,7 @@ def test_a_loop_that_closes_in_a_loaded_session_corrects_it(graph, tmp_path):
     start = {'initial_x_m': 3.0, 'initial_y_m': 1.2}
     poses = graph.heard('pose', PoseWithCovarianceStamped)
     grid = {'resolution_m': COARSE.grid.resolution_m}
-    play(graph, tmp_path / 'one', 420, poses, localizer=start, grid_mapper=grid)
+    play(graph, tmp_path / 'one', halves[0].count(), poses, localizer=start, grid_mapper=grid)
 
     def save():
         return graph.call(SaveMap, 'save_map', SaveMap.Request(path=stem))
@@ -296,7 +302,7 @@ def test_a_loop_that_closes_in_a_loaded_session_corrects_it(graph, tmp_path):
     own = {name: {'session_path': stem} for name in MAPPERS}
     own['localizer'] |= there
     own['grid_mapper'] |= grid
-    play(graph, tmp_path / 'two', len(halves[1].steps), poses, **own)
+    play(graph, tmp_path / 'two', halves[1].count(), poses, **own)
     for name in MAPPERS:
         assert 'not corrected' not in graph.log(name)
     assert save().success
