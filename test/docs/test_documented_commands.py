@@ -331,7 +331,7 @@ def _until(
             pytest.fail(f'{line.text}\n{line.process.poll()}\n{line.said()[-3000:]}')
 
 
-@pytest.mark.cpu_budget(40.0, 'each command of a page in a process of its own')
+@pytest.mark.cpu_budget(50.0, 'each command of a page in a process of its own')
 @pytest.mark.parametrize('page', PAGES)
 def test_the_commands_of_a_page_run(graph, place, environment, page):
     lines = [c.text for c in COMMANDS if c.document == page and not c.marked]
