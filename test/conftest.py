@@ -75,6 +75,13 @@ def without_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
+def own_environment() -> Iterator[None]:
+    """The variables that a test sets end with it."""
+    with forked.kept_environment():
+        yield
+
+
+@pytest.fixture(autouse=True)
 def started_programs(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests that start a process are marked: unit tests start none."""
     if any(request.node.get_closest_marker(name) for name in ('programs', 'live', 'browser')):

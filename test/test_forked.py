@@ -121,6 +121,13 @@ def test_other_libraries_make_a_start_anew(tmp_path: Path, monkeypatch: pytest.M
     assert process.wait(PATIENCE_S) == 0
 
 
+def test_variables_that_a_library_sets_do_not_stay() -> None:
+    with forked.kept_environment():
+        os.environ['PYTHONHASHSEED'] = '6640'
+        assert not forked.server().can_start(os.environ)
+    assert forked.server().can_start(os.environ)
+
+
 def test_the_server_ends_with_a_test_process_that_is_killed(tmp_path: Path) -> None:
     variables = {**os.environ, 'PYTHONPATH': f'{forked.TESTS}:{os.environ.get("PYTHONPATH", "")}'}
     done = subprocess.run(

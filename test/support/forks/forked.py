@@ -155,6 +155,17 @@ def run(
         return subprocess.CompletedProcess([module, *words], code, output.read(), errors.read())
 
 
+@contextmanager
+def kept_environment() -> Iterator[None]:
+    """Undo what a library sets for good, as Dask does: later programs could not be forks."""
+    before = dict(os.environ)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
 def _loads_rerun(module: str, arguments: list[str]) -> bool:
     """Whether a program loads rerun, whose threads panic at the end of some forks."""
     options = ('--view', '--recording')
