@@ -299,8 +299,7 @@ class StoredScan(NamedTuple):
         usable = scan.max_range_m
         ranges = np.where(scan.returned, scan.ranges_m, 0.0)
         reach = np.minimum(ranges + config.surface_thickness_m, usable)
-        without_return = min(config.no_return_clear_range_m, scan.range_max_m, usable)
-        reach = np.where(scan.without_return, without_return, reach)
+        reach = np.where(scan.without_return, config.cleared_range_m(scan), reach)
         bearings = scan.angles_rad + scan.T_base_laser[2]
         x = np.append(reach * np.cos(bearings), 0.0) + scan.T_base_laser[0]
         y = np.append(reach * np.sin(bearings), 0.0) + scan.T_base_laser[1]

@@ -184,6 +184,10 @@ class OccupancyConfig(Config):
     grazed_length_m: float = 0.4
     p_surely_occupied: float = 0.9
 
+    def cleared_range_m(self, scan: Scan) -> float:
+        """Range up to which the beams without return of a scan clear cells, m."""
+        return min(self.no_return_clear_range_m, scan.range_max_m, scan.max_range_m)
+
 
 # Cells of the papers, and of all results that are compared with published ones: experiments,
 # explorations in the simulator, benchmarks.
@@ -300,7 +304,6 @@ class OccupancyGrid:
         depth = self.config.surface_thickness_m
         x = (float(T_map_laser[0]) - self.frame.origin_x) / resolution
         y = (float(T_map_laser[1]) - self.frame.origin_y) / resolution
-        without_return = min(self.config.no_return_clear_range_m, scan.range_max_m, usable)
         radius = math.ceil(min(usable, scan.range_max_m + depth) / resolution) + 2
         tile_row = (math.floor(y) - radius) // TILE
         tile_col = (math.floor(x) - radius) // TILE
@@ -319,7 +322,7 @@ class OccupancyGrid:
         bend = 2.0 * math.cos(scan.angle_increment_rad)
         turn = (math.cos(heading), math.sin(heading))
         beams = (scan.ranges_m, scan.returned, scan.no_return, self._cosines, self._sines)
-        limits = (usable, without_return, depth, resolution, bend)
+        limits = (usable, self.config.cleared_range_m(scan), depth, resolution, bend)
         box = _draw(increments, laser, turn, *beams, limits, self._steps)
         self._merge(tile_row, tile_col, box, laser)
 
