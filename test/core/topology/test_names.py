@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from core.regions.floors import office, patch_of
+from core.topology.floors import office, patch_of
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.moved import MapMotion

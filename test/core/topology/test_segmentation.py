@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from core.regions.floors import CELL_M, noisy, office, patch_of
+from core.topology.floors import CELL_M, noisy, office, patch_of
 
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.regions import RegionKind, RegionMap, membership_of

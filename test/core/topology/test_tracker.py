@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from core.regions.floors import CELL_M, office, patch_of
+from core.topology.floors import CELL_M, office, patch_of
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from core.regions.floors import office, patch_of
+from core.topology.floors import office, patch_of
 from support.localized import local_grid
 from visualization_msgs.msg import MarkerArray
 
