@@ -81,6 +81,11 @@ def test_compiles():
     kernel([3.0, 1.0])
     assert time.process_time() - began > 0.2
 
+@pytest.mark.cpu_budget(0.2, 'planted')
+def test_fails():
+    spin(0.3)
+    raise LookupError('planted')
+
 def test_default():
     spin(0.3)
 """
@@ -110,6 +115,13 @@ def test_a_test_above_its_budget_fails_with_one_line(run, name):
     (line,) = [line for line in lines if 'CPU time' in line]
     assert f'.py::{name}: 0.' in line
     assert line.endswith(' s of CPU time: expected at most 0.2 s')
+
+
+def test_one_that_fails_has_its_own_reason(run):
+    lines, code = run('test_fails')
+    assert code == pytest.ExitCode.TESTS_FAILED
+    assert not [line for line in lines if 'CPU time' in line]
+    assert any('LookupError: planted' in line for line in lines)
 
 
 @pytest.mark.programs

@@ -20,6 +20,7 @@ TEST_S = 10.0
 STAGE = 'THINMAP_STAGE_CPU_S'
 _SHOWN = 10
 _BEGAN = pytest.StashKey[float]()
+_FAILED = pytest.StashKey[bool]()
 
 
 class _Compilation(event.Listener):
@@ -78,14 +79,18 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """At the end of a test: note its time, and let it fail above its budget."""
+    """At the end of a test: note its time, and let it fail above its budget.
+
+    One that has failed has its own reason, and may have waited for what never came.
+    """
     report = yield
+    item.stash[_FAILED] = item.stash.get(_FAILED, False) or report.failed
     if call.when != 'teardown' or item.get_closest_marker('slow'):
         return report
     spent_s = report.cpu_s = _cpu_s() - item.stash[_BEGAN]
     mark = item.get_closest_marker('cpu_budget')
     budget_s = _budget_s(*mark.args) if mark else TEST_S
-    if report.passed and spent_s > budget_s:
+    if not item.stash[_FAILED] and spent_s > budget_s:
         report.outcome = 'failed'
         report.longrepr = f'{item.nodeid}: {_above(spent_s, budget_s)}'
     return report
