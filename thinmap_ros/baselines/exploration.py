@@ -36,15 +36,11 @@ from thinmap_ros.core.planning.obstacles import RecentPath
 from thinmap_ros.core.planning.paths import path_lengths_to_nodes
 from thinmap_ros.core.planning.wavefront import START_ESCAPE_M, WavefrontConfig
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.se2 import SECOND_NS, Array, Cells, Mask
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.jit import kernel
 
 # Frontiers for the baseline strategies: clusters, viewpoints and path lengths.
-
-Cells = NDArray[np.int64]
-
-Mask = NDArray[np.bool_]
 
 _COARSE = 2
 
@@ -556,9 +552,7 @@ def shortest_rest(between: Array) -> Array:
 
 
 @kernel
-def _unknown_in_sight(
-    cells: NDArray[np.int8], places: NDArray[np.int64], reach: float
-) -> NDArray[np.float64]:
+def _unknown_in_sight(cells: NDArray[np.int8], places: Cells, reach: float) -> Array:
     """Unknown cells on rays (one a degree) from each place (N, 2) up to a known obstacle, (N,)."""
     rows, cols = cells.shape
     areas = np.zeros(places.shape[0])

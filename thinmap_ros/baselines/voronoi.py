@@ -5,18 +5,15 @@ Source: topological map paper sections 1 and 4 (hierarchical map building); Zwyn
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import Voronoi
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.thinning import known_free, select_free_space
 from thinmap_ros.core.topology.topology import build_along
 
-Mask = NDArray[np.bool_]
-Numbers = NDArray[np.int64]
 _EIGHT = np.ones((3, 3), dtype=np.bool_)
 _STEP_CELLS = 0.5  # distance of the points of a ridge that become cells
 
@@ -53,10 +50,10 @@ def voronoi_lines(patch: GridPatch, free: Mask, config: TopologyConfig) -> Mask:
     return _without_empty_holes(lines, free)
 
 
-def _border(known: Mask) -> Numbers:
+def _border(known: Mask) -> Cells:
     """Row and column (N, 2) of the cells beside known free cells; those of the rim are outside."""
     padded = np.pad(known, 1)
-    border: Numbers = np.argwhere(ndimage.binary_dilation(padded, _EIGHT) & ~padded) - 1
+    border: Cells = np.argwhere(ndimage.binary_dilation(padded, _EIGHT) & ~padded) - 1
     return border
 
 

@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, config_or_default, parameter
 from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 
 # With a smaller share of valid beams, the space in front of the laser is unobserved.
 MIN_VALID_BEAM_RATIO = 0.1
@@ -160,7 +160,7 @@ class Scan:
         return self.stamp_ns + round(min(self.first_beam_s, last_s, 0.0) * SECOND_NS)
 
     @cached_property
-    def returned(self) -> NDArray[np.bool_]:
+    def returned(self) -> Mask:
         """Beams that hit an obstacle: range_min <= range < range_max, (N,)."""
         return (
             (self.ranges_m >= self.range_min_m)
@@ -169,27 +169,27 @@ class Scan:
         )
 
     @cached_property
-    def hit(self) -> NDArray[np.bool_]:
+    def hit(self) -> Mask:
         """Beams that hit an obstacle within the usable range, (N,)."""
         return self.returned & (self.ranges_m < self.max_range_m)
 
     @cached_property
-    def without_return(self) -> NDArray[np.bool_]:
+    def without_return(self) -> Mask:
         """Beams without return: range >= range_max or +inf (REP 117), (N,)."""
         return self.ranges_m >= self.range_max_m
 
     @cached_property
-    def no_return(self) -> NDArray[np.bool_]:
+    def no_return(self) -> Mask:
         """Beams without return that show that there is no obstacle in range, (N,)."""
         return self.without_return & (not self.drops_out)
 
     @cached_property
-    def below_range_min(self) -> NDArray[np.bool_]:
+    def below_range_min(self) -> Mask:
         """Beams that hit an obstacle closer than range_min: -inf (REP 117), (N,)."""
         return np.isneginf(self.ranges_m)
 
     @cached_property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """Valid beams, (N,). Obstacles may hide behind the others (NaN, 0, below range_min).
 
         With zero_is_no_return a range of 0 is valid: the laser works, and nothing is near. It is

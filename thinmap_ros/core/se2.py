@@ -10,6 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Cell = tuple[int, int]  # row and column
+Cells = NDArray[np.int64]  # rows and columns (N, 2), or numbers (N,)
+Mask = NDArray[np.bool_]  # which cells (H, W), or which of some things (N,)
+Place = tuple[float, float]  # x and y, m
 
 # Larger coordinates are errors. Beyond 1e15 m, float64 cannot even resolve cells, and computed
 # indices lie outside of every array.

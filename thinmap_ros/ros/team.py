@@ -15,11 +15,11 @@ from thinmap_msgs.msg import SettledPlace as SettledPlaceMsg
 from thinmap_ros.core import errors, se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.exploration.team import MAX_SETTLED, Claim, Place, SettledPlace, SilenceConfig
+from thinmap_ros.core.exploration.team import MAX_SETTLED, Claim, SettledPlace, SilenceConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import JoinedMaps, TileMessage
 from thinmap_ros.core.planning.path_follower import Motion
-from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.se2 import SECOND_NS, Array, Place
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded

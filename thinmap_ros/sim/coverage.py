@@ -17,7 +17,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
 from thinmap_ros.core.planning.wavefront import WavefrontConfig
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.jit import kernel
 from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.world import World
@@ -33,11 +33,11 @@ _PER_CELL = 10  # points of a leaf, so that no ray passes between two of its cel
 class ObservableCells:
     """Observable free cells (H, W) bool, 10 cm wide, world frame."""
 
-    cells: NDArray[np.bool_]
+    cells: Mask
     frame: GridFrame
 
     @staticmethod
-    def share(known: Sequence[NDArray[np.bool_]]) -> float:
+    def share(known: Sequence[Mask]) -> float:
         """Share of these cells that one of several maps knows; known: of each, (N,)."""
         together = np.logical_or.reduce(known)
         return float(together.mean()) if together.size else 1.0
@@ -60,7 +60,7 @@ class ObservableCells:
             return self._count_known(patch, *offset) / count
         return float(self.known(patch, T_world_map).sum()) / count
 
-    def known(self, patch: GridPatch, T_world_map: Array | None = None) -> NDArray[np.bool_]:
+    def known(self, patch: GridPatch, T_world_map: Array | None = None) -> Mask:
         """Whether the map is free at the centre of each of these cells, (N,); see `coverage`."""
         centres = self._centres
         if T_world_map is not None:
@@ -152,7 +152,7 @@ def _with_standing_leaves(world: World, start: Array, radius_m: float) -> World:
     return World(world.name, occupied, world.frame, world.start)
 
 
-def _reachable_from(world: World, start: Array, radius_m: float) -> NDArray[np.bool_]:
+def _reachable_from(world: World, start: Array, radius_m: float) -> Mask:
     """Cells (H, W) that the centre of the robot can reach from its start."""
     from scipy import ndimage
 
@@ -167,7 +167,7 @@ def _reachable_from(world: World, start: Array, radius_m: float) -> NDArray[np.b
     return np.asarray(labels == labels[row, col])
 
 
-def _without_solids(world: World, frame: GridFrame, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def _without_solids(world: World, frame: GridFrame, shape: tuple[int, int]) -> Mask:
     """Cells without obstacles, (H, W)."""
     solid = frame.cells_of(world.frame.centres_of(np.argwhere(world.occupied)))
     free = np.ones(shape, dtype=np.bool_)
@@ -178,11 +178,11 @@ def _without_solids(world: World, frame: GridFrame, shape: tuple[int, int]) -> N
 @kernel
 def _sees_reachable(
     solid: NDArray[np.uint8],
-    wanted: NDArray[np.bool_],
+    wanted: Mask,
     places: Array,
     angles: Array,
     max_cells: float,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Whether rays from each place (N, 2; x, y in cells) meet a wanted cell before an obstacle."""
     rows, cols = solid.shape
     found = np.zeros(len(places), dtype=np.bool_)

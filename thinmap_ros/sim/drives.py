@@ -5,14 +5,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.path_follower import PathFollower, PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array, pose
+from thinmap_ros.core.se2 import Array, Mask, pose
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.simulation import STEP_NS, Simulation
@@ -107,9 +106,7 @@ def _is_clear(world: World, path: Array, radius_m: float) -> bool:
     return bool((world.distance_to_wall_m[cells[:, 0], cells[:, 1]] > radius_m).all())
 
 
-def random_start(
-    world: World, rng: np.random.Generator, within: NDArray[np.bool_] | None = None
-) -> Array:
+def random_start(world: World, rng: np.random.Generator, within: Mask | None = None) -> Array:
     """A random collision-free pose (3,), anywhere in the world or in some of its cells (H, W)."""
     room = world.distance_to_wall_m > RobotConfig().radius_m + MARGIN_M
     cells = np.argwhere(room if within is None else room & within)
@@ -121,7 +118,7 @@ def random_drive(
     world: World,
     start: Array,
     seed: int,
-    within: NDArray[np.bool_] | None = None,
+    within: Mask | None = None,
     laser: LaserScannerConfig | None = None,
 ) -> Iterator[DriveSample]:
     """Yield the samples of an endless drive from a start to random places.
@@ -137,7 +134,7 @@ def random_drive(
 def _random_paths(
     simulation: Simulation,
     rng: np.random.Generator,
-    within: NDArray[np.bool_] | None,
+    within: Mask | None,
     config: DriveConfig,
 ) -> Iterator[Array]:
     """Paths (K, 2) from the robot to random reachable places."""

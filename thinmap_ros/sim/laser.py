@@ -10,7 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.jit import kernel
 from thinmap_ros.sim.world import World
 
@@ -117,16 +117,12 @@ class LaserScanner:
         return result
 
 
-def _meets(
-    special: NDArray[np.bool_], x: float, y: float, angles: Array, cells: Array
-) -> NDArray[np.bool_]:
+def _meets(special: Mask, x: float, y: float, angles: Array, cells: Array) -> Mask:
     """Whether beams from (x, y) with lengths (N,), cells, end in a special cell."""
     inside = np.where(np.isfinite(cells), cells, 0.0) + _INTO_CELL
     cols = np.floor(x + inside * np.cos(angles)).astype(np.int64)
     rows = np.floor(y + inside * np.sin(angles)).astype(np.int64)
-    there: NDArray[np.bool_] = (
-        (rows >= 0) & (rows < special.shape[0]) & (cols >= 0) & (cols < special.shape[1])
-    )
+    there: Mask = (rows >= 0) & (rows < special.shape[0]) & (cols >= 0) & (cols < special.shape[1])
     there &= np.isfinite(cells)
     there[there] = special[rows[there], cols[there]]
     return there

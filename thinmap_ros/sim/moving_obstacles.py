@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Doors:
     ends: Array
     period_s: Array
     open_rad: Array
-    is_shut: NDArray[np.bool_]
+    is_shut: Mask
     held_open_m: float = 3.0  # for a robot that is nearer
 
     def segments(self, seconds: float, robot: Array, reach_m: float) -> Array:
@@ -84,7 +84,7 @@ class Doors:
         ends = np.column_stack([c * shut[:, 0] - s * shut[:, 1], s * shut[:, 0] + c * shut[:, 1]])
         return np.column_stack([self.hinges[doors], self.hinges[doors] + ends])
 
-    def _angles(self, doors: NDArray[np.int64], seconds: float, held: NDArray[np.bool_]) -> Array:
+    def _angles(self, doors: NDArray[np.int64], seconds: float, held: Mask) -> Array:
         """Opening angles of some doors, rad; doors held open do not close."""
         period = (seconds // self.period_s[doors]).astype(np.int64) % self.open_rad.shape[1]
         shut = self.is_shut[doors, period] & ~held

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.fields import distance_cells, reachable
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.sim.moving_obstacles import MovingObstacles
 
 
@@ -26,7 +26,7 @@ class World:
     occupied: NDArray[np.uint8]
     frame: GridFrame
     start: Array
-    glass: NDArray[np.bool_] | None = None
+    glass: Mask | None = None
     moving: MovingObstacles | None = None
 
     @staticmethod
@@ -104,14 +104,14 @@ def surfaces(world: World, shortest_m: float) -> Array:
     return np.concatenate([*found, *across])
 
 
-def inside_of(world: World) -> NDArray[np.bool_]:
+def inside_of(world: World) -> Mask:
     """Free cells (H, W) that are connected with the start."""
     return reachable(world.occupied == 0, world.frame.cells_of(world.start[None, :2]))
 
 
 def _rows_of_faces(
-    inside: NDArray[np.bool_],
-    free: NDArray[np.bool_],
+    inside: Mask,
+    free: Mask,
     frame: GridFrame,
     shortest_m: float,
     side: int,

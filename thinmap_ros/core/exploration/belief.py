@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
+from thinmap_ros.core.se2 import Cells, Place
 from thinmap_ros.core.snapshot import MAX_CELL_INDEX, MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
 from thinmap_ros.jit import inlined, kernel
 
@@ -113,10 +114,6 @@ def missing_area(hidden: Iterable[tuple[float, float]]) -> MissingArea:
 # - *Left* is a place to which the robot was on its way when another one became cheaper. It counts
 #   until the robot has seen something new.
 
-Place = tuple[float, float]
-
-_Cells = NDArray[np.int64]
-
 FIELDS = {
     'ids': Field(np.int64, ('n',), 1, MAX_ID),
     'places': Field(np.float64, ('n', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
@@ -131,7 +128,7 @@ _SAME_M = 0.5
 _SHARE = 0.5
 
 
-def _no_cells() -> _Cells:
+def _no_cells() -> Cells:
     return np.zeros((0, 2), dtype=np.int64)
 
 
@@ -148,7 +145,7 @@ class Evidence:
 
     id: int
     place: Place
-    cells: _Cells = field(default_factory=_no_cells)
+    cells: Cells = field(default_factory=_no_cells)
     visits: int = 0
     seen_from: tuple[Place, ...] = ()
     failures: int = 0
@@ -190,7 +187,7 @@ class EvidenceStore:
         self._next_id = first_id
 
     def follow(
-        self, places: Sequence[Place], frontiers: Sequence[_Cells], resolution: float
+        self, places: Sequence[Place], frontiers: Sequence[Cells], resolution: float
     ) -> list[Evidence]:
         """Evidence of each frontier (N, 2) now, on the lattice of the map, with its place, m."""
         # Of two that a frontier continues equally, what was tried counts.
@@ -254,7 +251,7 @@ class EvidenceStore:
         return self._next_id - 1
 
 
-def _joined(parts: Sequence[_Cells]) -> tuple[_Cells, NDArray[np.int64]]:
+def _joined(parts: Sequence[Cells]) -> tuple[Cells, NDArray[np.int64]]:
     """Cells (K, 2) of all parts (N, 2), and where each part begins and the last one ends."""
     ends = np.cumsum([0, *map(len, parts)], dtype=np.int64)
     return np.concatenate([_no_cells(), *parts]), ends
@@ -262,9 +259,9 @@ def _joined(parts: Sequence[_Cells]) -> tuple[_Cells, NDArray[np.int64]]:
 
 @kernel
 def _continued(
-    earlier: _Cells,
+    earlier: Cells,
     earlier_ends: NDArray[np.int64],
-    cells: _Cells,
+    cells: Cells,
     ends: NDArray[np.int64],
     reach: int,
 ) -> NDArray[np.int64]:
@@ -294,7 +291,7 @@ def _continued(
 
 
 @inlined
-def _count_on(cells: _Cells, frontier: _Cells, reach: int) -> int:
+def _count_on(cells: Cells, frontier: Cells, reach: int) -> int:
     """How many cells (N, 2) lie on a frontier (M, 2), or within reach of it."""
     if frontier.shape[0] == 0:
         return 0

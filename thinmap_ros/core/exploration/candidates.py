@@ -16,10 +16,8 @@ from scipy.spatial.distance import cdist
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter, robot_radius
-from thinmap_ros.core.exploration.belief import BeliefModel, Evidence, EvidenceStore, Place
+from thinmap_ros.core.exploration.belief import BeliefModel, Evidence, EvidenceStore
 from thinmap_ros.core.exploration.space import (
-    Cell,
-    Cells,
     FrontierMap,
     Reachable,
     depth_behind_m,
@@ -29,7 +27,7 @@ from thinmap_ros.core.exploration.space import (
 )
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode, unobserved
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.se2 import SECOND_NS, Array, Cell, Cells, Place
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
 SETTLED = 0.999  # probability of an end node without a frontier

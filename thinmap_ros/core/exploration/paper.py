@@ -21,7 +21,7 @@ from thinmap_ros.core.exploration.strategy import (
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.paths import path_lengths_to_nodes
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.se2 import Array, Place, wrap
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
 # How likely an end node is to stay where it is once all is explored: the equations, one by one.
@@ -98,8 +98,6 @@ def bayes_update(p: float, reliability: float) -> float:
 #   free.
 # - *Moved places.* A place farther than `node_reset_distance_m` from where its evidence began loses
 #   its evidence: it was about another place. Evidence continues that of the nearest place before.
-
-Place = tuple[float, float]
 
 PRIOR = 0.5
 

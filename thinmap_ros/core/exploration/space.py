@@ -19,7 +19,7 @@ from thinmap_ros.core.planning.grid_search import (
 )
 from thinmap_ros.core.planning.obstacles import RecentPath
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cell, Cells, Mask, Place
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import known_free, true_cells
 from thinmap_ros.jit import inlined, kernel
@@ -30,12 +30,6 @@ from thinmap_ros.jit import inlined, kernel
 # again only where a scan can have changed the map. A single missing beam makes a frontier, too, so
 # only clusters of some length count.
 # Source: Yamauchi, "A frontier-based approach for autonomous exploration", 1997.
-
-Mask = NDArray[np.bool_]
-
-Cells = NDArray[np.int64]
-
-Place = tuple[float, float]
 
 NOTHING: Bounds = (0, 0, 0, 0)
 
@@ -412,8 +406,6 @@ def _box(
 # shortest path of all places from which most of these points could be seen if nothing stands in the
 # unknown. A robot on the known side of a corner sees along the frontier, but nothing that the
 # corner hides; one at the end of its laser's range has to come only a little nearer.
-
-Cell = tuple[int, int]
 
 # Not more: across a wall one cell thick places where a robot can stand are six cells apart, and
 # stay apart in squares.

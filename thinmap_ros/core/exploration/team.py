@@ -12,7 +12,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.exploration.belief import Evidence
 from thinmap_ros.core.exploration.candidates import Candidate
-from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.se2 import SECOND_NS, Array, Place
 
 # The auction: who explores what, decided by each robot alone from the claims of all.
 #
@@ -67,8 +67,6 @@ def _holds(robot: int, claimed: NDArray[np.int64], told_m: Array) -> bool:
 #
 # A claim names the place of a frontier and no id of a node, so that each robot can have a graph of
 # its own. It holds as long as its robot is received and comes nearer to the place.
-
-Place = tuple[float, float]
 
 SAME_PLACE_M = 0.5  # a claimed place that moves less is the same one
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.edits import Erasures, Mask, touched_cells
+from thinmap_ros.core.grid.edits import Erasures, touched_cells
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import Bounds, GridFrame
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.stage import Destination
 
 # Stored poses and scans, for re-rendering the grid after a loop closure.
@@ -248,7 +248,7 @@ def _erased(frame: GridFrame, bounds: Bounds, polygons: Sequence[Array]) -> Mask
     return cells
 
 
-def _touches(cells: NDArray[np.int64], bounds: Bounds) -> bool:
+def _touches(cells: Cells, bounds: Bounds) -> bool:
     """Whether the rectangle of some cells (M, 2) and another have a cell in common."""
     low = cells.min(axis=0)
     high = cells.max(axis=0)
@@ -275,8 +275,6 @@ _TILES_PER_SLICE = 512
 _SCANS_PER_SLICE = 2
 
 _LAST_RING = 1 << 30
-
-_Cells = NDArray[np.int64]
 
 
 class StoredScan(NamedTuple):
@@ -325,7 +323,7 @@ class _Queue:
     """
 
     def __init__(
-        self, scans: Sequence[StoredScan], poses: Array, rings: _Cells, tile_counts: _Cells
+        self, scans: Sequence[StoredScan], poses: Array, rings: Cells, tile_counts: Cells
     ) -> None:
         """Start with scans at poses (N, 3); nearest ring (N,) and number of tiles (N,) of each."""
         order = np.argsort(rings, kind='stable')
@@ -446,14 +444,14 @@ class Rerendering:
             shown.set_tiles(completed, self.grid, self._added)
         self._complete_rings = complete
 
-    def _rings(self, low: _Cells, high: _Cells) -> _Cells:
+    def _rings(self, low: Cells, high: Cells) -> Cells:
         """Nearest ring (N,) of each box of tiles from low (N, 2) to high (N, 2), inclusive."""
         beyond = np.maximum(low - self._robot_tile, self._robot_tile - high)
-        rings: _Cells = np.maximum(beyond.max(axis=1), 0)
+        rings: Cells = np.maximum(beyond.max(axis=1), 0)
         return rings
 
 
-def _tile_boxes(extents: Sequence[Array], poses: Array, frame: GridFrame) -> _Cells:
+def _tile_boxes(extents: Sequence[Array], poses: Array, frame: GridFrame) -> Cells:
     """First and last tile (N, 2, 2), each (row, col), that scans at poses (N, 3) may touch."""
     corners = np.array(extents).reshape(-1, 4)[:, [[0, 1], [0, 3], [2, 1], [2, 3]]]
     c = np.cos(poses[:, 2])[:, None]

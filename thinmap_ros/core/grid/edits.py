@@ -11,19 +11,17 @@ from numpy.typing import NDArray
 from thinmap_ros.core import errors, se2, snapshot
 from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.core.grid.patch import Bounds, GridFrame, GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_ID, Field, State
 
 # Polygons on the cells of a map.
-
-Mask = NDArray[np.bool_]
 
 _WALL = np.int8(100)
 
 _STEPS_PER_CELL = 8  # along a line
 
 
-def inside(points: Array, polygon: Array) -> NDArray[np.bool_]:
+def inside(points: Array, polygon: Array) -> Mask:
     """Which points (N, 2) lie in a polygon (M, 2), by the even-odd rule, (N,)."""
     result = np.zeros(len(points), dtype=np.bool_)
     x = points[:, 0]

@@ -5,15 +5,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.jit import kernel
 
 # Connected components of a mask, with 8-connectivity.
 #
 # Runs of true cells are joined row by row, with a union-find structure.
-
-Cells = NDArray[np.int64]
-
-Mask = NDArray[np.bool_]
 
 
 def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
@@ -129,7 +126,7 @@ def _reachable(cells: Mask, seeds: Cells) -> Mask:
 FAR = 1.0e6  # squared distance in cells if the set is empty
 
 
-def distance_cells(marked: NDArray[np.bool_]) -> NDArray[np.float64]:
+def distance_cells(marked: Mask) -> Array:
     """Distance, in cells between centres, from each cell (H, W) to the nearest marked one.
 
     1000 if no cell is marked.
@@ -141,7 +138,7 @@ def distance_cells(marked: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 @kernel
-def _distance(marked: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _distance(marked: Mask) -> Array:
     rows, cols = marked.shape
     squared = np.full((rows, cols), FAR)
     # Along columns, two sweeps count the steps from marked cells.

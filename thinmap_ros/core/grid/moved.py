@@ -11,7 +11,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.tiles import MAX_CELLS
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 
 # How the places of a map have moved: each as the pose nearest to it.
 
@@ -151,7 +151,7 @@ def _resampled(
 
 def _reached_blocks(
     patch: GridPatch, motion: MapMotion, frame: GridFrame, shape: tuple[int, int]
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Blocks (H, W) of the cells of another frame in which known cells of a moved map may lie."""
     known = np.pad(patch.cells != UNKNOWN, [(0, -size % _BLOCK) for size in patch.shape])
     down, across = (size // _BLOCK for size in known.shape)
@@ -169,7 +169,7 @@ def _reached_blocks(
     return reached
 
 
-def _middles(row: int, cols: int) -> NDArray[np.int64]:
+def _middles(row: int, cols: int) -> Cells:
     """The middle cell of each block in a row of them."""
     across = np.arange(0, cols, _BLOCK) + _BLOCK // 2
     return np.column_stack([np.full(len(across), row + _BLOCK // 2), across])

@@ -24,7 +24,7 @@ from thinmap_ros.core.grid.patch import (
 from thinmap_ros.core.grid.raytrace import fill_segment
 from thinmap_ros.core.grid.tiles import MAX_TILE_INDEX, TILE, TileStore
 from thinmap_ros.core.scan import NO_RETURN_CLEAR_RANGE_M, Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, Field
 from thinmap_ros.jit import inlined, kernel
 
@@ -356,11 +356,11 @@ class OccupancyGrid:
             tiles.allocate(_tiles_of(self._increments, box) + (tile_row, tile_col))
             _apply(tiles.pool, tiles.directory, place, self._increments, box, self._steps)
 
-    def tiles(self) -> NDArray[np.int64]:
+    def tiles(self) -> Cells:
         """Tile coordinates (N, 2) as (row, col) of the tiles that exist."""
         return self._tiles.tile_coordinates()
 
-    def set_tiles(self, tiles: NDArray[np.int64], *grids: 'OccupancyGrid') -> None:
+    def set_tiles(self, tiles: Cells, *grids: 'OccupancyGrid') -> None:
         """Set tiles (N, 2) to the sum of the log odds of some grids with the same frame."""
         if not len(tiles):
             return
@@ -464,7 +464,7 @@ def _percent_table() -> NDArray[np.int8]:
 
 
 @inlined
-def _is_flat(ranges: Array, hit: NDArray[np.bool_], usable: float, bend: float, i: int) -> bool:
+def _is_flat(ranges: Array, hit: Mask, usable: float, bend: float, i: int) -> bool:
     """Whether a beam and those beside it end on one surface.
 
     On a straight line 1 / range is a sine of the bearing: the two outer ranges predict the middle
@@ -487,8 +487,8 @@ def _draw(
     laser: tuple[float, float],
     turn: tuple[float, float],
     ranges: Array,
-    hit: NDArray[np.bool_],
-    no_return: NDArray[np.bool_],
+    hit: Mask,
+    no_return: Mask,
     cosines: Array,
     sines: Array,
     limits: tuple[float, float, float, float, float],
@@ -536,7 +536,7 @@ def _draw_ends(
     width: int,
     ends: Array,
     ranges: Array,
-    hit: NDArray[np.bool_],
+    hit: Mask,
     usable: float,
     bend: float,
     step: int,
@@ -695,7 +695,7 @@ def _apply(
     return missing
 
 
-def _tiles_of(increments: NDArray[np.int16], box: tuple[int, int, int, int]) -> NDArray[np.int64]:
+def _tiles_of(increments: NDArray[np.int16], box: tuple[int, int, int, int]) -> Cells:
     """Tiles (N, 2), relative to the first one, that have increments."""
     rows, cols = np.nonzero(increments[: box[1] + 1])
     width = increments.shape[1] // TILE + 1

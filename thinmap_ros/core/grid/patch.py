@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, Cells, Mask
 
 # Transform between world points and the cells of a grid.
 
@@ -51,11 +51,11 @@ class GridFrame:
         """Points (N, 2), as x and y in cells from the corner of cell (0, 0)."""
         return np.asarray((points - (self.origin_x, self.origin_y)) / self.resolution)
 
-    def cells_of(self, points: Array) -> NDArray[np.int64]:
+    def cells_of(self, points: Array) -> Cells:
         """Cells (N, 2) as (row, col) that hold the points (N, 2)."""
         return np.floor(self.in_cells(np.atleast_2d(points))[:, ::-1]).astype(np.int64)
 
-    def centres_of(self, cells: NDArray[np.int64]) -> Array:
+    def centres_of(self, cells: Cells) -> Array:
         """World points (N, 2) at the centres of the cells (N, 2) given as (row, col)."""
         centres = np.empty(cells.shape)
         centres[:, 0] = (cells[:, 1] + 0.5) * self.resolution + self.origin_x
@@ -120,17 +120,17 @@ class GridPatch:
         return (self.cells.shape[0], self.cells.shape[1])
 
     @cached_property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Mask:
         """Cells known to be free, (H, W)."""
         return (self.cells >= 0) & (self.cells <= FREE_AT_MOST)
 
     @cached_property
-    def occupied(self) -> NDArray[np.bool_]:
+    def occupied(self) -> Mask:
         """Cells known to be occupied, (H, W)."""
         return self.cells >= OCCUPIED_AT_LEAST
 
     @cached_property
-    def unknown(self) -> NDArray[np.bool_]:
+    def unknown(self) -> Mask:
         """Cells that are neither free nor occupied, (H, W)."""
         return ~(self.free | self.occupied)
 
@@ -209,13 +209,13 @@ class GridPatch:
         """Bounds of the cells that differ from those of a patch of the same shape; None: none."""
         return bounds_of(self.cells != before.cells)
 
-    def contains(self, points: Array) -> NDArray[np.bool_]:
+    def contains(self, points: Array) -> Mask:
         """Which of the points (N, 2) lie inside, (N,)."""
         cells = self.frame.cells_of(points)
         return np.asarray(np.all((cells >= 0) & (cells < self.shape), axis=1))
 
 
-def bounds_of(chosen: NDArray[np.bool_]) -> Bounds | None:
+def bounds_of(chosen: Mask) -> Bounds | None:
     """Bounds of the chosen cells of an array (H, W); None where none is."""
     rows = np.flatnonzero(chosen.any(axis=1))
     if not rows.size:

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.jit import inlined, kernel
 
 _FRACTION_BITS = 32
@@ -64,7 +64,7 @@ def cast_rays(
 
 
 @kernel
-def line_is_clear(free: NDArray[np.bool_], row_a: int, col_a: int, row_b: int, col_b: int) -> bool:
+def line_is_clear(free: Mask, row_a: int, col_a: int, row_b: int, col_b: int) -> bool:
     """Whether every cell on the straight line between the centres of two cells is free.
 
     free (H, W) bool. A line through the corner of four cells visits one of the two beside it; cells

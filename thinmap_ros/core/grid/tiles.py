@@ -9,7 +9,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import MIN_RESOLUTION_M
-from thinmap_ros.core.se2 import MAX_COORDINATE_M
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Cells
 
 TILE = 64  # cells along the edge of a tile
 NO_TILE = -1
@@ -141,7 +141,7 @@ class TileStore:
         self.first_row = height.first
         self.first_col = width.first
 
-    def allocate(self, tiles: NDArray[np.int64]) -> None:
+    def allocate(self, tiles: Cells) -> None:
         """Allocate the tiles (N, 2), (row, col) in tile coordinates inside the directory.
 
         New ones are stored in the given order; existing ones are unchanged. Raises InputError if
@@ -166,7 +166,7 @@ class TileStore:
         """State for copies and pickles, without the unused part of the pool."""
         return {**self.__dict__, 'pool': self.pool[: self.used].copy()}
 
-    def tile_coordinates(self) -> NDArray[np.int64]:
+    def tile_coordinates(self) -> Cells:
         """Tile coordinates (N, 2) as (row, col) of the tiles in the order of their slots."""
         found = np.argwhere(self.directory != NO_TILE)
         order = np.argsort(self.directory[found[:, 0], found[:, 1]])
@@ -226,7 +226,7 @@ class TileStore:
                 row_a - row : row_b - row, col_a - col : col_b - col
             ]
 
-    def read_tiles(self, tiles: NDArray[np.int64]) -> NDArray[Any]:
+    def read_tiles(self, tiles: Cells) -> NDArray[Any]:
         """Copy of the tiles (N, 2), (row, col) in tile coordinates; 0 where no tile is."""
         cells = np.zeros((len(tiles), *self.pool.shape[1:]), dtype=self.pool.dtype)
         at = tiles - (self.first_row, self.first_col)
@@ -236,7 +236,7 @@ class TileStore:
         cells[inside[exist]] = self.pool[slots[exist]]
         return cells
 
-    def write_tiles(self, tiles: NDArray[np.int64], cells: NDArray[Any]) -> None:
+    def write_tiles(self, tiles: Cells, cells: NDArray[Any]) -> None:
         """Set the tiles (N, 2), (row, col) in tile coordinates, to cells (N, TILE, TILE, ...)."""
         low_row, low_col = tiles.min(axis=0).tolist()
         high_row, high_col = tiles.max(axis=0).tolist()

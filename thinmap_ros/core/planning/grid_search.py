@@ -13,13 +13,9 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.fields import reachable
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, Bounds, GridFrame, GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.thinning import column_distance, standing_room
 from thinmap_ros.jit import kernel
-
-Mask = NDArray[np.bool_]
-
-Cells = NDArray[np.int64]
 
 # Enough buckets for steps of up to four times the diagonal one.
 _STRAIGHT = 5

@@ -5,12 +5,11 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.jit import kernel
 
 # Blind sectors: invalid beams behind which an obstacle may stand.
@@ -79,9 +78,7 @@ class BlindSectors:
 
 
 @kernel
-def _sector_points(
-    invalid: NDArray[np.bool_], first: float, step: float, laser: Array, reach: float
-) -> Array:
+def _sector_points(invalid: Mask, first: float, step: float, laser: Array, reach: float) -> Array:
     """Points (K, 2) in the sectors of invalid beams (N,), up to a reach, where obstacles can hide.
 
     first, step: bearing of the first beam and increment, rad; laser (3,): its pose.
@@ -119,9 +116,7 @@ def _sector_points(
 
 
 @kernel
-def _is_seen(
-    points: Array, seen: Array, first: float, step: float, laser: Array
-) -> NDArray[np.bool_]:
+def _is_seen(points: Array, seen: Array, first: float, step: float, laser: Array) -> Mask:
     """Whether beams of a scan passed points (K, 2): (K,).
 
     seen (N,): observed range of each beam, m, NaN: invalid; first, step: bearing of the first beam
@@ -353,7 +348,7 @@ class RecentPath:
         if away >= self._step_m:
             self._append(here)
 
-    def cells(self, frame: GridFrame, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    def cells(self, frame: GridFrame, shape: tuple[int, ...]) -> Cells:
         """Cells (N, 2) of a map (H, W) on the path; consecutive cells share an edge."""
         if self._end == self._begin:
             return np.empty((0, 2), dtype=np.int64)
@@ -375,7 +370,7 @@ class RecentPath:
 
 
 @kernel
-def _connected_cells(cells: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]:
+def _connected_cells(cells: Cells, rows: int, cols: int) -> Cells:
     """Cells (N, 2) and the cells between them, first along the column, then along the row.
 
     Cells outside the map are omitted.

@@ -6,7 +6,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError, require_type
 from thinmap_ros.core.grid.patch import GridPatch
@@ -18,7 +17,7 @@ from thinmap_ros.core.planning.wavefront import (
     cost_of_cells,
     find_path,
 )
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask, Place
 from thinmap_ros.core.topology.graph import Edge, TopologicalMap, TopologyConfig
 from thinmap_ros.jit import kernel
 
@@ -27,12 +26,6 @@ from thinmap_ros.jit import kernel
 # The window holds start and goal with some room around. A path that leaves it is at least as long
 # as the way to the rim and on to the goal; a cheaper one in the window is the best of the whole
 # map. In all other cases the wavefront plans on the whole map.
-
-Cells = NDArray[np.int64]
-
-XY = tuple[float, float]
-
-Mask = NDArray[np.bool_]
 
 _GAP_M = TopologyConfig().max_unknown_gap_m
 
@@ -60,8 +53,8 @@ class _Window:
 
 def plan_short_path(
     patch: GridPatch,
-    start_xy: XY,
-    goal_xy: XY,
+    start_xy: Place,
+    goal_xy: Place,
     config: WavefrontConfig,
     obstacles: Obstacles | None,
     trail: Cells,
@@ -82,8 +75,8 @@ def plan_short_path(
 
 def _window(
     patch: GridPatch,
-    start_xy: XY,
-    goal_xy: XY,
+    start_xy: Place,
+    goal_xy: Place,
     config: WavefrontConfig,
     obstacles: Obstacles | None,
 ) -> _Window | None:
@@ -399,8 +392,8 @@ class _Checked:
 def route_band(
     topology: TopologicalMap,
     patch: GridPatch,
-    start_xy: XY,
-    goal_xy: XY,
+    start_xy: Place,
+    goal_xy: Place,
     config: WavefrontConfig,
     obstacles: Obstacles | None = None,
 ) -> Band | None:
@@ -429,7 +422,7 @@ def route_band(
 
 
 def _entrance(
-    checked: _Checked, xy: XY, reach_m: float
+    checked: _Checked, xy: Place, reach_m: float
 ) -> tuple[_Surroundings, list[_Entry]] | None:
     """The smallest surroundings of a point through which edges pass, and where these are entered.
 
@@ -450,7 +443,7 @@ def _entrance(
 
 
 def _surroundings(
-    patch: GridPatch, xy: XY, reach_m: float, size: int, config: WavefrontConfig
+    patch: GridPatch, xy: Place, reach_m: float, size: int, config: WavefrontConfig
 ) -> _Surroundings | None:
     """Path lengths within `size` cells of a point, or of the nearest traversable cell in reach."""
     resolution = patch.frame.resolution
@@ -467,7 +460,7 @@ def _surroundings(
 
 
 def _route(
-    checked: _Checked, starts: list[_Entry], goals: list[_Entry], goal_xy: XY
+    checked: _Checked, starts: list[_Entry], goals: list[_Entry], goal_xy: Place
 ) -> tuple[Array, float, float] | None:
     """Points (K, 2) on edges of the shortest drivable route, and its lengths to and from them."""
     first = checked.approaches(starts)
@@ -557,7 +550,7 @@ def _length(path: Array) -> float:
 
 
 @kernel
-def _paint_discs(cells: Mask, centres: NDArray[np.int64], radius: float) -> None:
+def _paint_discs(cells: Mask, centres: Cells, radius: float) -> None:
     """Mark the cells (H, W) within a radius, cells, of a path of cells (K, 2).
 
     Discs lie a third of their radius apart.

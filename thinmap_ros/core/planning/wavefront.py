@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from thinmap_ros.core.config import Config, parameter, robot_radius
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import disc, nearest_true, reachable_cells
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import column_distance, known_free
 from thinmap_ros.jit import inlined, kernel
 
-Mask = NDArray[np.bool_]
 _STEP_CELLS = 0.5
 _TOPOLOGY = TopologyConfig()
 # A start in collision may leave inflated cells within this distance, that of the usual inflation.
@@ -107,7 +106,7 @@ def find_path(
     goal_xy: tuple[float, float],
     config: WavefrontConfig,
     obstacles: Obstacles | None = None,
-    trail: NDArray[np.int64] | None = None,
+    trail: Cells | None = None,
     band: Mask | None = None,
 ) -> PlannedPath | None:
     """Path from start to goal, m, map frame, points half a cell apart; None: no path.
@@ -226,7 +225,7 @@ def _open_escape_cells(
     cost[start] = min(cost[start], config.escape_cost)
 
 
-def _beside_thin_wall(occupied: Mask, cells: NDArray[np.int64]) -> Mask:
+def _beside_thin_wall(occupied: Mask, cells: Cells) -> Mask:
     """Whether a diagonal step from cells (N, 2) leads between two occupied ones (H, W): (N,)."""
     rows, cols = cells.T
     found = np.zeros(len(cells), dtype=np.bool_)
@@ -292,7 +291,7 @@ def _look_up(distance: NDArray[np.int16], reach: int, table: Array) -> Array:
 
 
 @kernel
-def _push(keys: Array, cells: NDArray[np.int64], count: int, key: float, cell: int) -> None:
+def _push(keys: Array, cells: Cells, count: int, key: float, cell: int) -> None:
     place = count
     while place > 0:
         parent = (place - 1) // 2
@@ -306,7 +305,7 @@ def _push(keys: Array, cells: NDArray[np.int64], count: int, key: float, cell: i
 
 
 @kernel
-def _drop_first(keys: Array, cells: NDArray[np.int64], count: int) -> None:
+def _drop_first(keys: Array, cells: Cells, count: int) -> None:
     """Remove the smallest key from a binary heap of `count` entries."""
     key = keys[count - 1]
     cell = cells[count - 1]

@@ -5,11 +5,10 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import MIN_HITS, NO_RETURN_CLEAR_RANGE_M, Scan, is_most_missed
-from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 from thinmap_ros.jit import kernel
 
 # Decides from the data whether a beam without return shows free space.
@@ -110,7 +109,7 @@ class DropoutDetector:
         moved = se2.between(self._last, T_odom_base)
         return math.hypot(moved[0], moved[1]) > _APART_M or abs(float(moved[2])) > _APART_RAD
 
-    def _aimed_beams(self, scan: Scan, T_odom_base: Array) -> NDArray[np.bool_]:
+    def _aimed_beams(self, scan: Scan, T_odom_base: Array) -> Mask:
         """Which beams (N,) point at a surface of an earlier view."""
         if not self._views:
             return np.zeros(scan.ranges_m.size, dtype=np.bool_)
@@ -130,7 +129,7 @@ def _surfaces(scan: Scan) -> Array:
     return np.asarray(scan.points_base()[surfaces])
 
 
-def _interior(aimed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _interior(aimed: Mask) -> Mask:
     """The beams (N,) whose neighbours point at a surface, too.
 
     At its edge a small error of the odometry decides whether a beam meets it.
@@ -141,9 +140,7 @@ def _interior(aimed: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @kernel
-def _aimed(
-    points: Array, laser: Array, count: int, fan: tuple[float, float, float]
-) -> NDArray[np.bool_]:
+def _aimed(points: Array, laser: Array, count: int, fan: tuple[float, float, float]) -> Mask:
     """Which beams (count,) point at one of some points (M, 2) in reach.
 
     laser (3,): its pose in the frame of the points; fan: bearing of the first beam, angle between

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, OdometryBuffer
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 from thinmap_ros.core.sensing.beams import LaserMonitor
 from thinmap_ros.jit import inlined, kernel
 
@@ -106,9 +106,7 @@ def _relative(poses: Array) -> Array:
 
 
 @inlined
-def _range_at(
-    ranges: Array, hit: NDArray[np.bool_], x: Array, y: Array, i: int, k: int, angle: float
-) -> float:
+def _range_at(ranges: Array, hit: Mask, x: Array, y: Array, i: int, k: int, angle: float) -> float:
     """Range of beam i at an angle, on the surface between its end and that of its neighbour k."""
     measured: float = ranges[i]
     if not hit[i]:
@@ -126,9 +124,7 @@ def _range_at(
 
 
 @kernel
-def _moved_beams(
-    ranges: Array, hit: NDArray[np.bool_], moved: Array, fan: tuple[float, float]
-) -> Array:
+def _moved_beams(ranges: Array, hit: Mask, moved: Array, fan: tuple[float, float]) -> Array:
     """Ranges (N,) of beams after each has moved by a pose (N, 3) of the laser.
 
     Each direction takes the nearest moved beam. hit (N,); fan: bearing of the first beam, angle

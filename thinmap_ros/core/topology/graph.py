@@ -12,7 +12,7 @@ from thinmap_ros.core import errors
 from thinmap_ros.core.config import Config, parameter, robot_radius
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.grid.fields import SpatialHash
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Mask
 
 # Nodes are listed by squares, in which one is looked for up to so far away.
 _BUCKET_M = 4.0
@@ -212,8 +212,6 @@ class TopologicalMap:
 # The topological map as flat arrays, the fields of thinmap_msgs/TopologicalMap, and back.
 
 Flat = dict[str, NDArray[Any]]
-
-Mask = NDArray[np.bool_]
 
 FIELDS = {
     'node_ids': np.uint32,

@@ -6,21 +6,18 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.layers.free_space import squared_clearance
-from thinmap_ros.core.topology.layers.lattice import Cells, Lattice, rows_and_cols
+from thinmap_ros.core.topology.layers.lattice import Lattice, rows_and_cols
 from thinmap_ros.jit import inlined, kernel
 
 # Corner nodes: where chains of cells break so that straight lines stay where the robot fits.
 
-_Cells = NDArray[np.int64]
 
-
-def corner_indices(cells: _Cells, room: Array) -> _Cells:
+def corner_indices(cells: Cells, room: Array) -> Cells:
     """Indices into a chain's cells (K, 2) at which corner nodes stand, in order, without its ends.
 
     room (K,): how far, in cells, the robot's centre may leave each cell in any direction (clearance
@@ -32,11 +29,11 @@ def corner_indices(cells: _Cells, room: Array) -> _Cells:
     Source: exploration paper section 2.2, Fig. 3(c) and (d).
     """
     broken = _split(np.ascontiguousarray(cells), np.maximum(room, 0.0))
-    found: _Cells = np.flatnonzero(broken)
+    found: Cells = np.flatnonzero(broken)
     return found
 
 
-def corners_between(cells: _Cells, room: Array, stops: _Cells) -> _Cells:
+def corners_between(cells: Cells, room: Array, stops: Cells) -> Cells:
     """Indices `stops` of a chain's cells (K, 2), and the corners of the pieces between them.
 
     room (K,): see `corner_indices`.
@@ -49,8 +46,8 @@ def corners_between(cells: _Cells, room: Array, stops: _Cells) -> _Cells:
 
 
 def with_middles(
-    cells: _Cells, stops: _Cells, clearances: Array, longest: float, even: float
-) -> _Cells:
+    cells: Cells, stops: Cells, clearances: Array, longest: float, even: float
+) -> Cells:
     """Indices `stops` of a chain's cells (K, 2), and between them those that split long pieces.
 
     A piece is split into equal parts of at most `longest` cells, unless it is a corridor: as
@@ -70,7 +67,7 @@ def with_middles(
     return np.unique(np.concatenate(middles))
 
 
-def _bend(cells: _Cells) -> float:
+def _bend(cells: Cells) -> float:
     """Largest distance of cells (K, 2) from the line through the first and the last one."""
     line = (cells[-1] - cells[0]).astype(np.float64)
     off = cells - cells[0]
@@ -79,7 +76,7 @@ def _bend(cells: _Cells) -> float:
 
 
 @inlined
-def _held(cells: _Cells, room: Array, first: int, last: int, hint: int, row: int, col: int) -> int:
+def _held(cells: Cells, room: Array, first: int, last: int, hint: int, row: int, col: int) -> int:
     """A member of the piece within whose room a cell lies, or -1.
 
     `hint` and those after it are tried first.
@@ -94,7 +91,7 @@ def _held(cells: _Cells, room: Array, first: int, last: int, hint: int, row: int
 
 
 @inlined
-def _is_clear(cells: _Cells, room: Array, first: int, last: int) -> bool:
+def _is_clear(cells: Cells, room: Array, first: int, last: int) -> bool:
     """Whether every cell that the line between two members touches is held.
 
     At a cell's corner, both beside it.
@@ -123,7 +120,7 @@ def _is_clear(cells: _Cells, room: Array, first: int, last: int) -> bool:
 
 
 @inlined
-def _farthest(cells: _Cells, first: int, last: int) -> int:
+def _farthest(cells: Cells, first: int, last: int) -> int:
     """The member strictly between two others that is farthest from the line between them."""
     d_row = cells[last, 0] - cells[first, 0]
     d_col = cells[last, 1] - cells[first, 1]
@@ -142,7 +139,7 @@ def _farthest(cells: _Cells, first: int, last: int) -> int:
 
 
 @kernel
-def _split(cells: _Cells, room: Array) -> NDArray[np.bool_]:
+def _split(cells: Cells, room: Array) -> Mask:
     broken = np.zeros(cells.shape[0], dtype=np.bool_)
     stack = np.empty((cells.shape[0] + 1, 2), dtype=np.int64)
     stack[0, 0] = 0
@@ -200,7 +197,7 @@ def box_of(places: Cells, squared: Cells) -> Cells:
 
 
 @kernel
-def touched_boxes(boxes: Cells, places: Cells) -> NDArray[np.bool_]:
+def touched_boxes(boxes: Cells, places: Cells) -> Mask:
     """Which boxes (N, 4), see `box_of`, hold one of the cells (K, 2)."""
     found = np.zeros(len(boxes), dtype=np.bool_)
     low_row = places[:, 0].min()
@@ -233,7 +230,7 @@ _NOWHERE = np.array([[0, 0, -1, -1]])
 
 _MORE_BOXES = 64
 
-Place = tuple[int, int]  # cell; hash of the edge of whose path it is a corner, or 0
+_Key = tuple[int, int]  # cell; hash of the edge of whose path it is a corner, or 0
 
 
 class _Limits(NamedTuple):
@@ -363,7 +360,7 @@ class Registry:
         lengths_m = (config.robot_radius_m, _LONGEST_UNEVEN_M, _EVEN_M)
         self._limits = _Limits(*(length_m / frame.resolution for length_m in lengths_m))
         self._passages: dict[int, _Passage] = {}
-        self._nodes: dict[Place, int] = {}
+        self._nodes: dict[_Key, int] = {}
         self._boxes = _Boxes()
 
     @property
@@ -422,7 +419,7 @@ class Registry:
 
     def _remove_nodes(self, gone: set[int], loose: set[int]) -> list[Node]:
         """Remove the corners of paths, and vertices without edges, from the map."""
-        places: list[Place] = []
+        places: list[_Key] = []
         for number in gone:
             self._boxes.remove(number)
             places += [(cell, number) for cell in self._passages.pop(number).corners]
@@ -434,7 +431,7 @@ class Registry:
             self.map.drop_node(node.id)
         return old
 
-    def _put_nodes(self, lattice: Lattice, fresh: set[Place], old: list[Node]) -> None:
+    def _put_nodes(self, lattice: Lattice, fresh: set[_Key], old: list[Node]) -> None:
         """Put new nodes into the map, with the ids of old ones that they continue."""
         if not fresh:
             return

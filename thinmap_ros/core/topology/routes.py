@@ -11,14 +11,12 @@ from scipy.spatial import cKDTree
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.thinning import column_distance, known_free, squared_clearance
 from thinmap_ros.jit import inlined, kernel
 
 # A topological map that is edited: straight edges, and new nodes with their clearances.
-
-Mask = NDArray[np.bool_]
 
 _KINDS = (NodeKind.END, NodeKind.END, NodeKind.CORNER)  # by degree; else branch
 
@@ -165,7 +163,7 @@ def give_edges(graph: EditedGraph) -> None:
 
 
 @kernel
-def _farthest(standing: NDArray[np.bool_], row: int, col: int, directions: int) -> tuple[int, int]:
+def _farthest(standing: Mask, row: int, col: int, directions: int) -> tuple[int, int]:
     """The traversable cell that is farthest from one on a straight line over such cells."""
     best = (row, col)
     best_away = 0.0
@@ -188,7 +186,7 @@ def _farthest(standing: NDArray[np.bool_], row: int, col: int, directions: int) 
 
 
 @inlined
-def _is_true(mask: NDArray[np.bool_], row: int, col: int) -> bool:
+def _is_true(mask: Mask, row: int, col: int) -> bool:
     """Whether a cell lies in a mask (H, W) and is true."""
     return bool(0 <= row < mask.shape[0] and 0 <= col < mask.shape[1] and mask[row, col])
 
@@ -252,7 +250,7 @@ def _view(
 Box = tuple[float, float, float, float]  # smallest x and y, largest x and y, m
 
 
-def open_rings(graph: EditedGraph, known: NDArray[np.bool_], detail_m: float) -> None:
+def open_rings(graph: EditedGraph, known: Mask, detail_m: float) -> None:
     """Drop the narrowest edge of each ring round an obstacle smaller than detail_m.
 
     known (H, W): free cells; all others within a ring are the obstacle. The narrowest edges are
@@ -328,7 +326,7 @@ def _joined(one: Box, other: Box) -> Box:
 
 
 @kernel
-def _enclosed(known: NDArray[np.bool_], ring: NDArray[np.int64]) -> int:
+def _enclosed(known: Mask, ring: Cells) -> int:
     """Rows or columns, whichever are more, of the cells within a ring (K, 2) that are not free."""
     crossings = np.empty(len(ring))
     low_row = known.shape[0]
@@ -355,8 +353,6 @@ def _enclosed(known: NDArray[np.bool_], ring: NDArray[np.int64]) -> int:
 
 
 # Which places see the node that is nearest to them.
-
-Cells = NDArray[np.int64]
 
 _LATTICE_M = 0.5  # between the places that should see a node
 
@@ -628,7 +624,7 @@ MIN_NODE_SPACING_M = 0.05  # a cell of most maps
 def route_graph(
     topology: TopologicalMap,
     patch: GridPatch,
-    standing: NDArray[np.bool_],
+    standing: Mask,
     config: TopologyConfig,
     detail_m: float = DETAIL_M,
     node_spacing_m: float | None = None,

@@ -15,7 +15,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid import fields
 from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.snapshot import MAX_COUNT, MAX_ID, Field
 from thinmap_ros.core.topology import regions as region_names
 from thinmap_ros.core.topology.regions import Door, Region, RegionKind, RegionMap, RegionNames
@@ -76,8 +76,6 @@ class RegionConfig(Config):
 
 Labels = NDArray[np.int32]
 
-Cells = NDArray[np.int64]
-
 
 @dataclass(frozen=True)
 class Neck:
@@ -92,7 +90,7 @@ class Neck:
     least_cells: int
 
 
-def flood(clearance: NDArray[np.float64], neck: Neck) -> tuple[Labels, Cells]:
+def flood(clearance: Array, neck: Neck) -> tuple[Labels, Cells]:
     """Basins of a clearance (H, W), m, 0 outside of the space.
 
     Returns the basin of each cell, from 1, 0 outside, (H, W); and the saddles between basins,
@@ -110,7 +108,7 @@ def flood(clearance: NDArray[np.float64], neck: Neck) -> tuple[Labels, Cells]:
     return labels, np.column_stack([saddles[apart, 0], pairs[apart]])
 
 
-def _from_widest(flat: NDArray[np.float64]) -> Cells:
+def _from_widest(flat: Array) -> Cells:
     """Indices of the cells inside, the roomiest first."""
     inside = np.flatnonzero(flat > 0.0)
     return inside[np.argsort(-flat[inside], kind='stable')]
@@ -126,7 +124,7 @@ def _root(parent: Cells, k: int) -> int:
 
 @kernel
 def _flood(
-    flat: NDArray[np.float64],
+    flat: Array,
     order: Cells,
     cols: int,
     ratio: float,
@@ -184,10 +182,6 @@ def _flood(
 
 # Passages between basins of the clearance: which of them are doors, and which join corridors.
 
-Clearance = NDArray[np.float64]
-
-Mask = NDArray[np.bool_]
-
 _JAMB_M = 0.6  # on each side of a passage, over which a straight wall is no jamb
 
 _FACE_M = 0.15  # up to which a straight wall is rough
@@ -204,7 +198,7 @@ class Passage:
 
 
 def passages_at(
-    saddles: NDArray[np.int64], basins: Labels, clearance: Clearance, min_width_m: float
+    saddles: NDArray[np.int64], basins: Labels, clearance: Array, min_width_m: float
 ) -> list[Passage]:
     """One passage for each stretch of saddles (N, 3) between the same two basins, widest first."""
     is_saddle = np.zeros(basins.shape, dtype=np.bool_)
@@ -219,7 +213,7 @@ def passages_at(
     return list(found.values())
 
 
-def mean_widths_m(basins: Labels, clearance: Clearance) -> NDArray[np.float64]:
+def mean_widths_m(basins: Labels, clearance: Array) -> Array:
     """Mean width of each basin as of a strip, by number from 0 (unused) on, m.
 
     Across a strip the mean clearance is a quarter of the width. At a crossing it is more in a few
@@ -230,7 +224,7 @@ def mean_widths_m(basins: Labels, clearance: Clearance) -> NDArray[np.float64]:
 
 
 def gets_wider(
-    passage: Passage, basins: Labels, clearance: Clearance, reach: int, ratio: float
+    passage: Passage, basins: Labels, clearance: Array, reach: int, ratio: float
 ) -> bool:
     """Whether both basins are wider than a passage, by a ratio, within so many cells of it."""
     row, col = divmod(passage.cell, basins.shape[1])
@@ -269,7 +263,7 @@ def has_flat_jamb(passage: Passage, space: Mask, resolution_m: float) -> bool:
     return False
 
 
-def _covers(marks: NDArray[np.float64], reach: float) -> bool:
+def _covers(marks: Array, reach: float) -> bool:
     """Whether marks leave no gap of two cells between -reach and reach."""
     inside = np.sort(marks[np.abs(marks) <= reach])
     return bool((np.diff(np.concatenate(([-reach], inside, [reach]))) <= 2.0).all())
@@ -332,12 +326,12 @@ def room_space(patch: GridPatch, config: RegionConfig) -> Mask:
     return np.asarray(distance_cells(standing) < radius)
 
 
-def clearance_m(space: Mask, resolution_m: float) -> NDArray[np.float64]:
+def clearance_m(space: Mask, resolution_m: float) -> Array:
     """Distance of each cell (H, W) to the nearest cell outside a space, m; the rim is outside."""
     return _clearance_cells(space) * resolution_m
 
 
-def wide_cells(clearance: NDArray[np.float64], width_m: float, resolution_m: float) -> Mask:
+def wide_cells(clearance: Array, width_m: float, resolution_m: float) -> Mask:
     """Cells (H, W) of a space that a disc of a diameter covers where it fits, by clearances, m.
 
     Niches leave them as they are, where they lower the mean clearance of a room.
@@ -348,7 +342,7 @@ def wide_cells(clearance: NDArray[np.float64], width_m: float, resolution_m: flo
     return np.asarray(distance_cells(fits) * resolution_m < 0.5 * width_m) & (clearance > 0.0)
 
 
-def _clearance_cells(space: Mask) -> NDArray[np.float64]:
+def _clearance_cells(space: Mask) -> Array:
     return distance_cells(np.pad(~space, 1, constant_values=True))[1:-1, 1:-1]
 
 
@@ -393,7 +387,7 @@ def outline_of(cells: Mask, frame: GridFrame) -> Array:
 
 
 @kernel
-def _boundary(cells: Mask) -> NDArray[np.float64]:
+def _boundary(cells: Mask) -> Array:
     """Corners (K, 2), as (column, row), of the outer boundary of a connected part with a clear rim.
 
     The cells lie on the left. Where two cells meet at a corner only, it stays with its own.
@@ -447,7 +441,7 @@ class Segmentation:
 
     patch: GridPatch
     labels: Labels
-    clearance: NDArray[np.float64]
+    clearance: Array
     passages: list[Passage]
 
 
@@ -520,9 +514,7 @@ def _outline(found: Segmentation, number: int, box: tuple[slice, ...]) -> Array:
     return outline_of(own, found.patch.frame.with_origin_at(*low))
 
 
-def _kind(
-    clearance: NDArray[np.float64], wide: Mask, area_m2: float, config: RegionConfig
-) -> RegionKind:
+def _kind(clearance: Array, wide: Mask, area_m2: float, config: RegionConfig) -> RegionKind:
     """Kind of a region by its clearances, m, 0 outside, and where it is wider than a corridor."""
     inside = clearance > 0.0
     width_m = 4.0 * float(clearance[inside].mean())  # as in mean_widths_m
@@ -533,9 +525,7 @@ def _kind(
     return RegionKind.HALL if is_wide else RegionKind.ROOM
 
 
-def _centre(
-    clearance: NDArray[np.float64], low: tuple[int, int], patch: GridPatch
-) -> tuple[float, float]:
+def _centre(clearance: Array, low: tuple[int, int], patch: GridPatch) -> tuple[float, float]:
     """Centre of the cell with the largest clearance in a part of a grid that begins at low."""
     cell = np.unravel_index(int(clearance.argmax()), clearance.shape)
     x, y = patch.frame.centres_of(np.array([cell], dtype=np.int64) + low)[0]

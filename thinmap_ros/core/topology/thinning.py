@@ -8,14 +8,11 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.fields import label, reachable
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.jit import inlined, kernel
 
 # Which cells a robot can stand on, and how far from them the next obstacle is.
-
-Cells = NDArray[np.int64]
-
-Mask = NDArray[np.bool_]
 
 FAR = 1 << 14  # rows; "nothing in this column"
 
@@ -219,7 +216,7 @@ _ANY = 1
 _BOTTOM = 2
 
 
-def thin(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def thin(free: Mask) -> Mask:
     """Skeleton of the free cells: the cells that Zhang and Suen's two sub-iterations leave.
 
     free (H, W) bool; returns (H, W) bool, the input is not touched. Cells outside the array count
@@ -236,7 +233,7 @@ def thin(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return _unpack(words, stride, free.shape)
 
 
-def deletion_times(free: NDArray[np.bool_]) -> Times:
+def deletion_times(free: Mask) -> Times:
     """Sub-iteration that deletes each cell (H, W), from 1 on; KEPT in the skeleton, else 0.
 
     free (H, W) bool, see `thin`.
@@ -247,7 +244,7 @@ def deletion_times(free: NDArray[np.bool_]) -> Times:
     return times
 
 
-def _pack(free: NDArray[np.bool_]) -> tuple[Words, int]:
+def _pack(free: Mask) -> tuple[Words, int]:
     """Rows as words inside a margin of empty ones, one after the other; and the words of a row.
 
     Bit i of word w is column 64 w + i. Some more empty words follow, so that whole lanes may be
@@ -263,7 +260,7 @@ def _pack(free: NDArray[np.bool_]) -> tuple[Words, int]:
     return words, count + 2
 
 
-def _unpack(words: Words, stride: int, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _unpack(words: Words, stride: int, shape: tuple[int, ...]) -> Mask:
     inner = words[:-_LANES].reshape(-1, stride)[1:-1, 1:-1]
     in_bytes = np.ascontiguousarray(inner).astype('<u8').view(np.uint8)
     return np.unpackbits(in_bytes, axis=1, count=shape[1], bitorder='little').view(np.bool_)

@@ -25,11 +25,11 @@ from thinmap_ros.core.grid.patch import (
 )
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.grid.tiles import MAX_CELLS, MAX_TILE_INDEX, TILE
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.snapshot import MAX_CELL_INDEX, MAX_COORDINATE_M, MAX_ID, Field, State
 from thinmap_ros.core.stage import Stage
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
-from thinmap_ros.core.topology.layers.lattice import Cells, Lattice
+from thinmap_ros.core.topology.layers.lattice import Lattice
 from thinmap_ros.core.topology.layers.stack import Layers, Span
 from thinmap_ros.core.topology.registry import MATCH_RADIUS_M, Changes, Registry
 from thinmap_ros.core.topology.thinning import select_free_space
@@ -186,8 +186,8 @@ def build(
 
 def build_along(
     patch: GridPatch,
-    free: NDArray[np.bool_],
-    lines: NDArray[np.bool_] | None,
+    free: Mask,
+    lines: Mask | None,
     config: TopologyConfig,
 ) -> TopologicalMap:
     """Topological map of a whole grid along lines (H, W); None: along its thinned free space.
@@ -218,8 +218,8 @@ def build_again(
 
 def _all_edges(
     patch: GridPatch,
-    free: NDArray[np.bool_],
-    lines: NDArray[np.bool_] | None,
+    free: Mask,
+    lines: Mask | None,
     config: TopologyConfig,
 ) -> tuple[Lattice, Changes]:
     layers = Layers(patch.frame.resolution, config)

@@ -1,9 +1,9 @@
 """Paper 2, Fig. 2: the free space is thinned stage by stage."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import select_free_space, thin
 from thinmap_ros.core.topology.topology import build
@@ -11,7 +11,6 @@ from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.experiments.drives import Source, patch_of_world, world_of
 from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot
 
-Mask = NDArray[np.bool_]
 _SHOWN = (1, 2, 5, 8, 10, 13)
 # Neighbours p2 ... p9 in rows and columns, clockwise from north; as in pictures, the row before
 # lies to the north.

@@ -13,11 +13,11 @@ from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.mission import Mission, MissionState
 from thinmap_ros.core.exploration.strategy import Observation, Strategy
-from thinmap_ros.core.exploration.team import Claim, Place, Team, TeamConfig
+from thinmap_ros.core.exploration.team import Claim, Team, TeamConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import TileSender
 from thinmap_ros.core.planning.path_follower import MESSAGE_PERIOD_S, NEAR_ROBOT_M, Motion, moved_on
-from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.se2 import SECOND_NS, Array, Place
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.maps import new_map_id

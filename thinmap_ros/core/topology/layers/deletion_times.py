@@ -21,8 +21,8 @@ Source: topological map paper section 2.1, steps 1 and 2.
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.se2 import Cells
 from thinmap_ros.core.topology.layers.lattice import (
-    Cells,
     Lattice,
     cells_at,
     find_neighbours,

@@ -13,6 +13,7 @@ from thinmap_ros.core.grid.patch import (
 )
 from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_PERCENT
 from thinmap_ros.core.grid.tiles import TILE
+from thinmap_ros.core.se2 import Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.layers.deletion_times import skeleton_cells
 from thinmap_ros.core.topology.layers.lattice import (
@@ -21,7 +22,6 @@ from thinmap_ros.core.topology.layers.lattice import (
     OCCUPIED,
     ROWS,
     UNKNOWN,
-    Cells,
     Lattice,
     LatticeStore,
     cell_at,
@@ -65,10 +65,10 @@ class FreeSpace:
     def fill(
         self,
         patch: GridPatch,
-        free: NDArray[np.bool_] | None,
+        free: Mask | None,
         row: int,
         col: int,
-        lines: NDArray[np.bool_] | None = None,
+        lines: Mask | None = None,
     ) -> Cells:
         """Set all cells at once by a patch whose first cell is at (row, col).
 
@@ -87,7 +87,7 @@ class FreeSpace:
         _write_fields(self.lattice, fields, row - reach, col - reach)
         return skeleton_cells(self.lattice, times, row - reach, col - reach)
 
-    def states(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    def states(self) -> tuple[Cells, NDArray[np.uint8]]:
         """Row and column (N, 2) of the tiles with known states, and these (N, TILE, TILE)."""
         return self._store.states()
 
@@ -108,8 +108,8 @@ class _Fields(NamedTuple):
     """Values (H, W) of cells; percent: as in a patch of the grid."""
 
     percent: NDArray[np.int8]
-    known: NDArray[np.bool_]
-    free: NDArray[np.bool_]
+    known: Mask
+    free: Mask
     column: NDArray[np.int16]
     discs: NDArray[np.int16]
     time: NDArray[np.int16]
@@ -131,7 +131,7 @@ def _half_widths(disc: Cells) -> Cells:
 
 
 @kernel
-def _count_all_discs(known: NDArray[np.bool_], half_widths: Cells) -> NDArray[np.int16]:
+def _count_all_discs(known: Mask, half_widths: Cells) -> NDArray[np.int16]:
     """Known cells (H, W) within the disc around each cell."""
     rows, cols = known.shape
     counts = np.zeros((rows, cols), dtype=np.int16)

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.tiles import MAX_TILES, NO_TILE, TILE, TileStore
+from thinmap_ros.core.se2 import Cells, Mask
 from thinmap_ros.jit import inlined, kernel
 
-Cells = NDArray[np.int64]
 UNKNOWN = 0
 FREE = 1
 OCCUPIED = 2
@@ -66,7 +66,7 @@ class LatticeStore:
         self._needed: set[tuple[int, ...]] = set()
         self.view = self._view()
 
-    def add(self, row: int, col: int, is_needed: NDArray[np.bool_]) -> None:
+    def add(self, row: int, col: int, is_needed: Mask) -> None:
         """Add the tiles with cells (H, W) that are needed, the first at (row, col).
 
         So are the tiles within the margin around them.
@@ -85,7 +85,7 @@ class LatticeStore:
         self._needed.update(fresh)
         self.view = self._view()
 
-    def states(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    def states(self) -> tuple[Cells, NDArray[np.uint8]]:
         """Row and column (N, 2) of the tiles with known states, and these (N, TILE, TILE)."""
         cells = self._store.pool[1 : self._store.used]['state']
         is_known = cells.any(axis=(1, 2))
@@ -103,7 +103,7 @@ class LatticeStore:
 
 
 @kernel
-def needed_tiles(is_needed: NDArray[np.bool_], row: int, col: int) -> Cells:
+def needed_tiles(is_needed: Mask, row: int, col: int) -> Cells:
     """Tiles (N, 2) with cells (H, W) that are needed, the first at (row, col)."""
     first_row = row >> _BITS
     first_col = col >> _BITS

@@ -8,11 +8,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.layers.free_space import borders_unknown, squared_clearance
-from thinmap_ros.core.topology.layers.lattice import Cells, col_of, hash_of, key_of, row_of
+from thinmap_ros.core.topology.layers.lattice import col_of, hash_of, key_of, row_of
 from thinmap_ros.core.topology.layers.skeleton_graph import (
     CELL,
     HASH,
@@ -67,7 +67,7 @@ class Paths(NamedTuple):
     ends: Cells
     start: Cells
     chains: Cells
-    lengths: NDArray[np.float64]
+    lengths: Array
     hashes: Cells
     node: Cells
     up: Cells
@@ -97,7 +97,7 @@ def measure(arrays: Arrays, measured: Cells, box: Cells) -> None:
 
 
 @kernel
-def prune(arrays: Arrays, measured: Cells, limits: Limits) -> tuple[NDArray[np.bool_], Cells]:
+def prune(arrays: Arrays, measured: Cells, limits: Limits) -> tuple[Mask, Cells]:
     """Which chains (C,) are kept, and how many of them each vertex (V,) has; NONE: pruned.
 
     A spur is the path from an end to the first branch. What it adds is the length by which the
@@ -162,9 +162,7 @@ def _is_noise(
 
 
 @inlined
-def _remove_spur(
-    arrays: Arrays, alive: NDArray[np.bool_], degree: Cells, tip: int, base: int
-) -> None:
+def _remove_spur(arrays: Arrays, alive: Mask, degree: Cells, tip: int, base: int) -> None:
     vertex = tip
     while vertex != base:
         number = _other_chain(arrays, alive, vertex, NONE)
@@ -175,7 +173,7 @@ def _remove_spur(
 
 
 @inlined
-def _other_chain(arrays: Arrays, alive: NDArray[np.bool_], vertex: int, came: int) -> int:
+def _other_chain(arrays: Arrays, alive: Mask, vertex: int, came: int) -> int:
     """A kept chain at a vertex other than the one that was followed to it."""
     for number in arrays.vertices[vertex, SLOT:]:
         if number != NONE and alive[number] and number != came:
@@ -184,7 +182,7 @@ def _other_chain(arrays: Arrays, alive: NDArray[np.bool_], vertex: int, came: in
 
 
 @inlined
-def _base(arrays: Arrays, alive: NDArray[np.bool_], degree: Cells, tip: int) -> tuple[int, float]:
+def _base(arrays: Arrays, alive: Mask, degree: Cells, tip: int) -> tuple[int, float]:
     """Vertex at which the path from a tip branches or ends, and its length."""
     vertex = tip
     number = NONE
@@ -199,7 +197,7 @@ def _base(arrays: Arrays, alive: NDArray[np.bool_], degree: Cells, tip: int) -> 
 
 @kernel
 def find_paths(
-    arrays: Arrays, measured: Cells, alive: NDArray[np.bool_], degree: Cells, merge_distance: float
+    arrays: Arrays, measured: Cells, alive: Mask, degree: Cells, merge_distance: float
 ) -> Paths:
     """Nodes and the paths between them; a ring without nodes has one at its first vertex."""
     used = ~alive
@@ -264,7 +262,7 @@ def find_paths(
 
 @kernel
 def _edges_of(
-    paths: tuple[Cells, NDArray[np.float64], Cells], node: Cells, up: Cells, merge_distance: float
+    paths: tuple[Cells, Array, Cells], node: Cells, up: Cells, merge_distance: float
 ) -> tuple[Cells, Cells]:
     """Paths that are edges, and the hashes of all paths with those that lead to their nodes."""
     ends, lengths, hashes = paths
@@ -288,7 +286,7 @@ def _edges_of(
 
 
 @kernel
-def _first_of_ring(arrays: Arrays, used: NDArray[np.bool_], vertex: int) -> int:
+def _first_of_ring(arrays: Arrays, used: Mask, vertex: int) -> int:
     """The vertex of a ring with the first cell by its key; NONE if the ring has been followed."""
     number = NONE
     for some in arrays.vertices[vertex, SLOT:]:
@@ -327,7 +325,7 @@ def _merge_branches(
     measured: Cells,
     degree: Cells,
     merge_distance: float,
-    paths: tuple[Cells, NDArray[np.float64], Cells],
+    paths: tuple[Cells, Array, Cells],
     node: Cells,
     at_vertex: Cells,
 ) -> Cells:

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.se2 import Array, Cells
 from thinmap_ros.core.topology.layers.lattice import (
-    Cells,
     Lattice,
     col_of,
     hash_of,
@@ -66,7 +66,7 @@ class Arrays(NamedTuple):
     lattice: Lattice
     vertices: Cells
     chains: Cells
-    lengths: NDArray[np.float64]
+    lengths: Array
     spare: tuple[Cells, Cells]
 
 

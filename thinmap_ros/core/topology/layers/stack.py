@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cell, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.layers.deletion_times import update_skeleton
 from thinmap_ros.core.topology.layers.free_space import FreeSpace, nearest_free, nearest_kept
-from thinmap_ros.core.topology.layers.lattice import Cells, Lattice, rows_and_cols
+from thinmap_ros.core.topology.layers.lattice import Lattice, rows_and_cols
 from thinmap_ros.core.topology.layers.pruning import (
     COLUMNS,
     Limits,
@@ -89,8 +89,6 @@ def _nearest_kept(lattice: Lattice, cell: int) -> int:
 
 _NOWHERE = np.array([0, 0, -1, -1])
 
-Place = tuple[int, int]  # row and column of a cell
-
 
 class Span(NamedTuple):
     """A rectangle of cells."""
@@ -132,9 +130,9 @@ class Layers:
     def fill(
         self,
         patch: GridPatch,
-        place: Place,
-        free: NDArray[np.bool_] | None = None,
-        lines: NDArray[np.bool_] | None = None,
+        place: Cell,
+        free: Mask | None = None,
+        lines: Mask | None = None,
     ) -> None:
         """Set all cells at once by a patch whose first cell is at a place; empty before.
 
@@ -144,7 +142,7 @@ class Layers:
         kept = self._space.fill(patch, free, *place, lines)
         self._skeleton.update(self.lattice, kept)
 
-    def update_free_space(self, window: GridPatch, place: Place) -> int:
+    def update_free_space(self, window: GridPatch, place: Cell) -> int:
         """Update the free space by a window whose first cell is at a place.
 
         Returns the number of cells that changed.
@@ -161,7 +159,7 @@ class Layers:
         self._flipped = self._flipped[:0]
         self._skeleton.update(self.lattice, changed)
 
-    def mark_robot(self, place: Place) -> None:
+    def mark_robot(self, place: Cell) -> None:
         """Add a place of the robot: only parts of the map where it has been are published."""
         self._has_new_place |= self._robot.add(self.lattice, *place)
 
@@ -173,7 +171,7 @@ class Layers:
         """Row and column (N, 2) of the places of the robot."""
         return rows_and_cols(self.lattice, self._robot.cells)
 
-    def states(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    def states(self) -> tuple[Cells, NDArray[np.uint8]]:
         """Row and column (N, 2) of the tiles with known states, and these (N, TILE, TILE)."""
         return self._space.states()
 
@@ -213,7 +211,7 @@ class Layers:
         paths = find_paths(arrays, self._measured, alive, degree, self._limits.merge_distance)
         return paths, degree
 
-    def _is_reached(self) -> NDArray[np.bool_]:
+    def _is_reached(self) -> Mask:
         """Whether each vertex (V,) belongs to a part in which the robot has been."""
         arrays = self._skeleton.arrays
         part = components(arrays)
