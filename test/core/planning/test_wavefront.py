@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.graphs.doors import oblique_door, pass_door
+from thinmap_ros.core.grid.fields import nearest_true
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.planning.grid_search import nearest_true, path_collides
+from thinmap_ros.core.planning.grid_search import path_collides
 from thinmap_ros.core.planning.wavefront import (
     WavefrontConfig,
     cost_of_cells,

@@ -1,33 +1,29 @@
-"""Fields over cells: distances and connected components; and points near a point."""
+"""Fields over cells: connected components, distances, what is nearest; and points near a point."""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.se2 import Array, Cells, Mask
-from thinmap_ros.jit import kernel
+from thinmap_ros.core.se2 import Array, Cell, Cells, Mask
+from thinmap_ros.jit import inlined, kernel
 
-# Connected components of a mask, with 8-connectivity.
-#
-# Runs of true cells are joined row by row, with a union-find structure.
+FAR = 1.0e6  # squared distance in cells if the set is empty
 
 
 def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
     """Label the 8-connected components of a mask (H, W).
 
+    Runs of true cells are joined row by row, with a union-find structure.
     Returns the component number of each true cell (0 elsewhere), (H, W), and the number of cells of
     each component. Components are numbered in the order of their first cells, row by row.
     """
-    numbers: NDArray[np.int32]
-    numbers, sizes = _label(np.ascontiguousarray(cells))
-    return numbers, sizes
+    return _label(np.ascontiguousarray(cells))
 
 
 def reachable(cells: Mask, seeds: Cells) -> Mask:
     """True cells (H, W) in the same 8-connected component as one of the seeds (N, 2)."""
-    found: Mask = _reachable(np.ascontiguousarray(cells), np.ascontiguousarray(seeds))
-    return found
+    return _reachable(np.ascontiguousarray(cells), np.ascontiguousarray(seeds))
 
 
 @kernel
@@ -65,14 +61,14 @@ def _runs(cells: Mask) -> tuple[Cells, Cells, Cells, int]:
                 above += 1
             other = above
             while other < first[row] and runs[other, 1] <= runs[k, 2]:
-                a = _root(owner, k)
-                b = _root(owner, other)
+                a = root_of(owner, k)
+                b = root_of(owner, other)
                 owner[max(a, b)] = min(a, b)
                 other += 1
     parts = np.empty(count, dtype=np.int64)
     number = 0
     for k in range(count):
-        root = _root(owner, k)
+        root = root_of(owner, k)
         if root == k:
             number += 1
             parts[k] = number
@@ -81,9 +77,9 @@ def _runs(cells: Mask) -> tuple[Cells, Cells, Cells, int]:
     return runs[:count], first, parts, number
 
 
-@kernel
-def _root(owner: Cells, k: int) -> int:
-    """Root of a run in the union-find structure, with path compression."""
+@inlined
+def root_of(owner: Cells, k: int) -> int:
+    """Root of a member in a union-find structure (N,), with path compression."""
     while owner[k] != k:
         owner[k] = owner[owner[k]]
         k = owner[k]
@@ -121,20 +117,29 @@ def _reachable(cells: Mask, seeds: Cells) -> Mask:
     return found
 
 
-# Exact Euclidean distance of each cell to the nearest cell of a set.
-
-FAR = 1.0e6  # squared distance in cells if the set is empty
+def nearest_true(cells: Mask, cell: Cell, reach: float) -> Cell | None:
+    """The true cell (H, W) nearest to a cell, or None if there is none within `reach` cells."""
+    whole = math.floor(reach)
+    top = max(cell[0] - whole, 0)
+    left = max(cell[1] - whole, 0)
+    part = cells[top : max(cell[0] + whole + 1, 0), left : max(cell[1] + whole + 1, 0)]
+    near = np.argwhere(part) + (top, left)
+    squared = np.square(near - cell).sum(axis=1)
+    if near.size == 0 or squared.min() > reach * reach:
+        return None
+    best = near[squared.argmin()]
+    return int(best[0]), int(best[1])
 
 
 def distance_cells(marked: Mask) -> Array:
-    """Distance, in cells between centres, from each cell (H, W) to the nearest marked one.
+    """Exact distance, in cells between centres, from each cell (H, W) to the nearest marked one.
 
     1000 if no cell is marked.
 
     Source: Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012: the
     lower envelope of parabolas, along columns and then along rows.
     """
-    return np.asarray(_distance(np.ascontiguousarray(marked)))
+    return _distance(np.ascontiguousarray(marked))
 
 
 @kernel
@@ -182,11 +187,8 @@ def _distance(marked: Mask) -> Array:
     return squared
 
 
-# Spatial hash: finds the points near a point, by number.
-
-
 class SpatialHash:
-    """Numbers by square of the plane.
+    """Numbers by square of the plane: finds the points near a point.
 
     The time of a query does not depend on the number of points elsewhere.
     """

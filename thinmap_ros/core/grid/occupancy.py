@@ -12,8 +12,7 @@ from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import Config, config_or_default, parameter
 from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.patch import (
-    MAX_RESOLUTION_M,
-    MIN_RESOLUTION_M,
+    FRAME_FIELD,
     UNKNOWN,
     Bounds,
     GridFrame,
@@ -25,20 +24,43 @@ from thinmap_ros.core.grid.raytrace import fill_segment
 from thinmap_ros.core.grid.tiles import MAX_TILE_INDEX, TILE, TileStore
 from thinmap_ros.core.scan import NO_RETURN_CLEAR_RANGE_M, Scan
 from thinmap_ros.core.se2 import Array, Cells, Mask
-from thinmap_ros.core.snapshot import MAX_COORDINATE_M, Field
+from thinmap_ros.core.snapshot import Field
 from thinmap_ros.jit import inlined, kernel
 
-# Occupancy of a whole grid in percent, updated only where the grid has changed.
+# Log odds are kept as whole thousandths in int16: small, exact to add, and the same on every
+# machine.
+_SCALE = 1000.0
+_LIMIT = 6000
+# Occupancy in percent for log odds from -_LIMIT to _LIMIT; exactly 0 means unobserved.
+_PERCENT = np.round(100.0 / (1.0 + np.exp(-np.arange(-_LIMIT, _LIMIT + 1) / _SCALE)))
+_PERCENT = _PERCENT.astype(np.int8)
+_PERCENT[_LIMIT] = UNKNOWN
+# Clamps of the occupancy probability, so that a cell that has changed is relearned soon.
+P_MIN = 0.05
+P_MAX = 0.97
 
+# Three neighbouring beams hit one surface if the middle range differs by less than this from the
+# range that the others predict, m.
+_FLAT_M = 0.06
+_MAX_SURFACE_GAP_M = 3.0
+
+_TILE_BITS = TILE.bit_length() - 1
 _BAND_ROWS = 256  # rendered at once: a large map needs little more memory than its cells
+
+FIELDS = {
+    'frame': FRAME_FIELD,
+    'tiles': Field(np.int64, ('n', 2), -MAX_TILE_INDEX, MAX_TILE_INDEX),
+    'log_odds': Field(np.int16, ('n', TILE, TILE), -_LIMIT, _LIMIT),
+}
 
 
 class RenderedMap:
-    """Cells (H, W) int8 of all tiles, with the outdated part and the bounds of the known cells."""
+    """Occupancy of all tiles in percent, updated only where the grid has changed.
 
-    def __init__(self, percent: NDArray[np.int8]) -> None:
-        """Start empty; percent (2 L + 1,): occupancy in percent for log odds from -L to L."""
-        self._percent = percent
+    Cells (H, W) int8, with the outdated part and the bounds of the known ones.
+    """
+
+    def __init__(self) -> None:
         self._cells: NDArray[np.int8] = np.empty((0, 0), dtype=np.int8)
         self._bounds: Bounds = (0, 0, 0, 0)
         self._known: Bounds | None = None
@@ -47,7 +69,7 @@ class RenderedMap:
 
     def mark_dirty(self, row: int, col: int, end_row: int, end_col: int) -> None:
         """Mark cells [row, end_row) x [col, end_col) as outdated."""
-        self._stale = _union(self._stale, (row, col, end_row, end_col))
+        self._stale = union(self._stale, (row, col, end_row, end_col))
         self._patch = None
 
     def render(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
@@ -63,7 +85,8 @@ class RenderedMap:
     def _copy(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
         self._enlarge(tiles)
         if self._stale is not None:
-            row, col, end_row, end_col = _intersection(self._stale, self._bounds)
+            row, col = np.maximum(self._stale[:2], self._bounds[:2]).tolist()
+            end_row, end_col = np.minimum(self._stale[2:], self._bounds[2:]).tolist()
             for top in range(row, end_row, _BAND_ROWS):
                 self._refresh(tiles, top, col, min(top + _BAND_ROWS, end_row), end_col)
             self._stale = None
@@ -90,54 +113,14 @@ class RenderedMap:
     def _refresh(self, tiles: TileStore, row: int, col: int, end_row: int, end_col: int) -> None:
         if end_col <= col:
             return  # beyond all tiles
-        odds = tiles.read(row, col, end_row - row, end_col - col)
+        shown = _percentages(tiles.read(row, col, end_row - row, end_col - col))
         top, left = self._bounds[:2]
-        shown = self._percent[odds.astype(np.intp) + self._percent.size // 2]
         self._cells[row - top : end_row - top, col - left : end_col - left] = shown
         known = bounds_of(shown != UNKNOWN)
         if known is not None:
             # Known cells stay known: the rectangle only grows.
             found = (row + known[0], col + known[1], row + known[2], col + known[3])
-            self._known = _union(self._known, found)
-
-
-def _union(a: Bounds | None, b: Bounds) -> Bounds:
-    return b if a is None else union(a, b)
-
-
-def _intersection(a: Bounds, b: Bounds) -> Bounds:
-    return max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])
-
-
-# Log odds are kept as whole thousandths in int16: small, exact to add, and the same on every
-# machine.
-_SCALE = 1000.0
-
-_LIMIT = 6000
-
-_TILE_BITS = TILE.bit_length() - 1
-
-# Three neighbouring beams hit one surface if the middle range differs by less than this from the
-# range that the others predict, m.
-_FLAT_M = 0.06
-
-_MAX_SURFACE_GAP_M = 3.0
-
-# Clamps of the occupancy probability, so that a cell that has changed is relearned soon.
-P_MIN = 0.05
-
-P_MAX = 0.97
-
-FIELDS = {
-    'frame': Field(
-        np.float64,
-        (3,),
-        (-MAX_COORDINATE_M, -MAX_COORDINATE_M, MIN_RESOLUTION_M),
-        (MAX_COORDINATE_M, MAX_COORDINATE_M, MAX_RESOLUTION_M),
-    ),
-    'tiles': Field(np.int64, ('n', 2), -MAX_TILE_INDEX, MAX_TILE_INDEX),
-    'log_odds': Field(np.int16, ('n', TILE, TILE), -_LIMIT, _LIMIT),
-}
+            self._known = union(self._known, found)
 
 
 @dataclass(frozen=True)
@@ -234,9 +217,8 @@ class OccupancyGrid:
         self.config = config_or_default(config, OccupancyConfig)
         self.frame = frame or GridFrame(0.0, 0.0, self.config.resolution_m)
         self._tiles = TileStore()
-        self._percent = _percent_table()
-        self._rendered = RenderedMap(self._percent)
-        self._changed: tuple[int, int, int, int] | None = None
+        self._rendered = RenderedMap()
+        self._changed: Bounds | None = None
         self._increments: NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
         self._beam_geometry: tuple[int, float, float] = (0, 0.0, 0.0)
         self._cosines = self._sines = np.empty(0)
@@ -411,16 +393,11 @@ class OccupancyGrid:
     def _mark_changed(self, row: int, col: int, end_row: int, end_col: int) -> None:
         """The cells [row, end_row) x [col, end_col) may have changed."""
         self._rendered.mark_dirty(row, col, end_row, end_col)
-        if self._changed is not None:
-            row = min(row, self._changed[0])
-            col = min(col, self._changed[1])
-            end_row = max(end_row, self._changed[2])
-            end_col = max(end_col, self._changed[3])
-        self._changed = (row, col, end_row, end_col)
+        self._changed = union(self._changed, (row, col, end_row, end_col))
 
     def _cut(self, row: int, col: int, rows: int, cols: int) -> GridPatch:
         odds = self._tiles.read(row, col, rows, cols)
-        return GridPatch(self.frame.with_origin_at(row, col), _percentages(odds, self._percent))
+        return GridPatch(self.frame.with_origin_at(row, col), _percentages(odds))
 
     def _empty_increments(self, radius: int) -> NDArray[np.int16]:
         """Zeros for the increments of a scan: whole tiles, `radius` cells around any cell.
@@ -453,14 +430,6 @@ def _steps(config: OccupancyConfig) -> NDArray[np.int16]:
     )
     sure = min(round(_SCALE * log_odds(config.p_surely_occupied)), high)
     return np.array([free, hit, low, high, sure], dtype=np.int16)
-
-
-def _percent_table() -> NDArray[np.int8]:
-    """Occupancy in percent for log odds from -_LIMIT to _LIMIT; exactly 0 means unobserved."""
-    odds = np.arange(-_LIMIT, _LIMIT + 1) / _SCALE
-    table = np.round(100.0 / (1.0 + np.exp(-odds))).astype(np.int8)
-    table[_LIMIT] = UNKNOWN
-    return table
 
 
 @inlined
@@ -556,12 +525,12 @@ def _draw_ends(
 
 
 @kernel
-def _percentages(odds: NDArray[np.int16], percent: NDArray[np.int8]) -> NDArray[np.int8]:
+def _percentages(odds: NDArray[np.int16]) -> NDArray[np.int8]:
     """Occupancy (H, W), in percent, of log odds."""
     cells = np.empty(odds.shape, dtype=np.int8)
     for row in range(odds.shape[0]):
         for col in range(odds.shape[1]):
-            cells[row, col] = percent[np.int64(odds[row, col]) + _LIMIT]
+            cells[row, col] = _PERCENT[np.int64(odds[row, col]) + _LIMIT]
     return cells
 
 

@@ -11,12 +11,29 @@ from thinmap_ros.core.errors import InputError, quoted, require_type
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, Cells, Mask
-
-# Transform between world points and the cells of a grid.
+from thinmap_ros.core.snapshot import Field
 
 MIN_RESOLUTION_M = 0.001
-
 MAX_RESOLUTION_M = 10.0
+FRAME_FIELD = Field(
+    np.float64,
+    (3,),
+    (-MAX_COORDINATE_M, -MAX_COORDINATE_M, MIN_RESOLUTION_M),
+    (MAX_COORDINATE_M, MAX_COORDINATE_M, MAX_RESOLUTION_M),
+)  # a saved frame, see `GridFrame.as_array`
+
+UNKNOWN = -1
+# map_server's thresholds, in percent.
+FREE_AT_MOST = 25
+OCCUPIED_AT_LEAST = 65
+_LETHAL = 100  # cost of a cell in which a robot would collide
+
+# Of a robot that publishes no scans.
+_BEAMS = 360
+_RANGE_MIN_M = 0.01
+
+Bounds = tuple[int, int, int, int]  # first row, first column, end row, end column
+Margins = tuple[int, int, int, int]  # rows and columns before, rows and columns after
 
 
 @dataclass(frozen=True)
@@ -71,20 +88,6 @@ class GridFrame:
     def as_array(self) -> Array:
         """Origin x, origin y and resolution, (3,), m."""
         return np.array([self.origin_x, self.origin_y, self.resolution])
-
-
-UNKNOWN = -1
-
-# First row, first column, end row, end column.
-Bounds = tuple[int, int, int, int]
-
-# Rows before, columns before, rows after, columns after.
-Margins = tuple[int, int, int, int]
-
-# map_server's thresholds, in percent.
-FREE_AT_MOST = 25
-
-OCCUPIED_AT_LEAST = 65
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +149,7 @@ class GridPatch:
         table = np.full(256, UNKNOWN, dtype=np.int8)
         table[(values >= 0) & (values <= free_at_most)] = 0
         table[values >= occupied_at_least] = 100
-        cells: NDArray[np.int8] = table[self.cells.view(np.uint8)]
-        return cells
+        return np.asarray(table[self.cells.view(np.uint8)])
 
     def offset_of(self, other: 'GridPatch') -> tuple[int, int]:
         """Row and column of the first cell of another patch. Raises InputError off the lattice."""
@@ -226,18 +228,11 @@ def bounds_of(chosen: Mask) -> Bounds | None:
     return first, int(cols[0]), end, int(cols[-1]) + 1
 
 
-def union(a: Bounds, b: Bounds) -> Bounds:
-    """Bounds of all cells in one of two rectangles."""
+def union(a: Bounds | None, b: Bounds) -> Bounds:
+    """Bounds of all cells in one of two rectangles, of which the first may be none."""
+    if a is None:
+        return b
     return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
-
-
-# Maps of any publisher: costs as occupancy, and what a robot would see in them.
-
-_LETHAL = 100
-
-_BEAMS = 360
-
-_RANGE_MIN_M = 0.01
 
 
 def occupancy_from_costs(patch: GridPatch) -> GridPatch:

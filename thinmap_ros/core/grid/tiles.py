@@ -1,6 +1,7 @@
 """Tile storage for maps that grow in any direction; memory is proportional to the area touched."""
 
 import resource
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.patch import MIN_RESOLUTION_M
+from thinmap_ros.core.grid.patch import MIN_RESOLUTION_M, Bounds, bounds_of
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Cells
 
 TILE = 64  # cells along the edge of a tile
@@ -172,33 +173,24 @@ class TileStore:
         order = np.argsort(self.directory[found[:, 0], found[:, 1]])
         return np.asarray(found[order] + (self.first_row, self.first_col), dtype=np.int64)
 
-    def bounds(self) -> tuple[int, int, int, int] | None:
-        """First row, first col, end row, end col, in cells, of the rectangle of existing tiles.
-
-        None if empty.
-        """
-        rows, cols = np.nonzero(self.directory != NO_TILE)
-        if rows.size == 0:
+    def bounds(self) -> Bounds | None:
+        """Bounds of the cells of all existing tiles; None if there are none."""
+        found = bounds_of(self.directory != NO_TILE)
+        if found is None:
             return None
-        row_a = int(rows.min()) + self.first_row
-        row_b = int(rows.max()) + self.first_row + 1
-        col_a = int(cols.min()) + self.first_col
-        col_b = int(cols.max()) + self.first_col + 1
-        return row_a * TILE, col_a * TILE, row_b * TILE, col_b * TILE
+        row, col, end_row, end_col = found
+        return (
+            (self.first_row + row) * TILE,
+            (self.first_col + col) * TILE,
+            (self.first_row + end_row) * TILE,
+            (self.first_col + end_col) * TILE,
+        )
 
     def read(self, row: int, col: int, rows: int, cols: int) -> NDArray[Any]:
         """Copy of the cells [row, row + rows) x [col, col + cols); 0 where no tile is."""
         cells = np.zeros((rows, cols, *self.pool.shape[3:]), dtype=self.pool.dtype)
-        for tile_row, tile_col, slot in self._tiles_within(row, col, rows, cols):
-            top = tile_row * TILE
-            left = tile_col * TILE
-            row_a = max(row, top)
-            row_b = min(row + rows, top + TILE)
-            col_a = max(col, left)
-            col_b = min(col + cols, left + TILE)
-            cells[row_a - row : row_b - row, col_a - col : col_b - col] = self.pool[
-                slot, row_a - top : row_b - top, col_a - left : col_b - left
-            ]
+        for stored, part in self._parts_within(row, col, rows, cols):
+            cells[part] = stored
         return cells
 
     def write(self, row: int, col: int, cells: NDArray[Any]) -> None:
@@ -214,17 +206,8 @@ class TileStore:
 
     def overwrite(self, row: int, col: int, cells: NDArray[Any]) -> None:
         """Set those of the cells (H, W, ...) from (row, col) on whose tiles exist."""
-        rows, cols = cells.shape[:2]
-        for tile_row, tile_col, slot in self._tiles_within(row, col, rows, cols):
-            top = tile_row * TILE
-            left = tile_col * TILE
-            row_a = max(row, top)
-            row_b = min(row + rows, top + TILE)
-            col_a = max(col, left)
-            col_b = min(col + cols, left + TILE)
-            self.pool[slot, row_a - top : row_b - top, col_a - left : col_b - left] = cells[
-                row_a - row : row_b - row, col_a - col : col_b - col
-            ]
+        for stored, part in self._parts_within(row, col, *cells.shape[:2]):
+            stored[:] = cells[part]
 
     def read_tiles(self, tiles: Cells) -> NDArray[Any]:
         """Copy of the tiles (N, 2), (row, col) in tile coordinates; 0 where no tile is."""
@@ -245,24 +228,19 @@ class TileStore:
         at = tiles - (self.first_row, self.first_col)
         self.pool[self.directory[at[:, 0], at[:, 1]]] = cells
 
-    def _tiles_within(self, row: int, col: int, rows: int, cols: int) -> list[tuple[int, int, int]]:
-        """Existing tiles that touch a rectangle of cells: tile row, tile col, slot."""
-        low = (row // TILE - self.first_row, col // TILE - self.first_col)
-        high = (
-            (row + rows - 1) // TILE - self.first_row,
-            (col + cols - 1) // TILE - self.first_col,
-        )
-        part = self.directory[max(low[0], 0) : high[0] + 1, max(low[1], 0) : high[1] + 1]
+    def _parts_within(
+        self, row: int, col: int, rows: int, cols: int
+    ) -> Iterator[tuple[NDArray[Any], tuple[slice, slice]]]:
+        """Part of each existing tile in a rectangle of cells, a view, and where it lies there."""
+        origin = (self.first_row, self.first_col)
+        low = np.maximum(np.array([row, col]) // TILE - origin, 0)
+        end = np.array([row + rows - 1, col + cols - 1]) // TILE - origin + 1
+        part = self.directory[low[0] : max(end[0], 0), low[1] : max(end[1], 0)]
         found = np.argwhere(part != NO_TILE)
-        first = (max(low[0], 0), max(low[1], 0))
-        return [
-            (
-                int(r) + first[0] + self.first_row,
-                int(c) + first[1] + self.first_col,
-                int(part[r, c]),
-            )
-            for r, c in found
-        ]
+        corners = (found + low + origin) * TILE - (row, col)
+        for slot, (top, left) in zip(part[tuple(found.T)], corners.tolist(), strict=True):
+            here = (slice(max(top, 0), top + TILE), slice(max(left, 0), left + TILE))
+            yield self.pool[slot, max(-top, 0) : rows - top, max(-left, 0) : cols - left], here
 
 
 def _empty_pool(tile: tuple[int, ...], dtype: DTypeLike, least: int) -> NDArray[Any]:

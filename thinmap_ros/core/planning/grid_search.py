@@ -245,20 +245,6 @@ def reachable_cells(allowed: Mask, start: tuple[int, int]) -> Mask:
     return reachable(allowed, np.array([start]))
 
 
-def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[int, int] | None:
-    """The true cell nearest to a cell, or None if there is none within `reach` cells."""
-    whole = math.floor(reach)
-    top = max(cell[0] - whole, 0)
-    left = max(cell[1] - whole, 0)
-    part = allowed[top : max(cell[0] + whole + 1, 0), left : max(cell[1] + whole + 1, 0)]
-    near = np.argwhere(part) + (top, left)
-    squared = np.square(near - cell).sum(axis=1)
-    if near.size == 0 or squared.min() > reach * reach:
-        return None
-    best = near[squared.argmin()]
-    return int(best[0]), int(best[1])
-
-
 def path_collides(patch: GridPatch, path: Array, radius_m: float) -> bool:
     """Whether an occupied cell is closer to a path (K, 2), m, map frame, than a radius."""
     frame = patch.frame

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core.errors import InputError, require_type
+from thinmap_ros.core.grid.fields import nearest_true
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.grid_search import distance_field_from, nearest_true, path_collides
+from thinmap_ros.core.planning.grid_search import distance_field_from, path_collides
 from thinmap_ros.core.planning.wavefront import (
     START_ESCAPE_M,
     Obstacles,

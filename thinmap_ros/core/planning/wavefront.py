@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter, robot_radius
+from thinmap_ros.core.grid.fields import nearest_true
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.grid_search import disc, nearest_true, reachable_cells
+from thinmap_ros.core.planning.grid_search import disc, reachable_cells
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import column_distance, known_free

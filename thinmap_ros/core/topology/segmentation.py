@@ -12,8 +12,7 @@ from scipy import ndimage
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid import fields
-from thinmap_ros.core.grid.fields import distance_cells
+from thinmap_ros.core.grid.fields import distance_cells, label, root_of
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.snapshot import MAX_COUNT, MAX_ID, Field
@@ -114,14 +113,6 @@ def _from_widest(flat: Array) -> Cells:
     return inside[np.argsort(-flat[inside], kind='stable')]
 
 
-@inlined
-def _root(parent: Cells, k: int) -> int:
-    while parent[k] != k:
-        parent[k] = parent[parent[k]]
-        k = parent[k]
-    return k
-
-
 @kernel
 def _flood(
     flat: Array,
@@ -153,7 +144,7 @@ def _flood(
             if flat[other_cell] > highest:
                 highest = flat[other_cell]
                 uphill = basin[other_cell]
-            other = _root(parent, basin[other_cell])
+            other = root_of(parent, basin[other_cell])
             if best < 0 or best == other:
                 best = other
                 continue
@@ -172,11 +163,11 @@ def _flood(
             peak[uphill] = flat[at]
             basins += 1
         # Up the steepest path, so that a boundary runs through its saddle.
-        own = _root(parent, uphill)
+        own = root_of(parent, uphill)
         basin[at] = own
         cells[own] += 1
     for k in range(basins):
-        parent[k] = _root(parent, k)
+        parent[k] = root_of(parent, k)
     return basin, parent[:basins].copy(), saddles[:count].copy()
 
 
@@ -351,7 +342,7 @@ def _furniture(patch: GridPatch, longest: float) -> Mask:
 
     A thin piece is one of a wall between two doors, unless it is no longer than a table's leg.
     """
-    numbers, sizes = fields.label(~patch.free)
+    numbers, sizes = label(~patch.free)
     small = np.zeros(len(sizes), dtype=np.bool_)
     for number, box in enumerate(ndimage.find_objects(numbers), 1):
         extent = _extent(box)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.grid.fields import label, reachable
+from thinmap_ros.core.grid.fields import label, nearest_true, reachable
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
@@ -31,14 +31,18 @@ def select_free_space(
     frame; where it is not on such a cell, the nearest one within seed_search_radius_m; none: empty
     selection. Without seed: every part that is larger than the robot itself.
     Source: exploration paper section 2.1, "selection of free space"; rules beyond the papers are
-    stated above.
+    stated above. Raises InputError where the seed is not finite.
     """
     radius = config.robot_radius_m / patch.frame.resolution
     standing = standing_room(column_distance(known_free(patch, config)), radius)
     if seed_xy is None:
         return without_specks(standing, math.pi * radius**2)
-    seed = nearest_cell(standing, patch, seed_xy, config.seed_search_radius_m)
-    return reachable(standing, np.empty((0, 2), dtype=np.int64) if seed is None else seed[None])
+    if not (math.isfinite(seed_xy[0]) and math.isfinite(seed_xy[1])):
+        raise InputError(f'seed {seed_xy}: expected finite coordinates')
+    row, col = patch.frame.cells_of(np.array([seed_xy]))[0].tolist()
+    reach = math.ceil(config.seed_search_radius_m / patch.frame.resolution)
+    seed = nearest_true(standing, (row, col), reach)
+    return np.zeros_like(standing) if seed is None else reachable(standing, np.array([seed]))
 
 
 def known_free(patch: GridPatch, config: TopologyConfig) -> Mask:
@@ -61,31 +65,6 @@ def standing_room(distance: NDArray[np.int16], radius_cells: float) -> Mask:
     rows = np.sqrt(np.maximum(radius_cells**2 - offsets**2, 0.0))
     need = np.ceil(rows - 1e-9).astype(np.int16)
     return _standing_room(distance, need)
-
-
-def nearest_cell(
-    cells: Mask, patch: GridPatch, xy: tuple[float, float], reach_m: float
-) -> Cells | None:
-    """The true cell (row, col) nearest to a point, if one lies within reach_m.
-
-    Raises InputError where the point is not finite.
-    """
-    if not (math.isfinite(xy[0]) and math.isfinite(xy[1])):
-        raise InputError(f'seed {xy}: expected finite coordinates')
-    centre = patch.frame.cells_of(np.array([xy]))[0]
-    if np.all((centre >= 0) & (centre < cells.shape)) and cells[centre[0], centre[1]]:
-        own: Cells = centre
-        return own
-    reach = math.ceil(reach_m / patch.frame.resolution)
-    low = np.maximum(centre - reach, 0)
-    high = np.maximum(centre + reach + 1, 0)
-    found = np.argwhere(cells[low[0] : high[0], low[1] : high[1]]) + low
-    if found.size == 0:
-        return None
-    squared = ((found - centre) ** 2).sum(axis=1)
-    best = int(squared.argmin())
-    nearest: Cells = found[best]
-    return nearest if squared[best] <= reach**2 else None
 
 
 def without_specks(cells: Mask, smallest: float) -> Mask:

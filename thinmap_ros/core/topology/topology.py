@@ -17,8 +17,7 @@ from thinmap_ros.core.grid.correction import CorrectedPoses
 from thinmap_ros.core.grid.mapper import MapUpdate, WholeMap
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.patch import (
-    MAX_RESOLUTION_M,
-    MIN_RESOLUTION_M,
+    FRAME_FIELD,
     UNKNOWN,
     GridFrame,
     GridPatch,
@@ -41,12 +40,7 @@ _PERCENT = np.array([UNKNOWN, 0, 100, UNKNOWN], dtype=np.int8)  # of each state
 _A_BYTE = 4  # states
 
 FIELDS = {
-    'frame': Field(
-        np.float64,
-        (3,),
-        (-MAX_COORDINATE_M, -MAX_COORDINATE_M, MIN_RESOLUTION_M),
-        (MAX_COORDINATE_M, MAX_COORDINATE_M, MAX_RESOLUTION_M),
-    ),
+    'frame': FRAME_FIELD,
     'next_id': Field(np.int64, (), 1, MAX_ID),
     'robot_places': Field(np.int64, ('r', 2), -MAX_CELL_INDEX, MAX_CELL_INDEX),
     'tiles': Field(np.int64, ('t', 2), -MAX_TILE_INDEX, MAX_TILE_INDEX),
