@@ -4,6 +4,7 @@ T_a_b is the pose of frame b seen from frame a.
 """
 
 import math
+from collections.abc import Sequence
 from typing import overload
 
 import numpy as np
@@ -75,10 +76,48 @@ def transform_points(T_a_b: Array, points_b: Array) -> Array:
     return np.asarray(points_b @ np.array([[c, s], [-s, c]]) + T_a_b[:2])
 
 
+def transform_each(poses: Array, points: Array) -> Array:
+    """Points (N, 2), each by a pose of its own (N, 3)."""
+    c = np.cos(poses[:, 2])
+    s = np.sin(poses[:, 2])
+    x = poses[:, 0] + c * points[:, 0] - s * points[:, 1]
+    y = poses[:, 1] + s * points[:, 0] + c * points[:, 1]
+    return np.column_stack([x, y])
+
+
 def interpolate(T_a: Array, T_b: Array, share: float) -> Array:
     """Pose on the straight line from T_a (share 0) to T_b (share 1); the shorter rotation."""
     x, y = T_a[:2] + share * (T_b[:2] - T_a[:2])
     return pose(x, y, T_a[2] + share * wrap(float(T_b[2] - T_a[2])))
+
+
+def are_apart(T_a: Array, T_b: Array, metres: float, radians: float) -> bool:
+    """Whether two poses (3,) are more than a distance or an angle apart."""
+    x, y, turn = between(T_a, T_b).tolist()
+    return math.hypot(x, y) > metres or abs(turn) > radians
+
+
+def bearing(a: Sequence[float] | Array, b: Sequence[float] | Array) -> float:
+    """Direction of a point (x, y, ...) seen from another, rad."""
+    return math.atan2(b[1] - a[1], b[0] - a[0])
+
+
+def lengths_along(points: Array) -> Array:
+    """Length of a line through points (N, 2) from its start to each of them, (N,)."""
+    return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
+
+
+def path_length(points: Array) -> float:
+    """Length of a line through points (N, 2)."""
+    return float(np.hypot(*np.diff(points, axis=0).T).sum())
+
+
+def distances_from_line(points: Array) -> Array:
+    """Distance (N,) of points (N, 2) from the line through the first and the last of them."""
+    line = points[-1] - points[0]
+    off = points - points[0]
+    length = max(float(np.hypot(*line)), 1e-9)
+    return np.asarray(np.abs(off[:, 0] * line[1] - off[:, 1] * line[0]) / length)
 
 
 def is_bounded_pose(T: Array) -> bool:

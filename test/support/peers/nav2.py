@@ -178,7 +178,7 @@ class BtNavigator(LifecycleNode):
             self._end(GoalStatus.STATUS_CANCELED, 0, '')
             return
         # Nav2's own check of progress takes 10 s: no robot of these tests waits so long.
-        self._navigator._motion.detector = StuckDetector()
+        self._navigator._stuck_detector = StuckDetector()
         command = self._navigator.step(T_map_base, self._patch, scan, period_s)
         self._command.publish(messages.twist_msg(command.v, command.w))
         if command.state == 'reached':

@@ -30,11 +30,11 @@ class MapMotion:
 
     def moved(self, points: Array) -> Array:
         """Where points (M, 2) of the map are afterwards."""
-        return _transformed(self._forward[_nearest(self.before, points)], points)
+        return se2.transform_each(self._forward[_nearest(self.before, points)], points)
 
     def undone(self, points: Array, moved_as: NDArray[np.int64]) -> Array:
         """Where points (M, 2) were before; moved_as (M,): the pose as which each was moved."""
-        return _transformed(self._backward[moved_as], points)
+        return se2.transform_each(self._backward[moved_as], points)
 
     def nearest_after(self, points: Array) -> NDArray[np.int64]:
         """The pose nearest to each of the points (M, 2) afterwards, (M,)."""
@@ -57,15 +57,6 @@ def _nearest(poses: Array, points: Array) -> NDArray[np.int64]:
     from scipy.spatial import cKDTree
 
     return np.asarray(cKDTree(poses[:, :2]).query(points)[1], dtype=np.int64)
-
-
-def _transformed(poses: Array, points: Array) -> Array:
-    """Points (M, 2), each by a pose of its own (M, 3)."""
-    c = np.cos(poses[:, 2])
-    s = np.sin(poses[:, 2])
-    x = poses[:, 0] + c * points[:, 0] - s * points[:, 1]
-    y = poses[:, 1] + s * points[:, 0] + c * points[:, 1]
-    return np.column_stack([x, y])
 
 
 # Maps at a pose, or bent: with rows that are not parallel to the x axis, or laid over another.

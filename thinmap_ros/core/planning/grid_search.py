@@ -17,13 +17,9 @@ from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.thinning import column_distance, standing_room
 from thinmap_ros.jit import kernel
 
-# Enough buckets for steps of up to four times the diagonal one.
 _STRAIGHT = 5
-
 _DIAGONAL = 7
-
-_BUCKETS = 32
-
+_BUCKETS = 32  # enough for steps of up to four times the diagonal one
 _FAR = 2**31 - 1
 
 
@@ -49,41 +45,34 @@ def distance_field_from(allowed: Mask, start: tuple[int, int]) -> Array:
     return _cells(_field(allowed.astype(np.uint8), start[0], start[1], nothing, -1)[1:-1, 1:-1])
 
 
+@kernel
 def downsample_mask(allowed: Mask, factor: int) -> Mask:
     """Squares of factor x factor cells of a mask (H, W) with at least one true cell.
 
     Their shape is (ceil(H / factor), ceil(W / factor)).
     """
-    return np.asarray(_downsample(allowed, factor, 0, 0))
-
-
-def _cells(steps: NDArray[np.int32]) -> Array:
-    """Steps as lengths in cells."""
-    return np.where(steps == _FAR, np.inf, steps / _STRAIGHT)
-
-
-@kernel
-def _downsample(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
-    """Squares with a true cell; the first cell is (shift_row, shift_col) in its square."""
     rows, cols = allowed.shape
-    height = -(-(rows + shift_row) // factor)
-    width = -(-(cols + shift_col) // factor)
+    height = -(-rows // factor)
+    width = -(-cols // factor)
     squares = np.zeros((height, width), dtype=np.bool_)
     line = np.zeros(width * factor, dtype=np.uint8)
     for square in range(height):
         line[:] = 0
-        top = max(square * factor - shift_row, 0)
-        bottom = min((square + 1) * factor - shift_row, rows)
-        for row in range(top, bottom):
+        for row in range(square * factor, min((square + 1) * factor, rows)):
             # All rows of a square into one line (vectorized), then its columns.
             cells = allowed[row].view(np.uint8)
-            part = line[shift_col : shift_col + cols]
+            part = line[:cols]
             for col in range(cols):
                 part[col] |= cells[col]
         for col in range(width):
             for k in range(factor):
                 squares[square, col] |= line[col * factor + k] != 0
     return squares
+
+
+def _cells(steps: NDArray[np.int32]) -> Array:
+    """Steps as lengths in cells."""
+    return np.where(steps == _FAR, np.inf, steps / _STRAIGHT)
 
 
 @kernel
@@ -179,9 +168,6 @@ def _field(
                             waiting += 1
         now += 1
     return field
-
-
-# Traversable and reachable cells.
 
 
 def traversable_cells(free: Mask, radius_m: float, resolution: float) -> Mask:

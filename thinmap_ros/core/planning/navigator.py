@@ -150,15 +150,6 @@ class _Progress:
     robots: Array = field(default_factory=lambda: np.empty((0, 2)))
 
 
-class _Motion:
-    """Motion of the robot so far: its recent path, and where it did not obey its commands."""
-
-    def __init__(self, robot_radius_m: float) -> None:
-        self.recent_path = RecentPath()
-        self.detector = StuckDetector()
-        self.stuck_places = StuckPlaces(robot_radius_m)
-
-
 class Navigator:
     """Drives to one goal at a time; a new goal replaces the old one without a stop."""
 
@@ -174,7 +165,9 @@ class Navigator:
         self._heading_rad: float | None = None
         self._progress = _Progress()
         self._patch: GridPatch | None = None
-        self._motion = _Motion(self.config.planner.robot_radius_m)
+        self._recent_path = RecentPath()
+        self._stuck_detector = StuckDetector()
+        self._stuck_places = StuckPlaces(self.config.planner.robot_radius_m)
 
     @property
     def distance_remaining_m(self) -> float:
@@ -215,7 +208,7 @@ class Navigator:
         self._heading_rad = theta
         self.path = None
         self._progress = _Progress()
-        self._motion.stuck_places.goal_set()
+        self._stuck_places.goal_set()
 
     def reset_velocity(self) -> None:
         """Reset the commanded velocity: the robot was stopped from outside."""
@@ -234,9 +227,9 @@ class Navigator:
         The same scan may be given again while the robot moves.
         """
         self._obstacles.add_scan(T_map_base, scan)
-        self._motion.recent_path.add_pose(T_map_base)
-        self._motion.stuck_places.add_pose(T_map_base)
-        is_stuck = self._motion.detector.add(T_map_base, self._follower.v, self._follower.w, dt_s)
+        self._recent_path.add_pose(T_map_base)
+        self._stuck_places.add_pose(T_map_base)
+        is_stuck = self._stuck_detector.add(T_map_base, self._follower.v, self._follower.w, dt_s)
         if self._goal is None:
             return Command(*self._follower.stop(dt_s), 'idle')
         if is_stuck:
@@ -352,7 +345,7 @@ class Navigator:
             path = None if band is None else self._plan_in_band(start, band, obstacles)
             if path is not None:
                 return path
-        trail = self._motion.recent_path.cells(patch.frame, patch.shape)
+        trail = self._recent_path.cells(patch.frame, patch.shape)
         return plan_short_path(patch, start, self._target, self.config.planner, obstacles, trail)
 
     def _extra_obstacles(self, T_map_base: Array) -> Obstacles | None:
@@ -360,7 +353,7 @@ class Navigator:
 
         These while it is blocked. None for nothing.
         """
-        points = np.concatenate([self._motion.stuck_places.points(), self._progress.robots])
+        points = np.concatenate([self._stuck_places.points(), self._progress.robots])
         if self._progress.blocked_s > 0.0:
             reach_m = self.config.scan_obstacle_range_m
             points = np.concatenate([points, self._obstacles.query_radius(T_map_base, reach_m)])
@@ -372,7 +365,7 @@ class Navigator:
         self, start: tuple[float, float], band: Band, obstacles: Obstacles | None
     ) -> Array | None:
         """Path to the target by wavefront, over the cells of a band only."""
-        trail = self._motion.recent_path.cells(band.patch.frame, band.patch.shape)
+        trail = self._recent_path.cells(band.patch.frame, band.patch.shape)
         config = self.config.planner
         found = find_path(band.patch, start, self._target, config, obstacles, trail, band.cells)
         return None if found is None else found.points
@@ -428,8 +421,8 @@ class Navigator:
 
     def _stop_stuck(self, T_map_base: Array, dt_s: float) -> Command:
         """Stop a robot that does not move, and plan around the place; again: abort."""
-        is_turning = self._motion.detector.is_turning
-        is_repeated = self._motion.stuck_places.add_stuck(T_map_base, is_turning)
+        is_turning = self._stuck_detector.is_turning
+        is_repeated = self._stuck_places.add_stuck(T_map_base, is_turning)
         still = self._follower.override_speed(0.0, 0.0)
         self.path = None
         self._progress.standstills += 1
@@ -463,7 +456,7 @@ class Navigator:
         assert self.path is not None
         nearest = nearest_point(self.path, float(T_map_base[0]), float(T_map_base[1]))
         ahead = self.path[min(nearest + 3, len(self.path) - 1)]
-        return math.atan2(ahead[1] - T_map_base[1], ahead[0] - T_map_base[0])
+        return se2.bearing(T_map_base, ahead)
 
     def _narrow_passage_speed(self, T_map_base: Array, v: float, curvature: float) -> float:
         """Highest speed up to v through a passage hardly wider than the robot.

@@ -12,14 +12,13 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.jit import kernel
 
-# Blind sectors: invalid beams behind which an obstacle may stand.
-#
-# Between two valid beams an angle D apart, an obstacle of width w cannot hide closer than w / D.
-# The space beyond that in a sector of invalid beams is unobserved, unless a recent scan, made near
-# by, has observed it.
-
 # Width of the smallest relevant obstacle: a leg. Sectors are sampled at this spacing.
 MIN_OBSTACLE_WIDTH_M = 0.1
+
+_REMEMBERED_M = 1.0
+_SWEEP_STEP_M = 0.03
+_NEIGHBOURS = 2  # beams on either side
+_SAME_M = 0.03  # maximum difference of ranges of the same obstacle
 
 
 class _Observation(NamedTuple):
@@ -32,7 +31,12 @@ class _Observation(NamedTuple):
 
 
 class BlindSectors:
-    """Sectors of invalid beams in the newest scan, less the space that recent scans observed."""
+    """Sectors of invalid beams in the newest scan, behind which an obstacle may stand.
+
+    Between two valid beams an angle D apart, an obstacle of width w cannot hide closer than w / D.
+    The space beyond that in a sector of invalid beams is unobserved, unless a recent scan, made
+    near by, has observed it.
+    """
 
     def __init__(self, scans: int = 32, apart_m: float = 0.05, apart_rad: float = 0.1) -> None:
         """Remember so many scans, made at least some distance or angle apart."""
@@ -46,16 +50,15 @@ class BlindSectors:
         seen_m = np.where(scan.hit, scan.ranges_m, np.where(scan.valid, np.inf, np.nan))
         seen_m = np.where(scan.below_range_min, 0.0, seen_m)
         newest = _Observation(seen_m, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser)
-        if self._newest is not None and self._is_apart(self._newest.T_map_laser):
-            self._earlier.append(self._newest)
+        last = self._newest
         self._newest = newest
-
-    def _is_apart(self, T_map_laser: Array) -> bool:
-        if not self._earlier:
-            return True
-        moved = se2.between(self._earlier[-1].T_map_laser, T_map_laser)
-        has_moved = math.hypot(moved[0], moved[1]) > self._apart_m
-        return has_moved or abs(float(moved[2])) > self._apart_rad
+        if last is not None and (
+            not self._earlier
+            or se2.are_apart(
+                self._earlier[-1].T_map_laser, last.T_map_laser, self._apart_m, self._apart_rad
+            )
+        ):
+            self._earlier.append(last)
 
     def points(self, reach_m: float, remembered_m: float) -> Array:
         """Points (K, 2), map frame, in unobserved space up to reach_m from the laser.
@@ -135,17 +138,6 @@ def _is_seen(points: Array, seen: Array, first: float, step: float, laser: Array
     return result
 
 
-# Obstacles around the robot as points, and the free path length of a disc among them.
-
-_REMEMBERED_M = 1.0
-
-_SWEEP_STEP_M = 0.03
-
-_NEIGHBOURS = 2  # beams on either side
-
-_SAME_M = 0.03  # maximum difference of ranges of the same obstacle
-
-
 class ObstaclePoints:
     """Hits of the newest scan, and earlier hits near the robot outside its field of view.
 
@@ -194,9 +186,9 @@ class ObstaclePoints:
         Along it the disc touches no point and sweeps no unobserved space.
         """
         count = math.ceil(length_m / _SWEEP_STEP_M)
-        clear = _clear_steps_on_arc(T_map_base, curvature, length_m, count, self.points, radius_m)
-        unseen = self._blind_points_ahead(T_map_base, length_m, radius_m)
-        seen = _clear_steps_on_arc(T_map_base, curvature, length_m, count, unseen, radius_m)
+        arc = _arc(T_map_base, curvature, length_m, count)
+        clear = _clear_steps(arc, self.points, radius_m)
+        seen = _clear_steps(arc, self._blind_points_ahead(T_map_base, length_m, radius_m), radius_m)
         self.is_hidden = seen < clear
         return float(length_m * min(clear, seen) / max(count, 1))
 
@@ -262,17 +254,6 @@ def _clear_steps(centres: Array, points: Array, radius: float) -> int:
 
 
 @kernel
-def _clear_steps_on_arc(
-    start: Array, curvature: float, length_m: float, count: int, points: Array, radius: float
-) -> int:
-    """Number of steps, of `count` along an arc, that a disc can move without touching points.
-
-    See `_arc` and `_clear_steps`.
-    """
-    return _clear_steps(_arc(start, curvature, length_m, count), points, radius)
-
-
-@kernel
 def _smoothed(ranges: Array, i: int) -> float:
     """Smoothed range, m: mean of the neighbouring beams that differ by noise only (NaN: none).
 
@@ -320,13 +301,11 @@ def _points_around(
     return points[:count].copy()
 
 
-# Recent path of the robot.
-#
-# The robot can return along it, even if noise in the map makes a passage appear too narrow.
-
-
 class RecentPath:
-    """The last metres of the robot's path; reset when the pose jumps, as after a correction."""
+    """The last metres of the robot's path; reset when the pose jumps, as after a correction.
+
+    The robot can return along it, even if noise in the map makes a passage appear too narrow.
+    """
 
     def __init__(self, step_m: float = 0.03, jump_m: float = 0.5, capacity: int = 1300) -> None:
         """Keep the last points, step_m apart; a longer step than jump_m is a jump."""
@@ -397,25 +376,18 @@ def _connected_cells(cells: Cells, rows: int, cols: int) -> Cells:
     return found[:used].copy()
 
 
-# Robots that do not move as commanded: blocked wheels, or obstacles that the laser cannot see.
-
 # A robot is stuck if it has moved by less than this share of what it was commanded for a while, and
 # of so much that the noise of its pose does not matter. The least share of a simulated exploration
 # (dungeon/d1573, 543 s) is 0.88; a slow base, and wheels that slip while the localizer corrects
 # their odometry, lie between.
 _SHARE = 0.1
-
 _WINDOW_S = 1.5
-
 _MIN_PATH_M = 0.2
-
 _MIN_TURN_RAD = 0.5
 
 # Another pose than the one at which the robot was stuck.
 _MOVED_M = 0.1
-
 _MOVED_RAD = 0.3
-
 _RING = 2.0 * np.pi * np.arange(8) / 8.0
 
 
@@ -430,8 +402,9 @@ class _Sample(NamedTuple):
 
 
 class StuckDetector:
-    """Compares the motion of the robot with its commands.
+    """Detects robots that do not move as commanded.
 
+    Their wheels are blocked, or an obstacle that the laser cannot see is in the way.
     is_turning: whether what was commanded last was a turn on the spot.
     """
 

@@ -1,7 +1,4 @@
-"""Pure-pursuit path follower for a differential drive, and right of way between robots.
-
-Source: Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992.
-"""
+"""Pure-pursuit path follower for a differential drive, and right of way between robots."""
 
 import math
 from collections.abc import Iterable
@@ -14,8 +11,13 @@ from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.jit import kernel
 
 _MAX_CORNER_CUT_M = 0.05  # largest distance between the driven arc and the path: one cell
-
 _TURN_IN_PLACE_RAD = 0.9  # heading error above which the robot turns in place, and drives no arc
+
+# Of the right of way.
+MESSAGE_PERIOD_S = 1.0
+NEAR_ROBOT_M = 3.0  # robots this close to another one send their motion ten times a second
+_STEPS = 8
+_APPROACH_M = 1e-3  # two robots that are too close already may not come closer by more
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,10 @@ class PathFollowerConfig(Config):
 
 
 class PathFollower:
-    """Follows paths; stores the last command, so that acceleration limits hold."""
+    """Follows paths; stores the last command, so that acceleration limits hold.
+
+    Source: Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992.
+    """
 
     def __init__(self, config: PathFollowerConfig) -> None:
         self.config = config
@@ -199,21 +204,6 @@ def _max_deviation(path: Array, first: int, last: int, x: float, y: float) -> fl
     return most / length
 
 
-# Right of way between robots that know each other's poses and speeds.
-#
-# A laser that looks ahead does not see a robot beside it. A robot stops driving, and may turn,
-# where it would come too close to another one that stands. Of two that drive, the one with the
-# larger name stops.
-
-MESSAGE_PERIOD_S = 1.0
-
-NEAR_ROBOT_M = 3.0  # robots this close to another one send their motion ten times a second
-
-_STEPS = 8
-
-_APPROACH_M = 1e-3  # two robots that are too close already may not come closer by more
-
-
 @dataclass(frozen=True, eq=False)
 class Motion:
     """Name, pose (3,), speed, m/s, and turn rate, rad/s, of a robot."""
@@ -242,6 +232,9 @@ def as_heard(motion: Motion, age_s: float) -> list[Motion]:
 def must_stop(own: Motion, others: Iterable[Motion], distance_m: float, horizon_s: float) -> bool:
     """Whether a robot would come closer than distance_m to another one within a time, s.
 
+    A laser that looks ahead does not see a robot beside it. A robot stops driving, and may turn,
+    where it would come too close to another one that stands. Of two that drive, the one with the
+    larger name stops.
     own: its motion as it is commanded; horizon_s: at least the time that it needs to brake.
     """
     for other in others:
@@ -264,7 +257,5 @@ def _places(motion: Motion, times: Array) -> Array:
     half_turn = 0.5 * motion.w * times
     chord = motion.v * times * np.sinc(half_turn / math.pi)
     heading = motion.pose[2] + half_turn
-    places: Array = motion.pose[:2] + chord[:, None] * np.column_stack(
-        [np.cos(heading), np.sin(heading)]
-    )
-    return places
+    directions = np.column_stack([np.cos(heading), np.sin(heading)])
+    return np.asarray(motion.pose[:2] + chord[:, None] * directions)

@@ -18,23 +18,22 @@ from thinmap_ros.core.planning.wavefront import (
     cost_of_cells,
     find_path,
 )
-from thinmap_ros.core.se2 import Array, Cells, Mask, Place
-from thinmap_ros.core.topology.graph import Edge, TopologicalMap, TopologyConfig
+from thinmap_ros.core.se2 import Array, Cells, Mask, Place, lengths_along, path_length
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.jit import kernel
-
-# Short paths: planned in a window of the map, so that the cost does not grow with the map.
-#
-# The window holds start and goal with some room around. A path that leaves it is at least as long
-# as the way to the rim and on to the goal; a cheaper one in the window is the best of the whole
-# map. In all other cases the wavefront plans on the whole map.
 
 _GAP_M = TopologyConfig().max_unknown_gap_m
 
+# Of the window in which a short path is planned.
 _ROOM_M = 3.0  # around start and goal
-
 _ROOM_SHARE = 0.5  # of the distance between them, in addition
-
 _MAX_SHARE = 0.5  # of the map: a larger window saves nothing
+
+# Straight distance from which the wavefront in a band costs less than the wavefront alone.
+LONG_PATH_M = 20.0
+_BAND_M = 3.0  # half of its width: wide enough for the shortest path through most halls
+_ACCESS_M = 6.0  # the graph is looked for so far from either end; in halls twice that, and so on
+_MAX_ROUTES = 6  # that are tried, each without the contradicted edges of those before
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +61,10 @@ def plan_short_path(
 ) -> Array | None:
     """Path (K, 2) from start to goal, m, map frame; None: no path.
 
+    It is planned in a window of the map, so that the cost does not grow with the map. The window
+    holds start and goal with some room around. A path that leaves it is at least as long as the way
+    to the rim and on to the goal; a cheaper one in the window is the best of the whole map. In all
+    other cases the wavefront plans on the whole map.
     obstacles: points that the map need not contain; trail: cells (N, 2) of the recent path.
     """
     window = _window(patch, start_xy, goal_xy, config, obstacles)
@@ -126,11 +129,6 @@ def _rim_cells(resolution: float, config: WavefrontConfig, obstacles: Obstacles 
     return math.ceil((reach_m + _GAP_M) / resolution) + 1
 
 
-# A* on the topological map, between any two points.
-#
-# Source: topological map paper section 3.2: the length of the edges is the cost of a path.
-
-
 @dataclass(frozen=True)
 class Route:
     """A path along edges: the nodes in order, the edges between them, and its length in m."""
@@ -167,6 +165,7 @@ def shortest_route(
     edges that the route must not use.
     The heuristic is the straight distance to the goal. It is admissible because no edge is shorter
     than the distance between its nodes.
+    Source: topological map paper section 3.2: the length of the edges is the cost of a path.
     """
     reached_by: dict[int, tuple[int, int]] = {}
     costs = dict(starts)
@@ -229,7 +228,7 @@ def _lengths_to_next_nodes(topology: TopologicalMap, x: float, y: float) -> dict
         return {node.id: to_node}
     edge_id, index, approach = found
     edge = topology.edges[edge_id]
-    along = _along(edge)
+    along = lengths_along(edge.path)
     ends: dict[int, float] = {}
     for node_id, length in ((edge.a, along[index]), (edge.b, along[-1] - along[index])):
         ends[node_id] = min(ends.get(node_id, np.inf), approach + float(length))
@@ -241,17 +240,8 @@ def path_points(topology: TopologicalMap, route: Route) -> Array:
     first = topology.nodes[route.node_ids[0]]
     parts = [np.array([[first.x, first.y]])]
     for node_id, edge_id in zip(route.node_ids, route.edge_ids, strict=False):
-        parts.append(_leaving(topology.edges[edge_id], node_id)[1:])
+        parts.append(topology.edges[edge_id].path_from(node_id)[1:])
     return np.concatenate(parts)
-
-
-def _leaving(edge: Edge, node_id: int) -> Array:
-    return edge.path if node_id == edge.a else edge.path[::-1]
-
-
-def _along(edge: Edge) -> Array:
-    """Length of the path from its start to each of its points."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(edge.path, axis=0).T))])
 
 
 def _away(topology: TopologicalMap, node_id: int, xy: tuple[float, float]) -> float:
@@ -268,24 +258,6 @@ def _walked(last_id: int, reached_by: dict[int, tuple[int, int]], cost: float) -
         nodes.append(node_id)
         edges.append(edge_id)
     return Route(tuple(nodes[::-1]), tuple(edges[::-1]), cost)
-
-
-# Long paths: A* on the topological map finds the route, the wavefront the path along it.
-#
-# The wave spreads only in a band around the route. Its first and last part lead from the robot to
-# the graph and from the graph to the goal: the cells there are found on the grid. Edges that the
-# grid or scan points contradict are left out. Where the graph has no route, or no path along it is
-# open, and for goals that are near, the wavefront plans alone. Source: topological map paper
-# section 3.2.
-
-# Straight distance from which the wavefront in a band costs less than the wavefront alone.
-LONG_PATH_M = 20.0
-
-_BAND_M = 3.0  # half of its width: wide enough for the shortest path through most halls
-
-_ACCESS_M = 6.0  # the graph is looked for so far from either end; in halls twice that, and so on
-
-_MAX_ROUTES = 6  # that are tried, each without the contradicted edges of those before
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,7 +355,7 @@ class _Checked:
             edge = self.topology.edges[entry.edge_id]
             back = edge.path[entry.index :: -1]
             for node_id, path in ((edge.a, back), (edge.b, edge.path[entry.index :])):
-                length_m = entry.length_m + _length(path)
+                length_m = entry.length_m + path_length(path)
                 known = best.get(node_id)
                 if (known is None or length_m < known.length_m) and self.is_drivable(path):
                     best[node_id] = _Approach(node_id, length_m, path)
@@ -400,7 +372,12 @@ def route_band(
 ) -> Band | None:
     """The band around the shortest route on the graph from start to goal (m, map frame).
 
-    None if the graph does not connect them, or not by edges that the grid confirms.
+    A* on the graph finds the route of a long path, the wavefront the path along it: the wave
+    spreads only in the band. Its first and last part lead from the robot to the graph and from the
+    graph to the goal: the cells there are found on the grid. Edges that the grid or scan points
+    contradict are left out. None if the graph does not connect start and goal, or not by edges that
+    the grid confirms: the wavefront plans alone then, as for goals that are near.
+    Source: topological map paper section 3.2.
     """
     if not topology.edges or not patch.contains(np.array([start_xy, goal_xy])).all():
         return None
@@ -449,7 +426,7 @@ def _surroundings(
     """Path lengths within `size` cells of a point, or of the nearest traversable cell in reach."""
     resolution = patch.frame.resolution
     row, col = patch.frame.cells_of(np.array([xy]))[0].tolist()
-    part = _crop(patch, max(row - size, 0), max(col - size, 0), row + size + 1, col + size + 1)
+    part = patch.part((max(row - size, 0), max(col - size, 0), row + size + 1, col + size + 1))
     first_row = max(row - size, 0)
     first_col = max(col - size, 0)
     allowed = np.isfinite(cost_of_cells(part, config))
@@ -489,8 +466,8 @@ def _route(
             parts = [begin.path, path_points(topology, route), end.path[::-1]]
             return (
                 np.concatenate(parts),
-                begin.length_m - _length(begin.path),
-                end.length_m - _length(end.path),
+                begin.length_m - path_length(begin.path),
+                end.length_m - path_length(end.path),
             )
         avoided |= closed
     return None
@@ -508,7 +485,7 @@ def _on_one_edge(
             continue
         low = min(start.index, goal.index)
         path = checked.topology.edges[start.edge_id].path[low : max(start.index, goal.index) + 1]
-        length_m = start.length_m + _length(path) + goal.length_m
+        length_m = start.length_m + path_length(path) + goal.length_m
         if (best is None or length_m < best[0]) and checked.is_drivable(path):
             ordered = path if start.index <= goal.index else path[::-1]
             best = (length_m, ordered, start.length_m, goal.length_m)
@@ -531,7 +508,7 @@ def _band(
     last = first + [around.lengths_m.shape for around, _ in access]
     low = np.maximum(np.minimum(at.min(axis=0) - margin, first.min(axis=0)), 0)
     high = np.minimum(np.maximum(at.max(axis=0) + margin + 1, last.max(axis=0)), patch.shape)
-    part = _crop(patch, *low.tolist(), *high.tolist())
+    part = patch.part((*low.tolist(), *high.tolist()))
     cells = np.zeros(part.shape, dtype=np.bool_)
     _paint_discs(cells, at - low, _BAND_M / resolution)
     for around, length_m in access:
@@ -540,14 +517,6 @@ def _band(
         col = around.col - int(low[1])
         cells[row : row + rows, col : col + cols] |= around.lengths_m <= length_m
     return Band(part, cells)
-
-
-def _crop(patch: GridPatch, top: int, left: int, bottom: int, right: int) -> GridPatch:
-    return GridPatch(patch.frame.with_origin_at(top, left), patch.cells[top:bottom, left:right])
-
-
-def _length(path: Array) -> float:
-    return float(np.hypot(*np.diff(path, axis=0).T).sum())
 
 
 @kernel

@@ -198,14 +198,6 @@ def navigation_function(
     return np.asarray(_march(cost, goal[0], goal[1], row, col))
 
 
-def trace_gradient_path(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
-    """Path (K, 2) by gradient descent on a navigation function (H, W), in cells (x, y).
-
-    It leads from a point to the centre of the goal cell.
-    """
-    return np.asarray(_trace_gradient_path(field, x, y, goal_row, goal_col))
-
-
 def _open_escape_cells(
     cost: Array,
     occupied: Mask,
@@ -439,12 +431,14 @@ def _lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
 
 
 @kernel
-def _trace_gradient_path(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
-    """Gradient descent in steps of half a cell, with bilinear interpolation of the gradient.
+def trace_gradient_path(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
+    """Path (K, 2) by gradient descent on a navigation function (H, W), in cells (x, y).
 
-    Each new cell is lower than the previous one. Where the gradient does not lead to a lower cell
-    (beside walls, or after several steps in one cell), the path goes to the centre of the lowest
-    neighbour. Over a corner between two cells without a path it goes from centre to centre.
+    It leads from a point to the centre of the goal cell, in steps of half a cell, with bilinear
+    interpolation of the gradient. Each new cell is lower than the previous one. Where the gradient
+    does not lead to a lower cell (beside walls, or after several steps in one cell), the path goes
+    to the centre of the lowest neighbour. Over a corner between two cells without a path it goes
+    from centre to centre.
     """
     rows, cols = field.shape
     path = np.empty((8 * field.size + 8, 2))

@@ -77,7 +77,10 @@ class DropoutDetector:
 
     def update(self, scan: Scan, T_odom_base: Array) -> bool:
         """Add a scan made at an odometry pose (3,); returns whether the laser drops returns."""
-        if scan.is_blind or not self._is_apart(T_odom_base):
+        is_near = self._last is not None and not se2.are_apart(
+            self._last, T_odom_base, _APART_M, _APART_RAD
+        )
+        if scan.is_blind or is_near:
             return self.drops_out
         self._forget_turned(T_odom_base)
         self._last = T_odom_base
@@ -102,12 +105,6 @@ class DropoutDetector:
         while self._views and sum(self._turns_rad) > _MAX_TURN_RAD:
             self._views.popleft()
             self._turns_rad.popleft()
-
-    def _is_apart(self, T_odom_base: Array) -> bool:
-        if self._last is None:
-            return True
-        moved = se2.between(self._last, T_odom_base)
-        return math.hypot(moved[0], moved[1]) > _APART_M or abs(float(moved[2])) > _APART_RAD
 
     def _aimed_beams(self, scan: Scan, T_odom_base: Array) -> Mask:
         """Which beams (N,) point at a surface of an earlier view."""

@@ -79,7 +79,9 @@ def deskewed(scan: Scan, stamps_ns: NDArray[np.int64], poses: Array) -> Scan:
     at_s = np.append(beams_s, 0.0)
     values = (poses[:, 0], poses[:, 1], headings)
     bases = np.column_stack([np.interp(at_s, since_s, value) for value in values])
-    moved = _relative(_lasers(bases, scan.T_base_laser))
+    mount = scan.T_base_laser
+    lasers = se2.transform_each(bases, np.tile(mount[:2], (len(bases), 1)))
+    moved = _relative(np.column_stack([lasers, bases[:, 2] + mount[2]]))
     step = abs(scan.angle_increment_rad)
     if np.abs(moved[:, 2]).max() < 0.01 * step and np.abs(moved[:, :2]).max() < 1e-4:
         return scan
@@ -87,15 +89,6 @@ def deskewed(scan: Scan, stamps_ns: NDArray[np.int64], poses: Array) -> Scan:
     moved_m = _moved_beams(scan.ranges_m, scan.returned, moved, fan)
     ranges = moved_m.astype(np.float32).astype(np.float64)
     return replace(scan, ranges_m=ranges, beam_period_s=0.0, first_beam_s=0.0)
-
-
-def _lasers(bases: Array, T_base_laser: Array) -> Array:
-    """Poses (N, 3) of the laser, from those of the robot."""
-    c = np.cos(bases[:, 2])
-    s = np.sin(bases[:, 2])
-    x = bases[:, 0] + c * T_base_laser[0] - s * T_base_laser[1]
-    y = bases[:, 1] + s * T_base_laser[0] + c * T_base_laser[1]
-    return np.column_stack([x, y, bases[:, 2] + T_base_laser[2]])
 
 
 def _relative(poses: Array) -> Array:
