@@ -12,12 +12,32 @@ from thinmap_ros.core import errors
 from thinmap_ros.core.config import Config, parameter, robot_radius
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.grid.fields import SpatialHash
-from thinmap_ros.core.se2 import Array, Mask
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, Mask
 
 # Nodes are listed by squares, in which one is looked for up to so far away.
 _BUCKET_M = 4.0
-
 _FAR_M = 60.0
+
+# Arrays of thinmap_msgs/TopologicalMap.
+FIELDS = {
+    'node_ids': np.uint32,
+    'node_kinds': np.uint8,
+    'node_xy': np.float64,
+    'node_clearance_m': np.float32,
+    'edge_ids': np.uint32,
+    'edge_nodes': np.uint32,
+    'edge_length_m': np.float32,
+    'edge_clearance_m': np.float32,
+    'edge_first': np.uint32,
+    'edge_xy': np.float32,
+}
+# Ids of bags of 0.3.0 and before have 64 bits.
+_READ = {'node_ids': np.uint64, 'edge_ids': np.uint64}
+_PAIRS = ('node_xy', 'edge_nodes')
+_POINTS = 'edge_xy'
+_MAX_ID = 2**32 - 1  # of ids in other messages (EndNode, Region), and in Nav2's route graphs
+
+Flat = dict[str, NDArray[Any]]
 
 
 class NodeKind(IntEnum):
@@ -150,6 +170,13 @@ class TopologicalMap:
         """Edges that begin or end at a node; a loop counts once."""
         return [self.edges[i] for i in self._edges_at[node_id]]
 
+    def kind_at(self, node_id: int) -> NodeKind:
+        """Kind of a node by the number of ends of edges there."""
+        degree = sum(1 + (edge.a == edge.b) for edge in self.edges_at(node_id))
+        if degree == 2:
+            return NodeKind.CORNER
+        return NodeKind.END if degree < 2 else NodeKind.BRANCH
+
     def neighbours(self, node_id: int) -> list[int]:
         """Ids of the nodes one edge away, each once."""
         return list(dict.fromkeys(edge.other(node_id) for edge in self.edges_at(node_id)))
@@ -209,35 +236,6 @@ class TopologicalMap:
         return sorted(parts, key=len, reverse=True)
 
 
-# The topological map as flat arrays, the fields of thinmap_msgs/TopologicalMap, and back.
-
-Flat = dict[str, NDArray[Any]]
-
-FIELDS = {
-    'node_ids': np.uint32,
-    'node_kinds': np.uint8,
-    'node_xy': np.float64,
-    'node_clearance_m': np.float32,
-    'edge_ids': np.uint32,
-    'edge_nodes': np.uint32,
-    'edge_length_m': np.float32,
-    'edge_clearance_m': np.float32,
-    'edge_first': np.uint32,
-    'edge_xy': np.float32,
-}
-
-# Ids of bags of 0.3.0 and before have 64 bits.
-_READ = {'node_ids': np.uint64, 'edge_ids': np.uint64}
-
-_PAIRS = ('node_xy', 'edge_nodes')
-
-_POINTS = 'edge_xy'
-
-_KINDS = {int(kind): kind for kind in NodeKind}
-
-_MAX_ID = 2**32 - 1  # of ids in other messages (EndNode, Region), and in Nav2's route graphs
-
-
 def flat_topology(topology: TopologicalMap) -> Flat:
     """Arrays of a topological map by field of thinmap_msgs/TopologicalMap."""
     nodes = list(topology.nodes.values())
@@ -279,7 +277,9 @@ def _nodes(flat: Flat) -> list[Node]:
     names = ('node_ids', 'node_kinds', 'node_xy', 'node_clearance_m')
     columns = (flat[name].tolist() for name in names)
     rows = zip(*columns, strict=True)
-    return [Node(number, _KINDS[kind], x, y, clearance) for number, kind, (x, y), clearance in rows]
+    return [
+        Node(number, NodeKind(kind), x, y, clearance) for number, kind, (x, y), clearance in rows
+    ]
 
 
 def _edges(flat: Flat) -> list[Edge]:
@@ -329,8 +329,9 @@ def _check_sizes(flat: Flat) -> None:
 def _check_nodes(flat: Flat) -> None:
     ids = _checked_ids('node', flat['node_ids'])
     kinds, places, clearances = (flat[f'node_{name}'] for name in ('kinds', 'xy', 'clearance_m'))
-    for i in _first(~np.isin(kinds, list(_KINDS))):
-        raise InputError(f'node {ids[i]}: kind {kinds[i]}: expected one of {list(_KINDS)}')
+    known = [int(kind) for kind in NodeKind]
+    for i in _first(~np.isin(kinds, known)):
+        raise InputError(f'node {ids[i]}: kind {kinds[i]}: expected one of {known}')
     for i in _first(_is_unbounded(places)):
         errors.require_bounded(f'node {ids[i]}', places[i].tolist())
     for i in _first(_is_no_length(clearances)):
@@ -380,20 +381,16 @@ def _checked_ids(what: str, numbers: NDArray[np.uint64]) -> list[int]:
 
 def _is_unbounded(places: NDArray[Any]) -> Mask:
     """For each place (K, 2) whether it is not finite or too far away."""
-    is_far: Mask = np.any(~(np.abs(places) <= errors.MAX_COORDINATE_M), axis=1)
-    return is_far
+    return np.asarray(np.any(~(np.abs(places) <= MAX_COORDINATE_M), axis=1))
 
 
 def _is_no_length(lengths: NDArray[Any]) -> Mask:
-    return ~((lengths >= 0.0) & (lengths <= errors.MAX_COORDINATE_M))
+    return ~((lengths >= 0.0) & (lengths <= MAX_COORDINATE_M))
 
 
 def _first(bad: Mask) -> list[int]:
     """Index of the first one that is bad; empty where none is."""
     return [int(index) for index in np.flatnonzero(bad)[:1]]
-
-
-# Parameters of the topological map.
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,22 @@ from typing import NamedTuple
 import numpy as np
 
 from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.core.se2 import Array, Cells, Mask
+from thinmap_ros.core.se2 import Array, Cells, Mask, distances_from_line, lengths_along, path_length
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.layers.free_space import squared_clearance
 from thinmap_ros.core.topology.layers.lattice import Lattice, rows_and_cols
 from thinmap_ros.jit import inlined, kernel
 
-# Corner nodes: where chains of cells break so that straight lines stay where the robot fits.
+# A node that moved less than this while the map grew keeps its id.
+MATCH_RADIUS_M = 0.5
+_OTHER_KIND = 0.5  # share of MATCH_RADIUS_M by which a node of another kind is farther away
+_LONGEST_UNEVEN_M = 8.0
+_EVEN_M = 0.5
+
+EMPTY_BOX = np.array([0, 0, -1, -1])
+_MORE_BOXES = 64
+
+_Key = tuple[int, int]  # cell; hash of the edge of whose path it is a corner, or 0
 
 
 def corner_indices(cells: Cells, room: Array) -> Cells:
@@ -28,9 +37,7 @@ def corner_indices(cells: Cells, room: Array) -> Cells:
     this. A closed chain is always broken.
     Source: exploration paper section 2.2, Fig. 3(c) and (d).
     """
-    broken = _split(np.ascontiguousarray(cells), np.maximum(room, 0.0))
-    found: Cells = np.flatnonzero(broken)
-    return found
+    return np.flatnonzero(_split(np.ascontiguousarray(cells), np.maximum(room, 0.0)))
 
 
 def corners_between(cells: Cells, room: Array, stops: Cells) -> Cells:
@@ -54,25 +61,20 @@ def with_middles(
     straight, and its clearances (K,) as equal, as `even` cells. Elsewhere there are places beside a
     long piece from which the nodes at both of its ends are out of sight.
     """
-    steps = np.hypot(*np.diff(cells, axis=0).T)
-    path = np.concatenate(([0.0], np.cumsum(steps)))
+    places = cells.astype(np.float64)
+    path = lengths_along(places)
     middles = [stops]
     for first, last in pairwise(stops.tolist()):
         count = int((path[last] - path[first]) / longest)
         piece = slice(first, last + 1)
-        if count == 0 or max(_bend(cells[piece]), float(np.ptp(clearances[piece]))) <= even:
+        if (
+            count == 0
+            or max(distances_from_line(places[piece]).max(), np.ptp(clearances[piece])) <= even
+        ):
             continue
         shares = np.arange(1, count + 1) / (count + 1)
         middles.append(np.searchsorted(path, path[first] + shares * (path[last] - path[first])))
     return np.unique(np.concatenate(middles))
-
-
-def _bend(cells: Cells) -> float:
-    """Largest distance of cells (K, 2) from the line through the first and the last one."""
-    line = (cells[-1] - cells[0]).astype(np.float64)
-    off = cells - cells[0]
-    length = max(float(np.hypot(*line)), 1.0)
-    return float(np.abs(off[:, 0] * line[1] - off[:, 1] * line[0]).max() / length)
 
 
 @inlined
@@ -164,9 +166,6 @@ def _split(cells: Cells, room: Array) -> Mask:
     return broken
 
 
-# Clearances along paths, and the paths that a changed cell may concern.
-
-
 @kernel
 def squared_clearances(lattice: Lattice, cells: Cells) -> Cells:
     """Squared clearance of each cell (K,), in cells."""
@@ -215,22 +214,6 @@ def touched_boxes(boxes: Cells, places: Cells) -> Mask:
                 found[k] = True
                 break
     return found
-
-
-# A node that moved less than this while the map grew keeps its id.
-MATCH_RADIUS_M = 0.5
-
-_OTHER_KIND = 0.5  # share of MATCH_RADIUS_M by which a node of another kind is farther away
-
-_LONGEST_UNEVEN_M = 8.0
-
-_EVEN_M = 0.5
-
-_NOWHERE = np.array([[0, 0, -1, -1]])
-
-_MORE_BOXES = 64
-
-_Key = tuple[int, int]  # cell; hash of the edge of whose path it is a corner, or 0
 
 
 class _Limits(NamedTuple):
@@ -304,7 +287,9 @@ class _Boxes:
         """Set the box of the path with a hash."""
         if not self._unused:
             count = len(self._boxes)
-            self._boxes = np.concatenate((self._boxes, np.tile(_NOWHERE, (count + _MORE_BOXES, 1))))
+            self._boxes = np.concatenate(
+                (self._boxes, np.tile(EMPTY_BOX, (count + _MORE_BOXES, 1)))
+            )
             self._unused += range(count, len(self._boxes))
         row = self._unused.pop()
         self._boxes[row] = box
@@ -316,7 +301,7 @@ class _Boxes:
         row = self._rows.pop(number)
         del self._hashes[row]
         self._unused.append(row)
-        self._boxes[row] = _NOWHERE
+        self._boxes[row] = EMPTY_BOX
 
     def touched(self, places: Cells) -> list[int]:
         """Hashes of the paths that changed cells (K, 2) may concern."""
@@ -492,20 +477,15 @@ class Registry:
         for (a, b), (first, last), squared in zip(pairwise(ids), stops, least, strict=True):
             path = points[first : last + 1]
             edge_id = _taken_over(between.get((min(a, b), max(a, b)), []), path)
-            length = float(np.hypot(*np.diff(path, axis=0).T).sum())
             clearance = math.sqrt(squared) * self._frame.resolution
-            edge = Edge(edge_id or self._new_id(), a, b, path, length, clearance)
+            edge = Edge(edge_id or self._new_id(), a, b, path, path_length(path), clearance)
             self.map.put_edge(edge)
             passage.edges.append(edge.id)
 
     def _put_vertex(self, lattice: Lattice, cell: int) -> None:
         """Update the kind and the clearance of the node of a vertex."""
         node_id = self._nodes[cell, 0]
-        degree = sum(1 + (edge.a == edge.b) for edge in self.map.edges_at(node_id))
-        kind = NodeKind.BRANCH
-        if degree <= 2:
-            kind = NodeKind.END if degree < 2 else NodeKind.CORNER
-        node = self._node(node_id, kind, lattice, cell)
+        node = self._node(node_id, self.map.kind_at(node_id), lattice, cell)
         if node != self.map.nodes[node_id]:
             self.map.put_node(node)
 

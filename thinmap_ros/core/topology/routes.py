@@ -11,18 +11,31 @@ from scipy.spatial import cKDTree
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.se2 import Array, Cells, Mask
+from thinmap_ros.core.se2 import Array, Cells, Mask, distances_from_line, path_length
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.thinning import column_distance, known_free, squared_clearance
 from thinmap_ros.jit import inlined, kernel
 
-# A topological map that is edited: straight edges, and new nodes with their clearances.
+DETAIL_M = 1.2  # a small table; nodes are as far apart, unless another spacing is given
+MIN_NODE_SPACING_M = 0.05  # a cell of most maps
 
-_KINDS = (NodeKind.END, NodeKind.END, NodeKind.CORNER)  # by degree; else branch
+_DIRECTIONS = 72  # of straight lines from a cell
+_RAY_REACH_M = 3.0  # beyond, whatever ends a view is no part of the place
+# States of cells, besides 0, free.
+_UNKNOWN = 1
+_WALL = 2
+
+_LATTICE_M = 0.5  # between the places that should see a node
+_SIGHT_REACH_M = 10.0  # a node that is farther off is out of sight
+_MIN_GAIN = 3  # places that a node must show
+_NODE_REACH_M = 6.0  # of a place from an edge on which a node may show it
+_SPLIT_STEP_M = 0.25  # between the points on edges where nodes may be put
+
+Box = tuple[float, float, float, float]  # smallest x and y, largest x and y, m
 
 
 class EditedGraph:
-    """A map, and the cells on which its edges may run.
+    """A map that gets straight edges, and new nodes, and the cells on which its edges may run.
 
     ends: ids of the nodes at which the map ended before it was edited.
     """
@@ -52,7 +65,9 @@ class EditedGraph:
         start = self.map.nodes[a].position
         end = self.map.nodes[b].position
         steps = math.ceil(math.dist(start, end) / self.frame.resolution) + 1
-        self._put_edge(edge_id or self._new_id(), a, b, np.linspace(start, end, max(steps, 2)))
+        path = np.linspace(start, end, max(steps, 2))
+        clearance = float(self._clearances(path).min())
+        self.map.put_edge(Edge(edge_id or self._new_id(), a, b, path, path_length(path), clearance))
 
     def put_node(self, xy: Array) -> int:
         """Put a node at a point (2,), m; returns its id."""
@@ -71,15 +86,8 @@ class EditedGraph:
     def with_kinds(self) -> TopologicalMap:
         """The map, its nodes with the kinds that they have now."""
         for node in list(self.map.nodes.values()):
-            degree = sum(1 + (edge.a == edge.b) for edge in self.map.edges_at(node.id))
-            kind = _KINDS[degree] if degree < len(_KINDS) else NodeKind.BRANCH
-            self.map.put_node(replace(node, kind=kind))
+            self.map.put_node(replace(node, kind=self.map.kind_at(node.id)))
         return self.map
-
-    def _put_edge(self, edge_id: int, a: int, b: int, path: Array) -> None:
-        length = float(np.hypot(*np.diff(path, axis=0).T).sum())
-        clearance = float(self._clearances(path).min())
-        self.map.put_edge(Edge(edge_id, a, b, path, length, clearance))
 
     def _clearances(self, points: Array) -> Array:
         squared = squared_clearance(self._distance, self.frame.cells_of(points))
@@ -112,11 +120,6 @@ def is_drivable(standing: Mask, row: int, col: int, to_row: int, to_col: int) ->
     return False
 
 
-# Edges as a route server drives them: straight, one along a line, one at each node at least.
-
-_DIRECTIONS = 72
-
-
 def split_parallels(graph: EditedGraph) -> None:
     """Lead the longer one of two edges between the same nodes over a corner node.
 
@@ -133,21 +136,13 @@ def split_parallels(graph: EditedGraph) -> None:
 
 
 def _lead_over_corner(graph: EditedGraph, edge: Edge) -> None:
-    corner = edge.path[int(_off_line(edge.path).argmax())]
+    corner = edge.path[int(distances_from_line(edge.path).argmax())]
     row, col = graph.frame.cells_of(corner)[0].tolist()
     ends = {graph.cell(edge.a), graph.cell(edge.b)}
     if len(ends) == 2 and all((row, col) != at and graph.is_clear((row, col), at) for at in ends):
         graph.split(edge, graph.put_node(corner))
     else:
         graph.map.drop_edge(edge.id)
-
-
-def _off_line(path: Array) -> Array:
-    """Distance (K,) of the points of a path (K, 2) from the line through its ends."""
-    line = path[-1] - path[0]
-    off = path - path[0]
-    length = max(float(np.hypot(*line)), 1e-9)
-    return np.asarray(np.abs(off[:, 0] * line[1] - off[:, 1] * line[0]) / length)
 
 
 def give_edges(graph: EditedGraph) -> None:
@@ -191,18 +186,10 @@ def _is_true(mask: Mask, row: int, col: int) -> bool:
     return bool(0 <= row < mask.shape[0] and 0 <= col < mask.shape[1] and mask[row, col])
 
 
-# Branches into rays: space that a laser saw through glass, without walls around.
-
-_WALL = 2
-
-_UNKNOWN = 1
-
-_RAY_REACH_M = 3.0  # beyond, whatever ends a view is no part of the place
-
-
 def drop_rays(graph: EditedGraph, patch: GridPatch) -> None:
     """Drop ends that see more of the unknown than of walls, back to the first node that does not.
 
+    Such a branch is a ray: space that a laser saw through glass, without walls around.
     A node without edges counts as an end, unless nothing else is left.
     """
     states = _UNKNOWN * patch.unknown.astype(np.uint8) + _WALL * patch.occupied.astype(np.uint8)
@@ -243,11 +230,6 @@ def _view(
                 break
             away += 0.5
     return walls, unknown
-
-
-# Rings round small obstacles are opened: one path round is left, the wider one.
-
-Box = tuple[float, float, float, float]  # smallest x and y, largest x and y, m
 
 
 def open_rings(graph: EditedGraph, known: Mask, detail_m: float) -> None:
@@ -314,15 +296,13 @@ def _points(edge: Edge, came_by: dict[int, Edge]) -> Array:
 
 def _box(path: Array) -> Box:
     """The box of a path (K, 2)."""
-    low = path.min(axis=0)
-    high = path.max(axis=0)
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+    low_x, low_y = path.min(axis=0).tolist()
+    return low_x, low_y, *path.max(axis=0).tolist()
 
 
 def _joined(one: Box, other: Box) -> Box:
-    low_x = min(one[0], other[0])
-    low_y = min(one[1], other[1])
-    return low_x, low_y, max(one[2], other[2]), max(one[3], other[3])
+    low = (min(one[0], other[0]), min(one[1], other[1]))
+    return *low, max(one[2], other[2]), max(one[3], other[3])
 
 
 @kernel
@@ -350,15 +330,6 @@ def _enclosed(known: Mask, ring: Cells) -> int:
                     low_col = min(low_col, col)
                     high_col = max(high_col, col)
     return int(max(high_row - low_row, high_col - low_col) + 1)
-
-
-# Which places see the node that is nearest to them.
-
-_LATTICE_M = 0.5  # between the places that should see a node
-
-_SIGHT_REACH_M = 10.0  # a node that is farther off is out of sight
-
-_MIN_GAIN = 3  # places that a node must show
 
 
 class Sight:
@@ -486,13 +457,6 @@ def _first_clear(free: Mask, row: int, col: int, cells: Cells) -> int:
     return -1
 
 
-# Few nodes: one for several, and one more where places would not see the nearest.
-
-_NODE_REACH_M = 6.0  # of a place from an edge on which a node may show it
-
-_SPLIT_STEP_M = 0.25  # between the points on edges where nodes may be put
-
-
 def merge_nodes(graph: EditedGraph, sight: Sight, node_spacing_m: float, detail_m: float) -> None:
     """Let nodes stand for others, as long as as many places see the node nearest to them.
 
@@ -605,22 +569,6 @@ def _can_split(graph: EditedGraph, edge: Edge, cell: Cells) -> bool:
     return all(graph.is_clear(at, graph.cell(i)) for i in (edge.a, edge.b))
 
 
-# The graph of a saved map, reduced for a route server.
-#
-# A robot that maps needs every node: each is an event of its exploration. A route server needs few
-# nodes, straight edges, and a node in sight of each place. The reduced graph has
-#
-# - no branch into rays that passed through glass;
-# - one path, the wider one, round an obstacle smaller than `detail_m`;
-# - one node for several that are nearer to each other than `node_spacing_m`, and none on a straight
-#   line;
-# - no two edges along one straight line, and no node without an edge.
-
-DETAIL_M = 1.2  # a small table; nodes are as far apart, unless another spacing is given
-
-MIN_NODE_SPACING_M = 0.05  # a cell of most maps
-
-
 def route_graph(
     topology: TopologicalMap,
     patch: GridPatch,
@@ -630,6 +578,15 @@ def route_graph(
     node_spacing_m: float | None = None,
 ) -> TopologicalMap:
     """The reduced graph of a map; the given one is not changed.
+
+    A robot that maps needs every node: each is an event of its exploration. A route server needs
+    few nodes, straight edges, and a node in sight of each place. The reduced graph has
+
+    - no branch into rays that passed through glass;
+    - one path, the wider one, round an obstacle smaller than `detail_m`;
+    - one node for several that are nearer to each other than `node_spacing_m`, and none on a
+      straight line;
+    - no two edges along one straight line, and no node without an edge.
 
     standing (H, W): cells of the patch that a robot can traverse. Each edge that is changed is a
     straight line over such cells. detail_m: smaller obstacles are passed on one side only.

@@ -22,14 +22,10 @@ from thinmap_ros.core.topology.layers.pruning import (
     prune,
 )
 from thinmap_ros.core.topology.layers.skeleton_graph import CELL, NONE, A, SkeletonGraph, components
-from thinmap_ros.core.topology.registry import Changes
+from thinmap_ros.core.topology.registry import EMPTY_BOX, Changes
 
-# Where the robot has been, as cells of the free space and of the skeleton.
-
-_BLOCK = 10  # cells; one place in a block is enough
-
+_BLOCK = 10  # cells; one place of the robot in a block is enough
 _REACH = 160  # steps from a place to the skeleton that are tried first, in cells
-
 _MAX_REACH = 2560
 
 
@@ -85,9 +81,6 @@ def _nearest_kept(lattice: Lattice, cell: int) -> int:
         reach *= 2
         found = int(nearest_kept(lattice, cell, reach))
     return found
-
-
-_NOWHERE = np.array([0, 0, -1, -1])
 
 
 class Span(NamedTuple):
@@ -203,7 +196,7 @@ class Layers:
         if missing > 0:
             blank = np.full((missing, COLUMNS), NONE, dtype=np.int64)
             self._measured = np.concatenate((self._measured, blank))
-        box = _NOWHERE
+        box = EMPTY_BOX
         if len(places):
             box = np.concatenate((places.min(axis=0), places.max(axis=0)))
         measure(arrays, self._measured, box)
