@@ -1,4 +1,10 @@
-"""Kernels that are compiled before they are needed, with progress and within memory."""
+"""Kernels that are compiled before they are needed, with progress and within memory.
+
+Each algorithm warms up in a small room, so that its kernels are loaded before the first step: a
+node does so before it subscribes. Otherwise a robot loses its first seconds, and a simulation
+faster than real time many more. Each warm-up imports its own modules only, so that a node does not
+load the kernels of others, and is done once in a process.
+"""
 
 import ctypes
 import gc
@@ -8,9 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from functools import cache as cache_of_results
 from pathlib import Path
-from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,8 +29,6 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import cache as kernel_cache
 
-# Releases memory pages that are no longer needed.
-
 
 def compiler_memory_releaser(
     period_s: float = 3.0, threshold_bytes: float = 4e6
@@ -35,16 +37,16 @@ def compiler_memory_releaser(
 
     Kernels that are loaded later, with the first message, load the compiler again.
     """
-    looked_at = monotonic()
+    looked_at = time.monotonic()
     least = _shared_bytes()
 
     def look() -> None:
         nonlocal looked_at, least
-        if monotonic() - looked_at > period_s:
+        if time.monotonic() - looked_at > period_s:
             if _shared_bytes() > least + threshold_bytes:
                 release_compiler_pages()
                 least = _shared_bytes()
-            looked_at = monotonic()
+            looked_at = time.monotonic()
 
     return look
 
@@ -94,13 +96,8 @@ def _clean_mappings(smaps: str, name: str) -> Iterator[tuple[int, int]]:
             yield int(first, 16), int(last, 16)
 
 
-# Reports the compilation of kernels, which delays the first start of a program.
-
-_COMPILATION = 'numba:compile'
-
-
 class CompilationReport(event.Listener):
-    """Reports on stderr how many kernels are compiled."""
+    """Reports on stderr how many kernels are compiled: it delays the first start of a program."""
 
     def __init__(self, period_s: float = 5.0) -> None:
         self._period_s = period_s
@@ -137,23 +134,17 @@ class CompilationReport(event.Listener):
             self._seconds = 0.0
 
 
-@cache_of_results
+@cache
 def report_compilation() -> CompilationReport:
     """Report compilation until the process ends; called again, it is the same report."""
     report = CompilationReport()
-    event.register(_COMPILATION, report)
+    event.register('numba:compile', report)
     return report
 
 
 def _tell(what: str) -> None:
     print(f'thinmap: {what}', file=sys.stderr, flush=True)
 
-
-# Warm-up of each algorithm in a small room, so that kernels are loaded before the first step.
-#
-# A node warms up before it subscribes: otherwise a robot loses its first seconds, and a simulation
-# faster than real time many more. Each warm-up imports its own modules only, so that a node does
-# not load the kernels of others, and is done once in a process.
 
 if TYPE_CHECKING:
     from thinmap_ros.core.topology.graph import TopologicalMap
@@ -432,9 +423,7 @@ ALL = (
     active_search,
     map_joiner,
     sim,
-)
-
-"""Warm-ups of all nodes."""
+)  # warm-ups of all nodes
 
 
 def _graph(patch: GridPatch) -> 'TopologicalMap':

@@ -34,13 +34,11 @@ from thinmap_ros.core.planning.grid_search import (
 )
 from thinmap_ros.core.planning.obstacles import RecentPath
 from thinmap_ros.core.planning.paths import path_lengths_to_nodes
-from thinmap_ros.core.planning.wavefront import START_ESCAPE_M, WavefrontConfig
+from thinmap_ros.core.planning.wavefront import START_ESCAPE_M
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array, Cells, Mask
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.jit import kernel
-
-# Frontiers for the baseline strategies: clusters, viewpoints and path lengths.
 
 _COARSE = 2
 
@@ -48,8 +46,6 @@ _PART_M = 1.0
 
 # The same robot and the same frontiers as for the exploration of the paper.
 _EXPLORER = ExplorerConfig()
-
-_PLANNER = WavefrontConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +63,8 @@ class Frontier:
     @property
     def goal(self) -> Array:
         """The viewpoint, facing the centroid, (3,)."""
-        dx, dy = self.centroid - self.viewpoint
-        return se2.pose(self.viewpoint[0], self.viewpoint[1], math.atan2(dy, dx))
+        x, y = self.viewpoint
+        return se2.pose(x, y, se2.bearing(self.viewpoint, self.centroid))
 
 
 class FrontierFinder:
@@ -476,8 +472,8 @@ class VisitAllEndNodes(NearestFrontier):
         length_m = costs.get(best.id, math.inf)
         if not math.isfinite(length_m):
             return None
-        heading = math.atan2(best.y - T_map_base[1], best.x - T_map_base[0])
-        return se2.pose(best.x, best.y, heading), length_m
+        place = (best.x, best.y)
+        return se2.pose(*place, se2.bearing(T_map_base, place)), length_m
 
     def _is_end_node_at(self, goal: Array) -> bool:
         """Whether the present end node is at a goal (3,)."""

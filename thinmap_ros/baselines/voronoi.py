@@ -53,8 +53,7 @@ def voronoi_lines(patch: GridPatch, free: Mask, config: TopologyConfig) -> Mask:
 def _border(known: Mask) -> Cells:
     """Row and column (N, 2) of the cells beside known free cells; those of the rim are outside."""
     padded = np.pad(known, 1)
-    border: Cells = np.argwhere(ndimage.binary_dilation(padded, _EIGHT) & ~padded) - 1
-    return border
+    return np.asarray(np.argwhere(ndimage.binary_dilation(padded, _EIGHT) & ~padded) - 1)
 
 
 def _ridge_points(sites: Array, radius: float) -> Array:
@@ -71,8 +70,7 @@ def _ridge_points(sites: Array, radius: float) -> Array:
     ridge = np.repeat(np.arange(len(counts)), counts)
     step = np.arange(len(ridge)) - np.repeat(np.cumsum(counts) - counts, counts)
     share = step / np.maximum(counts[ridge] - 1, 1)
-    points: Array = first[ridge] + share[:, None] * line[ridge]
-    return points
+    return np.asarray(first[ridge] + share[:, None] * line[ridge])
 
 
 def _distance(points: Array, first: Array, last: Array) -> Array:
@@ -80,8 +78,7 @@ def _distance(points: Array, first: Array, last: Array) -> Array:
     line = last - first
     squared = np.maximum((line**2).sum(axis=1), 1e-12)
     share = np.clip(((points - first) * line).sum(axis=1) / squared, 0.0, 1.0)
-    distance: Array = np.hypot(*(first + share[:, None] * line - points).T)
-    return distance
+    return np.asarray(np.hypot(*(first + share[:, None] * line - points).T))
 
 
 def _without_empty_holes(lines: Mask, free: Mask) -> Mask:
@@ -89,5 +86,4 @@ def _without_empty_holes(lines: Mask, free: Mask) -> Mask:
     labels, count = ndimage.label(~np.pad(lines, 1))
     has_other = np.zeros(count + 1, dtype=np.bool_)
     has_other[labels[~np.pad(free, 1)]] = True
-    filled: Mask = ~has_other[labels][1:-1, 1:-1] | lines
-    return filled
+    return np.asarray(~has_other[labels][1:-1, 1:-1] | lines)

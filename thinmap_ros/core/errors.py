@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 
 MAX_QUOTE_LENGTH = 200
-
 _MAX_INTEGER = 10**30
+
+# Bounds on the contents of messages and files.
+MAX_ANGLE_RAD = 4.0 * np.pi
+MAX_BEAMS = 200_000
+# Drivers round the increment, as to 0.0175 rad for 1 degree, and some give the end of the last
+# interval as angle_max.
+_ROUNDING = 0.005
+_INTERVALS = 1.0
 
 
 class ThinmapError(Exception):
@@ -91,21 +98,6 @@ class _Quote(reprlib.Repr):
 _QUOTE = _Quote()
 
 
-# Bounds on the contents of messages and files.
-
-MAX_COORDINATE_M = se2.MAX_COORDINATE_M
-
-MAX_ANGLE_RAD = 4.0 * np.pi
-
-MAX_BEAMS = 200_000
-
-# Drivers round the increment, as to 0.0175 rad for 1 degree, and some give the end of the last
-# interval as angle_max.
-_ROUNDING = 0.005
-
-_INTERVALS = 1.0
-
-
 def pose_of(what: str, value: object) -> se2.Array:
     """A pose (3,) of a caller: x, y (m) and heading (rad). Raises InputError for anything else."""
     try:
@@ -117,7 +109,9 @@ def pose_of(what: str, value: object) -> se2.Array:
     return pose
 
 
-def require_bounded(what: str, values: Iterable[float], limit: float = MAX_COORDINATE_M) -> None:
+def require_bounded(
+    what: str, values: Iterable[float], limit: float = se2.MAX_COORDINATE_M
+) -> None:
     """Raise InputError unless all values are finite and at most `limit` in magnitude."""
     for value in values:
         if not abs(value) <= limit:
@@ -154,10 +148,10 @@ def angle_warning(
 
 
 def require_lengths(what: str, lengths: Iterable[float]) -> None:
-    """Raise InputError unless all lengths (m) are from 0 to MAX_COORDINATE_M."""
+    """Raise InputError unless all lengths (m) are from 0 to se2.MAX_COORDINATE_M."""
     for length in lengths:
-        if not 0.0 <= length <= MAX_COORDINATE_M:
-            raise InputError(f'{what}: {length} m: expected 0 to {MAX_COORDINATE_M:g} m')
+        if not 0.0 <= length <= se2.MAX_COORDINATE_M:
+            raise InputError(f'{what}: {length} m: expected 0 to {se2.MAX_COORDINATE_M:g} m')
 
 
 def quoted_name(text: str, longest: int = 80) -> str:

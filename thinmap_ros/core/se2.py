@@ -1,4 +1,4 @@
-"""Planar poses [x m, y m, theta rad] as float64 arrays.
+"""Planar poses [x m, y m, theta rad] as float64 arrays, their covariances, points and stamps.
 
 T_a_b is the pose of frame b seen from frame a.
 """
@@ -19,6 +19,13 @@ Place = tuple[float, float]  # x and y, m
 # Larger coordinates are errors. Beyond 1e15 m, float64 cannot even resolve cells, and computed
 # indices lie outside of every array.
 MAX_COORDINATE_M = 1e6
+BOUND_SIGMAS = 3.0  # an error of more standard deviations than this is not noise
+
+# Stamps are nanoseconds since 1970. Messages of ROS hold the seconds in 32 bits with a sign.
+SECOND_NS = 1_000_000_000
+CLOCK_JUMP_NS = SECOND_NS  # a clock that steps back by more was set back
+LATEST_S = 2**31  # in 2038
+LATEST_NS = LATEST_S * SECOND_NS
 
 
 @overload
@@ -130,11 +137,6 @@ def is_finite(T: Array) -> bool:
     return bool(np.isfinite(T).all())
 
 
-# Covariances (3, 3) of planar poses: rotated, and carried to a pose at a fixed offset.
-
-BOUND_SIGMAS = 3.0  # an error of more standard deviations than this is not noise
-
-
 def rotation(theta: float) -> Array:
     """Matrix R (3, 3) that rotates increments by theta, and covariances C by R C R'."""
     c = math.cos(theta)
@@ -170,14 +172,3 @@ def inverse(matrix: Array) -> Array:
 
 def _compounding(lever: Array) -> Array:
     return np.array([[1.0, 0.0, -lever[1]], [0.0, 1.0, lever[0]], [0.0, 0.0, 1.0]])
-
-
-# Stamps: nanoseconds since 1970. Messages of ROS hold the seconds in 32 bits with a sign.
-
-SECOND_NS = 1_000_000_000
-
-CLOCK_JUMP_NS = SECOND_NS  # a clock that steps back by more was set back
-
-LATEST_S = 2**31  # in 2038
-
-LATEST_NS = LATEST_S * SECOND_NS

@@ -15,9 +15,19 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
 
-# Result of one localizer step.
-
 MAX_ODDS = 1e12  # higher ones are reported as this
+
+# Values of the parameter `slam`.
+SCAN_MATCHING = 'scan_matching'
+EKF_TI = 'ekf_ti'
+EKF_FULL = 'ekf_full'
+
+# Values of the parameter `mode`, as in slam_toolbox.
+MAPPING = 'mapping'
+LOCALIZATION = 'localization'
+
+Input = TypeVar('Input', contravariant=True)
+Output = TypeVar('Output', covariant=True)
 
 
 @dataclass(frozen=True)
@@ -74,7 +84,7 @@ class Destination(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Estimated pose after a scan.
+    """Result of one localizer step: the estimated pose after a scan.
 
     T_map_base (3,) with covariance (3, 3); T_map_odom (3,).
 
@@ -127,11 +137,6 @@ class Estimate:
         return Destination.OPEN if self.is_contradicted else Destination.MAP
 
 
-Input = TypeVar('Input', contravariant=True)
-
-Output = TypeVar('Output', covariant=True)
-
-
 class Stage(Protocol[Input, Output]):
     """A part of the chain, in one process with the others or in a node of its own."""
 
@@ -172,21 +177,6 @@ class LocalizedScan:
     trajectory: Trajectory | None = None
 
 
-# Parameters of every localizer: which one it is, where it starts, and whether it maps.
-
-# Values of the parameter `slam`.
-SCAN_MATCHING = 'scan_matching'
-
-EKF_TI = 'ekf_ti'
-
-EKF_FULL = 'ekf_full'
-
-# Values of the parameter `mode`, as in slam_toolbox.
-MAPPING = 'mapping'
-
-LOCALIZATION = 'localization'
-
-
 def slam_parameter(default: str) -> Any:
     """Declare the field `slam`, which has another default in the configuration of each localizer.
 
@@ -202,7 +192,7 @@ def slam_parameter(default: str) -> Any:
 
 @dataclass(frozen=True)
 class StartConfig(Config):
-    """Parameters that all localizers have.
+    """Parameters that all localizers have: which one it is, where it starts, whether it maps.
 
     of_slam: the values of `slam` that a configuration is for. Raises ConfigError for another one.
     """

@@ -32,14 +32,19 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.types.abstract import Type
 from numba.core.types.containers import BaseNamedTuple, BaseTuple
 
-# What a kernel is compiled from, as a hash: neither comments, docstrings nor other code count.
-
 # How all kernels are compiled, besides what their decorators say.
 OPTIONS = {'nogil': True}
 
+PACKAGE = Path(__file__).resolve().parents[1]
+BESIDE_PACKAGE = PACKAGE / '__pycache__' / 'kernels'
 _PACKAGE = __name__.partition('.')[0]
-
 _SCALARS = (bool, int, float, complex, str, bytes, np.generic, np.dtype, type(None))
+_WORD = 16  # characters of a fingerprint in the names of files
+_KEPT = 8  # fingerprints of a function: its code in so many versions or clones
+
+# Of folders that only this user can read and write.
+_MODE = stat.S_IRWXU
+_OF_OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
 Function = Callable[..., Any]
 
@@ -48,6 +53,7 @@ Function = Callable[..., Any]
 def fingerprint(function: Function) -> str:
     """Hash of the code of a kernel, of all kernels that it calls, and of the values that they name.
 
+    Neither comments, docstrings nor other code count.
     To be called once all modules of the kernels are imported: kernels call some that stand below
     them. What Numba accepts as a global value counts: numbers, texts, tuples, arrays, their types,
     enumerations, named tuples, kernels; of a function of another module its name alone.
@@ -133,13 +139,6 @@ def _value(value: Any) -> Any:
     return getattr(value, '_fields', None)
 
 
-# Folders that only this user can read and write.
-
-_MODE = stat.S_IRWXU
-
-_OF_OTHERS = stat.S_IRWXG | stat.S_IRWXO
-
-
 def private_folder(folder: Path) -> Path:
     """Return the folder, created if missing.
 
@@ -163,15 +162,6 @@ def private_folder(folder: Path) -> Path:
 def temporary_folder() -> Path:
     """Path of this user's folder among the temporary files; it may not exist yet."""
     return Path(tempfile.gettempdir()) / f'thinmap-{os.getuid()}'
-
-
-PACKAGE = Path(__file__).resolve().parents[1]
-
-BESIDE_PACKAGE = PACKAGE / '__pycache__' / 'kernels'
-
-_WORD = 16  # characters of a fingerprint in the names of files
-
-_KEPT = 8  # fingerprints of a function: its code in so many versions or clones
 
 
 @cache

@@ -11,7 +11,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.path_follower import PathFollower, PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array, Mask, pose
+from thinmap_ros.core.se2 import Array, Mask, path_length, pose
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.simulation import STEP_NS, Simulation
@@ -53,8 +53,7 @@ def drive(
     if moment.scan is not None:
         yield DriveSample(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
     for path in paths:
-        length_m = float(np.hypot(*np.diff(path, axis=0).T).sum())
-        duration_s = config.timeout_factor * length_m / config.speed_m_s
+        duration_s = config.timeout_factor * path_length(path) / config.speed_m_s
         for _ in range(round(1e9 / STEP_NS * (config.min_timeout_s + duration_s))):
             T = simulation.robot.T_world_base
             if np.hypot(*(path[-1] - T[:2])) < config.goal_tolerance_m:

@@ -1,7 +1,7 @@
 """Random floor plans: rooms, corridors and halls, which are rectangles, and openings."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
 
@@ -107,7 +107,11 @@ def generate_floor_plan(
         _door(wall, parts, config, rng) for wall in _with_doors(parts, passages, wide_enough, rng)
     ]
     wall_m = config.wall_m
-    inner = [_shortened(wall, 0.5 * wall_m) for wall in passages if wall.length > 2.0 * wall_m]
+    inner = [
+        _stretch(wall, 0.5 * wall_m, wall.length - 0.5 * wall_m)
+        for wall in passages
+        if wall.length > 2.0 * wall_m
+    ]
     return FloorPlan(width, depth, wall_m, parts, doors, inner, closed)
 
 
@@ -118,7 +122,7 @@ def _split_block(
     short, long = sorted((block.width, block.depth))
     least, most = config.hall_side_m
     if short >= least and long <= most and rng.random() < config.hall_share:
-        return [_with_kind(Kind.HALL, block)]
+        return [replace(block, kind=Kind.HALL)]
     along_x = block.width >= block.depth
     if short <= config.row_depth_m and long <= config.max_row_length_m:
         return _rooms(block, along_x, config, rng)
@@ -133,7 +137,7 @@ def _split_block(
         sides = [_rooms(side, along_x, config, rng) for side in (first, last)]
     else:
         sides = [_split_block(side, config, rng) for side in (first, last)]
-    return [*sides[0], _with_kind(Kind.CORRIDOR, middle), *sides[1]]
+    return [*sides[0], replace(middle, kind=Kind.CORRIDOR), *sides[1]]
 
 
 def _rooms(
@@ -159,10 +163,6 @@ def _split(part: FloorPart, along_x: bool, marks: list[float]) -> list[FloorPart
         else:
             pieces.append(FloorPart(part.kind, part.x0, a, part.x1, b))
     return pieces
-
-
-def _with_kind(kind: Kind, part: FloorPart) -> FloorPart:
-    return FloorPart(kind, part.x0, part.y0, part.x1, part.y1)
 
 
 def _is_open(a: FloorPart, b: FloorPart) -> bool:
@@ -229,10 +229,6 @@ def _door(
     width = rng.uniform(*(config.wide_door_width_m if wide else config.door_width_m))
     begin = rng.uniform(jamb, wall.length - jamb - width)
     return _stretch(wall, begin, begin + width)
-
-
-def _shortened(wall: Opening, by: float) -> Opening:
-    return _stretch(wall, by, wall.length - by)
 
 
 def _stretch(wall: Opening, begin: float, end: float) -> Opening:

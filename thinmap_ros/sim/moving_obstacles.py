@@ -46,8 +46,7 @@ class Pedestrians:
         share = (now - begun) / (ended - begun)
         start = self._stations[who, span]
         goal = self._stations[who, span + 1]
-        places: Array = start + share[:, None] * (goal - start)
-        return places
+        return np.asarray(start + share[:, None] * (goal - start))
 
 
 @dataclass(frozen=True, eq=False)

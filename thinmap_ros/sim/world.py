@@ -84,14 +84,12 @@ class World:
         return float((beside**2).sum(axis=1).min(initial=np.inf))
 
 
-# Straight surfaces of a world, which a laser observes as lines.
-
-
 def surfaces(world: World, shortest_m: float) -> Array:
     """Axis-parallel obstacle faces that bound the free space around the start: ends (N, 4), m.
 
-    Each is at least shortest_m long; the two sides of a thin wall are two faces. Columns: x and y
-    of one end, x and y of the other. Oblique surfaces consist of short steps and are omitted.
+    A laser observes them as lines. Each is at least shortest_m long; the two sides of a thin wall
+    are two faces. Columns: x and y of one end, x and y of the other. Oblique surfaces consist of
+    short steps and are omitted.
     """
     free = world.occupied == 0
     inside = inside_of(world)

@@ -1,4 +1,4 @@
-"""Maps of a team: one that all robots share at once."""
+"""Maps of a team: one that all robots share at once, or one of each, completed by the others'."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -25,6 +25,9 @@ from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.team.radio import Radio, Trouble
+
+TILE_PERIOD_S = 5.0
+_REQUEST_BYTES = 12
 
 
 class TeamMaps(Protocol):
@@ -91,13 +94,6 @@ class SharedMap:
     def known_area(self) -> GridPatch:
         """As TeamMaps.known_area."""
         return self.grid.known_area()
-
-
-# Maps of a team: one for each robot, which sends the others the tiles that have changed.
-
-TILE_PERIOD_S = 5.0
-
-_REQUEST_BYTES = 12
 
 
 class _OwnMap:

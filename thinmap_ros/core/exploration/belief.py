@@ -14,40 +14,40 @@ from thinmap_ros.core.se2 import Cells, Place
 from thinmap_ros.core.snapshot import MAX_CELL_INDEX, MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
 from thinmap_ros.jit import inlined, kernel
 
-# Belief about a candidate: the probability that nothing is hidden behind it, and the area if not.
-#
-# The paper's threshold on a probability remains; the probability itself comes from the map:
-#
-# - the length of the frontier, the unknown area in line of sight behind it, and how deep the
-#   unknown is: inside of a wall it is two or three cells;
-# - each visit that showed nothing.
-#
-# Distance and angles of observations, the paper's D and A, add nothing to these.
-#
-# Source: exploration paper section 3.2; the constants are fitted, see `benchmarks/exploration/`.
-
 WORTH_SEEING_M2 = 0.5  # a smaller hidden area counts as nothing
-
 _LOG_ODDS_LIMIT = 14.0
-
 _MIN_LENGTH_M = 0.1
-
 _MIN_M2 = 0.05
-
 _MIN_DEPTH_M = 0.05
-
 _DEVIATIONS = 1.645  # of a normal distribution at 95 %
+
+_SAME_M = 0.5  # cells of a frontier so far apart are the same: corrections of the map move them
+_SHARE = 0.5  # of its cells with which a frontier continues an earlier one
+
+FIELDS = {
+    'ids': Field(np.int64, ('n',), 1, MAX_ID),
+    'places': Field(np.float64, ('n', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+    'visits': Field(np.int64, ('n',), 0, MAX_COUNT),
+    'cell_counts': Field(np.int64, ('n',), 0, MAX_COUNT),
+    # of the lattice of the map, place after place
+    'cells': Field(np.int64, ('k', 2), -MAX_CELL_INDEX, MAX_CELL_INDEX),
+}
 
 
 @dataclass(frozen=True)
 class BeliefModel:
-    """Fitted constants of the belief.
+    """Fitted constants of the probability that nothing is hidden behind a candidate.
 
+    The paper's threshold on a probability remains; the probability itself comes from the map: the
+    length of the frontier, the unknown area in line of sight behind it, and how deep the unknown
+    is (inside of a wall it is two or three cells); and each visit that showed nothing. Distance and
+    angles of observations, the paper's D and A, add nothing to these.
     log_odds: that nothing is hidden behind a frontier of 1 m, 1 m deep, with 1 m2 in line of sight;
     length, hidden, depth: added per natural logarithm of the length, m, of the area in line of
     sight, m2, and of the depth, m, of the unknown straight behind; visit: added for each visit that
     showed nothing. area_limits_m2, mean_area_m2: mean hidden area, if there is any, where less than
     a limit is in line of sight; the last one, where more is.
+    Source: exploration paper section 3.2; the constants are fitted, see `benchmarks/exploration/`.
     """
 
     log_odds: float
@@ -104,30 +104,6 @@ def missing_area(hidden: Iterable[tuple[float, float]]) -> MissingArea:
     return MissingArea(mean, mean * max(root, 0.0) ** 3)
 
 
-# Evidence: which frontier is which place, and what was tried there.
-#
-# - *The same place.* A frontier continues an earlier one if at least half of its cells lie on it. A
-#   cell lies on a frontier up to `_SAME_M` away, as corrections of the map move cells.
-# - *Tries* are visits that showed nothing, and failed drives. They are about the frontier as it was
-#   then: once half of it has changed, it is another place, and is tried anew. A visit is one from a
-#   place: where nothing has changed, another one from there shows nothing, either.
-# - *Left* is a place to which the robot was on its way when another one became cheaper. It counts
-#   until the robot has seen something new.
-
-FIELDS = {
-    'ids': Field(np.int64, ('n',), 1, MAX_ID),
-    'places': Field(np.float64, ('n', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
-    'visits': Field(np.int64, ('n',), 0, MAX_COUNT),
-    'cell_counts': Field(np.int64, ('n',), 0, MAX_COUNT),
-    # of the lattice of the map, place after place
-    'cells': Field(np.int64, ('k', 2), -MAX_CELL_INDEX, MAX_CELL_INDEX),
-}
-
-_SAME_M = 0.5
-
-_SHARE = 0.5
-
-
 def _no_cells() -> Cells:
     return np.zeros((0, 2), dtype=np.int64)
 
@@ -136,6 +112,11 @@ def _no_cells() -> Cells:
 class Evidence:
     """What was tried at one place (x, y), m.
 
+    Tries are visits that showed nothing, and failed drives. They are about the frontier as it was
+    then: once half of it has changed, it is another place, and is tried anew. A visit is one from a
+    place: where nothing has changed, another one from there shows nothing, either. Left is a place
+    to which the robot was on its way when another one became cheaper, until it has seen something
+    new.
     id: from FIRST_FRONTIER_ID on; cells (N, 2): of its frontier, on the lattice of the map, as it
     was at the first try; visits: how often the robot was there and the frontier stayed as it was;
     seen_from: where it was then, m; failures: how often the robot could not get there, the last
@@ -179,7 +160,10 @@ class Evidence:
 
 
 class EvidenceStore:
-    """Evidence by place: of the present frontiers, and of earlier ones that were tried."""
+    """Evidence by place: of the present frontiers, and of earlier ones that were tried.
+
+    A frontier continues an earlier one if at least half of its cells lie on it.
+    """
 
     def __init__(self, first_id: int) -> None:
         """first_id: id of the first place; no id is used twice."""

@@ -259,7 +259,7 @@ def _drives_to(candidate: Candidate, cell: Cell, frontiers: FrontierMap) -> bool
     x, y = frontiers.frame.centres_of(np.array([cell]))[0].tolist()
     if candidate.evidence.was_seen_from((x, y)):
         return False
-    candidate.goal = _facing((x, y), candidate.middle)
+    candidate.goal = se2.pose(x, y, se2.bearing((x, y), candidate.middle))
     return True
 
 
@@ -270,8 +270,3 @@ def _is_as_it_was(new: Candidate, known: Candidate, stamp_ns: int, T_map_base: A
     away_m = math.dist(new.middle, T_map_base[:2])
     is_recent = 0.0 <= age_s < max(_RENEW_S, _RENEW_S_M * away_m)
     return is_same and is_recent and known.examined_ns >= 0
-
-
-def _facing(place: Place, towards: Place) -> Array:
-    """Pose (3,) at a place, with another one ahead."""
-    return se2.pose(*place, math.atan2(towards[1] - place[1], towards[0] - place[0]))

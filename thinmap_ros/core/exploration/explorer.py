@@ -44,19 +44,26 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-# A full turn in place, before an exploration gives up beside unknown space.
-
-# Of the place where the robot turns; the end nodes' ids are below.
-TURN_ID = 2**32 - 1
-
-# With two parts, both ways to the next heading would be of the same length.
+TURN_ID = 2**32 - 1  # of the place where the robot turns; the end nodes' ids are below
+# Of a turn. With two parts, both ways to the next heading would be of the same length.
 _PARTS = 3
-
 _IS_THERE_RAD = 0.35
+
+_TURN_FROM_M = 0.3  # paths that are shorter begin with no turn
+_SAME_PLACE_M = 1.5  # a target or viewpoint that moves less is the same one
+_TURN_COST_M_RAD = 0.2  # driven in the time of a turn by one radian, at 0.2 m/s and 1 rad/s
+# Saving for which the target is changed, so that the robot does not oscillate.
+_SWITCH_MARGIN_M = 2.0
+_FIND_PERIOD_S = 1.0  # between two searches for candidates, which take time in large maps
+_MAX_VISITS = 3  # until a candidate is given up
+_MAX_FAILURES = 2
+_MAX_RESOLVED_M2 = 2.0  # of area that candidates may hide of which none is worth a visit
+_GONE_S = 0.35
+_FINAL_PAUSE_S = 40.0  # a navigator that starts, or is blocked by people, refuses goals meanwhile
 
 
 class LookAround:
-    """One full turn in place, if it can show anything.
+    """One full turn in place, before an exploration gives up, if it can show anything.
 
     At its start, a robot whose laser does not see all round may stand where it has not seen enough
     free space to drive to. is_in_the_dark: whether more is hidden around it than is known.
@@ -102,31 +109,6 @@ def _has_heading(T_map_base: Array, goal: Array) -> bool:
     return abs(se2.wrap(float(goal[2] - T_map_base[2]))) <= _IS_THERE_RAD
 
 
-_TURN_FROM_M = 0.3  # paths that are shorter begin with no turn
-
-_SAME_PLACE_M = 1.5  # a target or viewpoint that moves less is the same one
-
-_TURN_COST_M_RAD = 0.2  # driven in the time of a turn by one radian, at 0.2 m/s and 1 rad/s
-
-_SWITCH_MARGIN_M = (
-    2.0  # saving for which the target is changed, so that the robot does not oscillate
-)
-
-_SWITCH_MARGIN_M = 2.0
-
-_FIND_PERIOD_S = 1.0  # between two searches for candidates, which take time in large maps
-
-_MAX_VISITS = 3  # until a candidate is given up
-
-_MAX_FAILURES = 2
-
-_MAX_RESOLVED_M2 = 2.0  # of area that candidates may hide of which none is worth a visit
-
-_GONE_S = 0.35
-
-_FINAL_PAUSE_S = 40.0  # a navigator that starts, or is blocked by people, refuses goals meanwhile
-
-
 @dataclass(frozen=True)
 class ExplorerConfig(CandidateConfig):
     """What is worth a visit, and how the next target is chosen."""
@@ -153,14 +135,6 @@ class _Target:
     is_turn: bool = False
 
 
-@dataclass
-class _Clock:
-    """Stamps, ns: of this scan, and of the last search for candidates."""
-
-    now_ns: int = 0
-    found_ns: int = -(10**18)
-
-
 class Explorer:
     """Chooses targets, scan by scan, until no candidate is worth a visit."""
 
@@ -178,7 +152,8 @@ class Explorer:
         self._space = ReachableSpace(self.config.robot_radius_m)
         self._target = _Target()
         self._look = LookAround()
-        self._clock = _Clock()
+        self._now_ns = 0  # stamp of this scan
+        self._found_ns = -(10**18)  # and of the last search for candidates
         self._frame = self.frontier_map.frame
         self._start = Start()
         self._end = Streak()
@@ -212,13 +187,12 @@ class Explorer:
 
         patch: the whole map, on one lattice from step to step. Deterministic; call it once a scan.
         """
-        clock = self._clock
-        clock.now_ns = scan.stamp_ns
+        self._now_ns = scan.stamp_ns
         self._space.add_pose(T_map_base)
         self.frontier_map.update(patch, box_of_scan(scan, T_map_base), *self.team.take_changes())
         self._add_visit(T_map_base)
         if self._is_due():
-            clock.found_ns = scan.stamp_ns
+            self._found_ns = scan.stamp_ns
             self.team.apply_settled(self._finder.store.items, SAME_PLACE_M, scan.stamp_ns)
             self._frame = self.frontier_map.frame
             self._space.update(self.frontier_map, T_map_base)
@@ -240,7 +214,7 @@ class Explorer:
             self._look.stop()
         elif candidate is not None:
             candidate.evidence.failures += 1
-            candidate.evidence.failed_ns = self._clock.now_ns
+            candidate.evidence.failed_ns = self._now_ns
             # A robot or a person in the way is no property of the place.
             if reason.startswith(NO_PATH):
                 self.team.add_settled(candidate.evidence)
@@ -257,8 +231,6 @@ class Explorer:
         """Cells of each candidate, (N, 2), m, map frame."""
         return [self._frame.centres_of(c.cells) for c in self.candidates]
 
-    # Evidence.
-
     def _add_visit(self, T_map_base: Array) -> None:
         """A target that stays although the robot is there and observes it hides nothing, probably.
 
@@ -273,11 +245,9 @@ class Explorer:
             target.candidate.examined_ns = -1
             self._target = _Target()
 
-    # The target.
-
     def _is_due(self) -> bool:
         """Whether candidates are found again: once in a while, and when the target is gone."""
-        age_s = (self._clock.now_ns - self._clock.found_ns) / SECOND_NS
+        age_s = (self._now_ns - self._found_ns) / SECOND_NS
         if self._frame != self.frontier_map.frame or age_s >= _FIND_PERIOD_S:
             return True
         return age_s > _GONE_S and not self._target_remains()
@@ -292,7 +262,7 @@ class Explorer:
     def _choose(self, topology: TopologicalMap, T_map_base: Array) -> None:
         """Choose the target among the candidates."""
         worth = [c for c in self._doubtful if not _is_given_up(c)]
-        starts = self._start.lasts(topology, self._clock.now_ns)
+        starts = self._start.lasts(topology, self._now_ns)
         if not worth:
             self._target = _Target()
             may_end = self.frontier_map.free_cells > 0 and not starts
@@ -301,7 +271,7 @@ class Explorer:
             return
         self._end = Streak()
         self._look.stop()
-        own = self.claim(self._clock.now_ns, T_map_base)
+        own = self.claim(self._now_ns, T_map_base)
         ready = self.team.share(
             self._ready(worth), own, self._space.path_lengths_from, _SWITCH_MARGIN_M
         )
@@ -358,7 +328,7 @@ class Explorer:
         A frontier that has changed since is another candidate.
         """
         untried = [c for c in worth if not c.evidence.failures]
-        since_ns = self._clock.now_ns - _FINAL_PAUSE_S * SECOND_NS
+        since_ns = self._now_ns - _FINAL_PAUSE_S * SECOND_NS
         return untried or [c for c in worth if c.evidence.failed_ns < since_ns]
 
     def _kept(self, candidates: Iterable[Candidate]) -> Candidate | None:
@@ -399,8 +369,6 @@ class Explorer:
         lengths = self._space.path_lengths(T_map_base, goals[:, :2])
         costs = lengths + _TURN_COST_M_RAD * _turns(T_map_base, goals)
         return dict(zip(candidates, costs.tolist(), strict=True))
-
-    # The decision.
 
     def _decision(self) -> Decision:
         target = self._target

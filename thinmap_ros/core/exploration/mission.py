@@ -26,20 +26,29 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, Field
 
-# Whether a drive makes progress.
-
+# Of the progress of a drive.
 _STEP_M = 0.1
-
 _DETOUR_M = 1.0
-
 _MAX_DETOURS = 3
-
 # Longer gaps between two updates are missing inputs, no standstill.
 _MAX_GAP_S = 10.0
-
 _SAME_M = 0.1
-
 _SAME_RAD = 0.2
+
+# Of the answers of an action server.
+_FIRST_ANSWER_S = 5.0
+_LAST_ANSWER_S = 20.0
+_MAX_UNANSWERED = 3
+_MAX_REJECTED = 5
+_REJECTED_PAUSE_S = 2.0
+
+_MAX_ARRIVALS = 6
+STAYS = 'reached, but the target stays'
+# Within the distance at which a goal counts as reached: turns in place, and corrections of a pose.
+_DRIVEN_M = 0.3
+_MIN_STEP_M = 0.02
+_MIN_CORNERS = 3
+_EXPLORED = (FinishCode.ALL_RESOLVED, FinishCode.UNREACHABLE)
 
 
 def is_same_goal(a: Array, b: Array) -> bool:
@@ -96,23 +105,11 @@ class DriveProgress:
             self._path = _Approach()
 
 
-# A goal at an action server that may answer late, never, or refuse.
-
-_FIRST_ANSWER_S = 5.0
-
-_LAST_ANSWER_S = 20.0
-
-_MAX_UNANSWERED = 3
-
-_MAX_REJECTED = 5
-
-_REJECTED_PAUSE_S = 2.0
-
-
 @dataclass
 class DriveRequest:
-    """Goal (3,) that the server was given at sent_s, and what it reported on it; times in s.
+    """Goal (3,) that an action server was given at sent_s, and what it reported on it; times in s.
 
+    The server may answer late, never, or refuse.
     answer_timeout_s: after which the request counts as lost; feedback_timeout_s: after which a
     server that has published feedback is silent. A server without any feedback is never silent.
     """
@@ -186,19 +183,9 @@ class Retries:
         return not 0.0 < self._not_before_s - now_s <= _REJECTED_PAUSE_S
 
 
-# Whether the drives of an exploration have come to anything.
-
-_MAX_ARRIVALS = 6
-
-STAYS = 'reached, but the target stays'
-
-# Within the distance at which a goal counts as reached: turns in place, and corrections of a pose.
-_DRIVEN_M = 0.3
-
-
 @dataclass
 class Drives:
-    """What came of the drives so far.
+    """What came of the drives of an exploration so far.
 
     has_settled: whether a target was reached, or was none any more before the robot was there;
     failure: why the last drive failed.
@@ -246,13 +233,6 @@ class Drives:
         if self.failure and not (self.has_settled and distance_m > _DRIVEN_M):
             return f'no target was reached: {self.failure}'
         return '' if distance_m > _DRIVEN_M else 'the robot has not driven'
-
-
-_MIN_STEP_M = 0.02
-
-_MIN_CORNERS = 3
-
-_EXPLORED = (FinishCode.ALL_RESOLVED, FinishCode.UNREACHABLE)
 
 
 @dataclass(eq=False)
@@ -359,9 +339,7 @@ class Finish(NamedTuple):
         return self.is_explored and self.is_home
 
 
-Action = DriveTo | Finish | None
-
-"""What the robot shall do now; None: continue."""
+Action = DriveTo | Finish | None  # what the robot shall do now; None: continue
 
 
 @dataclass
@@ -407,27 +385,6 @@ class InputWatchdog:
         return None
 
 
-@dataclass
-class _MissionClock:
-    """Time since the start of a mission, s, that began at started_s, before_s after its start."""
-
-    started_s: float
-    before_s: float
-
-    def start(self, now_s: float) -> bool:
-        """Start with the first message of a simulated clock, which stands at 0 before it.
-
-        Returns whether that is so.
-        """
-        is_first = self.started_s == 0.0
-        if is_first:
-            self.started_s = now_s
-        return is_first
-
-    def elapsed_s(self, now_s: float) -> float:
-        return self.before_s + now_s - self.started_s
-
-
 class Mission:
     """One exploration from its start to its end.
 
@@ -456,13 +413,14 @@ class Mission:
         self.is_paused = False
         self.has_returned = False
         self._watchdog = watchdog
-        self._clock = _MissionClock(now_s, elapsed_s)
+        self._started_s = now_s
+        self._before_s = elapsed_s
         self._return_failures = 0
         watchdog.restart(now_s)
 
     def elapsed_s(self, now_s: float) -> float:
         """Time since the start."""
-        return self._clock.elapsed_s(now_s)
+        return self._before_s + now_s - self._started_s
 
     @property
     def is_running(self) -> bool:
@@ -495,7 +453,8 @@ class Mission:
 
         is_driving: whether the navigator reports on the goal that it was given.
         """
-        if self._clock.start(now_s):
+        if self._started_s == 0.0:  # a simulated clock stands at 0 before its first message
+            self._started_s = now_s
             self._watchdog.restart(now_s)
         if self.is_paused:
             self._watchdog.restart(now_s)
@@ -560,8 +519,6 @@ class Mission:
         return end
 
 
-# A mission as arrays, without its strategy: for an explorer that is killed and started again.
-
 FIELDS = {
     'budget': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
     'area': Field(np.float64, ('n', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
@@ -580,7 +537,10 @@ FIELDS = {
 
 
 def mission_state(mission: Mission, now_s: float) -> dict[str, NDArray[Any]]:
-    """Goal and progress of a mission as arrays by name; `resumed_mission` continues it."""
+    """Goal and progress of a mission as arrays by name, without its strategy.
+
+    For an explorer that is killed and started again: `resumed_mission` continues it.
+    """
     budget = mission.goal.budget
     start = mission.odometer.start
     return {

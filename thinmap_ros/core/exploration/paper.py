@@ -1,4 +1,8 @@
-"""Exploration by the position probability of end nodes, as the paper prints it."""
+"""Exploration by the position probability of end nodes, as the paper prints it.
+
+The equations come first, one by one: how likely an end node is to stay where it is once all is
+explored. Source: exploration paper sections 3.2, equations (1) to (10), and 4.
+"""
 
 import math
 from collections.abc import Sequence
@@ -24,12 +28,8 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, Place, wrap
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
-# How likely an end node is to stay where it is once all is explored: the equations, one by one.
-#
-# Source: exploration paper section 3.2, equations (1) to (10).
-
 NEAR_M = 0.5
-
+PRIOR = 0.5
 _SUREST = 1.0 - 1e-6
 
 
@@ -88,24 +88,14 @@ def bayes_update(p: float, reliability: float) -> float:
     return min(max(posterior, 1.0 - _SUREST), _SUREST)
 
 
-# Evidence about end nodes, as the paper counts it: views, visits and failed drives.
-#
-# What the paper leaves open, and how it is settled here:
-#
-# - *Independent views.* A view counts only if, since the last one that counted, the place as seen
-#   from the laser has moved by `observation_distance_m` or turned by `observation_angle_deg`.
-# - *Which views.* The place lies in the laser's range and field of view, and all cells between are
-#   free.
-# - *Moved places.* A place farther than `node_reset_distance_m` from where its evidence began loses
-#   its evidence: it was about another place. Evidence continues that of the nearest place before.
-
-PRIOR = 0.5
-
-
 @dataclass(frozen=True)
 class PaperConfig:
     """What the paper leaves open: which views count, and how long evidence stays with a place.
 
+    A view counts only if, since the last one that counted, the place as seen from the laser has
+    moved or turned far enough. The place lies in the laser's range and field of view, and all cells
+    between are free. A place too far from where its evidence began loses its evidence: it was about
+    another place. Evidence continues that of the nearest place before.
     probability_threshold: end nodes with at least this position probability are not visited;
     observation_distance_m, observation_angle_deg: motion of the robot, and change of the bearing,
     after which an end node counts as observed again; node_reset_distance_m: an end node that moves
@@ -237,23 +227,15 @@ def _continued(earlier: Array, places: Array, radius_m: float) -> list[int]:
     return indices
 
 
-# Exploration by the position probability of end nodes, as the paper prints it.
-#
-# - Each view of an end node updates its position probability by equations (1) to (10), from 0.5 on.
-# - Only end nodes below the threshold are visited: first the one that the robot faces, afterwards
-#   the nearest one on the graph. A target is kept until its probability passes the threshold or it
-#   disappears.
-# - Finished when no end node below the threshold is left.
-#
-# What the paper leaves open: which views count, and which end node continues which
-# (`paper_evidence`); an end node that the robot has reached without success is not visited again,
-# nor one that the navigator could not reach.
-#
-# Source: exploration paper sections 3.2 and 4.
-
-
 class PaperExplorer:
-    """Visits end nodes until the position probability of each one passes the threshold."""
+    """Visits end nodes until the position probability of each one passes the threshold.
+
+    Each view of an end node updates its position probability, from 0.5 on. Only end nodes below the
+    threshold are visited: first the one that the robot faces, afterwards the nearest one on the
+    graph. A target is kept until its probability passes the threshold or it disappears. What the
+    paper leaves open, besides `PaperConfig`: an end node that the robot has reached without success
+    is not visited again, nor one that the navigator could not reach.
+    """
 
     def __init__(self, config: PaperConfig | None = None) -> None:
         self.config = config or PaperConfig()
@@ -325,8 +307,7 @@ class PaperExplorer:
             return
         place = self._target.place
         if self._goal is None or not is_near(self._goal, place):  # it moves as the map grows
-            heading = math.atan2(place[1] - T_map_base[1], place[0] - T_map_base[0])
-            self._goal = se2.pose(*place, heading)
+            self._goal = se2.pose(*place, se2.bearing(T_map_base, place))
 
     def _next(
         self, left: list[PaperEndNode], topology: TopologicalMap, T_map_base: Array
@@ -361,7 +342,6 @@ def _published(node: PaperEndNode, target_goal: Array | None) -> EndNode:
     )
 
 
-def _turn(T_map_base: Array, place: tuple[float, float]) -> float:
+def _turn(T_map_base: Array, place: Place) -> float:
     """Size of the turn towards a place, rad."""
-    bearing = math.atan2(place[1] - T_map_base[1], place[0] - T_map_base[0])
-    return abs(se2.wrap(bearing - float(T_map_base[2])))
+    return abs(se2.wrap(se2.bearing(T_map_base, place) - float(T_map_base[2])))

@@ -24,30 +24,51 @@ from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import known_free, true_cells
 from thinmap_ros.jit import inlined, kernel
 
-# Frontiers of the whole map: where known free space ends although nothing stands there.
-#
-# A frontier cell is a free cell with an unknown cell above, below, left or right. Cells are found
-# again only where a scan can have changed the map. A single missing beam makes a frontier, too, so
-# only clusters of some length count.
-# Source: Yamauchi, "A frontier-based approach for autonomous exploration", 1997.
-
 NOTHING: Bounds = (0, 0, 0, 0)
 
+# Of frontiers.
 _GAPS = TopologyConfig()
-
 _SPARE_CELLS = 64  # of room on each side: where it is used up, all is rebuilt
-
 _MARGIN_CELLS = 3  # read beyond those that are written, so that the cut is no frontier
-
 _UPDATES_PER_WHOLE_MAP = 100  # corrections of the map reach cells that no scan can change
+
+# Of the unknown behind them.
+HIDDEN_REACH_M = 4.0  # to which unknown area counts as in line of sight
+DEPTH_REACH_M = 1.0  # deeper frontiers hide something alike often
+_RAYS = 120
+_DEPTH_RAYS = 64  # of a cluster at most
+_DEPTH_QUANTILE = 0.8
+_AROUND = 2  # cells on each side of a frontier cell that show where the unknown lies
+_SKIPPED = 2  # free cells with which a ray at an angle may begin
+
+_RIM_M = 0.5  # beyond the beams of a scan, in which it may have changed the map
+
+# Of viewpoints. Not more: across a wall one cell thick places where a robot can stand are six cells
+# apart, and stay apart in squares.
+SQUARE = 3
+# Most of what a border hides: so much of so many points. Of a long one, with a point every so many
+# cells, as many.
+_POINTS = 8
+_SHARE = 0.7
+_SPACING = 10
+_STRIDE = 4
+_SLACK_CELLS = 5
+
+# Of what can be reached.
+_ESCAPE_M = 0.6
+_DETOUR = 3.0  # of the straight line, where no path is known
 
 
 class FrontierMap:
     """Frontier cells of the whole map, updated where a scan can have changed it.
 
+    Known free space ends at a frontier although nothing stands there: a frontier cell is a free
+    cell with an unknown cell above, below, left or right. A single missing beam makes a frontier,
+    too, so only clusters of some length count.
     free (H, W): known free cells, small gaps closed; passable (H, W): all but occupied cells; mask
     (H, W): frontier cells; all on the cells of `frame`, which holds the map and some room for it to
     grow. free_cells: how many are free.
+    Source: Yamauchi, "A frontier-based approach for autonomous exploration", 1997.
     """
 
     def __init__(self) -> None:
@@ -63,7 +84,7 @@ class FrontierMap:
     def update(self, patch: GridPatch, *boxes: Array) -> None:
         """Find the frontier cells of the whole map in some boxes; now and then everywhere.
 
-        boxes (2, 2): lower left and upper right corner, m, of what a scan (visibility.box_of_scan)
+        boxes (2, 2): lower left and upper right corner, m, of what a scan (`box_of_scan`)
         or another robot has changed. It begins anew where the map has outgrown its room, lies on
         another lattice, or is replaced.
         """
@@ -221,28 +242,12 @@ def _clusters(
     return numbers, sizes[:clusters].copy()
 
 
-# Unknown space behind a frontier: its area in line of sight, and its depth straight behind.
-#
-# Both are evidence of what the frontier hides: behind one that runs along a wall, inside of which
-# no cell is known, the unknown is two or three cells deep.
-
-HIDDEN_REACH_M = 4.0  # to which unknown area counts as in line of sight
-
-DEPTH_REACH_M = 1.0  # deeper frontiers hide something alike often
-
-_RAYS = 120
-
-_DEPTH_RAYS = 64  # of a cluster at most
-
-_DEPTH_QUANTILE = 0.8
-
-_AROUND = 2  # cells on each side of a frontier cell that show where the unknown lies
-
-_SKIPPED = 2  # free cells with which a ray at an angle may begin
-
-
 def hidden_area_m2(frontiers: FrontierMap, place: Place, reach_m: float = HIDDEN_REACH_M) -> float:
-    """Unknown area in line of sight of a place, m: through the unknown, up to an obstacle."""
+    """Unknown area in line of sight of a place, m: through the unknown, up to an obstacle.
+
+    As `depth_behind_m`, it is evidence of what a frontier hides: behind one that runs along a wall,
+    inside of which no cell is known, the unknown is two or three cells deep.
+    """
     row, col = frontiers.frame.cells_of(np.array([place]))[0]
     resolution = frontiers.frame.resolution
     reach = reach_m / resolution
@@ -330,11 +335,6 @@ def _depth(free: Mask, passable: Mask, row: int, col: int, reach: int) -> float:
     return depth
 
 
-# What a scan sees, and where it may have changed the map.
-
-_RIM_M = 0.5
-
-
 def field_of_view(scan: Scan) -> tuple[float, float]:
     """Field of view of a scan: its first and last direction, rad, laser frame.
 
@@ -400,35 +400,15 @@ def _box(
     return box
 
 
-# Viewpoints: from where a robot sees most of what a frontier hides.
-#
-# Some points straight behind the frontier's cells stand for the unknown. A viewpoint has the
-# shortest path of all places from which most of these points could be seen if nothing stands in the
-# unknown. A robot on the known side of a corner sees along the frontier, but nothing that the
-# corner hides; one at the end of its laser's range has to come only a little nearer.
-
-# Not more: across a wall one cell thick places where a robot can stand are six cells apart, and
-# stay apart in squares.
-SQUARE = 3
-
-# Most of what a border hides: so much of so many points. Of a long one, with a point every so many
-# cells, as many.
-_POINTS = 8
-
-_SHARE = 0.7
-
-_SPACING = 10
-
-_STRIDE = 4
-
-_SLACK_CELLS = 5
-
-
 def place_for(
     free: Mask, passable: Mask, cells: Cells, allowed: Mask, ways: Array, depth: int, reach: float
 ) -> Cell | None:
     """Allowed cell with the shortest path that observes most of the space behind a frontier (N, 2).
 
+    Some points straight behind the frontier's cells stand for the unknown. Most of these could be
+    seen from there if nothing stands in the unknown. A robot on the known side of a corner sees
+    along the frontier, but nothing that the corner hides; one at the end of its laser's range has
+    to come only a little nearer.
     free, passable (all cells that are not occupied), allowed (H, W);
     ways (ceil(H / SQUARE), ceil(W / SQUARE)): path length to each square of SQUARE x SQUARE cells;
     the robot would stand in its middle; depth: of the space behind the frontier, in cells;
@@ -574,13 +554,6 @@ def _search_beside(
                 queue[tail] = r, c, steps + 1
                 tail += 1
     return place[0], place[1], is_enclosed
-
-
-# Where the robot can stand, where it can get from here, and how long the paths are.
-
-_ESCAPE_M = 0.6
-
-_DETOUR = 3.0  # of the straight line, where no path is known
 
 
 class Reachable(NamedTuple):

@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.errors import counted
 from thinmap_ros.core.exploration.belief import MissingArea, missing_area
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
@@ -19,11 +20,8 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 FIRST_FRONTIER_ID = 2_000_000_000
 
 _NEAR_M = 0.3
-
 _NEAR_RAD = 0.35
-
 _MIN_SCANS = 3
-
 _START_S = 5.0
 
 
@@ -199,7 +197,7 @@ def decide(
     """
     target = next((node for node in end_nodes if node.is_target), None)
     code = FinishCode.NONE
-    words = f'{left} end node{"" if left == 1 else "s"} left'
+    words = f'{counted(left, "end node")} left'
     if is_finished:
         code = FinishCode.UNREACHABLE if left else FinishCode.ALL_RESOLVED
         gone = f'{words}, which the robot cannot reach or see into'
@@ -207,9 +205,6 @@ def decide(
     return Decision(
         target, is_finished, words, code, end_nodes, sorted(aside), known_area_m2, left, hidden
     )
-
-
-# What a strategy decides from.
 
 
 class Observation(NamedTuple):

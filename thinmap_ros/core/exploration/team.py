@@ -14,16 +14,16 @@ from thinmap_ros.core.exploration.belief import Evidence
 from thinmap_ros.core.exploration.candidates import Candidate
 from thinmap_ros.core.se2 import SECOND_NS, Array, Place
 
-# The auction: who explores what, decided by each robot alone from the claims of all.
-#
-# Pairs of robot and candidate are formed, the shortest path first, one candidate for each robot. A
-# robot keeps what it has claimed unless another one is clearly nearer.
-# Sources: Zlot et al., "Multi-robot exploration controlled by a market economy", 2002; Werger and
-# Mataric, "Broadcast of local eligibility", 2000.
-
 NOTHING = -1
-
 _TIE_M = 0.1  # paths that differ less are equally long
+_CLAIM_RADIUS_M = 2.0  # a candidate belongs to a claim of a place within this distance
+_MAX_CANDIDATES = 40  # in an auction; the nearest ones
+
+SAME_PLACE_M = 0.5  # a claimed place that moves less is the same one
+MAX_SETTLED = 8  # places in a claim
+_PROGRESS_M = 0.5
+
+LengthsFrom = Callable[[Array, Array], Array]  # path lengths (N,), m, from a pose to goals (N, 2)
 
 
 def auction(
@@ -31,10 +31,15 @@ def auction(
 ) -> NDArray[np.int64]:
     """Candidate (R,) that each robot explores, NOTHING where there are fewer candidates.
 
+    Each robot decides this alone from the claims of all. Pairs of robot and candidate are formed,
+    the shortest path first, one candidate for each robot. A robot keeps what it has claimed unless
+    another one is clearly nearer.
     lengths_m (R, N): path length from each robot to each candidate, robots in the order in which
     ties are decided; claimed (R,): the candidate that each has claimed, or NOTHING; told_m (R,):
     path length to it of which each has told the others; margin_m: a claimed candidate counts as so
     much nearer.
+    Sources: Zlot et al., "Multi-robot exploration controlled by a market economy", 2002; Werger and
+    Mataric, "Broadcast of local eligibility", 2000.
     """
     robots, count = lengths_m.shape
     bids = np.round(lengths_m / _TIE_M)
@@ -61,16 +66,6 @@ def _holds(robot: int, claimed: NDArray[np.int64], told_m: Array) -> bool:
         return False
     rivals = np.flatnonzero(claimed == candidate)
     return int(rivals[told_m[rivals].argmin()]) == robot
-
-
-# Claims: what each robot of a team sends the others, and how long it holds.
-#
-# A claim names the place of a frontier and no id of a node, so that each robot can have a graph of
-# its own. It holds as long as its robot is received and comes nearer to the place.
-
-SAME_PLACE_M = 0.5  # a claimed place that moves less is the same one
-
-_PROGRESS_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -112,6 +107,8 @@ class SettledPlace(NamedTuple):
 class Claim:
     """What a robot sends the others, about once a second and when its target changes.
 
+    It names the place of a frontier and no id of a node, so that each robot can have a graph of its
+    own. It holds as long as its robot is received and comes nearer to the place.
     robot: its name; stamp_ns: by its own clock; pose (3,); place: of the frontier that it drives
     to, m, None without a target; remaining_m: rest of its path, 0 before it is planned; settled:
     its latest places; explores: False for one that takes no candidate, whatever is left.
@@ -200,17 +197,6 @@ def is_same_place(a: Place | None, b: Place | None) -> bool:
     if a is None or b is None:
         return a is b
     return math.dist(a, b) <= SAME_PLACE_M
-
-
-_CLAIM_RADIUS_M = 2.0  # a candidate belongs to a claim of a place within this distance
-
-_MAX_CANDIDATES = 40  # in an auction; the nearest ones
-
-MAX_SETTLED = 8  # places in a claim
-
-LengthsFrom = Callable[[Array, Array], Array]
-
-"""Path lengths (N,), m, from a pose (3,) to goals (N, 2)."""
 
 
 @dataclass(frozen=True)

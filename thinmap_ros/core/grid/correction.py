@@ -21,9 +21,15 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.stage import Destination
 
-# Stored poses and scans, for re-rendering the grid after a loop closure.
-
 _MAX_PLACE = 1 << 26  # more places than lie within MAX_COORDINATE_M
+_MARGIN_CELLS = 2  # by which the cells of a scan may lie beyond the ends of its beams
+MAX_OPEN = 1000  # scans that wait, the latest; 10 MB of a robot that stands at a start pose
+
+# Work of a slice, in tiles that scans may touch: 2 to 15 ms on a desktop processor.
+_TILES_PER_SLICE = 512
+# At least two scans, whatever they touch: while one scan arrives, two are rendered.
+_SCANS_PER_SLICE = 2
+_LAST_RING = 1 << 30
 
 Kept = TypeVar('Kept')
 
@@ -165,8 +171,7 @@ def _places_of(poses: Array, config: HistoryConfig) -> NDArray[np.int64]:
     """Number (N,) of the place and direction of each pose (N, 3)."""
     turn = np.floor(poses[:, 2] % (2.0 * math.pi) / (2.0 * math.pi) * config.directions)
     x, y = np.floor(poses[:, :2] / config.place_m).astype(np.int64).T
-    places: NDArray[np.int64] = (x * _MAX_PLACE + y) * config.directions + turn.astype(np.int64)
-    return places
+    return np.asarray((x * _MAX_PLACE + y) * config.directions + turn.astype(np.int64))
 
 
 def _numbers_of(
@@ -194,11 +199,6 @@ def _moved_along(poses: Array, before: Array, after: Array) -> Array:
     x = after[:, 0] + c * dx - s * dy
     y = after[:, 1] + s * dx + c * dy
     return np.column_stack([x, y, se2.wrap(poses[:, 2] + turn)])
-
-
-# Erasing a part of a grid, so that scans from before do not draw it again.
-
-_MARGIN_CELLS = 2  # by which the cells of a scan may lie beyond the ends of its beams
 
 
 def erase(grid: OccupancyGrid, corners: Array) -> None:
@@ -264,17 +264,6 @@ def _reach(grid: OccupancyGrid, scan: Scan, T_map_base: Array) -> Bounds:
     reach_m = min(scan.max_range_m, scan.range_max_m + grid.config.surface_thickness_m)
     cells = math.ceil(reach_m / grid.frame.resolution) + _MARGIN_CELLS
     return row - cells, col - cells, row + cells + 1, col + cells + 1
-
-
-# Re-renders a grid in slices after a correction, tiles near the robot first.
-
-# Work of a slice, in tiles that scans may touch: 2 to 15 ms on a desktop processor.
-_TILES_PER_SLICE = 512
-
-# At least two scans, whatever they touch: while one scan arrives, two are rendered.
-_SCANS_PER_SLICE = 2
-
-_LAST_RING = 1 << 30
 
 
 class StoredScan(NamedTuple):
@@ -447,8 +436,7 @@ class Rerendering:
     def _rings(self, low: Cells, high: Cells) -> Cells:
         """Nearest ring (N,) of each box of tiles from low (N, 2) to high (N, 2), inclusive."""
         beyond = np.maximum(low - self._robot_tile, self._robot_tile - high)
-        rings: Cells = np.maximum(beyond.max(axis=1), 0)
-        return rings
+        return np.asarray(np.maximum(beyond.max(axis=1), 0))
 
 
 def _tile_boxes(extents: Sequence[Array], poses: Array, frame: GridFrame) -> Cells:
@@ -465,13 +453,8 @@ def _tile_boxes(extents: Sequence[Array], poses: Array, frame: GridFrame) -> Cel
     return np.floor(np.stack([low, high], axis=1) / TILE).astype(np.int64)
 
 
-# Occupancy grid that is corrected after loop closures, and once a laser proves to drop out.
-
-MAX_OPEN = 1000  # scans that wait, the latest; 10 MB of a robot that stands at a start pose
-
-
 class CorrectableGrid:
-    """A grid that is re-rendered from stored scans after a correction, one slice per scan.
+    """A grid that is re-rendered from stored scans after a loop closure, one slice per scan.
 
     So it is when the beams without return of a laser turn out to show no free space (`drops_out`).
     `shown` is the published map. It is always complete: each tile shows the old rendering until its

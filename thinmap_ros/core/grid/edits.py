@@ -14,11 +14,27 @@ from thinmap_ros.core.grid.patch import Bounds, GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_ID, Field, State
 
-# Polygons on the cells of a map.
-
 _WALL = np.int8(100)
 
 _STEPS_PER_CELL = 8  # along a line
+
+MAX_AREAS = 100
+MAX_CORNERS = 200
+MAX_OUTLINE_M = 1000.0
+MAX_STORED_OUTLINE_M = 2.0 * MAX_OUTLINE_M  # numbers are rounded on the way
+MAX_MASK_CELLS = 1 << 24  # 205 x 205 m in cells of 0.05 m
+AREA_CORNERS = 3  # at least
+WALL_CORNERS = 2
+MAX_ERASURES = 200
+_STAMP_LIMIT_NS = 2**62
+
+FIELDS = {
+    'keep_out': Field(np.int64, ('a', 3), (1, 0, 1), (MAX_ID, 1, MAX_CORNERS)),
+    'keep_out_xy': Field(np.float64, ('c', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+    'keep_out_next_id': Field(np.int64, (), 1, MAX_ID + 1),
+    'erased': Field(np.int64, ('e', 2), (0, 1), (_STAMP_LIMIT_NS, MAX_CORNERS)),
+    'erased_xy': Field(np.float64, ('d', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+}
 
 
 def inside(points: Array, polygon: Array) -> Mask:
@@ -92,25 +108,6 @@ def _draw_line(cells: Mask, begin: Array, end: Array) -> None:
     cells[rows[inside], cols[inside]] = True
 
 
-# Keep-out areas and virtual walls: where a robot must not drive, whatever the map shows.
-#
-# They are no part of the map, which is what was observed. Planners lay them on it as walls.
-
-MAX_AREAS = 100
-
-MAX_CORNERS = 200
-
-MAX_OUTLINE_M = 1000.0
-
-MAX_STORED_OUTLINE_M = 2.0 * MAX_OUTLINE_M  # numbers are rounded on the way
-
-MAX_MASK_CELLS = 1 << 24  # 205 x 205 m in cells of 0.05 m
-
-AREA_CORNERS = 3  # at least
-
-WALL_CORNERS = 2
-
-
 @dataclass(frozen=True, eq=False)
 class KeepOutArea:
     """A polygon, or a line that is a wall, with corners (M, 2), m, map frame.
@@ -143,6 +140,8 @@ class KeepOutArea:
 class KeepOut:
     """All areas and walls of a map, in the order in which they were added.
 
+    A robot must not drive there, whatever the map shows. They are no part of the map, which is what
+    was observed: planners lay them on it as walls.
     next_id: smallest number that none has had.
     """
 
@@ -306,19 +305,6 @@ def moved_corners(corners: Array, before: Array, after: Array) -> Array:
     k = int(away.argmin())
     T = se2.compose(after[k], se2.invert(before[k]))
     return se2.transform_points(T, corners)
-
-
-MAX_ERASURES = 200
-
-_STAMP_LIMIT_NS = 2**62
-
-FIELDS = {
-    'keep_out': Field(np.int64, ('a', 3), (1, 0, 1), (MAX_ID, 1, MAX_CORNERS)),
-    'keep_out_xy': Field(np.float64, ('c', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
-    'keep_out_next_id': Field(np.int64, (), 1, MAX_ID + 1),
-    'erased': Field(np.int64, ('e', 2), (0, 1), (_STAMP_LIMIT_NS, MAX_CORNERS)),
-    'erased_xy': Field(np.float64, ('d', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
-}
 
 
 class Erasure(NamedTuple):

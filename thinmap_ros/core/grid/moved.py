@@ -13,12 +13,16 @@ from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridFrame, G
 from thinmap_ros.core.grid.tiles import MAX_CELLS
 from thinmap_ros.core.se2 import Array, Cells, Mask
 
-# How the places of a map have moved: each as the pose nearest to it.
+_ALIGNED_RAD = 1e-6
+_BLOCK = 8  # edge, in cells, of blocks that move as one
 
 
 @dataclass(frozen=True, eq=False)
 class MapMotion:
-    """Poses (N >= 1, 3) of places in a map, before and after it was moved or bent."""
+    """Poses (N >= 1, 3) of places in a map, before and after it was moved or bent.
+
+    All else moves as the pose nearest to it.
+    """
 
     before: Array
     after: Array
@@ -57,13 +61,6 @@ def _nearest(poses: Array, points: Array) -> NDArray[np.int64]:
     from scipy.spatial import cKDTree
 
     return np.asarray(cKDTree(poses[:, :2]).query(points)[1], dtype=np.int64)
-
-
-# Maps at a pose, or bent: with rows that are not parallel to the x axis, or laid over another.
-
-_ALIGNED_RAD = 1e-6
-
-_BLOCK = 8  # edge, in cells, of blocks that move as one
 
 
 def aligned_patch(

@@ -24,13 +24,6 @@ from thinmap_ros.core.grid.patch import (
 from thinmap_ros.core.grid.tiles import MAX_CELLS
 from thinmap_ros.core.se2 import Array
 
-# Tiles of a map that have changed: what robots send each other of their maps.
-#
-# A tile has 16 x 16 cells of 2 bits: unknown, free, occupied, or in between. A message holds the
-# tiles that have changed between two versions of the sender's map, compressed. A receiver that has
-# missed one notices by its versions, and asks for all that has changed since the last that it has.
-# The lattices of both maps must be the same.
-
 
 def _table() -> NDArray[np.uint8]:
     """Bits of each value of a cell."""
@@ -43,36 +36,31 @@ def _table() -> NDArray[np.uint8]:
 
 
 EDGE = 16
-
 _PACKED_BYTES = EDGE * EDGE // 4
+_UNKNOWN_TILE = bytes(_PACKED_BYTES)
+_MAX_TILES = 1 << 16
+_HEADER = struct.Struct('<IIIddd')
+_SHIFTS = np.array([0, 2, 4, 6], dtype=np.uint8)
+_CELLS = np.array([UNKNOWN, 0, 100, 50], dtype=np.int8)  # in the order of their bits
+_TABLE = _table()
 
 # Percent: after some four beams, of which most agree. docs/theory/exploration.md has the ablation.
 _SURELY_FREE = 10
-
 _SURELY_OCCUPIED = 90
 
-_MAX_TILES = 1 << 16
+# Updates that may be received before the whole map that they follow: those of some seconds.
+_MAX_KEPT_UPDATES = 50
 
-_HEADER = struct.Struct('<IIIddd')
-
-_SHIFTS = np.array([0, 2, 4, 6], dtype=np.uint8)
-
-# In the order of their bits.
-_CELLS = np.array([UNKNOWN, 0, 100, 50], dtype=np.int8)
-
-_TABLE = _table()
-
-_UNKNOWN_TILE = bytes(_PACKED_BYTES)
-
-Key = tuple[int, int]
-
-"""Row and column of a tile, in tiles from the origin of its frame."""
+Key = tuple[int, int]  # row and column of a tile, in tiles from the origin of its frame
 
 
 @dataclass(frozen=True)
 class TileMessage:
     """Tiles that have changed after one version of a map, up to another one.
 
+    A tile has 16 x 16 cells of 2 bits: unknown, free, occupied, or in between. A receiver that has
+    missed a message notices by its versions, and asks for all that has changed since the last that
+    it has. The lattices of both maps must be the same.
     frame: of the lattice; tiles: packed cells by row and column.
     """
 
@@ -280,11 +268,7 @@ def _tiles_of(patch: GridPatch, frame: GridFrame) -> dict[Key, bytes]:
 def _unpacked(packed: bytes) -> NDArray[np.int8]:
     """Cells (16, 16) of a tile."""
     bits = np.frombuffer(packed, dtype=np.uint8)[:, None] >> _SHIFTS & 3
-    cells: NDArray[np.int8] = _CELLS[bits].reshape(EDGE, EDGE)
-    return cells
-
-
-# Maps of other robots, received as tiles, laid into a robot's own map where that is undecided.
+    return np.asarray(_CELLS[bits].reshape(EDGE, EDGE))
 
 
 class _JoinedMap:
@@ -421,12 +405,6 @@ def _corners_of(box: Array) -> Array:
     return np.array([[x, y] for x in box[:, 0] for y in box[:, 1]])
 
 
-# Local copy of the map of another node, assembled from what it publishes.
-
-# Updates that may be received before the whole map that they follow: those of some seconds.
-_MAX_KEPT_UPDATES = 50
-
-
 class _Update(NamedTuple):
     """Cells from a row and a column of the map on."""
 
@@ -437,7 +415,7 @@ class _Update(NamedTuple):
 
 
 class MapReceiver:
-    """The newest whole map, with newer updates and windows in it.
+    """A copy of the map of another node: the newest whole map, with newer updates and windows.
 
     The lattice of all patches must be the same. Whole maps and updates have a topic each, and those
     of one topic may overtake the others: an update is made where it is newer than the whole map, by

@@ -11,39 +11,44 @@ from thinmap_ros.core.scan import MIN_HITS, NO_RETURN_CLEAR_RANGE_M, Scan, is_mo
 from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 from thinmap_ros.jit import kernel
 
-# Decides from the data whether a beam without return shows free space.
-#
-# A laser whose range ends in a hall has no return because nothing is in range. Cheap lasers also
-# drop returns of surfaces in range. The second kind contradicts itself: its beams without return
-# cross surfaces that it has just measured.
+_MIN_STEP_RAD = 1e-6
 
+# Of lasers that drop returns.
 _FAN_REACH = 0.8  # of the range: farther walls at a small angle may have gone out of range
 
 _APART_M = 0.1
-
 _APART_RAD = 0.1
 
 # Odometry drifts little over 4 m of path. Its turns are wrong by some percent: after half a radian,
 # by a beam.
 _VIEWS = 40
-
 _MAX_TURN_RAD = 0.5
-
 _SAME_SURFACE_M = 0.1
-
-_MIN_STEP_RAD = 1e-6
-
 # Measured over whole recordings: at most 0.017 with lasers of 3 to 80 m in rooms, halls and
 # outdoors; 0.05 with one that drops 5 % of its returns, 0.27 and 0.53 with cheap ones.
 _MAX_MISSED = 0.03
-
 # Measured: at most 0.06 in halls and outdoors, 0.15 and more with lasers that drop returns.
 _MAX_WRONG = 0.1
 
+# Of a finite range for beams without return. No surface gives exactly the same range to so many
+# beams: ranges are noisy, and walls are oblique.
+_MIN_SHARE = 0.2
+# Real ranges may lie between that value and range_max.
+_MAX_BEYOND = 0.05
+
+# Of scans that no laser measured.
+FROZEN = 'the same ranges while the robot moves'
+NO_RETURNS = 'no returns from surfaces that it has just measured'
+_MOVED_REACH = 0.9  # of range_max: a farther surface may have gone out of range
+_CONFIRMED_NS = 2 * SECOND_NS
+
 
 class DropoutDetector:
-    """Decides for a laser whether its beams without return show free space.
+    """Decides from the data whether the beams of a laser without return show free space.
 
+    A laser whose range ends in a hall has no return because nothing is in range. Cheap lasers also
+    drop returns of surfaces in range. The second kind contradicts itself: its beams without return
+    cross surfaces that it has just measured.
     Views are scans 0.1 m or 0.1 rad apart. In each, the beams are counted that point at a surface
     of earlier views within the range that a beam without return clears, and those of them that have
     no return. No return does not mean free if the laser misses more than 3 % of what it must hit,
@@ -158,15 +163,6 @@ def _aimed(points: Array, laser: Array, count: int, fan: tuple[float, float, flo
     return aimed
 
 
-# Recognizes a finite range that a driver publishes for beams without return.
-
-# No surface gives exactly the same range to so many beams: ranges are noisy, and walls are oblique.
-_MIN_SHARE = 0.2
-
-# Real ranges may lie between that value and range_max.
-_MAX_BEYOND = 0.05
-
-
 class NoReturnRange:
     """Largest range of a laser whose driver publishes a value below range_max for no return.
 
@@ -205,17 +201,6 @@ class NoReturnRange:
     def _is_largest(self, scan: Scan, range_m: float) -> bool:
         beyond = np.count_nonzero(scan.ranges_m[scan.returned] > range_m)
         return bool(beyond <= _MAX_BEYOND * scan.ranges_m.size)
-
-
-# Detects scans that a laser did not measure, by the scans before and the motion of the robot.
-
-FROZEN = 'the same ranges while the robot moves'
-
-NO_RETURNS = 'no returns from surfaces that it has just measured'
-
-_MOVED_REACH = 0.9  # of range_max: a farther surface may have gone out of range
-
-_CONFIRMED_NS = 2 * SECOND_NS
 
 
 @dataclass(frozen=True)
@@ -337,14 +322,11 @@ class LaserMonitor:
         return contradicts
 
 
-# Other robots in a scan: beams that end at them are no evidence about the map.
-
-
 def without_robots(scan: Scan, T_map_base: Array, places: Array, radius_m: float) -> Scan:
     """Scan made at a pose (3,) with the beams invalid that end within radius_m of places (M, 2), m.
 
-    The beams beside these are invalid as well: their ranges may be mixed with those
-    of walls behind.
+    Other robots are there: they are no evidence about the map. The beams beside these are invalid
+    as well: their ranges may be mixed with those of walls behind.
     """
     hit = np.flatnonzero(scan.hit)
     if not len(places) or not hit.size:

@@ -13,15 +13,6 @@ from thinmap_ros.core.scan import MIN_HITS, Scan
 from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, rotation
 from thinmap_ros.core.stage import Estimate
 
-# Estimates by how much the pose of the laser on the robot is wrong.
-#
-# A laser that is turned on the robot turns the motion that scan matching finds against that of the
-# odometry. A laser in another place moves while the robot turns in place. With a motion M by
-# odometry and the same motion F by scan matching, F = inverse(E) o M o E for the error E of the
-# mount. The translations are linear in the position of the laser and in cosine and sine of its yaw.
-# Source: Shiu and Ahmad, "Calibration of wrist-mounted robotic sensors by solving homogeneous
-# transform equations of the form AX = XB", 1989, in the plane.
-
 _ITERATIONS = 3
 
 
@@ -100,7 +91,16 @@ class _Span:
 
 
 class MountErrorEstimator:
-    """Compares the motion by scan matching with that by odometry."""
+    """Estimates by how much the pose of the laser on the robot is wrong.
+
+    A laser that is turned on the robot turns the motion that scan matching finds against that of
+    the odometry. A laser in another place moves while the robot turns in place. With a motion M by
+    odometry and the same motion F by scan matching, F = inverse(E) o M o E for the error E of the
+    mount. The translations are linear in the position of the laser and in cosine and sine of its
+    yaw.
+    Source: Shiu and Ahmad, "Calibration of wrist-mounted robotic sensors by solving homogeneous
+    transform equations of the form AX = XB", 1989, in the plane.
+    """
 
     def __init__(self, config: MountErrorConfig | None = None) -> None:
         self._config = config or MountErrorConfig()
@@ -262,14 +262,6 @@ def _first_yaw(H: Array, y: Array, place: Array, config: MountErrorConfig) -> fl
     return float(yaws[int(cost.argmin())])
 
 
-# Compares the turns of scans with those of the odometry, to find a mirrored laser.
-#
-# A driver whose angle increment has the wrong sign exchanges left and right. The map is a perfect
-# mirror image then, and nothing within the scans contradicts it. Only the scans turn against the
-# odometry. The turn between two near scans is that with which most of their ranges agree. The
-# odometry's translation is applied to it, its turn is not.
-
-
 @dataclass(frozen=True)
 class TurnComparisonConfig:
     """Scans that are compared, and how.
@@ -332,7 +324,13 @@ class Turns:
 
 
 class TurnComparison:
-    """Sums up the turns of scans, found without odometry, and those of the odometry."""
+    """Sums up the turns of scans and those of the odometry, to find a mirrored laser.
+
+    A driver whose angle increment has the wrong sign exchanges left and right. The map is a perfect
+    mirror image then, and nothing within the scans contradicts it. Only the scans turn against the
+    odometry. The turn between two near scans is that with which most of their ranges agree. The
+    odometry's translation is applied to it, its turn is not.
+    """
 
     def __init__(self, config: TurnComparisonConfig | None = None) -> None:
         self._config = config or TurnComparisonConfig()

@@ -1,4 +1,4 @@
-"""Scans with the odometry at their stamps, and without the motion during them."""
+"""Scans with the odometry at their stamps, without the motion during them; late measurements."""
 
 import math
 from collections import deque
@@ -15,22 +15,25 @@ from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 from thinmap_ros.core.sensing.beams import LaserMonitor
 from thinmap_ros.jit import inlined, kernel
 
-# Motion within a scan: all beams are moved to the stamp of the scan.
-#
-# A spinning laser measures its beams one after the other. At 1 rad/s and 7 Hz the last beam points
-# 8 degrees aside of where it would have pointed at the stamp. Odometry tells the motion in between.
-
 # Largest relative difference between the stated and the measured time of a revolution.
 _TOLERANCE = 0.2
-
 _USUAL_SCANS = 15
-
 # Neighbouring beams are on one surface where the range changes by at most this often the distance
 # between them: up to an angle of incidence of 70 degrees.
 _MAX_SLOPE = 3.0
-
 # A beam stands for its own direction and for half of the way to its neighbours.
 _NEAR = 0.75
+
+# Of streams of measurements.
+_USUAL_INTERVALS = 5
+_GAP_INTERVALS = 3.0  # a longer silence is no low rate
+# Two clocks of machines that are not synchronized drift apart by up to 1e-4.
+_DRIFT = 2e-4
+# A message may overtake another one. Several before the newest stamp: the clock was set back.
+_SET_BACK = 2
+# Stamps of one source grow. Two that do not, within so long: the diagnostics look once a second.
+_MIXED = 2
+_MIXED_NS = 2 * SECOND_NS
 
 
 class SweepTiming:
@@ -69,6 +72,9 @@ class SweepTiming:
 def deskewed(scan: Scan, stamps_ns: NDArray[np.int64], poses: Array) -> Scan:
     """The scan as a laser had measured it that makes all beams at the stamp of the scan.
 
+    A spinning laser measures its beams one after the other. At 1 rad/s and 7 Hz the last beam
+    points 8 degrees aside of where it would have pointed at the stamp. Odometry tells the motion in
+    between.
     poses (K, 3): odometry at ascending stamps (K,) that cover the stamp and the times of all beams.
     Beams keep their bearings: the surface between two moved ends gives the range in between. A
     bearing that no beam covers any more is invalid (NaN). Rounded to float32 as `Scan.create` does.
@@ -248,24 +254,6 @@ class ScanOdometrySynchronizer:
             return scan
         sweep = self._buffer.between(scan.begin_ns, scan.end_ns)
         return scan if sweep is None else deskewed(scan, *sweep)
-
-
-# Whether the measurements of a source are received often enough, and in time.
-
-_USUAL_INTERVALS = 5
-
-_GAP_INTERVALS = 3.0  # a longer silence is no low rate
-
-# Two clocks of machines that are not synchronized drift apart by up to 1e-4.
-_DRIFT = 2e-4
-
-# A message may overtake another one. Several before the newest stamp: the clock was set back.
-_SET_BACK = 2
-
-# Stamps of one source grow. Two that do not, within so long: the diagnostics look once a second.
-_MIXED = 2
-
-_MIXED_NS = 2 * SECOND_NS
 
 
 class Lateness:

@@ -13,11 +13,22 @@ from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, lengths_along
 from thinmap_ros.core.snapshot import Field
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-# Regions of a map and the doors between them, as values.
+_STEP_M = 0.05  # between points of a path
+_REACH_M = 0.5  # of a point from the nearest region
+
+MAX_NAMES = 1000
+MAX_LENGTH = 64
+_MAX_LETTER = 0x10FFFF
+
+FIELDS = {
+    'name_anchors': Field(np.float64, ('n', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+    # Code points, 0 behind the end.
+    'name_letters': Field(np.int32, ('n', MAX_LENGTH), 0, _MAX_LETTER),
+}
 
 
 class RegionKind(IntEnum):
@@ -90,13 +101,6 @@ class RegionMap:
         return {region: sorted(ends) for region, ends in found.items()}
 
 
-# Regions of the nodes and edges of a topological map, and doors on its edges.
-
-_STEP_M = 0.05
-
-_REACH_M = 0.5  # of a point from the nearest region
-
-
 @dataclass(frozen=True, eq=False)
 class Membership:
     """Regions, and the id of that of each node and edge, by id; without those in no region.
@@ -144,7 +148,7 @@ def membership_of(topology: TopologicalMap, regions: RegionMap) -> Membership:
 
 def _sampled(path: Array) -> Array:
     """Points (N, 2) every _STEP_M along a path (K, 2)."""
-    along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
+    along = lengths_along(path)
     marks = np.linspace(0.0, along[-1], 2 + int(along[-1] / _STEP_M))
     return np.column_stack([np.interp(marks, along, path[:, axis]) for axis in (0, 1)])
 
@@ -188,23 +192,6 @@ def _nearest_ids(regions: RegionMap, points: Array) -> list[int]:
 
 def _without_0(ids: dict[int, int]) -> dict[int, int]:
     return {key: value for key, value in ids.items() if value}
-
-
-# Names that people give to regions.
-
-MAX_NAMES = 1000
-
-MAX_LENGTH = 64
-
-_MAX_M = snapshot.MAX_COORDINATE_M
-
-_MAX_LETTER = 0x10FFFF
-
-FIELDS = {
-    'name_anchors': Field(np.float64, ('n', 2), -_MAX_M, _MAX_M),
-    # Code points, 0 behind the end.
-    'name_letters': Field(np.int32, ('n', MAX_LENGTH), 0, _MAX_LETTER),
-}
 
 
 def checked_name(text: str) -> str:

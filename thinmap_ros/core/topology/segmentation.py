@@ -20,7 +20,34 @@ from thinmap_ros.core.topology import regions as region_names
 from thinmap_ros.core.topology.regions import Door, Region, RegionKind, RegionMap, RegionNames
 from thinmap_ros.jit import inlined, kernel
 
-# Parameters of the regions of a map.
+Labels = NDArray[np.int32]
+
+# Of passages.
+_JAMB_M = 0.6  # on each side of a passage, over which a straight wall is no jamb
+_FACE_M = 0.15  # up to which a straight wall is rough
+
+# Of furniture. Least area in relation to its squared length: a square has a half, a wall 0.15 m
+# thick and 1 m long 0.13.
+_COMPACT = 0.15
+_LEG = 0.2  # length up to which any shape is furniture, as a share of the largest
+
+# Area of a basin above its saddle, as a share of the least area of a region: more and small rooms
+# join the corridor, less and noise divides regions.
+_SEED = 1 / 3
+_MIN_AREA_M2 = 3.0  # a smaller part is a niche of the one behind its widest passage
+# Free cells this near to a region lie within its outline: regions end before the walls, m.
+_WALL_MARGIN_M = 0.5
+
+# Of ids that stay.
+_UPDATES = 5  # after which a cell forgets its earlier id
+_STRIDE_M = 0.4  # between the cells that a state keeps
+
+_OWN_FIELDS = {
+    'region_frame': Field(np.float64, (3,), -snapshot.MAX_COORDINATE_M, snapshot.MAX_COORDINATE_M),
+    'region_labels': Field(np.int32, ('r', 'c'), 0, MAX_ID),
+    'next_region_id': Field(np.int64, (), 1, MAX_COUNT),
+}
+FIELDS = {**_OWN_FIELDS, **region_names.FIELDS}
 
 
 @dataclass(frozen=True)
@@ -64,18 +91,6 @@ class RegionConfig(Config):
     )
 
 
-# Basins of the clearance: a watershed by merge tree, cut where a passage is a neck.
-#
-# Cells are flooded from the roomiest one down. A cell beside one basin joins it; a cell beside two
-# is their saddle, the widest place of the narrowest path between them: they become one basin,
-# unless the saddle is a neck. So a path round a table, where basins meet again lower down, is no
-# door. Source: watershed after F. Meyer, "Topographic distance and watershed lines", 1994; compared
-# for maps by R. Bormann et al., "Room segmentation: survey, implementation, and analysis", ICRA
-# 2016.
-
-Labels = NDArray[np.int32]
-
-
 @dataclass(frozen=True)
 class Neck:
     """When a saddle separates two basins.
@@ -90,14 +105,22 @@ class Neck:
 
 
 def flood(clearance: Array, neck: Neck) -> tuple[Labels, Cells]:
-    """Basins of a clearance (H, W), m, 0 outside of the space.
+    """Basins of a clearance (H, W), m, 0 outside of the space: a watershed by merge tree.
 
+    Cells are flooded from the roomiest one down. A cell beside one basin joins it; a cell beside
+    two is their saddle, the widest place of the narrowest path between them: they become one basin,
+    unless the saddle is a neck. So a path round a table, where basins meet again lower down, is no
+    door.
     Returns the basin of each cell, from 1, 0 outside, (H, W); and the saddles between basins,
     widest first (N, 3): flat index of the cell, lower and higher basin.
+    Source: watershed after F. Meyer, "Topographic distance and watershed lines", 1994; compared for
+    maps by R. Bormann et al., "Room segmentation: survey, implementation, and analysis", ICRA 2016.
     """
     flat = np.ascontiguousarray(clearance).ravel()
+    inside = np.flatnonzero(flat > 0.0)
+    order = inside[np.argsort(-flat[inside], kind='stable')]  # the roomiest first
     basin, parent, saddles = _flood(
-        flat, _from_widest(flat), clearance.shape[1], neck.ratio, neck.widest, neck.least_cells
+        flat, order, clearance.shape[1], neck.ratio, neck.widest, neck.least_cells
     )
     number = np.zeros(len(parent) + 1, dtype=np.int32)  # the last: of cells outside
     number[:-1] = 1 + np.unique(parent, return_inverse=True)[1]
@@ -105,12 +128,6 @@ def flood(clearance: Array, neck: Neck) -> tuple[Labels, Cells]:
     apart = pairs[:, 0] != pairs[:, 1]
     labels: Labels = number[basin].reshape(clearance.shape)
     return labels, np.column_stack([saddles[apart, 0], pairs[apart]])
-
-
-def _from_widest(flat: Array) -> Cells:
-    """Indices of the cells inside, the roomiest first."""
-    inside = np.flatnonzero(flat > 0.0)
-    return inside[np.argsort(-flat[inside], kind='stable')]
 
 
 @kernel
@@ -169,13 +186,6 @@ def _flood(
     for k in range(basins):
         parent[k] = root_of(parent, k)
     return basin, parent[:basins].copy(), saddles[:count].copy()
-
-
-# Passages between basins of the clearance: which of them are doors, and which join corridors.
-
-_JAMB_M = 0.6  # on each side of a passage, over which a straight wall is no jamb
-
-_FACE_M = 0.15  # up to which a straight wall is rough
 
 
 @dataclass(frozen=True)
@@ -296,15 +306,6 @@ def joined(
     return region[basins], doors
 
 
-# The free space of a map as rooms have it: without furniture, specks and hollow walls.
-
-# Least area of furniture in relation to its squared length: a square has a half, a wall 0.15 m
-# thick and 1 m long 0.13.
-_COMPACT = 0.15
-
-_LEG = 0.2  # length up to which any shape is furniture, as a share of the largest
-
-
 def room_space(patch: GridPatch, config: RegionConfig) -> Mask:
     """Cells (H, W) that the robot's disc covers where it fits, with furniture taken for free.
 
@@ -345,23 +346,11 @@ def _furniture(patch: GridPatch, longest: float) -> Mask:
     numbers, sizes = label(~patch.free)
     small = np.zeros(len(sizes), dtype=np.bool_)
     for number, box in enumerate(ndimage.find_objects(numbers), 1):
-        extent = _extent(box)
+        extent = math.hypot(*(side.stop - side.start for side in box))
+        is_at_rim = any(s.start == 0 or s.stop == n for s, n in zip(box, patch.shape, strict=True))
         is_compact = sizes[number] >= _COMPACT * extent**2 or extent <= _LEG * longest
-        small[number] = extent <= longest and is_compact and not _at_rim(box, patch.shape)
+        small[number] = extent <= longest and is_compact and not is_at_rim
     return np.asarray(small[numbers])
-
-
-def _extent(box: Any) -> float:
-    """Diagonal of a box of slices, cells."""
-    return math.hypot(*(side.stop - side.start for side in box))
-
-
-def _at_rim(box: Any, shape: tuple[int, int]) -> bool:
-    """Whether a box of slices touches the rim of an array."""
-    return any(s.start == 0 or s.stop == n for s, n in zip(box, shape, strict=True))
-
-
-# Outer boundary of a set of cells as a polygon.
 
 
 def outline_of(cells: Mask, frame: GridFrame) -> Array:
@@ -411,16 +400,6 @@ def _boundary(cells: Mask) -> Array:
 def _ahead(row: int, col: int, heading: int) -> tuple[int, int]:
     """The cell ahead of a corner on the left of a heading; that on the right is the next one's."""
     return row - (heading >= 2), col - (heading in (1, 2))
-
-
-# Area of a basin above its saddle, as a share of the least area of a region: more and small rooms
-# join the corridor, less and noise divides regions.
-_SEED = 1 / 3
-
-# Free cells this near to a region lie within its outline: regions end before the walls, m.
-_MIN_AREA_M2 = 3.0  # a smaller part is a niche of the one behind its widest passage
-
-_WALL_MARGIN_M = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -532,21 +511,6 @@ def _doors(found: Segmentation, ids: NDArray[np.int64]) -> tuple[Door, ...]:
         ends = (int(ids[passage.a]), int(ids[passage.b]))
         doors.append(Door(*ends, float(x), float(y), passage.width_m))
     return tuple(doors)
-
-
-# Regions of a growing map with ids that stay.
-
-_UPDATES = 5  # after which a cell forgets its earlier id
-
-_STRIDE_M = 0.4  # between the cells that a state keeps
-
-_OWN_FIELDS = {
-    'region_frame': Field(np.float64, (3,), -snapshot.MAX_COORDINATE_M, snapshot.MAX_COORDINATE_M),
-    'region_labels': Field(np.int32, ('r', 'c'), 0, MAX_ID),
-    'next_region_id': Field(np.int64, (), 1, MAX_COUNT),
-}
-
-FIELDS = {**_OWN_FIELDS, **region_names.FIELDS}
 
 
 class _Memory:

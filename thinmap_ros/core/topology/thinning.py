@@ -12,8 +12,6 @@ from thinmap_ros.core.se2 import Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.jit import inlined, kernel
 
-# Which cells a robot can stand on, and how far from them the next obstacle is.
-
 FAR = 1 << 14  # rows; "nothing in this column"
 
 
@@ -182,16 +180,11 @@ Times = NDArray[np.int16]
 Index = np.uintp  # unsigned: compiled code then asks no question about indices below zero
 
 _WORD = 64
-
 _LANES = 4  # words that processors work on at once
-
 _BAND = 8  # rows that are looked at together
-
 # Where in a band: in its first row, in any, in its last
 _TOP = 0
-
 _ANY = 1
-
 _BOTTOM = 2
 
 

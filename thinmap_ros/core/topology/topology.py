@@ -33,11 +33,17 @@ from thinmap_ros.core.topology.layers.stack import Layers, Span
 from thinmap_ros.core.topology.registry import MATCH_RADIUS_M, Changes, Registry
 from thinmap_ros.core.topology.thinning import select_free_space
 
-# Saved states of the topological map: cells of the grid, robot places, nodes and edges.
+_OFF_LATTICE = 1e-3  # of a cell: windows farther off do not belong to the same grid
+_STALE_NS = -1  # before every correction: the graph is rebuilt from the next whole map
+# The time for the graph of the whole of a map grows with its cells.
+_GRAPH_PERIOD_NS = 2_000_000_000
+_CELLS_A_PERIOD = 1_000_000
 
+# Of saved states.
 _PERCENT = np.array([UNKNOWN, 0, 100, UNKNOWN], dtype=np.int8)  # of each state
-
 _A_BYTE = 4  # states
+
+Ids = dict[int, int]
 
 FIELDS = {
     'frame': FRAME_FIELD,
@@ -148,20 +154,6 @@ def _map_of(checked: Mapping[str, NDArray[Any]]) -> TopologicalMap:
         raise InputError(f'saved topology: {error}') from error
 
 
-# The global topological map, kept up to date from the cells of the grid that change.
-
-__all__ = [
-    'TopologyBuilder',
-    'TopologyConfig',
-    'build',
-    'build_again',
-    'build_along',
-    'moved_map',
-]
-
-_OFF_LATTICE = 1e-3  # of a cell: windows farther off do not belong to the same grid
-
-
 def build(
     patch: GridPatch,
     seed_xy: tuple[float, float] | None = None,
@@ -202,9 +194,8 @@ def build_again(
     The grids may differ in their frames. A node keeps its id where the last map has a node within
     MATCH_RADIUS_M, nearest pairs first; edges between the same nodes keep theirs.
     """
-    registry = Registry(patch.frame, config)
-    if last is not None:
-        registry = Registry(patch.frame, config, last.map, last.next_id)
+    before = (None, 1) if last is None else (last.map, last.next_id)
+    registry = Registry(patch.frame, config, *before)
     free = select_free_space(patch, seed_xy, config)
     registry.update(*_all_edges(patch, free, None, config))
     return registry
@@ -260,11 +251,12 @@ class TopologyBuilder:
         the paper removes when it merges, do not occur.
         Source: topological map paper section 2.2, Fig. 5 and 8.
         """
-        layers, registry, place = self._begin(window, T_map_base)
+        frame, layers, registry = self._begin(window, T_map_base)
+        place = _place_on(frame, window.frame)
         self._window = Span(*place, *window.shape)
         changed = layers.update_free_space(window, place)
         layers.update_skeleton()
-        for row, col in self._cells_of(T_map_base):
+        for row, col in frame.cells_of(T_map_base[..., :2]).tolist():
             layers.mark_robot((row, col))
         if changed == 0 and not layers.has_new_parts():
             return False
@@ -366,23 +358,15 @@ class TopologyBuilder:
         self._registry = registry
         registry.update(self._layers.lattice, self._layers.edge_changes(set()))
 
-    def _begin(
-        self, window: GridPatch, T_map_base: Array
-    ) -> tuple[Layers, Registry, tuple[int, int]]:
-        """Layers, registry, and row and column of the window's first cell."""
+    def _begin(self, window: GridPatch, T_map_base: Array) -> tuple[GridFrame, Layers, Registry]:
+        """Frame, layers and registry, new ones with the first window."""
         if not se2.is_finite(T_map_base):
             raise InputError(f'pose {T_map_base}: expected finite numbers')
         if self._frame is None or self._layers is None or self._registry is None:
             self._frame = window.frame
             self._layers = Layers(window.frame.resolution, self.config)
             self._registry = Registry(window.frame, self.config)
-        return self._layers, self._registry, _place_on(self._frame, window.frame)
-
-    def _cells_of(self, T_map_base: Array) -> list[list[int]]:
-        """Row and column of a pose (3,), or of each of some poses (N, 3)."""
-        assert self._frame is not None
-        cells: list[list[int]] = self._frame.cells_of(T_map_base[..., :2]).tolist()
-        return cells
+        return self._frame, self._layers, self._registry
 
 
 def _place_on(lattice: GridFrame, frame: GridFrame) -> tuple[int, int]:
@@ -434,10 +418,6 @@ def moved_map(topology: TopologicalMap, before: Array, after: Array) -> Topologi
         [replace(n, x=float(x), y=float(y)) for n, (x, y) in zip(nodes, xy, strict=True)],
         [replace(e, path=middle[None]) for e, middle in zip(edges, moved, strict=True)],
     )
-
-
-# Before every correction: the graph is rebuilt from the next whole map.
-_STALE_NS = -1
 
 
 class Job(Protocol):
@@ -631,14 +611,6 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
             self._job = self._begin(partial(self.builder.rebuilt, whole.patch, *moved))
 
 
-# Graph of a map that comes as a whole, again and again.
-
-# The time for the graph of the whole of a map grows with its cells.
-_GRAPH_PERIOD_NS = 2_000_000_000
-
-_CELLS_A_PERIOD = 1_000_000
-
-
 class MapGraph:
     """Builds the graph of the whole map again when it has changed, at most every two seconds.
 
@@ -672,11 +644,6 @@ class MapGraph:
             return False
         period_ns = _GRAPH_PERIOD_NS * max(1.0, patch.cells.size / _CELLS_A_PERIOD)
         return not 0 <= stamp_ns - self._built_ns < period_ns
-
-
-# One topological map of two maps of a place, whose grids have been joined: ids continue.
-
-Ids = dict[int, int]
 
 
 def join_topologies(
