@@ -239,7 +239,7 @@ class FrontierExplorer(ABC):
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """Choose a target; see core/exploration/strategy.Strategy."""
+        """Choose a target; see `Strategy`."""
         self.finder.update(patch, scan, T_map_base)
         self._drop_unchanged_target(T_map_base)
         if self._is_due(scan.stamp_ns):

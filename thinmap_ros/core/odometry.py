@@ -17,6 +17,20 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, Field
 
+# Between samples that are further apart, the robot need not have moved evenly. Odometry at 1 Hz is
+# interpolated, with one lost sample.
+MAX_ODOMETRY_GAP_NS = 2 * SECOND_NS
+# A stream is silent when several samples are missing; stamps of real robots come in bunches.
+_SHORTEST_GAP_NS = SECOND_NS
+_GAP_PERIODS = 3.0
+_USUAL_SAMPLES = 15
+
+FIELDS = {
+    'stamp_ns': Field(np.int64, (), 0, MAX_COUNT),
+    'T_map_odom': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+    'T_odom_base': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+}
+
 
 @dataclass(frozen=True)
 class OdometryLimits:
@@ -153,21 +167,6 @@ class OdometryBuffer:
         # In blocks, so that a long buffer is not shifted at every sample.
         if first > 256:
             del self._stamps[:first], self._poses[:first], self._silences_s[:first]
-
-
-# Between samples that are further apart, the robot need not have moved evenly. Odometry at 1 Hz is
-# interpolated, with one lost sample.
-MAX_ODOMETRY_GAP_NS = 2 * SECOND_NS
-# A stream is silent when several samples are missing; stamps of real robots come in bunches.
-_SHORTEST_GAP_NS = SECOND_NS
-_GAP_PERIODS = 3.0
-_USUAL_SAMPLES = 15
-
-FIELDS = {
-    'stamp_ns': Field(np.int64, (), 0, MAX_COUNT),
-    'T_map_odom': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
-    'T_odom_base': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
-}
 
 
 @dataclass(frozen=True, eq=False)

@@ -252,7 +252,7 @@ class PaperExplorer:
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """Choose where to drive; see strategy.Strategy."""
+        """Choose where to drive; see `Strategy`."""
         self._frontier_map.update(patch, box_of_scan(scan, T_map_base))
         nodes = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
         self._end_nodes = self._followed.follow(nodes, self.config.node_reset_distance_m)

@@ -41,7 +41,7 @@ class FreeSpace:
     Known is what is free, or an unknown gap between two free cells of a row or column: specks
     between beams. A cell is traversable if every cell whose centre is nearer than the robot's
     radius is known. The known cells of each disc are counted, so that a change costs the disc and
-    not the map. The rules are those of `free_space`.
+    not the map. The rules are those of `select_free_space`.
     Source: exploration paper section 2.1, "selection of free space"; the gaps are ours.
     """
 
