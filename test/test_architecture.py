@@ -9,6 +9,8 @@ from pathlib import Path
 import networkx
 import pytest
 
+from thinmap_ros.__main__ import PROGRAMS
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'thinmap_ros'
 PAGE = ROOT / 'docs' / 'development' / 'architecture.md'
@@ -127,6 +129,25 @@ for module in {modules!r}:
         [sys.executable, '-c', code], capture_output=True, text=True, cwd=PACKAGE.parent
     )
     assert done.returncode == 0, done.stderr
+
+
+def imported_first(path):
+    """Modules that a file imports when it is imported itself, not within functions."""
+    tree = ast.parse(path.read_text())
+    body = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+    return imports(ast.Module(body, []))
+
+
+def test_programs_without_ros_import_none_of_it():
+    arrows = networkx.DiGraph(
+        (f'thinmap_ros.{name}', imported)
+        for name, path in MODULES.items()
+        for imported in imported_first(path)
+    )
+    for name, program in PROGRAMS.items():
+        reached = networkx.descendants(arrows, f'thinmap_ros.{program.module}')
+        ros = {each for each in reached if each.split('.')[0].endswith(('rclpy', '_msgs'))}
+        assert not ros, f'{name} imports {sorted(ros)}'
 
 
 def packed(tree):

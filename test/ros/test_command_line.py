@@ -9,8 +9,8 @@ from support.forks import forked
 from support.node_list import ROOT
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.ros.foreign import translate
 from thinmap_ros.ros.node_main import init_ros
+from thinmap_ros.ros.parameters import translate
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures('ros_domain')]
 PRESETS = sorted((ROOT / 'config').glob('*/*.yaml'))

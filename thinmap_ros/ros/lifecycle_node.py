@@ -16,7 +16,6 @@ from thinmap_ros.core.snapshot import State
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint
 from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
-from thinmap_ros.ros.foreign import translate
 from thinmap_ros.ros.private_rclpy import RCLError
 from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.sole_source import follow_one_clock
@@ -42,7 +41,7 @@ class ThinmapNode(LifecycleNode):
         """
         super().__init__(name)
         self.program = name
-        translate(self, name)
+        parameters.translate(self, name)
         parameters.declare_strict(self)
         self._autostart = bool(
             parameters.declare_parameter(

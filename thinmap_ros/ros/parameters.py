@@ -1,10 +1,11 @@
 """Declaration of ROS parameters from the Config dataclasses of core, which hold the defaults."""
 
 import dataclasses
+import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -18,7 +19,7 @@ from rclpy.parameter import Parameter
 from thinmap_ros.core.config import (
     SAFE_HIGHER,
     SAFE_LOWER,
-    Config,
+    AnyConfig,
     check_safety,
     parameters_of,
     require_number,
@@ -26,7 +27,13 @@ from thinmap_ros.core.config import (
     with_values,
 )
 from thinmap_ros.core.errors import ConfigError
-from thinmap_ros.ros.foreign import is_known
+from thinmap_ros.ros.foreign import (
+    foreign_values,
+    given_files,
+    is_known,
+    overruled_values,
+    translated,
+)
 from thinmap_ros.ros.private_rclpy import declared_names, given_parameters
 
 STRICT = 'strict_parameters'
@@ -45,7 +52,6 @@ ROBOT = (
     'scan_topic',
 )
 
-AnyConfig = TypeVar('AnyConfig', bound=Config)
 _RUN_TIME = {
     SAFE_LOWER: 'at run time at most the value at the start',
     SAFE_HIGHER: 'at run time at least the value at the start',
@@ -156,6 +162,29 @@ def _accept_integer(node: Node, name: str, default: Any) -> None:
         return
     if given.type_ == Parameter.Type.INTEGER:
         overrides[name] = Parameter(name, value=float(given.value))
+
+
+def translate(node: Node, program: str) -> None:
+    """Give a node what was given last, and its own parameters for those of other packages.
+
+    program: name of the node before remapping. Sections of parameter files for the nodes that it
+    replaces are read, too. Raises InputError where a parameter file is none.
+    """
+    given = given_parameters(node)
+    for name, value in overruled_values(sys.argv, node.get_fully_qualified_name()).items():
+        given[name] = Parameter(name, value=value)
+    for file in given_files(sys.argv):
+        for name, value in foreign_values(file, program, node.get_namespace()).items():
+            if value is not None:
+                given.setdefault(name, Parameter(name, value=value))
+    if 'use_sim_time' in given:
+        # Of a foreign section: the node has declared it before.
+        node.set_parameters([given['use_sim_time']])
+    own = translated(program, {name: parameter.value for name, parameter in given.items()})
+    for name in given.keys() - own.keys():
+        del given[name]
+    for name in own.keys() - given.keys():
+        given[name] = Parameter(name, value=own[name])
 
 
 def given_text(node: Node, name: str, default: str) -> str:

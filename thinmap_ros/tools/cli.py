@@ -12,11 +12,11 @@ from dataclasses import fields, replace
 from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NoReturn, TextIO, TypeVar
+from typing import Any, NoReturn, TextIO
 
 import numpy as np
 
-from thinmap_ros.core.config import Config, is_parameter
+from thinmap_ros.core.config import AnyConfig, Config, is_parameter
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.scan import LaserConfig
 from thinmap_ros.kernels import report_compilation
@@ -138,8 +138,6 @@ def check_place(path: Path) -> None:
 
 
 INTERRUPTED = 130
-
-AnyConfig = TypeVar('AnyConfig', bound=Config)
 
 _NO_PARAMETERS = NodeParameters()
 

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from thinmap_ros.core.config import Config, parameters_of, suggestion, with_values
+from thinmap_ros.core.config import AnyConfig, parameters_of, suggestion, with_values
 from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.slam.localizer import default_config, parameters_elsewhere
 from thinmap_ros.core.stage import StartConfig
@@ -21,7 +21,6 @@ from thinmap_ros.ros.foreign import (
 
 _LOCALIZER = 'localizer'
 _STRICT = 'strict_parameters'
-AnyConfig = TypeVar('AnyConfig', bound=Config)
 
 
 @dataclass(frozen=True)
