@@ -155,7 +155,7 @@ class GridMapperNode(ThinmapNode):
         self._scans = ScanQueue()
         self._fault = ''
         self._output.followed = FollowedMap()
-        self._output.load_ns = self.get_clock().now().nanoseconds
+        self._output.load_ns = self.now_ns
         has_map = self._session or self._stamp.latest_ns is not None
         self._stamp.latest_ns = None
         self._mapper.reset()
@@ -165,7 +165,7 @@ class GridMapperNode(ThinmapNode):
             free_m2 = np.count_nonzero(patch.free) * patch.frame.resolution**2
             self.get_logger().info(f'loaded {self._session}: {free_m2:.0f} m2 free')
         if has_map:
-            self._stamp.latest_ns = self.get_clock().now().nanoseconds
+            self._stamp.latest_ns = self.now_ns
         self._publish_map()
 
     def _load_map(
@@ -254,7 +254,7 @@ class GridMapperNode(ThinmapNode):
             self._output.publish_map(self._mapper.whole_map(), self._stamp.latest_ns)
 
     def _on_get_map(self, _: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
-        stamp_ns = self._stamp.latest_ns or self.get_clock().now().nanoseconds
+        stamp_ns = self._stamp.latest_ns or self.now_ns
         response.map = self._output.map_message(self._mapper.whole_map().patch, stamp_ns)
         return response
 
@@ -274,7 +274,7 @@ class GridMapperNode(ThinmapNode):
 
     def _map_replaced(self) -> None:
         self._output.followed.leave()
-        self._output.load_ns = self.get_clock().now().nanoseconds
+        self._output.load_ns = self.now_ns
         self._stamp.latest_ns = self._stamp.latest_ns or self._output.load_ns
         self._publish_map()
 

@@ -67,7 +67,7 @@ class _NavigatorPublishers:
         self.base = base
         self._subscribers = 0
         self._stops = 0
-        self._clock = node.get_clock()
+        self._node = node
         self.velocity = VelocityPublisher(node, base_frame, declare_stamped(node))
         self._plan = node.create_publisher(Path, 'plan', qos.LATCHED)
         self._published_path: Array | None = None
@@ -102,8 +102,7 @@ class _NavigatorPublishers:
         """Publish a path (K, 2), unless it is the one that was published last."""
         if path is not None and path is not self._published_path:
             self._published_path = path
-            ns = self._clock.now().nanoseconds
-            self._plan.publish(messages.path_msg(path, self.map_frame, ns))
+            self._plan.publish(messages.path_msg(path, self.map_frame, self._node.now_ns))
 
 
 class NavigatorNode(ThinmapNode):
@@ -331,7 +330,6 @@ class NavigatorNode(ThinmapNode):
 
     def _publish_feedback(self, speed_m_s: float) -> None:
         """Publish feedback; current_pose has no frame while the pose is unknown."""
-        now_ns = int(self.get_clock().now().nanoseconds)
         remaining_m = self._navigator.distance_remaining_m
         elapsed_ns = self.elapsed_time.now_ns() - self._task.start_ns
         feedback = self._task.action.Feedback(
@@ -342,7 +340,7 @@ class NavigatorNode(ThinmapNode):
         T_map_base = self._robot.pose()
         if T_map_base is not None:
             frame = self._output.map_frame
-            feedback.current_pose = messages.pose_stamped_msg(T_map_base, frame, now_ns)
+            feedback.current_pose = messages.pose_stamped_msg(T_map_base, frame, self.now_ns)
         if speed_m_s > _MIN_SPEED_M_S and remaining_m > _MIN_DISTANCE_M:
             feedback.estimated_time_remaining = messages.duration_msg(remaining_m / speed_m_s)
         if self._task.action is NavigateThroughPoses:

@@ -144,7 +144,7 @@ class TopologyBuilderNode(ThinmapNode):
         else:
             self._regions.reset()
         if self._session or self._output.map.has_published:
-            self._publish(self.get_clock().now().nanoseconds)
+            self._publish(self.now_ns)
 
     def _is_of_this_map(self, message: ProbabilityGrid) -> bool:
         """Whether a grid is of the map of this graph; a graph of another map is discarded."""
@@ -227,7 +227,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._topology.replace(loaded)
         self._output.followed.leave()
         self._regions.reset(regions)
-        self._publish(self.get_clock().now().nanoseconds)
+        self._publish(self.now_ns)
         return f'graph of {len(loaded.map.nodes)} nodes' if path else 'graph reset'
 
 

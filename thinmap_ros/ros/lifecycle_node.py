@@ -63,6 +63,11 @@ class ThinmapNode(LifecycleNode):
         offer(self.create_service, Trigger, '~/reset', self._on_reset)
         self._reject_invalid_transitions()
 
+    @property
+    def now_ns(self) -> int:
+        """Time by the clock of the node, simulated or not, ns."""
+        return int(self.get_clock().now().nanoseconds)
+
     def start(self) -> None:
         """Become active, unless `autostart` is false."""
         if self._autostart:

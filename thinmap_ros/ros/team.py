@@ -203,11 +203,6 @@ def tiles_from_msg(message: MapTiles) -> TileMessage:
     return TileMessage.decode(message.data.tobytes())
 
 
-def request_msg(header: Header, robot: str, session: int, after: int) -> TileRequest:
-    """Message that asks a robot for the tiles after a version."""
-    return TileRequest(header=header, robot=robot, session=session, after=after)
-
-
 def _name(name: str) -> str:
     """Name of a robot. Raises InputError where it is empty or too long."""
     if not 0 < len(name) <= _MAX_NAME:
@@ -358,5 +353,9 @@ class TileReceiver:
         tiles = tiles_from_msg(message)
         after = self._maps.add(message.robot, message.session, tiles)
         if after is not None:
-            header = messages.header('', int(self._node.get_clock().now().nanoseconds))
-            self._requests.publish(request_msg(header, message.robot, message.session, after))
+            header = messages.header('', self._node.now_ns)
+            self._requests.publish(
+                TileRequest(
+                    header=header, robot=message.robot, session=message.session, after=after
+                )
+            )

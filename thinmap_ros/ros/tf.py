@@ -173,7 +173,7 @@ class MapBroadcaster:
         if self._T_map_odom is None:
             return
         ahead_ns = round(1e9 * self._config.transform_tolerance)
-        stamp_ns = self._node.get_clock().now().nanoseconds + ahead_ns
+        stamp_ns = self._node.now_ns + ahead_ns
         if self._sole is not None:
             self._sole.add_own(stamp_ns)
         poses = [self._T_map_odom, np.zeros(3)]
@@ -392,11 +392,11 @@ class OdometrySource:
         self._node.diagnostics.set_value('odometry by TF', missing or 'received')
 
 
-# Transforms between the frames of a robot, from /tf and /tf_static.
+_LOOKUP_STEP_NS = 20_000_000  # between two times that are tried
 
 
 class TransformListener:
-    """A buffer that is filled from /tf and /tf_static."""
+    """Transforms between the frames of a robot: a buffer that is filled from /tf and /tf_static."""
 
     def __init__(
         self, node: Node, received: Callable[[Any, bool], None] = lambda transform, is_static: None
@@ -414,6 +414,18 @@ class TransformListener:
         stamp_ns: None for the newest. Raises InputError with the reason where it is unknown.
         """
         return self._buffer.lookup(target_frame, source_frame, stamp_ns)
+
+    def lookup_lately(
+        self, target_frame: str, source_frame: str, stamp_ns: int, tolerance_ns: int
+    ) -> Array:
+        """As `lookup`, at a stamp or up to a time before it; the newest for stamp 0, as in tf2."""
+        reason: InputError | None = None
+        for age_ns in range(0, tolerance_ns + 1, _LOOKUP_STEP_NS):
+            try:
+                return self.lookup(target_frame, source_frame, max(stamp_ns - age_ns, 0) or None)
+            except InputError as error:
+                reason = reason or error
+        raise reason or InputError('transform_tolerance: expected at least 0 s')
 
     def clear(self) -> None:
         """Forget all but the static transforms: the time was set back."""

@@ -223,7 +223,7 @@ class CommandPublisher:
             if self._kind == UNSTAMPED:
                 self._publisher.publish(twist)
             else:
-                header = messages.header(self._frame, self._node.get_clock().now().nanoseconds)
+                header = messages.header(self._frame, self._node.now_ns)
                 self._publisher.publish(TwistStamped(header=header, twist=twist))
             return True
 

@@ -194,8 +194,7 @@ class NavigationClient:
         drive = _Drive(request, DriveProgress(goal), self._servers())
         self._drive = drive
         message = NavigateToPose.Goal()
-        now_ns = self._node.get_clock().now().nanoseconds
-        message.pose = messages.pose_stamped_msg(goal, self._frame_id, now_ns)
+        message.pose = messages.pose_stamped_msg(goal, self._frame_id, self._node.now_ns)
         sent = self._client.send_goal_async(
             message, lambda feedback: self._on_feedback(feedback, drive), self._others.new_id()
         )

@@ -336,8 +336,6 @@ def _offset_fault(source: str, offset_ns: int) -> str:
 
 _MAX_POSES = 10_000
 
-_LOOKUP_STEP_NS = 20_000_000
-
 
 class ErrorCode(IntEnum):
     """Codes of the results, as in Nav2 from Kilted on: Jazzy's messages do not name them."""
@@ -427,18 +425,13 @@ class TaskReader:
         self._map.keep_out.require_open(np.array([pose[:2] for pose in poses]))
 
     def _lookup(self, frame: str, stamp_ns: int) -> Array:
-        """T_map_frame (3,) at a stamp, or shortly before it; the newest for stamp 0, as in tf2."""
-        reason = ''
-        tolerance_ns = self._tolerance_ns if stamp_ns else 0
-        for age_ns in range(0, tolerance_ns + 1, _LOOKUP_STEP_NS):
-            at_ns = max(stamp_ns - age_ns, 0)
-            try:
-                return self._transforms.lookup(self._map_frame, frame, at_ns or None)
-            except InputError as error:
-                reason = reason or str(error)
-        raise _TransformError(
-            f'frame {quoted(frame)}: {reason}: expected a frame connected to "{self._map_frame}"'
-        )
+        """T_map_frame (3,) at a stamp, or shortly before it; the newest for stamp 0."""
+        own = self._map_frame
+        try:
+            return self._transforms.lookup_lately(own, frame, stamp_ns, self._tolerance_ns)
+        except InputError as error:
+            expected = f'expected a frame connected to "{own}"'
+            raise _TransformError(f'frame {quoted(frame)}: {error}: {expected}') from error
 
     def _read(
         self, action: Any, request: Any, poses: Callable[[], tuple[Array, ...]]

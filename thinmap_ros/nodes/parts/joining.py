@@ -263,7 +263,7 @@ def _correct(received: ReceivedKeyframes, message: KeyframePoses) -> None:
 class TeamPublishers:
     """Topics merged_map, merged_topology, merged_regions and join_status, and transforms."""
 
-    def __init__(self, node: Node, map_topic: str, world_frame: str) -> None:
+    def __init__(self, node: ThinmapNode, map_topic: str, world_frame: str) -> None:
         """map_topic: name of the joint map."""
         self._node = node
         self._frame = world_frame
@@ -275,7 +275,7 @@ class TeamPublishers:
 
     def publish_map(self, merged: TeamMap, regions: RegionMap) -> None:
         """Publish the joint map, its graph and its regions."""
-        now_ns = self._now_ns
+        now_ns = self._node.now_ns
         frame = self._frame
         membership = membership_of(merged.graph, regions)
         self._map.publish(messages.grid_msg(merged.patch, frame, now_ns))
@@ -284,25 +284,16 @@ class TeamPublishers:
 
     def publish_places(self, team: Team, places: dict[str, Array]) -> None:
         """Publish where the maps lie: status and transforms to their frames, NAMESPACE/map."""
-        now_ns = self._now_ns
+        now_ns = self._node.now_ns
         header = messages.header(self._frame, now_ns)
         maps = [_robot_map(team, name, places.get(name)) for name in sorted(team.maps)]
         self._status.publish(JoinStatus(header=header, maps=maps))
         transforms = [
-            messages.transform_msg(T, self._frame, map_frame_of(name), now_ns)
+            messages.transform_msg(T, self._frame, f'{name}/map'.lstrip('/'), now_ns)
             for name, T in places.items()
         ]
         if transforms:
             self._transforms.publish(TFMessage(transforms=transforms))
-
-    @property
-    def _now_ns(self) -> int:
-        return int(self._node.get_clock().now().nanoseconds)
-
-
-def map_frame_of(name: str) -> str:
-    """Frame of the map of a robot, by its namespace, for all robots in one tree."""
-    return f'{name}/map'.lstrip('/')
 
 
 def _robot_map(team: Team, name: str, place: Array | None) -> RobotMapMsg:

@@ -106,13 +106,10 @@ class MapEditing:
         except InputError as error:  # of a session with other cells
             self._node.get_logger().warning(f'keepout_filter_mask: {error}')
             return
-        self._mask.publish(messages.grid_msg(mask, self._frame_id, self._now_ns()))
+        self._mask.publish(messages.grid_msg(mask, self._frame_id, self._node.now_ns))
 
     def _header(self) -> Any:
-        return messages.header(self._frame_id, self._now_ns())
-
-    def _now_ns(self) -> int:
-        return int(self._node.get_clock().now().nanoseconds)
+        return messages.header(self._frame_id, self._node.now_ns)
 
     def _replace(self, keep_out: KeepOut) -> None:
         self._mapper.keep_out = keep_out

@@ -164,7 +164,7 @@ class Driver(Protocol):
 class TargetPublisher:
     """Publishes each new target on exploration_target."""
 
-    def __init__(self, node: Node, frame_id: str) -> None:
+    def __init__(self, node: ThinmapNode, frame_id: str) -> None:
         self._node = node
         self._frame_id = frame_id
         self._publisher = node.create_publisher(PoseStamped, 'exploration_target', qos.LATCHED)
@@ -175,8 +175,7 @@ class TargetPublisher:
         if self._last is not None and is_same_goal(self._last, goal):
             return
         self._last = goal
-        now_ns = self._node.get_clock().now().nanoseconds
-        self._publisher.publish(messages.pose_stamped_msg(goal, self._frame_id, now_ns))
+        self._publisher.publish(messages.pose_stamped_msg(goal, self._frame_id, self._node.now_ns))
 
     def clear(self) -> None:
         """Publish the next target in any case."""
@@ -427,7 +426,7 @@ class ExploreLiteTopics:
             for node in decision.end_nodes:
                 if node.frontier_length_m > 0.0:
                     markers.append(self._sphere(node, node.node_id in decision.unreachable))
-        header = messages.header(self._frame_id, self._node.get_clock().now().nanoseconds)
+        header = messages.header(self._frame_id, self._node.now_ns)
         for number, marker in enumerate(markers):
             marker.header = header
             marker.ns = _NAMESPACE
@@ -532,7 +531,7 @@ class MissionPublishers:
 
     def __init__(self, node: ThinmapNode, frame_id: str, on_resume: Callable[[bool], None]) -> None:
         """on_resume: receives what explore/resume asks for, continue or pause."""
-        self._clock = node.get_clock()
+        self._node = node
         self._frame_id = frame_id
         self._end_nodes = node.create_publisher(EndNodeArray, 'end_nodes', qos.LATCHED)
         self._status = node.create_publisher(ExplorationStatus, 'exploration_status', qos.LATCHED)
@@ -545,7 +544,7 @@ class MissionPublishers:
 
     def end_nodes_now(self, mission: Mission) -> EndNodeArray:
         """Message of the end nodes of the last decision."""
-        return end_nodes_msg(mission, self._frame_id, self._now_ns())
+        return end_nodes_msg(mission, self._frame_id, self._node.now_ns)
 
     def status(self, mission: Mission) -> ExplorationStatus:
         """Publish the status; returns the message."""
@@ -555,10 +554,7 @@ class MissionPublishers:
 
     def status_now(self, mission: Mission) -> ExplorationStatus:
         """Message of the present status."""
-        return status_msg(mission, self._frame_id, self._now_ns())
-
-    def _now_ns(self) -> int:
-        return int(self._clock.now().nanoseconds)
+        return status_msg(mission, self._frame_id, self._node.now_ns)
 
 
 # Parameters of the node explorer beside those of its strategy.

@@ -117,8 +117,6 @@ _MAX_SCANS = 50
 
 _MAX_SCAN_AGE_NS = 2 * SECOND_NS
 
-_LOOKUP_STEP_NS = 20_000_000
-
 
 class RobotView:
     """Newest scan whose pose in the map TF knows, and that pose.
@@ -166,7 +164,8 @@ class RobotView:
             stamp_ns = messages.stamp_ns(message.header.stamp)
             if abs(now_ns - stamp_ns) > _MAX_SCAN_AGE_NS:
                 return None
-            T_map_base = self._lookup(stamp_ns)
+            base_frame = self._laser_transform.base_frame
+            T_map_base = self._transforms.lookup(self._map_frame, base_frame, stamp_ns)
             scan = self._laser_transform.to_scan(message)
         except InputError:
             return None
@@ -174,17 +173,9 @@ class RobotView:
 
     def newest_pose(self, now_ns: int) -> Array:
         """Newest pose (3,) that is not too old. Raises InputError where TF knows none."""
-        reason: InputError | None = None
         tolerance_ns = round(self._settings.transform_tolerance * SECOND_NS)
-        for age_ns in range(0, tolerance_ns + 1, _LOOKUP_STEP_NS):
-            try:
-                return self._lookup(now_ns - age_ns)
-            except InputError as error:
-                reason = reason or error
-        raise reason or InputError('transform_tolerance: expected at least 0 s')
-
-    def _lookup(self, stamp_ns: int) -> Array:
-        return self._transforms.lookup(self._map_frame, self._laser_transform.base_frame, stamp_ns)
+        base_frame = self._laser_transform.base_frame
+        return self._transforms.lookup_lately(self._map_frame, base_frame, now_ns, tolerance_ns)
 
 
 # Whether somebody publishes a topic.
@@ -360,7 +351,7 @@ class ObservationSource:
         last: newest observation. In the map of another program, of now, by TF.
         """
         if self._uses_foreign_map():
-            now_ns = int(self._node.get_clock().now().nanoseconds)
+            now_ns = self._node.now_ns
             try:
                 return now_ns, self._view.newest_pose(now_ns)
             except InputError:
@@ -456,6 +447,6 @@ class ObservationSource:
         patch = self._map.patch()
         if patch is None:
             return None
-        now_ns = int(self._node.get_clock().now().nanoseconds)
+        now_ns = self._node.now_ns
         scan, T_map_base = self._view.look(patch, now_ns)
         return Observation(self._topologies.graph, patch, scan, T_map_base)

@@ -29,6 +29,7 @@ from thinmap_ros.core.errors import InputError, ThinmapError, one_line, one_line
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.merging import MergedMap
 from thinmap_ros.files.sessions import GRID, PARTS, REGIONS, load_edits, load_grid, load_topology
+from thinmap_ros.nodes.parts.localization import GIVEN_COVARIANCE
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.services import SaveDirectory
@@ -301,8 +302,7 @@ class RobotTasks:
     def drive_to(self, pose: Array) -> None:
         """Send a goal (3,), map frame. Raises InputError where no navigator runs."""
         self._require(self._navigate, NAVIGATE, 'navigator')
-        now_ns = int(self._node.get_clock().now().nanoseconds)
-        target = messages.pose_stamped_msg(pose, self._map_frame, now_ns)
+        target = messages.pose_stamped_msg(pose, self._map_frame, self._node.now_ns)
         self._on_goal(pose)
         self._send(self._navigate, NavigateToPose.Goal(pose=target), 'goal')
 
@@ -456,9 +456,6 @@ class Teleoperation:
 
 
 _RESUME = 'explore/resume'
-
-# Standard deviations of a pose that a person has drawn, as of RViz: 0.5 m, 15 degrees.
-_DRAWN = np.diag([0.25, 0.25, 0.0685])
 
 # What a robot that is held may be asked for.
 _ALWAYS = (
@@ -697,10 +694,11 @@ class Steering:
         self._tasks.drive_to(np.array([*start, 0.0]))
 
     def _set_initial_pose(self, x: float, y: float, theta: float) -> None:
-        now_ns = int(self._node.get_clock().now().nanoseconds)
         pose = np.array([x, y, theta])
         self._publishers['initialpose'].publish(
-            messages.pose_with_covariance_msg(pose, _DRAWN, self._map_frame, now_ns)
+            messages.pose_with_covariance_msg(
+                pose, GIVEN_COVARIANCE, self._map_frame, self._node.now_ns
+            )
         )
         self.tell(f'initial pose {x:.2f}, {y:.2f}')
 

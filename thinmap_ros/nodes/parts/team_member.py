@@ -65,7 +65,7 @@ class TileOutput:
         if sender.version == self._next_after:
             return
         tiles = sender.changes_after(self._next_after)
-        header = messages.header(self._frame_id, int(self._node.get_clock().now().nanoseconds))
+        header = messages.header(self._frame_id, self._node.now_ns)
         self._publisher.publish(tiles_msg(header, self._name, self._session, tiles))
         self._next_after = sender.version
 
@@ -294,7 +294,7 @@ class _ClaimOutput:
         remaining_m = progress.remaining_m or 0.0
         if goal is not None and progress.remaining_m is None:
             remaining_m = math.dist(goal[:2], T_map_base[:2])
-        now_ns = int(self._node.get_clock().now().nanoseconds)
+        now_ns = self._node.now_ns
         claim = strategy.claim(now_ns, T_map_base, remaining_m)
         if not explores:
             claim = Claim(self.name, now_ns, T_map_base, settled=claim.settled, explores=False)
