@@ -30,10 +30,10 @@ from thinmap_ros.strategies import DEFAULT, make_strategy
 CONTROL_STEPS = 2
 # The period of the candidate search; thinning costs more than all other stages.
 SCANS_PER_GRAPH = 5
+# Receives each decision, and the estimated pose (3,) at which it was made.
 Watch = Callable[[Decision, Array], None]
-"""Receives each decision, and the estimated pose (3,) at which it was made."""
+# Command of a robot at a pose (3,) for the next seconds, as others allow it to drive.
 RightOfWay = Callable[[Array, Command, float], Command]
-"""Command of a robot at a pose (3,) for the next seconds, as others allow it to drive."""
 
 
 def drives_alone(T_map_base: Array, command: Command, period_s: float) -> Command:

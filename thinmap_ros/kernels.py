@@ -10,7 +10,6 @@ import ctypes
 import gc
 import mmap
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -108,7 +107,7 @@ class CompilationReport(event.Listener):
 
     def on_start(self, event: Any) -> None:
         """Handle the start of a compilation, possibly nested in another one."""
-        now = time.monotonic()
+        now = monotonic()
         if self._depth == 0:
             self._began_at = now
         self._depth += 1
@@ -123,7 +122,7 @@ class CompilationReport(event.Listener):
         """Handle the end of a compilation."""
         self._depth -= 1
         if self._depth == 0:
-            self._seconds += time.monotonic() - self._began_at
+            self._seconds += monotonic() - self._began_at
 
     def end(self) -> None:
         """Report duration and cache folder, if any kernels were compiled."""
@@ -412,6 +411,7 @@ def sim() -> None:
     LaserScanner(LaserScannerConfig(), 0).scan(world, start, 0)
 
 
+# Warm-ups of all nodes.
 ALL = (
     localizer,
     ekf_localizer,

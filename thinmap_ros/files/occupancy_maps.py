@@ -176,9 +176,8 @@ def _colour_pixels(strip: 'Image.Image', least_alpha: int) -> _Pixels:
     return pixels[..., :3].sum(axis=-1, dtype=np.uint16), pixels[..., 3] < least_alpha
 
 
+# Receives a line that the user of a map should know.
 Report = Callable[[str], object]
-
-"""Receives a line that the user of a map should know."""
 
 _MARK = '# written by thinmap'
 

@@ -13,6 +13,7 @@ from thinmap_ros.core.grid.edits import KeepOut, KeepOutArea
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.topology.regions import RegionKind
 
 
 def time_ns(stamp: Any) -> int:
@@ -119,6 +120,14 @@ def outline(region: Any) -> Array:
     points = corners(region.outline)
     errors.require_bounded(f'region {region.id}', points.ravel().tolist())
     return points
+
+
+def region_kind(region: Any) -> RegionKind:
+    """Kind of a thinmap_msgs/Region. Raises InputError where it is unknown."""
+    try:
+        return RegionKind(region.kind)
+    except ValueError as error:
+        raise InputError(f'region {region.id}: kind {region.kind}: expected 0 to 2') from error
 
 
 def corners(polygon: Any) -> Array:

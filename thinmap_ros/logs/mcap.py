@@ -45,7 +45,7 @@ _LENGTH = struct.Struct('<I')
 
 _MESSAGE = struct.Struct('<HIQQ')
 
-_IN_CHUNK = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+_PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 
 _SLICE = 2**16
 
@@ -246,7 +246,7 @@ class _Found:
         at = 0
         while at + HEAD.size <= len(data):
             code, length = HEAD.unpack_from(data, at)
-            if code not in _IN_CHUNK and code < FIRST_PRIVATE_OPCODE:
+            if code not in _PLAIN and code < FIRST_PRIVATE_OPCODE:
                 self._end_at = self.size - len(data) + at
                 break
             start = at + HEAD.size
@@ -373,10 +373,6 @@ def _short(error: Exception) -> str:
 _FOOTER = struct.Struct('<QQI')
 
 _CHANNEL_ID = struct.Struct('<H')
-
-_PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-
-_LAST_OPCODE = Opcode.DATA_END
 
 
 @dataclass
@@ -662,7 +658,7 @@ def _chunk_spans(
             return
         if code == Opcode.CHUNK:
             yield ChunkSpan(at, min(end, size), is_chunk=True, whole=end <= size)
-        if end <= size and (0 < code <= _LAST_OPCODE or code >= FIRST_PRIVATE_OPCODE):
+        if end <= size and (0 < code <= Opcode.DATA_END or code >= FIRST_PRIVATE_OPCODE):
             if code in _PLAIN and not plain:
                 damage.parts[at] = f'record of {length} bytes: expected at most {LOGS.chunk_bytes}'
             at = end

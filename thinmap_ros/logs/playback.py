@@ -4,15 +4,13 @@ from collections.abc import Iterator
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs import storage
-from thinmap_ros.logs.readers.bag import Bag
+from thinmap_ros.logs.readers.bag import SCAN, Bag
 from thinmap_ros.logs.storage import RawMessage
-
-_SCAN = 'sensor_msgs/msg/LaserScan'
 
 
 def is_scan(message: RawMessage) -> bool:
     """Whether a message is a laser scan, the unit of steps and lockstep."""
-    return message.type_name == _SCAN
+    return message.type_name == SCAN
 
 
 class Playback:
@@ -68,7 +66,7 @@ class Playback:
 
     def step(self) -> list[RawMessage]:
         """Messages up to and including the next scan; without scans, the next message."""
-        has_scans = any(self._bag.topics[topic] == _SCAN for topic in self._topics)
+        has_scans = any(self._bag.topics[topic] == SCAN for topic in self._topics)
         taken: list[RawMessage] = []
         while self._next is not None:
             laps = self.laps

@@ -219,9 +219,8 @@ def _begin(path: Path) -> bytes:
 
 # QoS profiles in bags, stored with each topic so that players can offer the same.
 
+# Key of a channel's metadata in an MCAP file; its value is YAML.
 KEY = 'offered_qos_profiles'
-
-"""Key of a channel's metadata in an MCAP file; its value is YAML."""
 
 _FOREVER = QosTime(2147483647, 4294967295)
 

@@ -273,7 +273,7 @@ class TransformBuffer:
 
     def is_used(self, frame: str) -> bool:
         """Whether a transform to this child frame was needed for a lookup."""
-        return _frame_name(frame) in self._used
+        return _without_slash(frame) in self._used
 
     def clear(self) -> None:
         """Forget all but the static transforms: the time was set back."""
@@ -283,8 +283,8 @@ class TransformBuffer:
 
     def add(self, transform: Any, is_static: bool) -> None:
         """Add a geometry_msgs/TransformStamped. Raises InputError where it is invalid."""
-        child = _frame_name(transform.child_frame_id)
-        parent = _frame_name(transform.header.frame_id)
+        child = _without_slash(transform.child_frame_id)
+        parent = _without_slash(transform.header.frame_id)
         T_parent_child = _planar_pose(transform)
         edge = self._edges.get(child)
         if edge is None or edge.parent != parent:
@@ -316,8 +316,8 @@ class TransformBuffer:
 
     def _path(self, target_frame: str, source_frame: str) -> tuple[list[str], list[str]]:
         """Frames from the target, and from the source, up to below their common ancestor."""
-        target = self._path_to_root(_frame_name(target_frame))
-        source = self._path_to_root(_frame_name(source_frame))
+        target = self._path_to_root(_without_slash(target_frame))
+        source = self._path_to_root(_without_slash(source_frame))
         common = next((frame for frame in source if frame in target), None)
         if common is None:
             raise InputError(
@@ -360,7 +360,7 @@ class TransformBuffer:
 
     def _missing(self, target_frame: str, source_frame: str) -> str:
         known = set(self._edges) | {edge.parent for edge in self._edges.values()}
-        unknown = [f for f in (target_frame, source_frame) if _frame_name(f) not in known]
+        unknown = [f for f in (target_frame, source_frame) if _without_slash(f) not in known]
         if unknown:
             return f'frame {", ".join(quoted(frame) for frame in unknown)} is not on /tf'
         return 'they are in trees that are not connected'
@@ -372,11 +372,6 @@ def _planar_pose(transform: Any) -> Array:
     errors.require_bounded(name, (moved.x, moved.y, moved.z))
     rotation = rotation_matrix(transform.transform.rotation)
     return se2.pose(moved.x, moved.y, math.atan2(rotation[1, 0], rotation[0, 0]))
-
-
-def _frame_name(frame: str) -> str:
-    """Frame name without the leading slash of ROS 1."""
-    return str(frame).lstrip('/')
 
 
 class TransformOdometry:
@@ -403,7 +398,7 @@ class TransformOdometry:
 
     def add(self, transform: Any, is_static: bool) -> None:
         """Add a geometry_msgs/TransformStamped. Raises InputError where it is invalid."""
-        child = _frame_name(transform.child_frame_id)
+        child = _without_slash(transform.child_frame_id)
         if not (is_static and child in self._static):
             self._buffer.add(transform, is_static)
         if is_static:

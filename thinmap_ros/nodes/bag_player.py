@@ -17,7 +17,7 @@ from thinmap_ros.core import errors
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError, InputError, counted
 from thinmap_ros.logs.playback import Playback, is_scan
-from thinmap_ros.logs.readers.bag import Bag
+from thinmap_ros.logs.readers.bag import SCAN, Bag
 from thinmap_ros.logs.storage import RawMessage
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
@@ -25,8 +25,6 @@ from thinmap_ros.ros.localized_scan import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S,
 from thinmap_ros.ros.messages import message_class
 from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.time_jumps import STEADY
-
-_SCAN = 'sensor_msgs/msg/LaserScan'
 
 
 @dataclass(frozen=True)
@@ -184,7 +182,7 @@ class BagPlayerNode(Node):
             )
 
     def _has_subscribers(self) -> bool:
-        scans = [t for t in self._publishers_by_topic if self._bag.topics[t] == _SCAN]
+        scans = [t for t in self._publishers_by_topic if self._bag.topics[t] == SCAN]
         counts = [
             self._publishers_by_topic[t].get_subscription_count()
             for t in scans or self._publishers_by_topic

@@ -11,9 +11,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, Region, RegionArray, TopologicalMap
 from thinmap_ros.core import errors
-from thinmap_ros.core.errors import InputError, one_line
+from thinmap_ros.core.errors import one_line
 from thinmap_ros.core.topology.graph import NodeKind, topology_from_msg
-from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -21,7 +20,6 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.view import palette
 
 _END = palette.NODES[NodeKind.END]
-_KINDS = {int(kind): kind for kind in RegionKind}
 _REMOTE = '#999999'
 _TEXT_COLOUR = '#000000'
 
@@ -86,12 +84,11 @@ def regions(message: RegionArray) -> MarkerArray:
     outlines = _marker(message.header, 'regions', Marker.LINE_LIST, _REGION.size_m, palette.EDGE)
     names = []
     for region in message.regions:
-        if region.kind not in _KINDS:
-            raise InputError(f'region {region.id}: kind {region.kind}: expected 0 to 2')
+        kind = decode.region_kind(region)
         corners = [_point(x, y, _REGION.z_m) for x, y in decode.outline(region).tolist()]
         ends = [point for pair in pairwise([*corners, *corners[:1]]) for point in pair]
         outlines.points += ends
-        colour = _colour(palette.region(_KINDS[region.kind], region.id))
+        colour = _colour(palette.region(kind, region.id))
         outlines.colors += len(ends) * [colour]
         names.append(_region_name(message.header, region))
     doors = _marker(message.header, 'doors', Marker.SPHERE_LIST, _DOOR.size_m, palette.ESTIMATE)
@@ -108,7 +105,7 @@ def _region_name(header: Header, region: Region) -> Marker:
     errors.require_bounded(f'region {region.id}', place)
     text = _marker(header, 'region_names', Marker.TEXT_VIEW_FACING, _TEXT.size_m, _TEXT_COLOUR)
     text.id = region.id % 2**31
-    text.text = one_line(region.name) or f'{_KINDS[region.kind].name.lower()} {region.id}'
+    text.text = one_line(region.name) or f'{decode.region_kind(region).name.lower()} {region.id}'
     text.pose.position = _point(*place, _TEXT.z_m)
     return text
 

@@ -33,8 +33,6 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.team import heard_robots
 from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.web import access, server
-from thinmap_ros.web import access as links
-from thinmap_ros.web.access import qr_code
 from thinmap_ros.web.pages import Board, Pages
 from thinmap_ros.web.picture import Picture
 
@@ -162,9 +160,9 @@ class WebNode(ThinmapNode):
         if self._tokens is None or not self._tokens.is_new:
             return
         host = self._address.host
-        url = server.Address(links.reached_host(host), opened.port).url
-        for role, link in links.links(url, self._tokens).items():
-            code = '' if access.is_loopback(host) else qr_code(link, sys.stderr.isatty())
+        url = server.Address(access.reached_host(host), opened.port).url
+        for role, link in access.links(url, self._tokens).items():
+            code = '' if access.is_loopback(host) else access.qr_code(link, sys.stderr.isatty())
             self.get_logger().info(f'to {role}: {link}\n{code}'.rstrip('\n'))
 
 

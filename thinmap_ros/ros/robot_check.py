@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -22,7 +23,6 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import messages, qos, stop_topic, velocity
 from thinmap_ros.ros.diagnostics import full_name, publisher_names, subscriber_names
-from thinmap_ros.ros.velocity import KINDS, TOPIC
 
 _MAX_DELAY_S = 1.0  # of a stamp against the clock, beyond which clocks differ
 
@@ -58,14 +58,21 @@ class Finding:
 
 def check_robot(names: RobotNames, seconds: float) -> list[Finding]:
     """What a robot publishes within some seconds, compared with what is needed."""
-    rclpy.init()
-    node = rclpy.create_node('doctor')
-    try:
+    with _own_node() as node:
         check = RobotCheck(node, names)
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             rclpy.spin_once(node, timeout_sec=_SPIN_S)
         return list(check.findings())
+
+
+@contextmanager
+def _own_node() -> Iterator[Node]:
+    """The node of this program, while it looks."""
+    rclpy.init()
+    node = rclpy.create_node('doctor')
+    try:
+        yield node
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
@@ -263,13 +270,8 @@ def try_watchdog(odom_topic: str, base_frame: str) -> Finding:
 
     Raises InputError where it cannot be tried: no base or odometry, or somebody else drives.
     """
-    rclpy.init()
-    node = rclpy.create_node('doctor')
-    try:
+    with _own_node() as node:
         return BaseTrial(node, odom_topic, base_frame).finding()
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
 
 
 class BaseTrial:
@@ -287,7 +289,7 @@ class BaseTrial:
         if self._turn_rate_after(2.0 * _LOOK_S) > _TURNS_RAD_S:
             raise InputError('the robot turns: expected one that stands')
         kind = self._require_free_base()
-        publisher = self._node.create_publisher(kind, TOPIC, qos.STREAM)
+        publisher = self._node.create_publisher(kind, velocity.TOPIC, qos.STREAM)
 
         def command(w: float) -> None:
             twist = messages.twist_msg(0.0, w)
@@ -316,15 +318,15 @@ class BaseTrial:
 
     def _require_free_base(self) -> type:
         """Type of the commands of the base. Raises InputError without one, or with a driver."""
-        name = self._node.resolve_topic_name(TOPIC)
+        name = self._node.resolve_topic_name(velocity.TOPIC)
         drivers = publisher_names(self._node, name)
         if drivers:
             raise InputError(f'{name}: published by {", ".join(drivers)}: end it first')
         infos = self._node.get_subscriptions_info_by_topic(name)
-        kinds = sorted({info.topic_type for info in infos} & set(KINDS))
+        kinds = sorted({info.topic_type for info in infos} & set(velocity.KINDS))
         if not kinds:
             raise InputError(f'{name}: nobody subscribes: expected the driver of the base')
-        return KINDS[kinds[0]]
+        return velocity.KINDS[kinds[0]]
 
     def _on_odometry(self, message: Odometry) -> None:
         yaw = float(messages.pose_from_msg(message.pose.pose)[2])

@@ -7,14 +7,11 @@ from rclpy.duration import Duration
 
 from thinmap_ros.core.se2 import CLOCK_JUMP_NS
 
+# Clock of the machine, which nobody sets: for timers.
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-
-"""Clock of the machine, which nobody sets: for timers."""
-
 _BACKWARD = JumpThreshold(
     min_forward=None, min_backward=Duration(nanoseconds=-CLOCK_JUMP_NS), on_clock_change=False
 )
-
 _ANY = JumpThreshold(
     min_forward=Duration(nanoseconds=CLOCK_JUMP_NS),
     min_backward=Duration(nanoseconds=-CLOCK_JUMP_NS),

@@ -18,8 +18,8 @@ from thinmap_ros.files.safe import write_text
 from thinmap_ros.view import report_page
 from thinmap_ros.view.summary import summary_figure
 
+# Stamps, ns, and poses (3,).
 Trajectory = tuple[Sequence[int], Sequence[Array]]
-"""Stamps, ns, and poses (3,)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import errors
-from thinmap_ros.core.errors import InputError, one_line
+from thinmap_ros.core.errors import one_line
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.path_follower import Motion
@@ -303,8 +303,6 @@ _MAX_APART_POINTS = 20_000
 
 _EDGE_STEP = 4  # points of an edge are a cell apart
 
-_KINDS = {int(kind): kind for kind in RegionKind}
-
 
 class Picture:
     """Shows what the robot publishes on a board.
@@ -446,11 +444,9 @@ class Picture:
 
 
 def _region(region: Any) -> dict[str, Any]:
-    if region.kind not in _KINDS:
-        raise InputError(f'region {region.id}: kind {region.kind}: expected 0 to 2')
+    kind = decode.region_kind(region)
     center = (region.center.x, region.center.y)
     errors.require_bounded(f'region {region.id}', (*center, region.area_m2))
-    kind = _KINDS[region.kind]
     return {
         'id': int(region.id),
         'name': one_line(region.name) or f'{kind.name.lower()} {region.id}',

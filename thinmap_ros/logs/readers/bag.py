@@ -40,7 +40,7 @@ from thinmap_ros.logs.storage import (
     is_sqlite,
 )
 
-_SCAN = 'sensor_msgs/msg/LaserScan'
+SCAN = 'sensor_msgs/msg/LaserScan'
 
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 
@@ -58,7 +58,7 @@ _ZSTD = b'\x28\xb5\x2f\xfd'  # begin of a message that is compressed by itself
 
 _MAX_WARNINGS = 8
 
-_USUAL_TOPICS = {_SCAN: '/scan', _ODOMETRY: '/odom'}
+_USUAL_TOPICS = {SCAN: '/scan', _ODOMETRY: '/odom'}
 
 
 class Bag:
@@ -244,7 +244,7 @@ class BagLog:
             raise
 
     def _events(self, bag: Bag) -> Iterator[Event]:
-        scan_topic = self._topic(bag, _SCAN, self.scan_topic, 'laser scans')
+        scan_topic = self._topic(bag, SCAN, self.scan_topic, 'laser scans')
         self.expected_scans = bag.message_count(scan_topic)
         frames = BagFrames(
             bag, FrameOptions(self.T_base_laser, self.base_frame, self.odom_frame), self.skipped
@@ -272,7 +272,7 @@ class BagLog:
         """Events of a message; none, and counted, if it is unusable."""
         try:
             decoded = bag.decode(message)
-            if message.type_name != _SCAN:
+            if message.type_name != SCAN:
                 yield from odometry.samples(decoded)
                 return
             scan = decode.scan(decoded, decode.stamp_ns(decoded), laser=self.laser)

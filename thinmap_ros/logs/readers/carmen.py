@@ -128,7 +128,9 @@ class CarmenLog:
             with open_unpacked(self.path) as stream:
                 # One byte more than the limit: no more of a longer line is ever read.
                 lines = iter(lambda: stream.readline(LOGS.line_bytes + 1), b'')
-                unread = _unpacked_bytes(self.path)
+                unread = LOGS.line_bytes * LOGS.lines
+                if isinstance(stream, gzip.GzipFile):
+                    unread = LOGS.unpacked_bytes(self.path.stat().st_size)
                 for number, line in enumerate(lines, start=1):
                     unread -= len(line)
                     if number > LOGS.lines or unread < 0:
@@ -251,7 +253,7 @@ class CarmenLog:
             )
 
 
-def is_carmen(path: Path) -> bool:
+def _is_carmen(path: Path) -> bool:
     """Whether a path has the name of a CARMEN log, or scan lines at its beginning."""
     return path.name.lower().endswith(_SUFFIXES) or bool(CarmenLog(path)._beginning()[0])
 
@@ -284,17 +286,6 @@ def _unpacked(stream: IO[bytes]) -> Iterator[IO[bytes] | gzip.GzipFile]:
     yield gzip.GzipFile(fileobj=stream) if is_zipped else stream
 
 
-def _is_gzip(path: Path) -> bool:
-    with open_regular_file(path) as stream:
-        return stream.read(2) == b'\x1f\x8b'
-
-
-def _unpacked_bytes(path: Path) -> int:
-    """Largest number of bytes that are read of a log."""
-    size = path.stat().st_size
-    return LOGS.unpacked_bytes(size) if _is_gzip(path) else LOGS.line_bytes * LOGS.lines
-
-
 def _stamp(word: str) -> int:
     """Seconds as written, exact to the nanosecond."""
     seconds, _, fraction = word.partition('.')
@@ -323,4 +314,4 @@ def _log(path: Path, options: LogOptions) -> Log:
     return CarmenLog(path, options.carmen, options.T_base_laser, options.laser)
 
 
-FORMAT = LogFormat('a CARMEN log (plain or gzip)', is_carmen, _log)
+FORMAT = LogFormat('a CARMEN log (plain or gzip)', _is_carmen, _log)

@@ -318,9 +318,8 @@ def _robot_map(team: Team, name: str, place: Array | None) -> RobotMapMsg:
 
 # A thread for long work, which uses a share of a core at most.
 
+# Takes what work has found, in the thread of the node.
 Result = Callable[[], None]
-
-"""Takes what work has found, in the thread of the node."""
 
 
 def _fail(error: Exception) -> None:

@@ -120,9 +120,8 @@ class GoalMonitor:
 
 _ARRIVED_M = 0.3
 
+# Receives whether the robot reached the last goal, and the reason where it did not.
 OnResult = Callable[[bool, str], None]
-
-"""Receives whether the robot reached the last goal, and the reason where it did not."""
 
 
 class Driver(Protocol):
@@ -470,44 +469,6 @@ def _identity() -> Pose:
 _NOT_ESTIMATED = -1.0
 
 
-def end_nodes_msg(mission: Mission, frame_id: str, stamp_ns: int) -> EndNodeArray:
-    """End nodes of the strategy's last decision."""
-    end_nodes = [] if mission.decision is None else mission.decision.end_nodes
-    return EndNodeArray(
-        header=messages.header(frame_id, stamp_ns),
-        end_nodes=[_end_node_msg(node) for node in end_nodes],
-    )
-
-
-def status_msg(mission: Mission, frame_id: str, now_ns: int) -> ExplorationStatus:
-    """State and progress of a mission."""
-    status = ExplorationStatus(
-        header=messages.header(frame_id, now_ns),
-        state=int(mission.state),
-        reason_code=int(mission.end.code),
-        reason=mission.end.reason,
-        distance_m=mission.odometer.distance_m,
-        elapsed=messages.duration_msg(mission.elapsed_s(now_ns / 1e9)),
-        missing_area_m2=_NOT_ESTIMATED,
-        missing_area_bound_m2=_NOT_ESTIMATED,
-    )
-    decision = mission.decision
-    if decision is None:
-        return status
-    status.coverage_estimate = decision.coverage_estimate
-    status.known_area_m2 = decision.known_area_m2
-    status.reason = status.reason or decision.reason
-    status.end_nodes_remaining = decision.remaining
-    if decision.missing is not None:
-        status.missing_area_m2 = decision.missing.expected_m2
-        status.missing_area_bound_m2 = decision.missing.bound_m2
-    if decision.target is not None:
-        status.has_target = True
-        status.target_id = decision.target.node_id
-        status.target_position = Point(x=decision.target.x, y=decision.target.y)
-    return status
-
-
 def _end_node_msg(node: EndNode) -> EndNodeMsg:
     is_observed = math.isfinite(node.min_distance_m)
     return EndNodeMsg(
@@ -540,11 +501,11 @@ class MissionPublishers:
 
     def end_nodes(self, mission: Mission, stamp_ns: int) -> None:
         """Publish the end nodes of a decision about a scan."""
-        self._end_nodes.publish(end_nodes_msg(mission, self._frame_id, stamp_ns))
+        self._end_nodes.publish(self._end_nodes_msg(mission, stamp_ns))
 
     def end_nodes_now(self, mission: Mission) -> EndNodeArray:
         """Message of the end nodes of the last decision."""
-        return end_nodes_msg(mission, self._frame_id, self._node.now_ns)
+        return self._end_nodes_msg(mission, self._node.now_ns)
 
     def status(self, mission: Mission) -> ExplorationStatus:
         """Publish the status; returns the message."""
@@ -553,8 +514,40 @@ class MissionPublishers:
         return message
 
     def status_now(self, mission: Mission) -> ExplorationStatus:
-        """Message of the present status."""
-        return status_msg(mission, self._frame_id, self._node.now_ns)
+        """Message of the present state and progress."""
+        now_ns = self._node.now_ns
+        status = ExplorationStatus(
+            header=messages.header(self._frame_id, now_ns),
+            state=int(mission.state),
+            reason_code=int(mission.end.code),
+            reason=mission.end.reason,
+            distance_m=mission.odometer.distance_m,
+            elapsed=messages.duration_msg(mission.elapsed_s(now_ns / 1e9)),
+            missing_area_m2=_NOT_ESTIMATED,
+            missing_area_bound_m2=_NOT_ESTIMATED,
+        )
+        decision = mission.decision
+        if decision is None:
+            return status
+        status.coverage_estimate = decision.coverage_estimate
+        status.known_area_m2 = decision.known_area_m2
+        status.reason = status.reason or decision.reason
+        status.end_nodes_remaining = decision.remaining
+        if decision.missing is not None:
+            status.missing_area_m2 = decision.missing.expected_m2
+            status.missing_area_bound_m2 = decision.missing.bound_m2
+        if decision.target is not None:
+            status.has_target = True
+            status.target_id = decision.target.node_id
+            status.target_position = Point(x=decision.target.x, y=decision.target.y)
+        return status
+
+    def _end_nodes_msg(self, mission: Mission, stamp_ns: int) -> EndNodeArray:
+        end_nodes = [] if mission.decision is None else mission.decision.end_nodes
+        return EndNodeArray(
+            header=messages.header(self._frame_id, stamp_ns),
+            end_nodes=[_end_node_msg(node) for node in end_nodes],
+        )
 
 
 # Parameters of the node explorer beside those of its strategy.

@@ -3,7 +3,6 @@
 import base64
 import subprocess
 import sys
-import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -77,8 +76,6 @@ _MAX_SESSIONS = 200
 
 _MAX_PICTURE_BYTES = 4 << 20
 
-_ITEM = 'merge'
-
 
 class _Trial:
     """The program merge_sessions at work, in a folder of its own, which `drop` deletes."""
@@ -89,7 +86,7 @@ class _Trial:
         self.stem = str(folder / 'merged')
         self._picture = folder / 'merged.png'
         self._log = folder / 'log'
-        self._began_s = time.monotonic()
+        self._began_s = monotonic()
         program = ['nice', sys.executable, '-m', 'thinmap_ros.tools.merge_sessions', '--quiet']
         words = [*maps, '-o', self.stem, '--picture', str(self._picture)]
         with self._log.open('wb') as log:
@@ -105,7 +102,7 @@ class _Trial:
     @property
     def is_overdue(self) -> bool:
         """Whether it takes too long."""
-        return self.code is None and time.monotonic() - self._began_s > _MERGE_TIMEOUT_S
+        return self.code is None and monotonic() - self._began_s > _MERGE_TIMEOUT_S
 
     def lines(self) -> list[str]:
         """What it has said."""
@@ -223,7 +220,7 @@ class SessionMerge:
     def _show(self, state: str, words: list[str], picture: str = '') -> None:
         own = f'{self._directory.path}/'
         shown = [one_line(line.replace(own, '')) for line in words]
-        self._board.put(_ITEM, {'state': state, 'words': shown, 'picture': picture})
+        self._board.put('merge', {'state': state, 'words': shown, 'picture': picture})
 
 
 def _save(stem: str, path: str) -> str:

@@ -104,9 +104,8 @@ class Progress(NamedTuple):
     remaining_m: float | None
 
 
+# Progress after the newest observation.
 GetProgress = Callable[[Observation | None], Progress]
-
-"""Progress after the newest observation."""
 
 
 class Alone:
