@@ -12,7 +12,7 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, path_length_m
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.segmentation import RegionConfig
@@ -266,7 +266,7 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'features': len(result.pipeline.localizer.features),
         'features_local_median': float(np.median(result.local_features)),
         'rejected': result.pipeline.localizer.rejected,
-        'distance': round(float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()), 3),
+        'distance': round(path_length_m(poses), 3),
         'nodes': len(result.pipeline.topology.map.nodes),
         'edges': len(result.pipeline.topology.map.edges),
     }

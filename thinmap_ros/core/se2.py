@@ -43,6 +43,11 @@ def wrap(angle: float | Array) -> float | Array:
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
+def path_length_m(path: Array) -> float:
+    """Length of a path of points (N, 2) or poses (N, 3), m."""
+    return float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())
+
+
 def pose(x: float, y: float, theta: float) -> Array:
     """Pose array (3,) with its heading wrapped."""
     return np.array([x, y, wrap(float(theta))])

@@ -11,7 +11,7 @@ from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, MissingArea
 from thinmap_ros.core.exploration.paper import NEAR_M
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.evaluation.trajectory_errors import aligned_rms
 
 MILESTONES = (0.90, 0.95, 0.98, 0.99)
@@ -145,7 +145,7 @@ def exploration_report(
         'end_nodes_visited': census.visited,
         'pose_rmse': round(float(np.sqrt(np.mean(errors**2))), 5),
         'pose_rmse_aligned': round(aligned_rms(estimated_poses, true_poses), 5),
-        'turned_rad': round(float(np.abs(_turns(true_poses)).sum()), 2),
+        'turned_rad': round(float(np.abs(wrap(np.diff(true_poses[:, 2]))).sum()), 2),
         'curve': [
             [
                 round(float(time), 2),
@@ -161,11 +161,6 @@ def first_time(coverage: Array, share: float) -> float | None:
     """Time, s, of the first measurement (time, coverage) (M, 2) of a coverage; None: of none."""
     reached = np.flatnonzero(coverage[:, 1] >= share)
     return round(float(coverage[reached[0], 0]), 3) if reached.size else None
-
-
-def _turns(poses: Array) -> Array:
-    turns = np.diff(poses[:, 2])
-    return np.asarray((turns + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def exploration_title(report: dict[str, Any]) -> str:

@@ -5,11 +5,10 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from thinmap_ros.evaluation.parallel_jobs import provenance
+from thinmap_ros.evaluation.parallel_jobs import Report, provenance
 from thinmap_ros.files.safe import read_text, write_text
 from thinmap_ros.view.figures import write_small_png
 
-About = dict[str, Any]
 _STYLE = """
 body { font: 15px/1.5 sans-serif; max-width: 70em; margin: 2em auto; padding: 0 1em; }
 img { max-width: 100%; } figure { margin: 1.5em 0; } figcaption { color: #444; }
@@ -20,9 +19,9 @@ td, th { border: 1px solid #bbb; padding: 0.3em 0.6em; text-align: left; }
 _VERDICTS = {True: 'yes', False: 'no', None: ''}
 
 
-def read_about(out: Path, name: str) -> About:
+def read_about(out: Path, name: str) -> Report:
     """Description of an experiment, from its folder."""
-    about: About = json.loads(read_text(out / name / 'about.json'))
+    about: Report = json.loads(read_text(out / name / 'about.json'))
     return about
 
 
@@ -43,7 +42,7 @@ def write_page(out: Path, names: list[str]) -> Path:
     return out / 'index.html'
 
 
-def _section(name: str, about: About) -> str:
+def _section(name: str, about: Report) -> str:
     parts = [
         f'<h2 id="{name}">{escape(about["title"])}</h2>',
         f'<p><b>{escape(about["source"])}</b></p>',

@@ -251,7 +251,7 @@ class RobotRun:
     @property
     def distance_m(self) -> float:
         """Length of this path."""
-        return float(np.hypot(*np.diff(self.true[:, :2], axis=0).T).sum())
+        return se2.path_length_m(self.true)
 
 
 def write_team(

@@ -52,7 +52,7 @@ class Run:
     @property
     def path_length_m(self) -> float:
         """Length of the true path, m."""
-        return float(np.hypot(*np.diff(np.array(self.truth)[:, :2], axis=0).T).sum())
+        return se2.path_length_m(np.array(self.truth))
 
 
 def run_drive(

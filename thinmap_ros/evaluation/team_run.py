@@ -10,7 +10,7 @@ import numpy as np
 from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.team import Team, TeamConfig
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, path_length_m
 from thinmap_ros.evaluation.exploration_metrics import MILESTONES, first_time
 from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.other_robots import SharedWorld
@@ -78,7 +78,7 @@ def explore_together(
     outcome = loop.run(goal, options.time_limit_s, show)
     wall_s = time.perf_counter() - began
     cpu_s = time.process_time() - cpu_began
-    distances = [_path_length(member.loop.log.true_poses) for member in loop.members]
+    distances = [path_length_m(np.array(member.loop.log.true_poses)) for member in loop.members]
     coverage = np.array(loop.coverage)
     decision_s = [sum(member.loop.log.decision_s) for member in loop.members]
     report: dict[str, Any] = {
@@ -124,8 +124,3 @@ def _sent_bytes(loop: TeamLoop) -> dict[str, int]:
     if isinstance(loop.maps, OwnMaps):
         sent['tiles'] = loop.maps.tiles.sent_bytes
     return sent
-
-
-def _path_length(poses: Sequence[Array]) -> float:
-    steps = np.diff(np.array(poses)[:, :2], axis=0)
-    return float(np.hypot(*steps.T).sum())

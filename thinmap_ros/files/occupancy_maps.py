@@ -61,19 +61,7 @@ _STRIP_ROWS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class CellRule:
-    """How the pixels of an image become cells.
-
-    table_of: cell value of each level, for a number of levels from black to white. least_alpha:
-    pixels with a smaller alpha, of 255, are unknown.
-    """
-
-    table_of: Callable[[int], NDArray[np.int8]]
-    least_alpha: int = 1
-
-
-@dataclass(frozen=True, eq=False)
-class ImageCells:
+class _ImageCells:
     """Cells of an image (H, W), its bottom row first, and how many pixels have which level.
 
     counts (levels,): from black to white, without pixels that are unknown as they are transparent.
@@ -83,7 +71,7 @@ class ImageCells:
     counts: NDArray[np.int64]
 
 
-def read_cells(path: Path, rule: CellRule) -> ImageCells:
+def _read_cells(path: Path, shades: '_Shades') -> _ImageCells:
     """Read the cells of an image.
 
     Raises OSError, ValueError, or another error of the decoder for an image that cannot be read.
@@ -96,7 +84,7 @@ def read_cells(path: Path, rule: CellRule) -> ImageCells:
         _check_header(stream)
         with Image.open(stream, formats=_FORMATS) as image:
             image.load()
-            return _cells_of(image, rule)
+            return _cells_of(image, shades)
 
 
 def _check_header(stream: BinaryIO) -> None:
@@ -135,19 +123,19 @@ def _check_comments(stream: BinaryIO) -> None:
             raise ValueError(f'more than {FILES.image_comments} comments')
 
 
-def _cells_of(image: 'Image.Image', rule: CellRule) -> ImageCells:
+def _cells_of(image: 'Image.Image', shades: '_Shades') -> _ImageCells:
     levels, pixels_of = _decoder_of(image)
-    table = rule.table_of(levels)
+    table = shades.table(levels)
     counts = np.zeros(levels, dtype=np.int64)
     cells = np.empty((image.height, image.width), dtype=np.int8)
     for top in range(0, image.height, _STRIP_ROWS):
         end = min(top + _STRIP_ROWS, image.height)
-        level, is_clear = pixels_of(image.crop((0, top, image.width, end)), rule.least_alpha)
+        level, is_clear = pixels_of(image.crop((0, top, image.width, end)), shades.least_alpha)
         rows = np.where(is_clear, np.int8(UNKNOWN), table[level])
         cells[image.height - end : image.height - top] = rows[::-1]
         opaque = level[~np.broadcast_to(is_clear, level.shape)]
         counts += np.bincount(opaque, minlength=levels)
-    return ImageCells(cells, counts)
+    return _ImageCells(cells, counts)
 
 
 _Pixels = tuple[NDArray[np.uint16] | NDArray[np.uint8], NDArray[np.bool_]]
@@ -359,9 +347,9 @@ class _Shades:
         return _Shades(occupied, free, mode, _is_negated(path, content))
 
     @property
-    def rule(self) -> CellRule:
-        """The conversion of an image; in mode scale only opaque pixels are known."""
-        return CellRule(self._table, 255 if self.mode is _Mode.SCALE else 1)
+    def least_alpha(self) -> int:
+        """Pixels with a smaller alpha, of 255, are unknown: in mode scale all but opaque ones."""
+        return 255 if self.mode is _Mode.SCALE else 1
 
     def freed_unknown(self, counts: NDArray[np.int64]) -> int:
         """Number of pixels of map_saver's unknown that are free, of the counts of all levels.
@@ -372,7 +360,7 @@ class _Shades:
         unknown = self._level(_Grey.UNKNOWN, levels)
         ends = (self._level(_Grey.OCCUPIED, levels), self._level(_Grey.FREE, levels))
         grey = int(counts[min(ends) + 1 : max(ends)].sum())
-        is_free = 0 <= self._table(levels)[unknown] <= FREE_AT_MOST
+        is_free = 0 <= self.table(levels)[unknown] <= FREE_AT_MOST
         return int(counts[unknown]) if is_free and 2 * counts[unknown] > grey else 0
 
     def freed_text(self, path: Path, count: int, keeps_unknown: bool) -> str:
@@ -391,7 +379,7 @@ class _Shades:
         level = grey * (levels - 1) // 255
         return levels - 1 - level if self.negate else level
 
-    def _table(self, levels: int) -> NDArray[np.int8]:
+    def table(self, levels: int) -> NDArray[np.int8]:
         """Cell value of each level from 0 to levels - 1."""
         shade = np.arange(levels) / (levels - 1)
         darkness = shade if self.negate else 1.0 - shade
@@ -411,10 +399,10 @@ class _Shades:
         return cells
 
 
-def _read_image(path: Path, image: Path, shades: _Shades) -> ImageCells:
+def _read_image(path: Path, image: Path, shades: _Shades) -> _ImageCells:
     """Cells of an image. Raises InputError where it cannot be read."""
     try:
-        return read_cells(image, shades.rule)
+        return _read_cells(image, shades)
     except Exception as error:  # Pillow raises many types for corrupt images
         reason = getattr(error, 'strerror', None) or one_line_reason(error)
         raise InputError(f'{image}: {reason}: expected an image that {path} names') from error

@@ -100,7 +100,7 @@ def read_arrays(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(stream) as archive:
             members = archive.infolist()
             _check_sizes(members)
-            return {_name_of(member): _read(archive, member) for member in members}
+            return {each.filename.removesuffix(_ENDING): _read(archive, each) for each in members}
     except (OSError, ThinmapError):
         raise
     except Exception as error:  # zlib and NumPy raise many types for corrupt files
@@ -118,10 +118,6 @@ def _check_sizes(members: list[zipfile.ZipInfo]) -> None:
     for member in members:
         if not member.filename.endswith(_ENDING) or member.compress_type not in _METHODS:
             raise InputError(f'{quoted(member.filename)}: expected an array, stored or deflated')
-
-
-def _name_of(member: zipfile.ZipInfo) -> str:
-    return member.filename.removesuffix(_ENDING)
 
 
 def _read(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:

@@ -218,33 +218,32 @@ NONE = 'none'
 SOURCES = (TOPIC, TF, NONE)
 
 
-class BagOdometry(Protocol):
-    """Odometry of a bag. name: for messages; topics: that it reads."""
+class BagOdometry:
+    """Odometry of a bag, which has no sample here. name: for messages; topics: that it reads."""
 
-    name: str
-    topics: set[str]
+    def __init__(self, name: str, topics: set[str]) -> None:
+        self.name = name
+        self.topics = topics
 
     @property
     def missing(self) -> str:
         """What is missing for a sample, after a colon; '' if unknown."""
-        ...
+        return ''
 
     def samples(self, message: Any) -> Iterator[OdometryEvent]:
         """Samples that a message of its topics completes. Raises InputError if it is unusable."""
-        ...
+        yield from ()
 
     def at_scan(self, stamp_ns: int) -> Iterator[OdometryEvent]:
         """Samples at the stamp of a scan, before it."""
-        ...
+        yield from ()
 
 
-class OdometryOnTopic:
+class OdometryOnTopic(BagOdometry):
     """nav_msgs/Odometry, in the frames of the robot or in frames connected to them."""
 
     def __init__(self, topic: str, frames: OdometryFrames) -> None:
-        self.name = topic
-        self.topics = {topic}
-        self.missing = ''
+        super().__init__(topic, {topic})
         self._frames = frames
 
     def samples(self, message: Any) -> Iterator[OdometryEvent]:
@@ -257,17 +256,12 @@ class OdometryOnTopic:
             )
         yield OdometryEvent(decode.stamp_ns(message), T_odom_base)
 
-    def at_scan(self, stamp_ns: int) -> Iterator[OdometryEvent]:
-        """No sample."""
-        yield from ()
 
-
-class OdometryByTransforms:
+class OdometryByTransforms(BagOdometry):
     """The transform from the odometry frame to that of the robot."""
 
     def __init__(self, frames: BagFrames) -> None:
-        self.name = 'transforms'
-        self.topics = frames.tf_topics
+        super().__init__('transforms', frames.tf_topics)
         self._transforms: TransformOdometry = frames.by_transforms()
 
     @property
@@ -289,22 +283,12 @@ class OdometryByTransforms:
         if invalid is not None:
             raise invalid
 
-    def at_scan(self, stamp_ns: int) -> Iterator[OdometryEvent]:
-        """No sample."""
-        yield from ()
 
-
-class NoOdometry:
+class NoOdometry(BagOdometry):
     """The robot never moves in its odometry frame: there is a sample at each scan."""
 
     def __init__(self) -> None:
-        self.name = 'scans'
-        self.topics: set[str] = set()
-        self.missing = ''
-
-    def samples(self, message: Any) -> Iterator[OdometryEvent]:
-        """No sample."""
-        yield from ()
+        super().__init__('scans', set())
 
     def at_scan(self, stamp_ns: int) -> Iterator[OdometryEvent]:
         """A sample at the origin."""

@@ -4,12 +4,13 @@ Also the message types that a file defines.
 """
 
 import bz2
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory, TemporaryFile
-from typing import IO, Any, Protocol, cast
+from typing import IO, Any, cast
 
 import zstandard
 from mcap.records import Channel, Schema
@@ -286,41 +287,39 @@ class RawMessage:
     data: bytes
 
 
-class Storage(Protocol):
+class Storage(ABC):
     """One file of a bag: `topics` and their types, `offers` (QoS) of their publishers, `damage`.
 
     message_counts: number of messages by topic, as recorded; a topic without a number is missing.
     """
 
-    topics: dict[str, str]
-    offers: dict[str, list[Qos]]
-    damage: Damage
-    message_counts: dict[str, int]
+    has_messages = True
 
-    @property
-    def has_messages(self) -> bool:
-        """Whether it has messages."""
-        ...
+    def __init__(self) -> None:
+        self.damage = Damage()
+        self.topics: dict[str, str] = {}
+        self.offers: dict[str, list[Qos]] = {}
+        self.message_counts: dict[str, int] = {}
+        self._typestore = get_typestore(Stores.ROS2_JAZZY)
 
     def typestore(self, type_name: str) -> Typestore:
         """Typestore for decoding messages of a type."""
-        ...
+        return self._typestore
 
+    @abstractmethod
     def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
         """Intact messages of the given topics, or of all, in log order."""
-        ...
 
 
-class McapStorage:
+class McapStorage(Storage):
     """An MCAP file, possibly truncated or damaged."""
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self._file = McapFile(path)
         self.damage = self._file.damage
         self.has_messages = self._file.has_messages
         self.message_counts = self._file.message_counts
-        self.topics: dict[str, str] = {}
-        self.offers: dict[str, list[Qos]] = {}
         self._schemas: dict[str, Schema] = {}
         self._typestores: dict[str, Typestore] = {}
         for number, channel in self._file.definitions.channels.items():
@@ -342,18 +341,13 @@ class McapStorage:
             yield RawMessage(channel.topic, schema.name, message.log_time, message.data)
 
 
-class SqliteStorage:
-    """An SQLite file of a rosbag2 folder."""
-
-    has_messages = True
+class SqliteStorage(Storage):
+    """An SQLite file of a rosbag2 folder; it defines all of its types together."""
 
     def __init__(self, path: Path) -> None:
         """Raises InputError if it cannot be opened."""
+        super().__init__()
         self._path = path
-        self.damage = Damage()
-        self.topics: dict[str, str] = {}
-        self.offers: dict[str, list[Qos]] = {}
-        self.message_counts: dict[str, int] = {}
         try:
             with self._reader() as reader:
                 for connection in reader.connections:
@@ -367,10 +361,6 @@ class SqliteStorage:
         except Exception as error:  # rosbags raises many types for corrupt files
             reason = ' '.join(str(error).split())[:200] or type(error).__name__
             raise InputError(f'{path}: {reason}') from error
-
-    def typestore(self, type_name: str) -> Typestore:
-        """Types of the whole file."""
-        return self._typestore
 
     def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
         """Messages in the order of the log."""
@@ -471,17 +461,13 @@ _TIMES = ('builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
 _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 
 
-class Ros1Storage:
+class Ros1Storage(Storage):
     """A ROS 1 bag. Topics whose types ROS 2 does not have, or defines otherwise, are left out."""
 
     def __init__(self, path: Path) -> None:
         """Raises InputError if it cannot be opened."""
+        super().__init__()
         self._path = path
-        self.damage = Damage()
-        self.topics: dict[str, str] = {}
-        self.offers: dict[str, list[Qos]] = {}
-        self.message_counts: dict[str, int] = {}
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
         try:
             with Reader(path) as reader:
                 for connection in reader.connections:
@@ -496,15 +482,7 @@ class Ros1Storage:
                 f'{path}: ROS 1 bag: {one_line_reason(error)}: `rosbag reindex` of ROS 1 repairs a '
                 'bag that was cut off'
             ) from error
-
-    @property
-    def has_messages(self) -> bool:
-        """Whether it has messages."""
-        return any(self.message_counts.values())
-
-    def typestore(self, type_name: str) -> Typestore:
-        """Types of ROS 2 Jazzy."""
-        return self._typestore
+        self.has_messages = any(self.message_counts.values())
 
     def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
         """Messages in the order of the log; up to the first damaged chunk."""

@@ -49,8 +49,10 @@ class CommandTimeout:
     intervals.
     """
 
-    def __init__(self, is_simulated: bool) -> None:
+    def __init__(self, is_simulated: bool, limit_s: float = _TIMEOUT_S) -> None:
+        """limit_s: where the time is that of the machine."""
         self._is_simulated = is_simulated
+        self._least_s = _SIMULATED_TIMEOUT_S if is_simulated else limit_s
         self._intervals_s: deque[float] = deque(maxlen=_USUAL_INTERVALS)
         self._sent_s: float | None = None  # of the last command, if that was a motion
         self._is_expired = False
@@ -58,10 +60,8 @@ class CommandTimeout:
     @property
     def limit_s(self) -> float:
         """Longest time without a command."""
-        if not self._is_simulated:
-            return _TIMEOUT_S
-        usual_s = fmean(self._intervals_s) if self._intervals_s else 0.0
-        return max(_SIMULATED_TIMEOUT_S, _INTERVALS * usual_s)
+        usual_s = fmean(self._intervals_s) if self._is_simulated and self._intervals_s else 0.0
+        return max(self._least_s, _INTERVALS * usual_s)
 
     def add(self, is_motion: bool, now_s: float) -> None:
         """Register a command."""

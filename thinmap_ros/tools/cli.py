@@ -137,7 +137,7 @@ def check_place(path: Path) -> None:
         raise InputError(f'{path}: the folder {there} may not be written to')
 
 
-INTERRUPTED = 130
+_INTERRUPTED = 130
 
 _NO_PARAMETERS = NodeParameters()
 
@@ -161,7 +161,7 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
         sys.exit(BAD_INPUT)
     except KeyboardInterrupt:
         print(f'{parser.prog}: interrupted', file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        sys.exit(_INTERRUPTED)
     finally:
         compilation.end()
 

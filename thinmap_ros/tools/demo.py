@@ -22,7 +22,6 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation import recorded_run
-from thinmap_ros.evaluation import recorded_run as recorded_team_run
 from thinmap_ros.evaluation.parallel_jobs import end_with_parent
 from thinmap_ros.evaluation.ros_domains import use_free_domain
 from thinmap_ros.files import package_data
@@ -92,10 +91,6 @@ class Processes:
             if process.poll() is None:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, number)
-
-
-def _raise_interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
 
 
 def explore(arguments: argparse.Namespace, world: Path, starts: Sequence[Array]) -> None:
@@ -251,7 +246,7 @@ def _work(arguments: argparse.Namespace) -> None:
     world = package_data.world_path(arguments.world)
     arguments.out = out_folder(arguments.out, 'demo')
     starts = _starts(arguments, world)
-    signal.signal(signal.SIGTERM, _raise_interrupt)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     _prepare(arguments.out)
     _choose_domain()
     explore(arguments, world, starts)
@@ -261,7 +256,7 @@ def _work(arguments: argparse.Namespace) -> None:
     if len(starts) == 1:
         report = recorded_run.write(*run, command)
     else:
-        report = recorded_team_run.write_team(*run, map_poses(starts), command)
+        report = recorded_run.write_team(*run, map_poses(starts), command)
     print(
         f'{report["reason"]}: {100.0 * report["coverage"]:.1f} % seen, '
         f'{report["distance"]:.1f} m, {report["time"]:.1f} s, {report["collisions"]} collisions; '

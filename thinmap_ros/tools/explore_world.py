@@ -30,7 +30,6 @@ from thinmap_ros.view.run_folder import RunResult, write_report, write_run
 
 MAX_ROBOTS = 10
 MAX_DELAY_S = 1000.0
-STRATEGY_HELP = f'{", ".join(NAMES)}, or your own as package.module:factory (default {DEFAULT})'
 WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's worlds"
 
 
@@ -184,7 +183,12 @@ def main() -> None:
     parser = Parser('explore_world', __doc__)
     parser.add_argument('world', help=WORLD_HELP)
     add_out(parser, 'out/WORLD')
-    parser.add_argument('--strategy', default=DEFAULT, metavar='NAME', help=STRATEGY_HELP)
+    parser.add_argument(
+        '--strategy',
+        default=DEFAULT,
+        metavar='NAME',
+        help=f'{", ".join(NAMES)}, or your own as package.module:factory (default {DEFAULT})',
+    )
     parser.add_argument(
         '--start', help="X,Y or X,Y,THETA in m, m, rad (default: the world's own start)"
     )

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.files.safe import atomic_write
@@ -28,9 +29,14 @@ def draw_map(axes: 'Axes', patch: GridPatch) -> None:
     shade = np.full((*patch.shape, 3), _GREY, dtype=np.uint8)
     shade[patch.free] = 255
     shade[patch.occupied] = 0
-    rows, cols = patch.shape
-    x = patch.frame.origin_x + patch.frame.resolution * np.arange(cols + 1)
-    y = patch.frame.origin_y + patch.frame.resolution * np.arange(rows + 1)
+    draw_shades(axes, shade, patch.frame, patch.frame.resolution)
+
+
+def draw_shades(axes: 'Axes', shade: NDArray[np.uint8], frame: GridFrame, cell_m: float) -> None:
+    """Draw cells of a size in their colours (H, W, 3), from the origin of a frame on."""
+    rows, cols = shade.shape[:2]
+    x = frame.origin_x + cell_m * np.arange(cols + 1)
+    y = frame.origin_y + cell_m * np.arange(rows + 1)
     # Not by imshow: it takes some 90 bytes per pixel.
     axes.pcolormesh(x, y, shade, antialiased=False, rasterized=True)
 

@@ -99,10 +99,7 @@ class StampMatcher(Generic[Left, Right]):
         partner = self._rights.pop(stamp_ns, None)
         if partner is not None:
             return value, partner
-        self._lefts[stamp_ns] = value
-        if len(self._lefts) > self._capacity:
-            self._lefts.popitem(last=False)
-            self.dropped += 1
+        self._keep(self._lefts, stamp_ns, value)
         return None
 
     def add_right(self, stamp_ns: int, value: Right) -> tuple[Left, Right] | None:
@@ -110,11 +107,14 @@ class StampMatcher(Generic[Left, Right]):
         partner = self._lefts.pop(stamp_ns, None)
         if partner is not None:
             return partner, value
-        self._rights[stamp_ns] = value
-        if len(self._rights) > self._capacity:
-            self._rights.popitem(last=False)
-            self.dropped += 1
+        self._keep(self._rights, stamp_ns, value)
         return None
+
+    def _keep(self, waiting: OrderedDict[int, Any], stamp_ns: int, value: Any) -> None:
+        waiting[stamp_ns] = value
+        if len(waiting) > self._capacity:
+            waiting.popitem(last=False)
+            self.dropped += 1
 
 
 # Scans of a piece of map that is apart, until it is joined.

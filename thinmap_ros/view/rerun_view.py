@@ -153,17 +153,13 @@ _ODOMETRY = '#777777'
 
 _SCAN = '#CC0000'
 
-_PLAN = '#F0E442'
-
-_TARGET = '#F0E442'
+_PLAN = '#F0E442'  # and its target
 
 _SAMPLE = '#7B3FA0'
 
-_LOCAL_LINE = '#0072B2'
+_LOCAL = '#0072B2'  # lines and nodes of the local area
 
 _LINE = '#8FBEDB'
-
-_LOCAL_NODE = '#0072B2'
 
 _STAYS = '#7D7D7D'  # an end node with position probability 1
 
@@ -402,7 +398,7 @@ class View(NullView):
 
         def draw() -> None:
             strips = [_lifted(ends, _Z['lines']) for ends in segments]
-            shades = [rgb(_LOCAL_LINE if near else _LINE) for near in local]
+            shades = [rgb(_LOCAL if near else _LINE) for near in local]
             widths = [self._px(2.5 if near else 1.5) for near in local]
             self._log('map/lines', self._rr.LineStrips3D(strips, colors=shades, radii=widths))
 
@@ -412,7 +408,7 @@ class View(NullView):
         """Show the nodes (N, 2) of the local area, at most once a second."""
 
         def draw() -> None:
-            colour = [*rgb(_LOCAL_NODE), 90]
+            colour = [*rgb(_LOCAL), 90]
             points = _lifted(places, _Z['local_area'])
             self._log(
                 'map/local_area', self._rr.Points3D(points, colors=[colour], radii=[self._px(9.0)])
@@ -452,7 +448,7 @@ class View(NullView):
         self._target = places
         self._at(ns)
         points = self._rr.Points3D(
-            _lifted(places, _Z['target']), colors=[rgb(_TARGET)], radii=[self._px(10.0)]
+            _lifted(places, _Z['target']), colors=[rgb(_PLAN)], radii=[self._px(10.0)]
         )
         self._log('map/target', points)
 

@@ -15,7 +15,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.regions import RegionKind, RegionMap
 from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.view import palette
-from thinmap_ros.view.figures import DPI, draw_graph, draw_hidden_areas, draw_map
+from thinmap_ros.view.figures import DPI, draw_graph, draw_hidden_areas, draw_map, draw_shades
 
 # Cells of a map as they are drawn: one by one, or in blocks where the map is large.
 
@@ -245,11 +245,7 @@ def _draw_cells(axes: 'Axes', patch: GridPatch, regions: RegionMap | None) -> di
     if (shade[cells.free] == 255).all(axis=1).any():
         surfaces['free'] = _FREE
     shade[cells.occupied] = palette.rgb(_WALL)
-    rows, cols = cells.free.shape
-    x = patch.frame.origin_x + cell_m * np.arange(cols + 1)
-    y = patch.frame.origin_y + cell_m * np.arange(rows + 1)
-    # Not by imshow: it takes some 90 bytes per pixel.
-    axes.pcolormesh(x, y, shade, antialiased=False, rasterized=True)
+    draw_shades(axes, shade, patch.frame, cell_m)
     if labels is not None:
         _draw_boundaries(axes, labels, patch.frame, cell_m)
     return surfaces

@@ -11,14 +11,6 @@ from thinmap_ros.web.pages import Pages
 _START_S = 10.0
 
 
-def require_library() -> None:
-    """Raise InputError with installation advice if tornado is missing."""
-    try:
-        import tornado.websocket  # noqa: F401
-    except ImportError as error:
-        raise InputError('tornado is not installed: pip install tornado') from error
-
-
 @dataclass(frozen=True)
 class Address:
     """Where the server listens."""
@@ -41,7 +33,10 @@ class Server:
 
     def __init__(self, address: Address, pages: Pages) -> None:
         """Raises InputError where the address cannot be used, or tornado is missing."""
-        require_library()
+        try:
+            import tornado.websocket  # noqa: F401
+        except ImportError as error:
+            raise InputError('tornado is not installed: pip install tornado') from error
         # Tornado's lines about closed sockets are no news here.
         logging.getLogger('tornado').setLevel(logging.CRITICAL)
         self._pages = pages

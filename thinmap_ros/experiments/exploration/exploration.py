@@ -9,7 +9,7 @@ from thinmap_ros.core.exploration.paper import PaperExplorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, path_length_m
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus
@@ -75,7 +75,7 @@ def run(source: Source) -> Outcome:
     coverage = [(m.seconds, goal.coverage(m.patch)) for m in moments]
     last = moments[-1]
     poses = np.array([moment.T_map_base for moment in moments])
-    way_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+    way_m = path_length_m(poses)
     shown = [moments[round(share * (len(moments) - 1))] for share in _SETUP.shown]
     unvisited = census.seen - census.visited
     return Outcome(

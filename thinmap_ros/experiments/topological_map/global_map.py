@@ -64,7 +64,7 @@ def run(source: Source) -> Outcome:
                 'one connected map',
                 'yes',
                 f'{len(states[-1].components())} part',
-                _is_one(states[-1]),
+                len(states[-1].components()) == 1,
             ),
             Comparison(
                 'redundant nodes at the edge of the window, deleted by the end',
@@ -136,10 +136,6 @@ def _agreement(one: TopologicalMap, other: TopologicalMap) -> float:
 def _redundant(early: TopologicalMap, final: TopologicalMap) -> int:
     """Nodes of an early map where the final one has none."""
     return round(len(early.nodes) * (1.0 - _agreement(early, final)))
-
-
-def _is_one(graph: TopologicalMap) -> bool:
-    return len(graph.components()) == 1
 
 
 def _rows(graph: TopologicalMap) -> Rows:

@@ -10,7 +10,7 @@ from thinmap_ros.core.planning.wavefront import (
     navigation_function,
     plan,
 )
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, path_length_m
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.experiments.drives import Source, grid_of, tour_of
 from thinmap_ros.view.plots import Curve, MapLayer, Panel, Plot, Raster
@@ -34,8 +34,9 @@ def run(source: Source) -> Outcome:
             path = plan(patch, _START, goal, config)
             if path is not None:
                 cells = patch.frame.cells_of(path)
-                room = clearance_m[cells[:, 0], cells[:, 1]]
-                rows.append([name, *goal, _length(path), float(room.min()), float(room.mean())])
+                clear_m = clearance_m[cells[:, 0], cells[:, 1]]
+                room_m = (float(clear_m.min()), float(clear_m.mean()))
+                rows.append([name, *goal, path_length_m(path), *room_m])
                 paths[name] = path
     field = _field(patch, goals[-1])
     minima = _local_minima(field)
@@ -98,10 +99,6 @@ def _local_minima(field: Array) -> int:
         np.where(np.isfinite(field), field, np.inf), 3, mode='constant', cval=np.inf
     )
     return int(np.count_nonzero(np.isfinite(field) & (field <= lowest) & (field > 0.0)))
-
-
-def _length(path: Array) -> float:
-    return float(np.hypot(*np.diff(path, axis=0).T).sum())
 
 
 def _plot(patch: GridPatch, field: Array, paths: dict[str, Array]) -> Plot:

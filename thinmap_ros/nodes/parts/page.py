@@ -378,18 +378,6 @@ class TopSpeeds(NamedTuple):
     turn: float
 
 
-class HoldTimeout(CommandTimeout):
-    """Whether a velocity is no longer asked for, whatever the clock of the node."""
-
-    def __init__(self) -> None:
-        super().__init__(is_simulated=False)
-
-    @property
-    def limit_s(self) -> float:
-        """Longest time without a request."""
-        return _HOLD_S
-
-
 class Teleoperation:
     """Publishes the velocity that one page at a time asks for.
 
@@ -403,7 +391,9 @@ class Teleoperation:
         self._lock = Lock()
         self._sent_s = 0.0
         self._holder: int | None = None
-        self._watchdog = CommandWatchdog(self._send, lambda seconds: None, HoldTimeout())
+        # By the clock of the machine, whatever that of the node.
+        timeout = CommandTimeout(is_simulated=False, limit_s=_HOLD_S)
+        self._watchdog = CommandWatchdog(self._send, lambda seconds: None, timeout)
 
     def take(self, page: int) -> bool:
         """Let a page drive; returns whether it begins to. Raises InputError where another does."""
