@@ -41,9 +41,7 @@ from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.jit import kernel
 
 _COARSE = 2
-
 _PART_M = 1.0
-
 # The same robot and the same frontiers as for the exploration of the paper.
 _EXPLORER = ExplorerConfig()
 

@@ -30,8 +30,6 @@ from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 
-# Kidnaps the robot during exploration, and measures detection and recovery.
-
 
 @dataclass(frozen=True)
 class _Criteria:

@@ -197,8 +197,6 @@ def _named(error: Exception) -> str:
     return f'{type(error).__name__}: {one_line_reason(error)}'
 
 
-# Child processes that end with their parent.
-
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 
 
@@ -207,12 +205,8 @@ def end_with_parent() -> None:
     ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGTERM)
 
 
-# Machine and commit of a measurement.
-
 _ROOT = Path(__file__).resolve().parents[2]
-
 _PROVENANCE = 'provenance.txt'
-
 _GIT_S = 10.0
 
 

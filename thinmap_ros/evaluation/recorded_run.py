@@ -204,8 +204,6 @@ def _census(recording: Recording) -> EndNodeCensus:
     return census
 
 
-# Results of a run of several robots on the live graph, from its bag.
-
 _TEAM_TOPICS = {'/merged_map', '/merged_topology', '/join_status'}
 
 

@@ -90,12 +90,8 @@ def run_drive(
     return run
 
 
-# Errors and costs of other programs on public logs, as recorded.
-
 Range = tuple[float, float]  # lowest and highest of some runs; twice the same of one
-
 INTEL = 'intel'  # 5,438 scans
-
 COMPLETE = ('intel_raw', 'aces_raw', 'csail_raw')
 
 
@@ -140,11 +136,8 @@ def _published(system: str, log: str, final_m: float, note: str = '') -> PeerRun
 
 
 LAMA = 'IRIS LaMa slam2d'
-
 CARTOGRAPHER = 'Cartographer 2D'
-
 _HESS = 'Hess et al., ICRA 2016, Table II'
-
 _KUEMMERLE = 'Kümmerle et al., Autonomous Robots 27, 2009'
 
 # LaMa closes no loops. Of all but its first build, one error is recorded for a log: it is listed

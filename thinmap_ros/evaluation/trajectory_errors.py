@@ -126,12 +126,7 @@ def _nearest(times: Array, t: float) -> int:
     )
 
 
-# Errors of a trajectory against a reference, with the conventions of evo.
-#
-# Source: Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017.
-
 MIN_POSES = 3
-
 MAX_TIME_DIFFERENCE_S = 0.01  # as evo's --t_max_diff
 
 
@@ -177,11 +172,12 @@ class Comparison:
 def compare_with_tum(
     path: Path, reference: Path, is_aligned: bool, max_difference_s: float, delta: int
 ) -> Comparison:
-    """Absolute and relative pose errors of a TUM trajectory against another one.
+    """Absolute and relative pose errors of a TUM trajectory against another one, as evo has them.
 
     is_aligned: whether the trajectory is moved onto the reference first (evo's --align), which
     does not change relative errors. delta: poses between the two of a relative error. Raises
     InputError where a file is invalid, or fewer than three stamps are common.
+    Source: Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017.
     """
     stamps_ns, poses = read_tum(path)
     known_ns, truth = read_tum(reference)

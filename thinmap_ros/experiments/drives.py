@@ -207,8 +207,6 @@ def samples_of_bag(path: Path) -> Iterator[DriveSample]:
         yield DriveSample(event.scan, T_odom_base[stamp_ns], truth[stamp_ns])
 
 
-# Maps that several experiments begin with.
-
 CELL_M = PAPER_GRID.resolution_m
 
 

@@ -34,29 +34,15 @@ from thinmap_ros.files.safe import (
     write_text,
 )
 
-# Reads images of maps within limits, and converts them to cells strip by strip.
-#
-# Formats: PGM (or another netpbm format), PNG, BMP and JPEG. The header is read from the first
-# bytes of the file, and the size that it gives is checked before pixels are decoded. Besides the
-# decoded image and its cells, the conversion takes the memory of one strip of rows.
-#
-# The level of a pixel is the sum of red, green and blue, as map_server takes their mean; the
-# luminance of an image would make a green wall lighter than a red one.
-
 if TYPE_CHECKING:
     from PIL import Image
 
 # Readers of other formats run programs, or decode before they check the size.
 _FORMATS = ('PPM', 'PNG', 'BMP', 'JPEG')
-
 _PLAIN_NETPBM = (b'P1', b'P2', b'P3')
-
 _GREYS_8 = 1 << 8
-
 _GREYS_16 = 1 << 16
-
 _SUMS_OF_COLOURS = 3 * 255 + 1
-
 _STRIP_ROWS = 64
 
 
@@ -72,7 +58,13 @@ class _ImageCells:
 
 
 def _read_cells(path: Path, shades: '_Shades') -> _ImageCells:
-    """Read the cells of an image.
+    """Read the cells of an image: PGM (or another netpbm format), PNG, BMP or JPEG.
+
+    Its size is that of the header, and is checked before pixels are decoded. Besides the decoded
+    image and its cells, the conversion takes the memory of one strip of rows.
+
+    The level of a pixel is the sum of red, green and blue, as map_server takes their mean; the
+    luminance of an image would make a green wall lighter than a red one.
 
     Raises OSError, ValueError, or another error of the decoder for an image that cannot be read.
     """
@@ -166,9 +158,7 @@ def _colour_pixels(strip: 'Image.Image', least_alpha: int) -> _Pixels:
 
 # Receives a line that the user of a map should know.
 Report = Callable[[str], object]
-
 _MARK = '# written by thinmap'
-
 # map_saver writes 0.25 beside the same grey values, but map_server takes each pixel below
 # free_thresh as free, and unknown is 50/255 = 0.19608 dark: the map would lose what is unknown.
 # Another grey value would not be unknown to readers that expect 205.

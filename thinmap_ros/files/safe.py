@@ -22,14 +22,13 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason, quoted
 from thinmap_ros.core.snapshot import State
 
-# Limits of what is read from files and logs: a larger one is refused before it fills the memory.
-#
-# One table for all formats; the readers name the limit in their error messages.
-
 
 @dataclass(frozen=True)
 class FileLimits:
-    """Maps, graphs, worlds, sessions and configuration files. Sizes in bytes."""
+    """Limits of maps, graphs, worlds, sessions and configuration files. Sizes in bytes.
+
+    A larger file is refused before it fills the memory; the readers name the limit.
+    """
 
     text_bytes: int = 1 << 30
     yaml_bytes: int = 4 << 20
@@ -49,7 +48,7 @@ class FileLimits:
 
 @dataclass(frozen=True)
 class LogLimits:
-    """Bags and logs of sensor data. Sizes in bytes."""
+    """Limits of bags and logs of sensor data, as `FileLimits`."""
 
     file_bytes: int = 32 << 30  # decompressed
     file_ratio: int = 200  # of decompressed to compressed bytes, beyond `small_file_bytes`
@@ -71,27 +70,21 @@ class LogLimits:
 
 
 PIECE_BYTES = 1 << 20  # large files are read in pieces
-
 FILES = FileLimits()
-
 LOGS = LogLimits()
 
 
-# Reads NumPy archives (.npz) of any origin: the size of each array is checked before it is read.
-#
-# Members may be compressed a thousandfold, and the header of an array may declare any size. Sizes
-# are therefore summed first, and each declared size is compared with that of its member. The limits
-# are above the largest map of thinmap: 512 MiB in total, 64 arrays.
-
 _ENDING = '.npy'
-
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-
 _READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
 def read_arrays(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an archive, by name.
+    """Read all arrays of an archive (.npz) of any origin, by name.
+
+    Members may be compressed a thousandfold, and the header of an array may declare any size. Sizes
+    are therefore summed first, and each declared size is compared with that of its member. The
+    limits are above the largest map of thinmap.
 
     Raises InputError if it is no archive of plain arrays (no pickled objects), or exceeds the
     limits; OSError as the stream.
@@ -141,9 +134,6 @@ def _check_header(stream: IO[bytes], member: zipfile.ZipInfo) -> None:
         raise InputError(f'{quoted(member.filename)}: {found}: expected an array of {actual} bytes')
 
 
-# Paths as callers give them.
-
-
 def path_of(value: object) -> Path:
     """Path of a text or a Path. Raises InputError for anything else."""
     if isinstance(value, str | Path):
@@ -151,10 +141,7 @@ def path_of(value: object) -> Path:
     raise InputError(f'path = {quoted(value)}: expected a text or a Path')
 
 
-# Opens files of any origin for reading: regular ones only, as others block or never end.
-
 _READ_ONLY = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK
-
 _KINDS = {
     stat.S_IFIFO: 'a named pipe',
     stat.S_IFSOCK: 'a socket',
@@ -166,8 +153,9 @@ _KINDS = {
 
 @contextmanager
 def open_regular_file(path: Path, flags: int = 0) -> Iterator[BinaryIO]:
-    """Open a regular file for reading, symbolic links followed.
+    """Open a regular file of any origin for reading; others block or never end.
 
+    Symbolic links are followed.
     flags: additional ones for os.open, such as O_NOFOLLOW.
     Raises OSError as open, and where it is no regular file: a pipe, a socket or a device is refused
     before it is opened.
@@ -190,8 +178,6 @@ def _require_regular(path: Path, status: os.stat_result) -> None:
         kind = _KINDS.get(stat.S_IFMT(status.st_mode), 'a special file')
         raise OSError(errno.EINVAL, f'{kind}: expected a regular file', str(path))
 
-
-# Atomic writing of files (temporary file, then rename), and reading of texts up to a limit.
 
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
@@ -245,41 +231,30 @@ def read_text(path: Path, max_bytes: int = FILES.text_bytes) -> str:
         ) from error
 
 
-# Reads YAML of any origin, within limits that are checked before objects are constructed.
-#
-# A file of a few hundred bytes can describe billions of members by repetition (anchors and aliases,
-# merge keys). No file of this project needs them, so they are rejected. The limits are far above
-# any world: 4 MiB, 100,000 nodes (values, lists and mappings), 20 levels, numbers of 100
-# characters.
-#
-# Numbers are those of yaml-cpp, which reads the same files in ROS: `1e-1`, `-.5` and `1.e2` are
-# numbers, `010` is ten, and `1:30` and `1_000` are texts. YAML 1.1, which PyYAML follows, says
-# otherwise.
-
 _MERGE_TAG = 'tag:yaml.org,2002:merge'
-
 _INTEGER_TAG = 'tag:yaml.org,2002:int'
-
 _FLOAT_TAG = 'tag:yaml.org,2002:float'
-
 _NUMBER_TAGS = (_INTEGER_TAG, _FLOAT_TAG)
-
 _DECIMAL = re.compile(r'[-+]?[0-9]+\Z')
-
 _INTEGER = re.compile(r'(?:[-+]?[0-9]+|0x[0-9a-fA-F]+)\Z')
-
 _FLOAT = re.compile(
     r'(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?'
     r'|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))\Z'
 )
-
 _TRUE = ('y', 'yes', 'true', 'on')
-
 _FALSE = ('n', 'no', 'false', 'off')
 
 
 def parse_yaml(text: str) -> object:
-    """Parse a YAML text: mappings, lists, texts, numbers, booleans, dates or nothing.
+    """Parse a YAML text of any origin: mappings, lists, texts, numbers, booleans, dates or nothing.
+
+    A file of a few hundred bytes can describe billions of members by repetition (anchors and
+    aliases, merge keys). No file of this project needs them, so they are rejected. The limits are
+    far above any world, and checked before objects are constructed.
+
+    Numbers are those of yaml-cpp, which reads the same files in ROS: `1e-1`, `-.5` and `1.e2` are
+    numbers, `010` is ten, and `1:30` and `1_000` are texts. YAML 1.1, which PyYAML follows, says
+    otherwise.
 
     Raises InputError, without a file name, if it is no YAML, or exceeds the limits.
     """
@@ -420,19 +395,16 @@ def _at(event: yaml.Event) -> str:
     return 'somewhere' if mark is None else f'line {mark.line + 1}, column {mark.column + 1}'
 
 
-# Snapshots of states as NumPy archives: sessions and checkpoints of nodes.
-#
-# An archive holds the arrays of a state by name, and a label: what it is a state of, and the
-# version of the format. The class of the state declares the arrays and validates them
-# (`core/snapshot.py`).
-
 VERSION = 2
-
 _LABEL = 'thinmap_format'
 
 
 def write_snapshot(stream: IO[bytes], kind: str, state: State, compress: bool = True) -> None:
-    """Write a state; compress: smaller and slower. Raises OSError."""
+    """Write a state as an archive of NumPy arrays; compress: smaller and slower. Raises OSError.
+
+    Its arrays are by name, with a label: what it is a state of, and the version of the format. The
+    class of the state declares the arrays and validates them (`core/snapshot.py`).
+    """
     arrays: dict[str, Any] = {_LABEL: np.array(_label(kind)), **state}
     (np.savez_compressed if compress else np.savez)(stream, **arrays)
 

@@ -170,11 +170,8 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-# Conversion of core values to message objects for a bag, without ROS.
-
-
 class BagObjects:
-    """Makes message objects of the types of a typestore."""
+    """Makes message objects of core values, without ROS: of the types of a typestore."""
 
     def __init__(self, types: dict[str, Any]) -> None:
         self._types = types

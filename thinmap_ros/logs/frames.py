@@ -17,9 +17,7 @@ from thinmap_ros.logs.storage import RawMessage
 from thinmap_ros.logs.transforms import Mount, OdometryFrames, StaticTransforms, TransformOdometry
 
 _TF = 'tf2_msgs/msg/TFMessage'
-
 _BASE = 'base_link'
-
 _ODOM = 'odom'
 
 
@@ -207,14 +205,9 @@ class BagFrames:
         return True
 
 
-# Sources of the odometry of a bag: its topic, its transforms, or none.
-
 TOPIC = 'topic'
-
 TF = 'tf'
-
 NONE = 'none'
-
 SOURCES = (TOPIC, TF, NONE)
 
 

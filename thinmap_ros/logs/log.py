@@ -15,7 +15,6 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs import readers
 
 _MAX_REASONS = 20
-
 _OTHER = 'other reasons'
 
 
@@ -94,9 +93,6 @@ class Log(Protocol):
         ...
 
 
-# Properties of a laser that a CARMEN log does not contain.
-
-
 @dataclass(frozen=True)
 class LaserOptions(Config):
     """Properties of the laser that FLASER lines do not contain.
@@ -118,9 +114,6 @@ class LaserOptions(Config):
     range_max_m: float = parameter(
         80.0, 'ranges from here on are "no return", m', low=0.1, high=1000.0
     )
-
-
-# Formats of logs: what a module of `logs.readers` defines, and which one opens a file.
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,10 @@
 """Reads MCAP files, also truncated or damaged ones: intact messages in log order or file order.
 
 The `mcap` package has no recovery (`mcap recover` is a program written in Go), and neither it nor
-rosbags limits the decompressed size of a chunk. Only the record types of `mcap` are used.
+rosbags limits the decompressed size of a chunk. Only the record types of `mcap` are used. Declared
+sizes are checked before memory is allocated.
+
+Source: https://mcap.dev/spec.
 """
 
 import heapq
@@ -29,28 +32,15 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import LATEST_NS
 from thinmap_ros.files.safe import LOGS, PIECE_BYTES, open_regular_file
 
-# Records of MCAP files, within limits: declared sizes are checked before memory is allocated.
-#
-# Source: https://mcap.dev/spec.
-
 MAGIC = b'\x89MCAP0\r\n'
-
 FIRST_PRIVATE_OPCODE = 0x80
-
 HEAD = struct.Struct('<BQ')
-
 _CHUNK = struct.Struct('<QQQI')
-
 _LENGTH = struct.Struct('<I')
-
 _MESSAGE = struct.Struct('<HIQQ')
-
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-
 _SLICE = 2**16
-
 _LONGEST_NAME = 1000  # of a compression
-
 Definition = Schema | Channel
 
 
@@ -371,7 +361,6 @@ def _short(error: Exception) -> str:
 
 
 _FOOTER = struct.Struct('<QQI')
-
 _CHANNEL_ID = struct.Struct('<H')
 
 

@@ -29,13 +29,9 @@ from thinmap_ros.logs.log import (
     format_of,
 )
 
-# Clocks that jump back in the middle of a log: it ends there, or continues on one time line.
-
 # Odometry continues where it moves at most so many steps as before: two samples may be lost.
 _STEPS = 3
-
 _REST_M = 0.02
-
 _REST_RAD = 0.02
 
 
@@ -198,9 +194,6 @@ def _moved(event: Event, shift_ns: int) -> Event:
     return dataclasses.replace(event, scan=scan)
 
 
-# Events of a log in the order of their stamps, where some of them came late.
-
-
 def by_stamp(events: Iterable[Event]) -> Iterator[Event]:
     """Put events in the order of their stamps, within `CLOCK_JUMP_NS`.
 
@@ -332,8 +325,6 @@ def complete_scans(pairing: ScanOdometrySynchronizer, event: Event) -> list[tupl
         return pairing.add_odometry(event.stamp_ns, event.T_odom_base)
     return pairing.add_scan(event.scan)
 
-
-# Why scans of a log have no odometry at their stamps, with counts and times.
 
 _UNITS = (('s', 1.0), ('h', 3600.0), ('days', 86400.0), ('years', 365.25 * 86400.0))
 

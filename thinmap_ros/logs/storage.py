@@ -44,8 +44,6 @@ from thinmap_ros.files.safe import (
 from thinmap_ros.logs.mcap import MAGIC as _MCAP
 from thinmap_ros.logs.mcap import Damage, DamagedError, McapFile, decompress
 
-# rosbag2 folders: their files, and how these are compressed (metadata.yaml).
-
 
 @dataclass(frozen=True)
 class BagFiles:
@@ -168,10 +166,7 @@ def _unpack(file: Path, out: IO[bytes]) -> None:
         raise InputError(f'{file}: no zstd file: {str(error)[:120]}') from error
 
 
-# Formats of log files, told by their first bytes.
-
 _ROS1 = b'#ROSBAG V'
-
 _SQLITE = b'SQLite format 3\0'
 
 
@@ -222,7 +217,6 @@ def _begin(path: Path) -> bytes:
 
 # Key of a channel's metadata in an MCAP file; its value is YAML.
 KEY = 'offered_qos_profiles'
-
 _FOREVER = QosTime(2147483647, 4294967295)
 
 
@@ -451,18 +445,17 @@ def _parsed(name: str, encoding: str, text: str) -> Typestore:
     return typestore
 
 
-# ROS 1 bags, read by rosbags; their messages are converted to those of ROS 2.
-
 _HEADER = 'std_msgs/msg/Header'
-
 _TIMES = ('builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
-
 # Types of ROS 1 that have another name in ROS 2.
 _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 
 
 class Ros1Storage(Storage):
-    """A ROS 1 bag. Topics whose types ROS 2 does not have, or defines otherwise, are left out."""
+    """A ROS 1 bag, read by rosbags, with messages of ROS 2.
+
+    Topics whose types ROS 2 does not have, or defines otherwise, are left out.
+    """
 
     def __init__(self, path: Path) -> None:
         """Raises InputError if it cannot be opened."""

@@ -18,13 +18,9 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.decode import require_rotation
 
-# Poses of frames on a robot, from static transforms: chained in 3D, projected to the plane.
-
 _MAX_TILT_DEG = 15.0
-
 # Smaller changes are of rounding, or of a calibration that was refined.
 _MAX_CHANGE_M = 0.01
-
 _MAX_CHANGE_RAD = 0.01
 
 
@@ -120,7 +116,7 @@ _Links = Mapping[str, _Link]
 
 
 class StaticTransforms:
-    """The transforms of /tf_static. Of several for one frame, the first one holds.
+    """The transforms of /tf_static, chained in 3D. Of several for one frame, the first one holds.
 
     The map is made with it; `change` describes how the newest differs.
     """
@@ -423,9 +419,6 @@ class TransformOdometry:
         except InputError as error:
             return str(error)
         return ''
-
-
-# The frames of odometry messages: those of the robot's parameters, or fixed to them.
 
 
 class OdometryFrames:

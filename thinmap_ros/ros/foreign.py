@@ -1,4 +1,8 @@
-"""Parameters of other packages: their files, names and values as those of thinmap."""
+"""Parameters of other packages: their files, names and values as those of thinmap.
+
+Names and defaults are those of slam_toolbox (Jazzy), nav2_amcl, Nav2's map server, controller and
+navigator, and m-explore-ros2's explore_lite and map_merge.
+"""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,11 +13,6 @@ from typing import Any, NamedTuple
 
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.files.safe import parse_yaml, read_mapping
-
-# Parameters of other packages, with the parameters of thinmap that do the same.
-#
-# Names and defaults are those of slam_toolbox (Jazzy), nav2_amcl, Nav2's map server, controller
-# and navigator, and m-explore-ros2's explore_lite and map_merge.
 
 
 @dataclass(frozen=True)
@@ -50,17 +49,11 @@ def _row(name: str, default: str, *targets: str, note: str = '') -> ForeignParam
 
 
 _NO_CORRELATION = 'no: points are matched with walls, without a search grid'
-
 _NO_RESPONSE = 'no: a match is judged by its inlier ratio'
-
 _NO_SOLVER = 'no: the pose graph has a solver of its own'
-
 _NO_BEAM_MODEL = 'no: poses are refined by scan matching, without a beam model'
-
 _NO_FILTER = 'no: there is no particle filter; samples are drawn only while the robot is lost'
-
 _NO_UTILITY = 'no: the nearest target is next, by path'
-
 _REMAP = 'by remapping'
 
 SLAM_TOOLBOX = Package(
@@ -305,18 +298,11 @@ MAP_SERVER = Package(
 PACKAGES = (SLAM_TOOLBOX, AMCL, MAP_SERVER, EXPLORE_LITE, MAP_MERGE, NAV2)
 
 
-# Sections of parameter files: which nodes they are for, also those of other packages' files.
-
 EXPECTED = 'a parameter file: NODE: ros__parameters: NAME: VALUE'
-
 WILDCARDS = ('**', '*')
-
 _VALUES = 'ros__parameters'
-
 _FILE = '--params-file'
-
 _RULES = ('-p', '--param')
-
 _ANY = '/**'
 
 
@@ -469,8 +455,6 @@ def _leaves(values: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]
         else:
             yield f'{prefix}{name}', value
 
-
-# Translation of given values of other packages' parameters.
 
 _SEED = 'random_seed'  # negative: AMCL takes one from the clock
 

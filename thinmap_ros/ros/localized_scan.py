@@ -115,22 +115,16 @@ def _laser(message: LocalizedScanMsg) -> LaserConfig:
         raise InputError(str(error)) from error
 
 
-# Lockstep: a player or simulation waits for the result of each scan, so that none is lost.
-
 NONE = 'none'
-
 _TYPES: dict[str, Any] = {
     'pose': PoseWithCovarianceStamped,
     'local_grid': LocalGrid,
     'local_topology': TopologicalMap,
     'localization_status': LocalizationStatus,
 }
-
 TOPICS = (NONE, *_TYPES)
-
 # Long: a busy machine, or one that compiles kernels, still publishes a result.
 TIMEOUT_S = 10.0
-
 TIMEOUT_DESCRIPTION = 'Time after which lockstep continues without a result (s, machine time).'
 
 

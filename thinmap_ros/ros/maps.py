@@ -15,11 +15,6 @@ from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
 
-# Which map a pose, a grid or a graph belongs to: ids that the localizer gives out.
-#
-# A localizer gives its map an id when it begins or loads one, and says which one a reset has
-# replaced. The id 0 is that of a map whose localizer has none, such as another package's.
-
 UNKNOWN = 0
 
 
@@ -37,7 +32,11 @@ class Origin(Enum):
 
 
 class FollowedMap:
-    """The id of the map that a node has, learned from messages."""
+    """The id of the map that a node has, learned from messages.
+
+    A localizer gives its map an id when it begins or loads one. The id 0 is that of a map whose
+    localizer has none, such as another package's.
+    """
 
     def __init__(self, map_id: int = UNKNOWN) -> None:
         self.id = map_id
@@ -58,9 +57,6 @@ class FollowedMap:
             self.id = map_id
             return Origin.SAME
         return Origin.OTHER
-
-
-# The map of a topic, with its updates on a topic beside it.
 
 
 def updates_topic(node: Node, topic: str) -> str:

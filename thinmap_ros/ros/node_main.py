@@ -33,15 +33,12 @@ from thinmap_ros.ros.foreign import (
 )
 from thinmap_ros.ros.private_rclpy import RCLError, UnknownROSArgsError
 
-# The command line of nodes: its help, and what ROS would report in its own words.
-
 _RULES = {
     '-p': 'NAME:=VALUE',
     '--param': 'NAME:=VALUE',
     '-r': 'FROM:=TO',
     '--remap': 'FROM:=TO',
 }
-
 _SET = ':='
 
 
@@ -116,13 +113,9 @@ def show_help(node: Any) -> bool:
 
 
 _SECURITY = 'ROS_SECURITY_ENABLE'
-
 _KEYSTORE = 'ROS_SECURITY_KEYSTORE'
-
 _STRATEGY = 'ROS_SECURITY_STRATEGY'
-
 _PERMISSIVE = 'Permissive'
-
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

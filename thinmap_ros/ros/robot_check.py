@@ -25,13 +25,9 @@ from thinmap_ros.ros import messages, qos, stop_topic, velocity
 from thinmap_ros.ros.diagnostics import full_name, publisher_names, subscriber_names
 
 _MAX_DELAY_S = 1.0  # of a stamp against the clock, beyond which clocks differ
-
 _MIN_RATE_HZ = 2.0
-
 _MAX_MESSAGES = 10_000
-
 _SPIN_S = 0.1
-
 _LISTENING = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -241,27 +237,17 @@ class RobotCheck:
         return Finding('clock', abs(delay_s) <= _MAX_DELAY_S, seen, advice)
 
 
-# Whether a base stops by itself when its commands end: tried on the robot, with a slow turn.
-
 TURN_RAD_S = 0.3
-
 _PERIOD_S = 0.1
-
 _COMMANDED_S = 2.0
-
 _STOPS = 10  # at the end
-
 # A base that turns on after so long has no time-out that helps: at 0.5 m/s it drives a metre.
 WATCHED_S = 2.0
-
 # A turn rate is a mean over so long: noise of 0.01 rad is then a fifth of what counts as turning.
 _LOOK_S = 0.5
-
 _TURNS_RAD_S = 0.1
-
 # Odometry that takes so many times longer than its stamps is silent.
 _PATIENCE = 5.0
-
 _WHAT = 'watchdog of the base'
 
 

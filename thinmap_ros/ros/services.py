@@ -70,21 +70,18 @@ async def call(node: Node, client: Client, request: Any) -> Any | None:
     )
 
 
-# Directory in which services may read and write, symbolic links resolved.
-#
-# Any caller of a service can name a path. Paths that the operator gives when starting a node (the
-# parameters `session` and `map`) are not confined.
-
 # A peer that saves again and again neither fills the disk nor keeps the node from its work.
 _MAX_SAVES = 20
-
 _PERIOD_S = 60.0
-
 _MIN_FREE_BYTES = 100 << 20
 
 
 class SaveDirectory:
-    """The directory that contains the paths of a node's services."""
+    """The directory in which the services of a node may read and write, symbolic links resolved.
+
+    Any caller of a service can name a path. Paths that the operator gives when starting a node,
+    as parameters, are not confined.
+    """
 
     def __init__(self, node: Node) -> None:
         """Declare the parameter `save_directory`; empty: the working directory of the node."""

@@ -24,8 +24,6 @@ from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 
-# Whether a node's robot explores with others, under which name, and where their maps lie.
-
 
 @dataclass(frozen=True)
 class MembershipConfig(Config):
@@ -72,14 +70,9 @@ class JoinedPlaces:
         self.poses = {name: se2.between(own, T) for name, T in world.items()}
 
 
-# Messages between robots that explore together: claims, and tiles of their maps.
-
 _MAX_SPEED = 100.0  # m/s and rad/s
-
 _MAX_COUNT = 255
-
 _MAX_NAME = 200
-
 _SOMEWHERE = (0.0, 0.0)
 
 
@@ -232,8 +225,6 @@ def _moved_place(T: Array, place: Place | None) -> Place | None:
     return None if place is None else _moved(T, [place])[0]
 
 
-# The other robots of a team by what they send, in the map of this one.
-
 CLAIMS = '/team/claims'
 
 
@@ -304,10 +295,7 @@ def heard_robots(node: ThinmapNode) -> HeardRobots | None:
     return HeardRobots(node, JoinedPlaces(node, name), name, silence_s)
 
 
-# Tiles of the maps of other robots, in the map of this one.
-
 TILES = '/team/tiles'
-
 REQUESTS = '/team/tile_requests'
 
 

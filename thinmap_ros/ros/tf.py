@@ -25,10 +25,7 @@ from thinmap_ros.ros.diagnostics import WARN, full_name
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded
 
-# Transforms that another node publishes between frames that this node connects.
-
 _RECENT_S = 3.0  # a source that publishes more rarely is one that has ended
-
 _OWN_STAMPS = 2 * qos.TRANSFORMS.depth  # at most the depth is queued
 
 
@@ -94,9 +91,6 @@ class SoleBroadcaster:
 
 def _topic(is_static: bool) -> str:
     return '/tf_static' if is_static else '/tf'
-
-
-# The transform from the map to the odometry frame, published ahead of time.
 
 
 @dataclass(frozen=True)
@@ -187,32 +181,21 @@ class MapBroadcaster:
         )
 
 
-# Serialized messages of /tf and /tf_static, of which only what is needed is decoded.
-#
-# Decoding all transforms of two thousand frames at 20 Hz takes more than half of a processor, in
-# each node.
-
 _MANY = 200  # frames; robots with arms and heads have fewer
-
 _MAX_FRAMES = 10_000
-
 _PERIOD_S = 1.0
-
 # Layout of CDR, little endian, offsets from the end of its header of four bytes.
 _LITTLE_ENDIAN = b'\x00\x01'
-
 _HEADER = 4
-
 _COUNT = struct.Struct('<I')
-
 _STAMP_AND_SIZE = struct.Struct('<iII')
-
 _NUMBERS = struct.Struct('<7d')
 
 
 class TransformReader:
-    """Reads the transforms of serialized tf2_msgs/TFMessage.
+    """Reads the transforms of serialized tf2_msgs/TFMessage, of which it decodes what is needed.
 
+    Decoding all of two thousand frames at 20 Hz takes more than half of a processor, in each node.
     Of more than 200 frames, those that are not used are read once a second. Frames beyond the first
     10,000 are not read.
     """
@@ -277,9 +260,6 @@ def _transform(
     moved.x, moved.y, moved.z = numbers[:3]
     turned.x, turned.y, turned.z, turned.w = numbers[3:]
     return message
-
-
-# Odometry of the robot: from its topic, from TF, or none.
 
 
 @dataclass(frozen=True)

@@ -27,18 +27,12 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.private_rclpy import RCLError
 from thinmap_ros.ros.time_jumps import STEADY
 
-# Stops a robot whose next command does not come.
-
 # A command follows every 0.1 s.
 _TIMEOUT_S = 0.5
-
 # A simulated robot stands while its clock does; a busy machine must not stop it.
 _SIMULATED_TIMEOUT_S = 2.0
-
 _WATCH_PERIOD_S = 0.1
-
 _USUAL_INTERVALS = 10
-
 _INTERVALS = 5.0
 
 
@@ -125,23 +119,15 @@ class CommandWatchdog:
 
 
 TOPIC = 'cmd_vel'
-
 UNSTAMPED = 'geometry_msgs/msg/Twist'
-
 STAMPED = 'geometry_msgs/msg/TwistStamped'
-
 KINDS: dict[str, type] = {UNSTAMPED: Twist, STAMPED: TwistStamped}
-
 _CHECK_PERIOD_S = 0.25
-
 # Checks after which the type changes: a subscriber that follows the type of the publishers, as the
 # simulated robot, is given the time to do so.
 _MISMATCHES = 4
-
 _ECHO_S = 0.5  # after a robot is held, motions from before are still received
-
 _REPORT_S = 2.0  # a report stays so long: diagnostics look once a second
-
 _ACKNOWLEDGEMENT = Duration(seconds=1.0)
 
 

@@ -26,16 +26,13 @@ from thinmap_ros.logs.log import LaserOptions, Log
 from thinmap_ros.logs.transforms import parse_laser_pose
 from thinmap_ros.tools.parameter_file import NodeParameters
 
-# Completion of command lines with Tab, in a shell in which argcomplete is registered.
-
 _ASKED = '_ARGCOMPLETE'
-
 # What argcomplete is to take for the name of the program: the subcommand, the second word.
 _SUBCOMMAND = '2'
 
 
 def is_asked() -> bool:
-    """Whether this process is to complete a command line instead of running it."""
+    """Whether this process is to complete a command line (Tab) instead of running it."""
     return _ASKED in os.environ
 
 
@@ -60,10 +57,7 @@ def complete(parser: argparse.ArgumentParser) -> None:
     argcomplete.autocomplete(parser)
 
 
-# The parser of a program's command line, and kinds of arguments that several programs have.
-
 BAD_INPUT = 2
-
 _UNKNOWN = 'unrecognized arguments: '
 
 
@@ -138,9 +132,7 @@ def check_place(path: Path) -> None:
 
 
 _INTERRUPTED = 130
-
 _NO_PARAMETERS = NodeParameters()
-
 # argparse's base class of parsers and groups of options.
 Options = argparse._ActionsContainer
 
@@ -306,8 +298,6 @@ def open_log(
         ),
     )
 
-
-# Whether ROS 2 is there, for programs that need it.
 
 _NEEDED = ('rclpy', 'thinmap_msgs')
 

@@ -20,14 +20,13 @@ from thinmap_ros.logs.readers.carmen import CarmenLog, open_unpacked
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.cli import Parser
 
-# The published logs that the results are measured on, and how a file is known to be one of them.
-#
-# benchmarks/data.md says where each is published.
-
 
 @dataclass(frozen=True)
 class PublishedLog:
-    """A log by its name; sha256: of its text, unpacked."""
+    """A log that the results are measured on, by its name; sha256: of its text, unpacked.
+
+    benchmarks/data.md says where each is published.
+    """
 
     name: str
     sha256: str
@@ -62,7 +61,6 @@ def unpacked_sha256(path: Path) -> str:
 
 
 _PLACES = ('{0}/log.clf', '{0}.clf', '{0}.log')
-
 _RELATIONS = '{0}.relations'
 
 

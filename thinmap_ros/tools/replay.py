@@ -32,16 +32,11 @@ from thinmap_ros.tools.parameter_file import NodeParameters, read_parameter_file
 from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.rerun_view import View
 
-# Replays the log that a command line names, here or as one of many jobs.
-
 # Whose parameters replay takes from a file.
 _NODES = ('localizer', 'grid_mapper', 'topology_builder')
-
 # Arguments that do not decide about the result.
 _ASIDE = ('logs', 'out', 'jobs', 'dask', 'quiet', 'view', 'recording', 'command')
-
 _COLUMNS = ('scans', 'distance_m', 'ms_per_scan', 'loops', 'lost', 'apart')
-
 Opened = Callable[[Log], AbstractContextManager[Any]]
 
 
@@ -121,7 +116,6 @@ def _config(arguments: argparse.Namespace, parameters: NodeParameters) -> Pipeli
 
 # Large data are converted once a second: a view does not draw them more often.
 _PERIOD_NS = 1_000_000_000
-
 _STAGES = {'localizer': 'localizer', 'grid': 'map update', 'topology': 'graph update'}
 
 

@@ -14,8 +14,6 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.logs import decode
 
-# The interface of views, and a view that shows nothing.
-
 
 class NullView:
     """A view that shows nothing, and the interface of all views.
@@ -75,10 +73,7 @@ class NullView:
         """Finish the recording."""
 
 
-# Exact-time synchronizer of two topics.
-
 Left = TypeVar('Left')
-
 Right = TypeVar('Right')
 
 
@@ -116,8 +111,6 @@ class StampMatcher(Generic[Left, Right]):
             waiting.popitem(last=False)
             self.dropped += 1
 
-
-# Scans of a piece of map that is apart, until it is joined.
 
 _STEP_M = 0.5
 

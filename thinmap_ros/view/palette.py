@@ -18,7 +18,6 @@ REGIONS = {
     RegionKind.CORRIDOR: ('#FBE7B5', '#F8DCC0'),
     RegionKind.HALL: ('#D2EBCB', '#E2F0BF'),
 }
-
 # For curves, in the order of best contrast.
 PALETTE = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#555555')
 

@@ -1,6 +1,6 @@
 """A run as one HTML page beside its report.json: figures, picture, missing area, files, command.
 
-The page needs no other file: pictures are part of it.
+The page needs no other file, as pictures are part of it, and runs no script.
 """
 
 import base64
@@ -14,8 +14,6 @@ from urllib.parse import quote
 
 from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2
 from thinmap_ros.files.safe import write_text
-
-# An HTML page that needs no other file, loads nothing from elsewhere and runs no script.
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -86,9 +84,7 @@ def write_page(path: Path, page: Page) -> Path:
 
 
 NAME = 'report.html'
-
 _PICTURE = 'summary.png'
-
 _MAX_PLACES = 20
 
 
@@ -250,8 +246,6 @@ def _file_table(names: set[str]) -> str:
     return '<table>\n' + '\n'.join(lines) + '\n</table>'
 
 
-# Results of many files as one HTML page: a table, and the picture of each with its own page.
-
 _TABLE_STYLE = """
 .many { max-width: none; }
 .many th, .many td { white-space: nowrap; }
@@ -280,7 +274,7 @@ class Entry:
 def write_batch(
     folder: Path, title: str, columns: Sequence[str], entries: Sequence[Entry], command: str
 ) -> Path:
-    """Write report.html over folders of results beside it; returns its path."""
+    """Write report.html over folders of results beside it: a table and their pictures."""
     content = _CONTENT.format(
         head=''.join(f'<th>{html.escape(column)}</th>' for column in columns),
         rows='\n'.join(_table_row(folder, entry) for entry in entries),

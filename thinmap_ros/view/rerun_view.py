@@ -18,14 +18,9 @@ from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.palette import rgb
 from thinmap_ros.view.rerun_sinks import TIMELINE, RecordingSinks, library
 
-# Layout of a view in rerun: the map, curves beside it, and a legend below them.
-
 UNKNOWN_GREY = 205
-
 _WIDTHS = (5, 3)  # of the map, and of curves and legends
-
 _PLOT_WIDTHS = (3, 1)  # of curves, and of their legend
-
 _COLOURS = ('blue', 'orange', 'green', 'pink', 'amber', 'light blue', 'grey')  # of the palette
 
 LEGEND = """
@@ -150,21 +145,13 @@ def _eye(rrb: Any, patch: GridPatch) -> Any:
 
 
 _ODOMETRY = '#777777'
-
 _SCAN = '#CC0000'
-
 _PLAN = '#F0E442'  # and its target
-
 _SAMPLE = '#7B3FA0'
-
 _LOCAL = '#0072B2'  # lines and nodes of the local area
-
 _LINE = '#8FBEDB'
-
 _STAYS = '#7D7D7D'  # an end node with position probability 1
-
 _LABEL = '#000000'
-
 # Colour and radius in pixels: the estimated path is visible below the true one.
 _TRAILS = {
     'estimate': (palette.ESTIMATE, 2.4),
@@ -220,7 +207,6 @@ class _Confidence:
 
 
 _DRAWN = _Thresholds(period_ns=1_000_000_000, trail_step_m=0.05, growth=1.4)
-
 _CONFIDENCE = _Confidence(chi_square=5.991, points=33, sigmas=1.96, wedge_m=1.0)
 
 

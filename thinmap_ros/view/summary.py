@@ -17,11 +17,14 @@ from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.view import palette
 from thinmap_ros.view.figures import DPI, draw_graph, draw_hidden_areas, draw_map, draw_shades
 
-# Cells of a map as they are drawn: one by one, or in blocks where the map is large.
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from thinmap_ros.view.map_figure import MapFigure
 
 # The largest side of a drawn map, cells: a cell of a smaller size than a pixel may vanish.
 _MAX_CELLS = 1100
-
 Cell = TypeVar('Cell', np.bool_, np.int32)
 
 
@@ -54,27 +57,14 @@ def block_maximum(cells: NDArray[Cell], factor: int) -> NDArray[Cell]:
     return blocks
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from thinmap_ros.view.map_figure import MapFigure
-
 _UNKNOWN = '#CCCCCC'
-
 _FREE = '#FFFFFF'
-
 _WALL = '#000000'
-
 _BOUNDARY = '#777777'
-
 _KINDS = {RegionKind.ROOM: 'room', RegionKind.CORRIDOR: 'corridor', RegionKind.HALL: 'hall'}
-
 # Free cells this near to a region are drawn as part of it: regions end before the walls, m.
 _REGION_MARGIN_M = 0.5
-
 _NO_POINTS = np.empty((0, 2))
-
 _ELLIPSIS = '…'
 
 
@@ -372,10 +362,7 @@ def _draw_legend(
     )
 
 
-# Picture of maps, and of the map that they were merged into.
-
 _PANEL_IN = 5.0
-
 _NODE_PT = 2.5
 
 
@@ -395,9 +382,6 @@ def merged_figure(path: Path, maps: Sequence[tuple[str, GridPatch, TopologicalMa
         axes.set_title(title, parse_math=False)
     with atomic_write(path) as aside:
         figure.savefig(aside, format='png', metadata={'Software': None})
-
-
-# Pictures for notebooks and programs: of a pipeline, or of a map with a graph.
 
 
 def plot(shown: Any, topology: TopologicalMap | None = None, title: str = '') -> 'MapFigure':

@@ -15,11 +15,8 @@ from urllib.parse import urlsplit
 from thinmap_ros.core.errors import InputError, quoted
 
 _TOKEN_BYTES = 16
-
 _MIN_TOKEN_LENGTH = 16
-
 _MAX_FILE_BYTES = 4096
-
 _OWNER_ONLY = 0o600
 
 
@@ -139,11 +136,8 @@ def is_loopback(name: str) -> bool:
         return False
 
 
-# Links to the page, as another device opens them.
-
 # Addresses that documents use: a route to them is that of the network, and nothing is sent there.
 _ELSEWHERE = {4: (socket.AF_INET, '192.0.2.1'), 6: (socket.AF_INET6, '2001:db8::1')}
-
 _PORT = 9
 
 
@@ -169,15 +163,12 @@ def reached_host(host: str) -> str:
         return str(probe.getsockname()[0])
 
 
-# QR codes of links in a terminal. Segno is part of the extra `web`; without it there is none.
-
 _LIGHT_ON_DARK = '\033[97;40m'
-
 _PLAIN = '\033[0m'
 
 
 def qr_code(link: str, has_colours: bool = False) -> str:
-    """QR code of a link, two modules a character, with its quiet zone; '' without segno.
+    """QR code of a link, two modules a character, with its quiet zone; '' without the extra web.
 
     has_colours: light on dark, whatever the colours of the terminal are. Without, the terminal has
     to be dark.

@@ -9,11 +9,9 @@ from typing import Any, Protocol
 from thinmap_ros.web.access import Gate, Role
 from thinmap_ros.web.requests import Request, beat
 
-# What the pages show: named items, of which a page receives those that changed.
-
 
 class Board:
-    """Items as JSON by name, each with the number of the change that it last underwent.
+    """What the pages show: JSON by name, each with the number of the change that it last underwent.
 
     Filled by the node and read by the server, in threads of their own.
     """
@@ -59,15 +57,10 @@ class Board:
 
 
 PERIOD_S = 0.1
-
 MAX_PAGES = 16  # of each role: who may only watch takes no place of those who steer
-
 MAX_STRANGERS = 64  # sockets that have not said a token yet
-
 _MAX_REQUESTS_PER_S = 50
-
 _HELLO_S = 5.0
-
 # A page that takes nothing for so long is gone.
 _STUCK_S = 10.0
 

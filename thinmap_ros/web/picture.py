@@ -24,19 +24,14 @@ from thinmap_ros.view import palette
 from thinmap_ros.view.interface import ApartScans, StampMatcher
 from thinmap_ros.web.pages import Board
 
-# The newest diagnostics of each node as a table, the worst first.
-
 _LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
-
 _STALE = 3
-
 _SILENT_S = 5.0
-
 _MAX_ROWS = 100
 
 
 class DiagnosticsTable:
-    """Rows of level, name and message, by name; a node that is silent is stale."""
+    """The newest level, name and message of each node, the worst first; a silent one is stale."""
 
     def __init__(self) -> None:
         self._rows: dict[str, tuple[float, int, str]] = {}
@@ -65,15 +60,12 @@ def _level(level: bytes | int) -> int:
     return level[0] if isinstance(level, bytes) else int(level)
 
 
-# The driven path in pieces, of which the last one grows.
-
 _STEP_M = 0.2
-
 _PIECE = 100  # points
 
 
 class DrivenPath:
-    """Puts the path of the robot on a board: a correction replaces it up to its stamp."""
+    """Puts the path of the robot on a board in pieces; a correction replaces it up to its stamp."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
@@ -118,11 +110,8 @@ class DrivenPath:
         self._board.put('path', len(starts))
 
 
-# Colours of the page with what they mean: those of summary.png.
-
-
 def colours() -> dict[str, str]:
-    """Colour of each thing that is drawn, by its name on the page."""
+    """Colour of each thing that is drawn, as in summary.png, by its name on the page."""
     return {
         'end node': palette.NODES[NodeKind.END],
         'branch node': palette.NODES[NodeKind.BRANCH],
@@ -141,23 +130,16 @@ def colours() -> dict[str, str]:
     }
 
 
-# The map as tiles: a page receives those in which cells have changed.
-
 _SIDE = 128  # cells
-
 _UNKNOWN = 0
-
 _FREE = 1
-
 _OCCUPIED = 2
-
 _LEVEL = 1  # of compression: the fastest
-
 Classes = NDArray[np.uint8]
 
 
 class MapTiles:
-    """Puts the tiles of a map on a board.
+    """Puts the tiles of a map on a board; a page receives those in which cells have changed.
 
     Tiles lie on the lattice of the cells whatever the origin of the map, which moves as it grows.
     """
@@ -233,10 +215,7 @@ def _tiles(classes: Classes, row: int, col: int) -> Iterator[tuple[tuple[int, in
             yield (tile_row, tile_col), tile
 
 
-# The state of the robot in words.
-
 _STATES = ('TRACKING', 'LOST', 'BLIND', 'NO MAP', 'MISALIGNED', 'MAPPING APART')
-
 _DETAILS = (
     'the laser confirms the pose',
     'the place of the robot in the map is unknown',
@@ -245,9 +224,7 @@ _DETAILS = (
     'the laser is turned on the robot: its scans are not mapped',
     'lost: a piece of its own is mapped',
 )
-
 _MAPPING_APART = 5
-
 _DOING = ('idle', 'exploring', 'returning', 'finished')
 
 
@@ -298,9 +275,7 @@ def _finite(number: float) -> float:
 
 
 _MAX_PATH_POINTS = 500
-
 _MAX_APART_POINTS = 20_000
-
 _EDGE_STEP = 4  # points of an edge are a cell apart
 
 

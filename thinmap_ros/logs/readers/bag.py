@@ -41,11 +41,8 @@ from thinmap_ros.logs.storage import (
 )
 
 SCAN = 'sensor_msgs/msg/LaserScan'
-
 _ODOMETRY = 'nav_msgs/msg/Odometry'
-
 EXPECTED = 'a rosbag2 folder, an MCAP or SQLite file, or a ROS 1 bag'
-
 _IDL_NAMES = {
     'bool': 'boolean',
     'byte': 'octet',
@@ -53,11 +50,8 @@ _IDL_NAMES = {
     'float32': 'float',
     'float64': 'double',
 }
-
 _ZSTD = b'\x28\xb5\x2f\xfd'  # begin of a message that is compressed by itself
-
 _MAX_WARNINGS = 8
-
 _USUAL_TOPICS = {SCAN: '/scan', _ODOMETRY: '/odom'}
 
 
@@ -318,9 +312,6 @@ class BagLog:
             raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {has}')
         names = errors.quoted_names(found)
         raise InputError(f'{self.path}: {what} on several topics: choose one of {names}')
-
-
-# Bags as logs: rosbag2 folders, MCAP and SQLite files, and ROS 1 bags.
 
 
 def _log(path: Path, options: LogOptions) -> Log:

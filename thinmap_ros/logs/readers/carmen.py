@@ -38,13 +38,9 @@ from thinmap_ros.logs.log import (
 from thinmap_ros.logs.storage import is_mcap, refuse_foreign
 
 _SCAN_KEYWORDS = (b'FLASER', b'ROBOTLASER1')
-
 _KEYWORDS = (b'ODOM', *_SCAN_KEYWORDS)  # other lines are not read
-
 _SUFFIXES = ('.log', '.clf', '.log.gz', '.clf.gz')
-
 _SAMPLE_BYTES = 1 << 22
-
 _TOO_LONG = (
     f'expected at most {LOGS.lines} lines, and {LOGS.file_ratio} times the bytes of a gzip file: '
     'only the lines before are read'
@@ -302,9 +298,6 @@ def _pose(words: list[str]) -> Array:
     if pose.shape != (3,) or not np.abs(pose).max() <= se2.MAX_COORDINATE_M:
         raise ValueError(f'pose {words}: expected three numbers, at most {se2.MAX_COORDINATE_M:g}')
     return se2.pose(*pose)
-
-
-# CARMEN logs, plain or gzip.
 
 
 def _log(path: Path, options: LogOptions) -> Log:

@@ -26,10 +26,8 @@ from thinmap_ros.ros.subscription import WARN_PERIOD_S
 from thinmap_ros.ros.time_jumps import STEADY
 
 _PERIOD_S = 0.1
-
 # Time after a failure in which a goal that has replaced ours becomes known.
 _SETTLE_S = 0.3
-
 _STATUS_NAMES = {
     GoalStatus.STATUS_CANCELED: 'cancelled by somebody else',
     GoalStatus.STATUS_ABORTED: 'aborted',
@@ -257,10 +255,7 @@ class NavigationClient:
         return self._node.elapsed_time.now_s()
 
 
-# The result of a goal, also of one whose server is killed and started again.
-
 _RESULT_PERIOD_S = 1.0
-
 # A request before the new server has discovered its client is lost.
 _REQUESTS = 20
 

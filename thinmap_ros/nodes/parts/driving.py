@@ -41,8 +41,6 @@ from thinmap_ros.ros.team import TileReceiver, heard_robots
 from thinmap_ros.ros.tf import TransformListener
 from thinmap_ros.ros.time_jumps import ElapsedTime
 
-# Whether the base moves as commanded.
-
 _RELEASE = 'no goal is driven before ~/reset, or a stop that is released'
 
 
@@ -113,8 +111,6 @@ class BaseWatch:
     def _add_command(self, v: float, w: float) -> None:
         self._supervisor.add_command(self._node.elapsed_time.now_s(), v, w)
 
-
-# The map that the navigator plans on: thinmap's grid, or the map of another node.
 
 # grid_mapper answers each scan: several of the slowest laser that a robot drives by, at 2.5 Hz.
 _WARN_S = 2.0
@@ -212,12 +208,9 @@ def _mapper_stream(timeout_s: float) -> InputStream:
     return InputStream('grid_mapper', timeout_ns, timeout_ns)
 
 
-# Pose and view of the robot, by the last scan, odometry and pose received.
-
 # Without a new pose the last correction of the odometry holds for a while; without odometry, the
 # robot does not know its pose meanwhile.
 _POSE_TIMEOUT_NS = 3_000_000_000
-
 _POSE_ONLY_TIMEOUT_NS = SECOND_NS
 
 
@@ -332,8 +325,6 @@ def _offset_fault(source: str, offset_ns: int) -> str:
     )
 
 
-# Goals of Nav2's actions as poses in the map frame.
-
 _MAX_POSES = 10_000
 
 
@@ -368,7 +359,7 @@ class _TransformError(InputError):
 
 
 class TaskReader:
-    """Reads goals in any frame that is connected to the map by transforms.
+    """Reads goals of Nav2's actions, in any frame that transforms connect to the map.
 
     stop_reason: why it refuses all of them, '' if it does not.
     """
@@ -455,9 +446,6 @@ class TaskReader:
             raise InvalidGoalError(result) from error
 
 
-# Driving beside other robots of a team: over the ground that they know, and with right of way.
-
-
 @dataclass(frozen=True)
 class GiveWayConfig(Config):
     """How near another robot may come."""
@@ -472,7 +460,10 @@ class GiveWayConfig(Config):
 
 
 class TeamDriving:
-    """What a navigator knows of the other robots; without a team, nothing."""
+    """What a navigator knows of the other robots; without a team, nothing.
+
+    It drives over the ground that they know, too, and with right of way.
+    """
 
     def __init__(self, node: ThinmapNode) -> None:
         """Declare the parameters."""

@@ -39,15 +39,12 @@ from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.tf import TransformListener
 
-# The topics and services of AMCL, in mode localization.
-
 _SAMPLES = 200
-
 _SHOWN = 1000  # hypotheses of the global localizer
 
 
 class AmclInterface:
-    """amcl_pose and particle_cloud out; AMCL's services.
+    """The interface of AMCL, in mode localization: amcl_pose, particle_cloud, and services.
 
     amcl_pose: the last known pose: none is published while the robot is lost. particle_cloud:
     samples of the posterior; while the robot is lost, the samples of the global localizer.
@@ -136,15 +133,12 @@ class AmclInterface:
         return response
 
 
-# The last pose in a map, which survives a restart of the machine.
-
 _SAVE_WARN_PERIOD_S = 60.0
-
 _KEYS = ('x', 'y', 'yaw')
 
 
 class LastPose:
-    """A small YAML file with the map and the last pose of the robot in it."""
+    """A small YAML file with the map and the last pose in it; it survives a restart."""
 
     def __init__(self, node: Node, path: str, rate: float, map_name: str) -> None:
         """path: '' for the default; rate: of saving, 1/s; map_name: the pose belongs to it."""
@@ -213,11 +207,11 @@ def _default_path(node: Node) -> Path:
     return state / 'thinmap' / f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}.pose.yaml'
 
 
-# The map of a mapper that has outlived the localizer: its successor finds it.
-
-
 class LivingMap:
-    """Subscribes to grid until there is a map of a known id, and calls `found` with both."""
+    """Subscribes to grid until there is a map of a known id, and calls `found` with both.
+
+    Its mapper has outlived the localizer.
+    """
 
     def __init__(self, node: Node, found: Callable[[int, GridPatch], None]) -> None:
         self._node = node
@@ -236,11 +230,8 @@ class LivingMap:
         self._found(message.map_id, patch)
 
 
-# The map that a localizer localizes in: of a file, a session, or a topic.
-
-
 class MapSource:
-    """Creates localizers in the given map.
+    """Creates localizers in the given map: of a file, a session, or a topic.
 
     patch: None until topic map is received, where no other map is given. name: of the map, to which
     a saved pose belongs.
@@ -336,9 +327,6 @@ def load_localizer(
         return loaded
     grid = sessions.load_grid(path, None, folder, report)
     return Localizer.in_occupancy_map(grid.known_area(), config)
-
-
-# Initial poses of a user, in any frame.
 
 
 class InitialPoses:

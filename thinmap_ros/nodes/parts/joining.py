@@ -37,8 +37,6 @@ from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
 from thinmap_ros.ros.private_rclpy import given_parameters
 from thinmap_ros.ros.subscription import subscribe_guarded
 
-# The joint map of several robots: how their maps bend, and what they show together.
-
 
 @dataclass(frozen=True, eq=False)
 class Merge:
@@ -75,17 +73,17 @@ class JointMap:
         self._merged = None
 
 
-# Parameters of the node map_joiner; names as in m-explore's map_merge where it has them.
-
 # As map_merge names them: /robot1/map_merge/init_pose_x.
 _INITIAL_POSE = re.compile(r'(/\S*)/map_merge/init_pose_(x|y|z|yaw)')
-
 _CONFIDENCE = 'estimation_confidence'
 
 
 @dataclass(frozen=True)
 class MapJoinerConfig(Config):
-    """Which maps are joined, when, and under which names the joint map is published."""
+    """Which maps are joined, when, and under which names the joint map is published.
+
+    Names are as in m-explore's map_merge where it has them.
+    """
 
     robot_map_topic: str = parameter(
         'map', 'Name of the maps of the robots (nav_msgs/OccupancyGrid), without their namespaces.'
@@ -162,13 +160,13 @@ def odds_text(log_odds: float) -> str:
     return f'log odds {log_odds:.1f}'
 
 
-# The maps of all robots on the graph: found by the names of their topics, as map_merge does.
-
 _TYPE = 'nav_msgs/msg/OccupancyGrid'
 
 
 class RobotMaps:
     """Subscribes to map, topology and keyframes of each robot, by its namespace.
+
+    They are found by the names of topics on the graph, as map_merge does.
 
     patches, graphs: the newest ones; a robot without topological map has no graph.
     """
@@ -257,9 +255,6 @@ def _correct(received: ReceivedKeyframes, message: KeyframePoses) -> None:
     received.correct(message.session, message.revision, poses)
 
 
-# What map_joiner publishes: the joint map, its graph and regions, and where each map lies.
-
-
 class TeamPublishers:
     """Topics merged_map, merged_topology, merged_regions and join_status, and transforms."""
 
@@ -316,8 +311,6 @@ def _robot_map(team: Team, name: str, place: Array | None) -> RobotMapMsg:
     )
 
 
-# A thread for long work, which uses a share of a core at most.
-
 # Takes what work has found, in the thread of the node.
 Result = Callable[[], None]
 
@@ -340,7 +333,7 @@ class Turns:
 
 
 class Worker:
-    """Does one thing after another in a thread, and rests between them."""
+    """Does one thing after another in a thread, and rests between them: a share of a core."""
 
     def __init__(self, share: float) -> None:
         """share: of the time of a core that the work may take, 0 to 1."""

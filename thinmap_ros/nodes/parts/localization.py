@@ -20,8 +20,6 @@ from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.maps import new_map_id
 
-# Parameters for localization in a given map: the map, and the pose at the start.
-
 # Of a pose that a user gives: standard deviations of 0.5 m and 15 degrees, as in RViz.
 GIVEN_COVARIANCE = np.diag([0.25, 0.25, 0.0685])
 
@@ -81,8 +79,6 @@ class LocalizationConfig(Config):
     initial_pose: InitialPoseConfig = part(InitialPoseConfig)
 
 
-# Where an initial pose may lie: in the map, or near it.
-
 # A robot farther away sees nothing of the map: the range of long lasers.
 _MARGIN_M = 30.0
 
@@ -103,14 +99,9 @@ def require_near_map(T_map_base: Array, localizer: AnyLocalizer) -> None:
         )
 
 
-# What a localizer that was killed continues with: its map, and where the robot was in it.
-
 _STAMPS = 'keyframe_stamps_ns'
-
 _CALIBRATION = 'calibration'
-
 _OF_ODOMETRY = Field(np.float64, (5, 4), -10.0, 10.0)
-
 _NEWER = 'newer_'  # begins the names of what the pose is saved with
 
 
@@ -207,12 +198,10 @@ def _unpacked(state: State) -> SavedKeyframes:
     return saved.with_stamps(snapshot.validate(own, fields, 'keyframes')[_STAMPS].tolist())
 
 
-# Publishes the keyframes of the map that the localizer makes, for a map of several robots.
-
-
 class KeyframeOutput:
     """Topics keyframes, a message each, and keyframe_poses after a correction, both latched.
 
+    They are for a map of several robots.
     At most one keyframe with each scan: those of a loaded map follow one after another.
     """
 

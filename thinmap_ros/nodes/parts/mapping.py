@@ -33,12 +33,8 @@ from thinmap_ros.ros.maps import FollowedMap, updates_topic
 from thinmap_ros.ros.services import fill_response, offer
 from thinmap_ros.ros.team import heard_robots
 
-# Editing of the map by services: keep-out areas, virtual walls, and parts that are erased.
-
 _FREE = np.int8(0)
-
 _FORBIDDEN = np.int8(100)
-
 _KEEPOUT_FILTER = 0  # type of Nav2's filter
 
 
@@ -157,10 +153,7 @@ def mask_of(keep_out: KeepOut, frame: GridFrame) -> GridPatch:
     return GridPatch(at, np.where(cells, _FORBIDDEN, _FREE))
 
 
-# The map of grid_mapper at a time: its values, its rate, and what distinguishes it from others.
-
 TRINARY = 'trinary'
-
 PROBABILITY = 'probability'
 
 
@@ -256,15 +249,11 @@ class MapVersion:
         return self.identity.config.shown(part)
 
 
-# The topic map: the whole map, and updates of what has changed in it.
-
 # Calls after which a whole map follows an update: one that was lost, for a reason that no
 # publisher knows, is missing for so long. That of a large map is rarer, so that it is no more
 # traffic than this.
 _MAX_CALLS_BEHIND = 10
-
 _MAX_REPEATED_BYTES_PER_S = 40e3
-
 # Room of a map that grows, a share of its length: it grows again when the room is used up.
 _ROOM = 0.25
 
@@ -383,9 +372,6 @@ def _with_room(patch: GridPatch, margins: Margins) -> Margins:
     )
 
 
-# The map as others read it, and the exact grid for thinmap's own nodes.
-
-
 class MapPublishers:
     """Publishes the map for others, and the exact grid for thinmap's own nodes, when they change.
 
@@ -443,9 +429,6 @@ class MapPublishers:
         )
 
 
-# Localized scans, each after the trajectory that its pose follows.
-
-
 class ScanQueue:
     """Localized scans, which wait for a trajectory that their pose follows and that comes later.
 
@@ -487,9 +470,6 @@ class ScanQueue:
             yield replace(localized, trajectory=self._trajectory if is_new and is_here else None)
             # Not before: if following it fails, the next scan has the trajectory, too.
             self._corrected_ns = localized.corrected_ns
-
-
-# Scans without the other robots of a team, which are no part of the map.
 
 
 @dataclass(frozen=True)

@@ -40,16 +40,12 @@ from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.strategies import DEFAULT, NAMES, check_strategy, make_strategy
 
-# Goals that others have at the server that drives the robot.
-
 _ACTIVE = (
     GoalStatus.STATUS_ACCEPTED,
     GoalStatus.STATUS_EXECUTING,
     GoalStatus.STATUS_CANCELING,
 )
-
 _THROUGH_POSES = 'navigate_through_poses'
-
 PREFIX_BYTES = 8
 
 
@@ -116,10 +112,7 @@ class GoalMonitor:
         )
 
 
-# Who drives the robot to the targets of an exploration.
-
 _ARRIVED_M = 0.3
-
 # Receives whether the robot reached the last goal, and the reason where it did not.
 OnResult = Callable[[bool, str], None]
 
@@ -216,12 +209,8 @@ class ForeignDriver:
             self._on_result(True, '')
 
 
-# What an explorer that was killed and is started again continues with.
-
 _ID_BYTES = 16
-
 _STRATEGY = 'strategy_'
-
 _IDS = {
     'goal_ids': Field(np.uint8, ('g', _ID_BYTES)),  # none, or one
     'drive_prefix': Field(np.uint8, (PREFIX_BYTES,)),
@@ -230,7 +219,7 @@ _IDS = {
 
 @dataclass(frozen=True, eq=False)
 class ExplorerState:
-    """State of the node.
+    """What an explorer that was killed and is started again continues with.
 
     latest_ns: stamp of the last observation; 0 before the first. goal_id: of the action explore;
     empty without one. drive_prefix: of the goals at the navigator, as in `GoalMonitor`. mission: as
@@ -276,8 +265,6 @@ class ExplorerState:
         prefix = ids['drive_prefix'].tobytes()
         return ExplorerState(latest_ns, goal_id, prefix, mission, strategy)
 
-
-# What starts an exploration: always a goal of the action explore, also of the explorer itself.
 
 ACTION = 'explore'
 
@@ -334,30 +321,18 @@ def _mission_goal(message: Explore.Goal) -> MissionGoal:
     return MissionGoal(budget, area, bool(message.return_home))
 
 
-# Topics of explore_lite: explore/frontiers, explore/status and explore/resume.
-
+# Words of explore/status, as explore_lite has them.
 STARTED = 'exploration_started'
-
 IN_PROGRESS = 'exploration_in_progress'
-
 PAUSED = 'exploration_paused'
-
 COMPLETE = 'exploration_complete'
-
 RETURNING = 'returning_to_origin'
-
 RETURNED = 'returned_to_origin'
-
 _NAMESPACE = 'frontiers'
-
 _POINT_M = 0.1
-
 _SPHERE_M = 0.3
-
 _BLUE = ColorRGBA(b=1.0, a=1.0)
-
 _GREEN = ColorRGBA(g=1.0, a=1.0)
-
 _RED = ColorRGBA(r=1.0, a=1.0)
 
 
@@ -464,8 +439,6 @@ def _identity() -> Pose:
     return messages.pose_msg(np.zeros(3))
 
 
-# What the explorer publishes of its mission.
-
 _NOT_ESTIMATED = -1.0
 
 
@@ -550,8 +523,6 @@ class MissionPublishers:
         )
 
 
-# Parameters of the node explorer beside those of its strategy.
-
 _BASE_FRAME = 'base_link'
 
 
@@ -634,11 +605,8 @@ class ExplorationSettings(Config):
         laser_transform.base_frame = frame
 
 
-# Strategies of the node explorer: by its parameters, from a session, or of the last mission.
-
-
 class StrategySource:
-    """Makes the strategy that the node's parameters describe.
+    """Makes strategies: by the node's parameters, from a session, or of the last mission.
 
     A config that is changed at run time holds from the next mission on.
     """

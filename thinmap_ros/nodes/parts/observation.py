@@ -36,11 +36,9 @@ from thinmap_ros.ros.maps import UNKNOWN, FollowedMap, Origin, updates_topic
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.tf import TransformListener
 
-# The map of any publisher: a SLAM, a map server or a costmap.
-
 
 class ForeignMap:
-    """Newest map of a topic, with its updates.
+    """Newest map of a topic, of a SLAM, a map server or a costmap, with its updates.
 
     is_changed: whether it has changed since somebody set this to False.
     """
@@ -111,10 +109,7 @@ class ForeignMap:
             )
 
 
-# What a robot sees of a map that somebody else makes, and from where: by TF and scans.
-
 _MAX_SCANS = 50
-
 _MAX_SCAN_AGE_NS = 2 * SECOND_NS
 
 
@@ -178,8 +173,6 @@ class RobotView:
         return self._transforms.lookup_lately(self._map_frame, base_frame, now_ns, tolerance_ns)
 
 
-# Whether somebody publishes a topic.
-
 _PERIOD_S = 1.0
 
 
@@ -211,18 +204,12 @@ class PublisherCheck:
         self._checked_s = monotonic()
 
 
-# Inputs of an exploration: those of thinmap's nodes, or the map of any publisher and TF.
-
 _LOOK_PERIOD_S = 0.5
-
 # A publisher that is silent because its map does not change: the old one holds.
 _UNCHANGED_S = 10.0
-
 _AWAITED = 'scan that shows anything on local_grid of grid_mapper'
-
 # As of the map of navigator: a mapper answers each scan.
 _SILENT_NS = 2 * SECOND_NS
-
 # A robot that was not localized for so long is somewhere else, perhaps.
 _POSE_TIMEOUT_S = 3.0
 

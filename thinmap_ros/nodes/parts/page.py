@@ -43,8 +43,6 @@ from thinmap_ros.web.pages import Board
 from thinmap_ros.web.picture import Picture
 from thinmap_ros.web.requests import Request, is_name
 
-# Work that other threads leave for the thread of the node.
-
 
 class NodeQueue:
     """Does in the node's thread, in turn, what other threads put."""
@@ -68,12 +66,8 @@ class NodeQueue:
                 self._on_error(str(error))
 
 
-# Two saved sessions merged on trial: a page sees the joint map before it is saved.
-
 _MERGE_TIMEOUT_S = 600.0
-
 _MAX_SESSIONS = 200
-
 _MAX_PICTURE_BYTES = 4 << 20
 
 
@@ -230,18 +224,11 @@ def _save(stem: str, path: str) -> str:
     return '; '.join(merged.save(path))
 
 
-# Goals of navigate_to_pose and explore, of a page; cancelled with those of everybody.
-
 NAVIGATE = 'navigate_to_pose'
-
 EXPLORE = 'explore'
-
 _PAUSED = 'exploration_paused'  # as explore_lite has it, on explore/status
-
 _DRIVING = (NAVIGATE, 'navigate_through_poses')
-
 _ACTIVE = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING)
-
 _OUTCOMES = {
     GoalStatus.STATUS_SUCCEEDED: 'done',
     GoalStatus.STATUS_CANCELED: 'cancelled',
@@ -250,7 +237,7 @@ _OUTCOMES = {
 
 
 class RobotTasks:
-    """Sends goals, and cancels all goals of the robot, of all clients."""
+    """Sends goals of navigate_to_pose and explore; cancels all of the robot, of all clients."""
 
     def __init__(
         self,
@@ -362,11 +349,8 @@ class RobotTasks:
         self._word = message.data
 
 
-# Driving by hand: a velocity holds only while a page asks for it again and again.
-
 # With the period of the watchdog, 0.1 s, the robot is stopped 0.3 s after the last request.
 _HOLD_S = 0.2
-
 # After the last command the publisher stays as long as a stop may need to be received.
 _LINGER_S = 2.0
 
@@ -379,7 +363,7 @@ class TopSpeeds(NamedTuple):
 
 
 class Teleoperation:
-    """Publishes the velocity that one page at a time asks for.
+    """Publishes the velocity that one page at a time asks for, again and again.
 
     The publisher exists while somebody drives, or the robot is held: another one of cmd_vel is
     reported by the navigator.

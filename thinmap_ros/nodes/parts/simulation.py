@@ -37,8 +37,6 @@ from thinmap_ros.sim.other_robots import starts_in, starts_side_by_side
 from thinmap_ros.sim.simulation import SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 
-# The exploration of a robot, as the demo requests it: its goal, map, progress and result.
-
 # Without an answer for this time, the goal is sent again: an explorer that has just been discovered
 # may be unable to answer.
 _RESEND_S = 10.0
@@ -141,8 +139,6 @@ class RequestedExploration:
         self.status = status
         self._on_progress()
 
-
-# The topics of a simulated robot: its sensors and true pose out, commands in.
 
 _COMMAND_TIMEOUT_NS = 500_000_000
 
@@ -279,13 +275,10 @@ class RobotInterface:
             self._diagnostics.message_rejected(self._teleports, str(error))
 
 
-# Where the simulated robots start: as given, as in the file of the world, or side by side.
-
-
 def robot_starts(
     world: World, file: Path, count: int, given: tuple[str, str], radius_m: float
 ) -> list[Array]:
-    """Start (3,) of each robot of a radius.
+    """Start (3,) of each robot of a radius: as given, as in the file of the world, or side by side.
 
     file: of the world; given: the parameters start and starts.
     Raises ConfigError where these are wrong, InputError where there is no room.

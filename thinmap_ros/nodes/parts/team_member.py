@@ -37,8 +37,6 @@ from thinmap_ros.ros.team import (
     tiles_msg,
 )
 
-# The tiles of a robot's own map, for the other robots of its team.
-
 
 class TileOutput:
     """Publishes the tiles that have changed since the last message, or since what is asked for."""
@@ -85,9 +83,7 @@ class TileOutput:
 
 
 _NEAR_PERIOD_S = 0.1
-
 _NEAR_STEP_M = 0.05  # near to another robot the pose is sent after each cell, not at standstill
-
 _TILE_PERIOD_S = 5.0
 
 

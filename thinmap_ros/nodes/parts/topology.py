@@ -43,8 +43,6 @@ from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.subscription import WARN_PERIOD_S
 from thinmap_ros.ros.time_jumps import STEADY
 
-# Regions as messages.
-
 
 def region_array_msg(membership: Membership, frame_id: str, ns: int) -> RegionArray:
     """Message of all regions and doors, with the nodes and edges of the graph in them."""
@@ -92,10 +90,7 @@ def _door_msg(door: Door, edge_ids: list[int]) -> DoorMsg:
     )
 
 
-# Rooms, corridors, halls and doors of the map, published while it grows.
-
 _POLL_S = 0.1
-
 # Of a core, that is used for regions at most: on a map of 100 x 100 m they take more than a second.
 _MAX_CPU_SHARE = 0.1
 
@@ -248,9 +243,6 @@ class RegionUpdates:
         self._publisher.publish(message)
 
 
-# Names of regions: given by a service, and moved with the map.
-
-
 class RegionNaming:
     """Service name_region: a region has a name, which stays at its place in the building."""
 
@@ -297,8 +289,6 @@ def _anchor(regions: RegionMap, request: NameRegion.Request) -> tuple[int, Array
         raise InputError(f'point {place[0]:g}, {place[1]:g}: expected a point in a region')
     return number, np.array(place)
 
-
-# The topological map as route graph of Nav2's route server, updated while it grows.
 
 _SERVICE = 'route_server/set_route_graph'
 
