@@ -43,15 +43,15 @@ def rotation_matrix(q: Any) -> Array:
     )
 
 
-def parse_laser_pose(text: str) -> Array:
-    """Pose (3,) of a laser on its robot as "x,y,yaw" (m, m, rad). Raises ConfigError."""
+def parse_pose(text: str, name: str = 'laser_pose', form: str = 'x,y,yaw') -> Array:
+    """Pose (3,), m, m, rad, of the text of an option. Raises ConfigError with its name and form."""
     try:
-        x, y, yaw = (float(part) for part in text.split(','))
-        T = se2.pose(x, y, yaw)
+        x, y, heading = (float(part) for part in text.split(','))
+        T = se2.pose(x, y, heading)
     except ValueError:
         T = np.full(3, np.nan)
     if not se2.is_finite(T):
-        raise ConfigError(f'laser_pose = {quoted(text)}: expected "x,y,yaw" in m, m, rad')
+        raise ConfigError(f'{name} = {quoted(text)}: expected "{form}" in m, m, rad')
     return T
 
 

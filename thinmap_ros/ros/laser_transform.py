@@ -10,7 +10,7 @@ from tf2_msgs.msg import TFMessage
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.logs.transforms import Mount, StaticTransforms, parse_laser_pose
+from thinmap_ros.logs.transforms import Mount, StaticTransforms, parse_pose
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -70,7 +70,7 @@ class LaserTransform:
             )
         )
         self._laser = parameters.declare_config(node, LaserConfig)
-        self._fixed = Mount(parse_laser_pose(str(given)), upside_down=False) if given else None
+        self._fixed = Mount(parse_pose(str(given)), upside_down=False) if given else None
         self._transforms = StaticTransforms()
         self._reader = TransformReader(lambda frame: frame in self._mounts)
         self._mounts: dict[str, Mount] = {}

@@ -23,7 +23,7 @@ from thinmap_ros.kernels import report_compilation
 from thinmap_ros.logs import reading
 from thinmap_ros.logs.frames import SOURCES
 from thinmap_ros.logs.log import LaserOptions, Log
-from thinmap_ros.logs.transforms import parse_laser_pose
+from thinmap_ros.logs.transforms import parse_pose
 from thinmap_ros.tools.parameter_file import NodeParameters
 
 _ASKED = '_ARGCOMPLETE'
@@ -289,7 +289,7 @@ def open_log(
         config_from(arguments, LaserOptions),
         arguments.scan_topic,
         arguments.odom_topic,
-        parse_laser_pose(given) if given else T_base_laser,
+        parse_pose(given) if given else T_base_laser,
         arguments.base_frame or text('base_frame'),
         odometry_source=arguments.odom_source or text('odom_source'),
         odom_frame=arguments.odom_frame or text('odom_frame'),

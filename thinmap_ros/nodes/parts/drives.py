@@ -15,6 +15,7 @@ from rclpy.task import Future
 from thinmap_ros.core.exploration.mission import DriveProgress, DriveRequest, Retries
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.nodes.parts.mission import (
+    Driver,
     ExplorationSettings,
     GoalMonitor,
     OnResult,
@@ -50,13 +51,12 @@ class _Drive:
     failed_s: float = 0.0
 
 
-class NavigationClient:
+class NavigationClient(Driver):
     """Sends goals, and reports how the last one ended.
 
     A goal that is not answered, or no longer reported on, is sent again. One that is rejected, not
     answered or without progress too long has failed. While the server drives for somebody else, the
     goal waits.
-    goal: the one (3,) that has not ended.
     """
 
     def __init__(
@@ -67,23 +67,17 @@ class NavigationClient:
         on_result: OnResult,
     ) -> None:
         """frame_id: frame of the goals; on_result: receives success and reason of the last one."""
+        super().__init__(on_result)
         self._node = node
         self._settings = settings
         self._frame_id = frame_id
-        self._on_result = on_result
         self._client = ActionClient(node, NavigateToPose, settings.navigate_to_pose_action)
         self._others = GoalMonitor(node, settings.navigate_to_pose_action)
-        self.goal: Array | None = None
         self._drive: _Drive | None = None
         self._retries = Retries()
         # Only while there is a goal.
         self._timer = node.create_active_timer(_PERIOD_S, self._advance, clock=STEADY)
         self._timer.cancel()
-
-    @property
-    def is_driving(self) -> bool:
-        """Whether there is a goal that has not ended."""
-        return self.goal is not None
 
     @property
     def remaining_m(self) -> float | None:

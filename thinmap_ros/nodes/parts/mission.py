@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 from uuid import uuid4
 
 import numpy as np
@@ -117,37 +116,46 @@ _ARRIVED_M = 0.3
 OnResult = Callable[[bool, str], None]
 
 
-class Driver(Protocol):
-    """Drives to one goal at a time, and reports how the last one ended."""
+class Driver:
+    """Drives to one goal at a time, and reports how the last one ended.
+
+    goal: the one (3,) that has not ended.
+    """
+
+    def __init__(self, on_result: OnResult) -> None:
+        self._on_result = on_result
+        self.goal: Array | None = None
 
     @property
     def is_driving(self) -> bool:
         """Whether there is a goal that has not ended."""
+        return self.goal is not None
 
     @property
     def is_yielding(self) -> bool:
         """Whether the goal waits for the end of somebody else's."""
-
-    @property
-    def goal(self) -> Array | None:
-        """The goal (3,) that has not ended."""
+        return False
 
     @property
     def remaining_m(self) -> float | None:
         """Rest of the path to the goal; None where it is unknown."""
+        return None
 
     @property
     def goal_prefix(self) -> bytes:
         """PREFIX_BYTES with which the ids of its goals begin."""
+        return bytes(PREFIX_BYTES)
 
     def adopt(self, goal_prefix: bytes) -> None:
         """Count the goals of a killed driver as own ones, by their prefix."""
 
     def drive_to(self, goal: Array) -> None:
         """Set the goal (3,) in the map frame, instead of an earlier one."""
+        self.goal = goal
 
     def cancel(self) -> None:
         """Cancel the goal; there is no result."""
+        self.goal = None
 
     def robot_moved(self, T_map_base: Array) -> None:
         """Process the present pose (3,) of the robot."""
@@ -174,32 +182,8 @@ class TargetPublisher:
         self._last = None
 
 
-class ForeignDriver:
+class ForeignDriver(Driver):
     """Another navigator drives to the published targets until it arrives, or the target changes."""
-
-    is_yielding = False
-    remaining_m: float | None = None
-    goal_prefix = bytes(PREFIX_BYTES)
-
-    def __init__(self, on_result: OnResult) -> None:
-        self._on_result = on_result
-        self.goal: Array | None = None
-
-    @property
-    def is_driving(self) -> bool:
-        """Whether the robot is still to arrive at the goal."""
-        return self.goal is not None
-
-    def adopt(self, goal_prefix: bytes) -> None:
-        """Nothing: goals have no ids here."""
-
-    def drive_to(self, goal: Array) -> None:
-        """Set the goal (3,)."""
-        self.goal = goal
-
-    def cancel(self) -> None:
-        """Forget the goal."""
-        self.goal = None
 
     def robot_moved(self, T_map_base: Array) -> None:
         """Report the arrival of a robot at a pose (3,)."""

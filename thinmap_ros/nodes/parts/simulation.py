@@ -27,6 +27,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.worlds import read_starts
+from thinmap_ros.logs.transforms import parse_pose
 from thinmap_ros.nodes.parts.drives import GoalResult
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
@@ -295,7 +296,7 @@ def robot_starts(
             )
         return poses
     if start:
-        return starts_side_by_side(world, _pose('start', start), count, radius_m)
+        return starts_side_by_side(world, _parsed('start', start), count, radius_m)
     listed = read_starts(file)
     if not se2.is_finite(world.start) and not len(listed) >= count > 1:
         raise ConfigError(f'start: world {world.name} has none: expected "x,y,theta"')
@@ -304,15 +305,8 @@ def robot_starts(
 
 def poses_from(name: str, text: str) -> list[Array]:
     """Poses (3,) of a parameter like "x,y,theta; x,y,theta". Raises ConfigError."""
-    return [_pose(name, part) for part in text.split(';')]
+    return [_parsed(name, part) for part in text.split(';')]
 
 
-def _pose(name: str, text: str) -> Array:
-    try:
-        x, y, theta = (float(part) for part in text.split(','))
-        start = se2.pose(x, y, theta)
-    except ValueError:
-        start = se2.pose(0.0, 0.0, float('nan'))
-    if not se2.is_finite(start):
-        raise ConfigError(f'{name} = {quoted(text)}: expected "x,y,theta" in m, m, rad')
-    return start
+def _parsed(name: str, text: str) -> Array:
+    return parse_pose(text, name, 'x,y,theta')
