@@ -10,6 +10,7 @@ from pathlib import Path
 
 from benchmarks.graphs import compactness, doors, map_to_graph, real_maps, voronoi
 from benchmarks.release import command as release
+from benchmarks.rows import Row, show
 from benchmarks.speed import (
     ekf_step,
     exploration,
@@ -27,7 +28,6 @@ from benchmarks.speed import (
 )
 from benchmarks.time_and_memory import machine
 from benchmarks.worlds import WORLDS
-from thinmap_ros.evaluation.outcome import Row, show
 from thinmap_ros.evaluation.parallel_jobs import write_provenance
 
 _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
-from thinmap_ros.evaluation.outcome import Row
+from benchmarks.rows import Row
 from thinmap_ros.pipeline import Pipeline
 
 

@@ -7,11 +7,11 @@ from statistics import median
 from typing import NamedTuple
 
 from benchmarks.graphs.map_sizes import graph_in_bytes, grid_as_png, grid_in_bytes
+from benchmarks.rows import Row, at_least
 from benchmarks.worlds import groups
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import build
-from thinmap_ros.evaluation.outcome import Row, at_least
 from thinmap_ros.experiments.drives import Source, grid_of
 from thinmap_ros.files.occupancy_maps import read_map
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, at_least, at_most
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.grid_search import path_collides
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import build
-from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 
 _ROOM_M = 8.0
 _WALL_M = 0.2

@@ -5,12 +5,12 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.graphs.graph_metrics import completeness, drivable_share
+from benchmarks.rows import Row, at_least, at_most
 from benchmarks.time_and_memory import best_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
-from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.files.occupancy_maps import read_map
 
 _SECONDS = {'kth/50052751': 0.1, 'kth/50037764_PLAN1': 0.5}

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from benchmarks.rows import Row, at_least, at_most
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
@@ -20,7 +21,6 @@ from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.routes import route_graph
 from thinmap_ros.core.topology.thinning import select_free_space
 from thinmap_ros.core.topology.topology import build_along
-from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.files.occupancy_maps import read_map, write_map
 from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.pipeline import PipelineConfig

@@ -16,6 +16,7 @@ from benchmarks.graphs.graph_metrics import (
     loop_count,
     sight_share,
 )
+from benchmarks.rows import Row, at_least
 from benchmarks.time_and_memory import median_seconds
 from benchmarks.worlds import Floor, groups
 from thinmap_ros.baselines.voronoi import build_voronoi, voronoi_lines
@@ -23,7 +24,6 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.thinning import select_free_space, thin
 from thinmap_ros.core.topology.topology import build
-from thinmap_ros.evaluation.outcome import Row, at_least
 from thinmap_ros.files.occupancy_maps import read_map
 
 _CONFIG = TopologyConfig()

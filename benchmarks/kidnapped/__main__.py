@@ -13,8 +13,8 @@ from pathlib import Path
 
 from benchmarks.kidnapped.cases import ROWS, Case, Setting
 from benchmarks.kidnapped.summary import Written, summary
+from benchmarks.rows import show
 from benchmarks.worlds import WORLDS
-from thinmap_ros.evaluation.outcome import show
 from thinmap_ros.evaluation.parallel_jobs import write_provenance
 
 _LOG = WORLDS.parent / 'logs' / 'intel' / 'log.clf'

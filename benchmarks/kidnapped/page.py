@@ -10,8 +10,8 @@ from pathlib import Path
 from benchmarks.charts import BAD, DOCS, OURS, Mark, Panel, chart_path, draw, picture
 from benchmarks.kidnapped.__main__ import read
 from benchmarks.kidnapped.summary import Written, by_group, summary
+from benchmarks.rows import Row
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.outcome import Row
 from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.files.safe import write_text
 

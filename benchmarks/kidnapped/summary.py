@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from benchmarks.kidnapped.split_log import is_in_map
-from thinmap_ros.evaluation.outcome import Row, at_least, at_most
+from benchmarks.rows import Row, at_least, at_most
 
 Written = dict[str, str]  # a record as it is in a file
 _SCANS = 30

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, show
 from benchmarks.scoreboard.cases import EXACT_S
 from benchmarks.scoreboard.measure import play
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import config_with
-from thinmap_ros.evaluation.outcome import Row, show
 from thinmap_ros.evaluation.parallel_jobs import write_provenance
 from thinmap_ros.evaluation.trajectory_errors import (
     RelationErrors,

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, at_least, at_most
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.ekf_slam.feature_map import AssociationConfig
 from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, at_least, at_most
 from benchmarks.worlds import Floor, floors
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.evaluation.exploration_run import explore
-from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 
 _LARGEST = 'kth/50037764_PLAN1'
 _DUNGEON = 'dungeon/'

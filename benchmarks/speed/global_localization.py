@@ -11,6 +11,7 @@ import numpy as np
 from benchmarks.kidnapped.cases import ROWS, Setting
 from benchmarks.kidnapped.summary import summary
 from benchmarks.kidnapped.trials import shifted_map
+from benchmarks.rows import Row, at_most
 from benchmarks.time_and_memory import median_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.core.places.likelihood import Judge
@@ -22,7 +23,6 @@ from thinmap_ros.core.places.place_database import (
     random_pose,
 )
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
-from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.sim.drives import random_drive
 
 _QUICK = {'paper': 5, 'lab': 20, 'voronoi': 20, 'twins': 2, 'foreign': 4, 'dungeon': 10}

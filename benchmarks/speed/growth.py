@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, at_most
 from benchmarks.time_and_memory import CpuTimedPipeline, resident_mb
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.track import LocalizerConfig
-from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.files.package_data import world_path
 from thinmap_ros.files.worlds import read_tour, read_world
 from thinmap_ros.pipeline import PipelineConfig

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, at_most
 from benchmarks.speed.node_process import TrafficListener, processor_s, start, stop, use_own_domain
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import TopologyBuilder
-from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import write_map
 

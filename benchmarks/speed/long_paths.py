@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, at_least, at_most
 from benchmarks.worlds import floors
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.paths import LONG_PATH_M, route_band
@@ -15,7 +16,6 @@ from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells, 
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
-from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.experiments.drives import patch_of_world
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.sim.buildings import BuildingConfig, generate_building

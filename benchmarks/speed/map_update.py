@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, at_least
 from benchmarks.time_and_memory import best_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.outcome import Row, at_least
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 
 _TARGET = 20_000.0

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, at_most
 from benchmarks.speed.node_process import processor_s, start, stop, use_own_domain
-from thinmap_ros.evaluation.outcome import Row, at_most
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 _SETTLE_S = 5.0

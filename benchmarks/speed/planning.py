@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from benchmarks.rows import Row, at_least, at_most
 from benchmarks.worlds import Floor, floors
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, navigation_function, plan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.files.occupancy_maps import read_map
 
 _GOALS = 1000

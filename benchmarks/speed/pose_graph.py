@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, at_most
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, inverse
@@ -14,7 +15,6 @@ from thinmap_ros.core.slam.graph.loop_closure import KeyframeGraph
 from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge
 from thinmap_ros.core.slam.odometry import OdometryCalibration
 from thinmap_ros.core.slam.wall_compass import Heading, Reference
-from thinmap_ros.evaluation.outcome import Row, at_most
 
 _NUMBERS = (2000, 5000, 15_000)
 _NUMBERS_QUICK = (2000,)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.drive import tour
+from benchmarks.rows import Row, at_least
 from benchmarks.worlds import floors
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
@@ -20,7 +21,6 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
 from thinmap_ros.core.slam.matching.surface import surface_points
-from thinmap_ros.evaluation.outcome import Row, at_least
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 
 _QUICK = ('kth/50052751',)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.morphology import skeletonize
 
+from benchmarks.rows import Row, at_least, at_most
 from benchmarks.time_and_memory import best_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.core.topology.thinning import thin
-from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 
 Mask = NDArray[np.bool_]
 _FASTER = {400: (20.0, 40.0), 1000: (50.0, 100.0), 4000: (50.0, 100.0)}

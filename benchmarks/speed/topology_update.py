@@ -7,8 +7,8 @@ import numpy as np
 
 from benchmarks.drive import Drive, final_map, tour
 from benchmarks.graphs.graph_metrics import agreement, drivable_share, loop_count
+from benchmarks.rows import Row, at_least, at_most
 from benchmarks.worlds import floors
-from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 
 _QUICK = ('dungeon/d114',)
 _WORLDS = ('dungeon/d114', 'dungeon/d2555', 'kth/50052751', 'kth/50052748')
