@@ -24,6 +24,7 @@ from thinmap_msgs.msg import (
     TeamClaim,
     TopologicalMap,
 )
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.team import MAX_SETTLED
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.shared import JoinedMaps, TileSender
@@ -456,3 +457,36 @@ def numbers(message):
             for part in value:
                 if hasattr(part, 'get_fields_and_field_types'):
                     yield from numbers(part)
+
+
+def is_rejected(message):
+    """Whether its conversion refuses it, in one line; else the values are sound."""
+    try:
+        CHECKS[type(message)](message)
+    except InputError as error:
+        assert '\n' not in str(error) and len(str(error)) < 500
+        return True
+    return False
+
+
+def is_plain(message):
+    """Whether a sound message is as it was before strange values were put into it."""
+    if isinstance(message, LaserScan):
+        return (
+            message.header.frame_id == 'laser'
+            and list(message.ranges) == 61 * [2.0]
+            and message.range_max == 8.0
+        )
+    if isinstance(message, LocalizedScan):
+        return is_plain(message.scan) and message.pose.pose.position.x == 0.0
+    if isinstance(message, LocalGrid):
+        return is_plain(message.grid) and is_plain(message.localized)
+    if isinstance(message, OccupancyGrid | ProbabilityGrid):
+        return (
+            message.info.width == 40
+            and abs(message.info.origin.position.x + 2.0) < 1e-9
+            and message.data[41] == 0
+        )
+    if isinstance(message, TopologicalMap | TeamClaim | MapTiles):
+        return True
+    return message.pose.pose.position.x == 0.0 and message.pose.pose.position.y == 0.0

@@ -1,87 +1,21 @@
-"""Markers for RViz and Foxglove: they show the contents of the messages."""
+"""The node markers on a live graph: it shows what is latched, and no NaN."""
 
 import math
 
-import numpy as np
 import pytest
-from fuzz.strange_messages import made, numbers
-from visualization_msgs.msg import Marker, MarkerArray
+from fuzz.strange_messages import is_rejected, made, numbers
+from visualization_msgs.msg import MarkerArray
 
-from thinmap_msgs.msg import EndNode, EndNodeArray, LineFeature, LineFeatureArray, TopologicalMap
-from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.topology.graph import topology_from_msg
-from thinmap_ros.nodes import markers
+from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.ros import qos
 
 pytestmark = pytest.mark.live
 
 
-def by_name(array):
-    assert array.markers[0].action == Marker.DELETEALL
-    return {marker.ns: marker for marker in array.markers[1:]}
-
-
-def test_a_graph_as_lines_and_balls():
-    message = next(m for m in made(TopologicalMap, 20) if is_sound(m))
-    assert len(message.edge_xy) == 4
-    shown = by_name(markers.topology(message))
-    positions = np.reshape(message.node_xy, (-1, 2))
-    np.testing.assert_array_equal([(p.x, p.y) for p in shown['nodes'].points], positions)
-    assert len(shown['nodes'].colors) == 3 and len(shown['edges'].points) == 2
-    assert shown['edges'].header.frame_id == 'map' and shown['edges'].type == Marker.LINE_LIST
-    assert [m.action for m in markers.topology(TopologicalMap()).markers] == [Marker.DELETEALL]
-
-
-def is_sound(message):
-    try:
-        topology_from_msg(message)
-    except InputError:
-        return False
-    return not any(message.node_kinds)
-
-
-def test_end_nodes_show_their_probability():
-    nodes = [
-        EndNode(node_id=i, position_probability=p, is_target=i == 1)
-        for i, p in enumerate((0.25, 0.9))
-    ]
-    balls = [
-        m
-        for m in markers.end_nodes(EndNodeArray(end_nodes=nodes)).markers
-        if m.type == Marker.SPHERE
-    ]
-    texts = [m.text for m in markers.end_nodes(EndNodeArray(end_nodes=nodes)).markers if m.text]
-    assert (
-        texts == ['0.25', '0.90']
-        and balls[0].color.a < balls[1].color.a
-        and balls[0].scale.x < balls[1].scale.x
-    )
-    assert len({(ball.ns, ball.id) for ball in balls}) == 2
-    for wrong in (math.nan, math.inf, 2.0):
-        with pytest.raises(InputError, match='probability of end node 7'):
-            markers.end_nodes(
-                EndNodeArray(end_nodes=[EndNode(node_id=7, position_probability=wrong)])
-            )
-
-
-def test_line_features_from_end_to_end():
-    feature = LineFeature(id=4, in_local_area=True)
-    feature.start.x = 1.0
-    feature.end.y = 2.0
-    (lines,) = by_name(markers.line_features(LineFeatureArray(features=[feature]))).values()
-    assert (
-        np.allclose([(p.x, p.y) for p in lines.points], [(1.0, 0.0), (0.0, 2.0)])
-        and len(lines.colors) == 2
-    )
-    feature.end.y = math.nan
-    with pytest.raises(InputError, match='line 4'):
-        markers.line_features(LineFeatureArray(features=[feature]))
-
-
 def test_the_node_shows_what_is_latched_and_no_nan(graph):
     said = graph.node.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
     messages_made = made(TopologicalMap, 60)
-    good = [m for m in messages_made if is_sound(m)]
+    good = [m for m in messages_made if not is_rejected(m) and not any(m.node_kinds)]
     said.publish(good[0])
     graph.start('markers')
     shown = graph.heard('topology_markers', MarkerArray, qos.LATCHED)
@@ -89,6 +23,6 @@ def test_the_node_shows_what_is_latched_and_no_nan(graph):
     for message in [*messages_made, good[-1]]:
         said.publish(message)
         graph.executor.spin_once(timeout_sec=0.01)
-    graph.until(lambda: len(by_name(shown[-1])) == 2, 'the last graph')
+    graph.until(lambda: {'nodes', 'edges'} <= {m.ns for m in shown[-1].markers}, 'the last graph')
     assert all(math.isfinite(number) for array in shown for number in numbers(array))
     assert graph.stop('markers') == 0

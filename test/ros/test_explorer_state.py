@@ -1,9 +1,12 @@
-"""The checkpoint of the explorer: what it restores, and what it refuses."""
+"""The state of the explorer in messages, and in the checkpoint that it restores or refuses."""
 
 import numpy as np
 import pytest
 
+from thinmap_msgs.msg import ExplorationStatus
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.mission import MissionState
+from thinmap_ros.core.exploration.strategy import FinishCode
 from thinmap_ros.nodes.parts.mission import ExplorerState
 
 GOAL_ID = bytes(range(16))
@@ -42,3 +45,10 @@ def test_nothing_may_be_missing(name):
     del arrays[name]
     with pytest.raises(InputError, match=name):
         ExplorerState.from_arrays(arrays)
+
+
+def test_codes_and_states_are_those_of_the_message():
+    for code in FinishCode:
+        assert getattr(ExplorationStatus, code.name) == code
+    for state in MissionState:
+        assert getattr(ExplorationStatus, state.name) == state

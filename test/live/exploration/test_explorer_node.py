@@ -26,8 +26,6 @@ from thinmap_msgs.msg import (
     TopologicalMap,
 )
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros.core.exploration.mission import MissionState
-from thinmap_ros.core.exploration.strategy import FinishCode
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
@@ -138,13 +136,6 @@ class Robot:
             n.node_id: (n.position_probability, n.min_distance_m)
             for n in self.end_nodes[-1].end_nodes
         }
-
-
-def test_codes_and_states_are_those_of_the_message():
-    for code in FinishCode:
-        assert getattr(ExplorationStatus, code.name) == code
-    for state in MissionState:
-        assert getattr(ExplorationStatus, state.name) == state
 
 
 @pytest.fixture

@@ -1,15 +1,10 @@
-"""Invalid messages on a live graph.
-
-Conversions give valid values or an error of one line; no node dies or publishes NaN.
-"""
+"""Invalid messages on a live graph: no node dies or publishes NaN."""
 
 import math
-from collections import Counter
 
-import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from fuzz.strange_messages import CHECKS, made, numbers
+from fuzz.strange_messages import is_plain, is_rejected, made, numbers
 from geometry_msgs.msg import Point32, PoseWithCovarianceStamped, Twist
 from lifecycle_msgs.srv import GetState
 from nav2_msgs.action import NavigateToPose
@@ -34,46 +29,9 @@ from thinmap_msgs.msg import (
     TeamClaim,
     TopologicalMap,
 )
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
-
-
-def is_rejected(message):
-    try:
-        CHECKS[type(message)](message)
-    except InputError as error:
-        assert '\n' not in str(error) and len(str(error)) < 500
-        return True
-    return False
-
-
-@pytest.mark.parametrize('kind', CHECKS)
-def test_conversions_give_sound_values_or_refuse_in_one_line(kind):
-    rejected = Counter(is_rejected(message) for message in made(kind, 800))
-    # Both occur often.
-    assert rejected[True] > 80 and rejected[False] > 80
-
-
-@pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_a_map_with_a_yaw_in_its_origin_is_resampled(sign):
-    good = next(m for m in made(OccupancyGrid, 40) if not is_rejected(m) and is_plain(m))
-    good.info.origin.orientation = messages.quaternion_msg(sign * math.pi / 2)
-    patch = messages.grid_from_msg(good)
-    cells = np.array(good.data, dtype=np.int8).reshape(40, 40)
-    assert np.array_equal(patch.cells, np.rot90(cells[::-1], int(sign))[::-1])
-
-
-@pytest.mark.parametrize(
-    ('sec', 'nanosec', 'rejected'),
-    [(0, 0, False), (-1, 0, True), (1, 10**9 - 1, False), (1, 10**9, True), (1, 2**32 - 1, True)],
-)
-def test_stamps(sec, nanosec, rejected):
-    good = next(message for message in made(Odometry, 40) if not is_rejected(message))
-    good.header.stamp.sec = sec
-    good.header.stamp.nanosec = nanosec
-    assert is_rejected(good) == rejected
 
 
 SPOKEN = {
@@ -291,25 +249,3 @@ def good(kind, ns):
     found = next(m for m in made(kind, 40) if not is_rejected(m) and is_plain(m))
     found.header.stamp = messages.time_msg(ns)
     return found
-
-
-def is_plain(message):
-    if isinstance(message, LaserScan):
-        return (
-            message.header.frame_id == 'laser'
-            and list(message.ranges) == 61 * [2.0]
-            and message.range_max == 8.0
-        )
-    if isinstance(message, LocalizedScan):
-        return is_plain(message.scan) and message.pose.pose.position.x == 0.0
-    if isinstance(message, LocalGrid):
-        return is_plain(message.grid) and is_plain(message.localized)
-    if isinstance(message, OccupancyGrid | ProbabilityGrid):
-        return (
-            message.info.width == 40
-            and abs(message.info.origin.position.x + 2.0) < 1e-9
-            and message.data[41] == 0
-        )
-    if isinstance(message, TopologicalMap | TeamClaim | MapTiles):
-        return True
-    return message.pose.pose.position.x == 0.0 and message.pose.pose.position.y == 0.0
