@@ -12,7 +12,7 @@ from thinmap_ros.core.slam.localizer import ActiveMap, HeadingCorrection, Locali
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
 from thinmap_ros.core.slam.odometry import OdometryCalibration
-from thinmap_ros.core.slam.track import LocalizerConfig, MapEvidence, Track
+from thinmap_ros.core.slam.track import LocalizerConfig, MapEvidence, Tracker
 
 FAILING = 4  # calls in a row
 
@@ -24,7 +24,7 @@ FAILING = 4  # calls in a row
         (Matcher, 'match'),
         (MapEvidence, 'update'),
         (OdometryCalibration, 'update'),
-        (Track, 'record_agreement'),
+        (Tracker, '_record_agreement'),
         (HeadingCorrection, 'correct'),
         (LocalMap, 'add_scan'),
         (LoopClosure, 'add'),

@@ -14,6 +14,8 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
+from thinmap_ros.core.slam.joining.join import Atlas
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.local_map import MIN_HIT_RATIO, LocalMapConfig
 from thinmap_ros.core.slam.track import LocalizerConfig
@@ -318,7 +320,7 @@ def test_after_dead_reckoning_a_few_points_that_fit_badly_do_not_move_the_pose(s
     for k in range(150):
         odom = se2.compose(odom, se2.pose(0.05, 0.0, 0.03))
         predicted = localizer.step(replace(BLIND, stamp_ns=(60 + k) * PERIOD_NS), odom)
-    assert localizer.config.matching.is_wide(localizer._tracker.track.uncertainty.since_match)
+    assert localizer.config.matching.is_wide(localizer._tracker.uncertainty.since_match)
     scan = scan_in(ELSEWHERE, se2.pose(1.0, 1.5, 0.5), rng, 210 * PERIOD_NS)
     ranges = np.full(scan.ranges_m.size, np.inf)
     ranges[60:100] = scan.ranges_m[60:100]
@@ -599,6 +601,16 @@ def test_other_parameters_apply_at_once_and_keep_the_map(threshold):
     assert any(estimate.is_lost for _, estimate, _ in carried) == (threshold == 1.0)
 
 
+def test_the_odds_of_a_join_may_change_while_a_map_is_kept(monkeypatch):
+    asked = []
+    monkeypatch.setattr(Atlas, 'step', lambda self, join_odds: asked.append(join_odds))
+    localizer = Localizer(LocalizerConfig(loop_closure=LoopClosureConfig(join_odds=50.0)))
+    localizer.adjust(LocalizerConfig(loop_closure=LoopClosureConfig(join_odds=2000.0)))
+    scan, odometry, _ = next(iter(drive_round_the_block()))
+    localizer.step(scan, odometry)
+    assert asked == [2000.0]
+
+
 def crowd(at, rng):
     """The room, and a crowd around a position that moves between scans."""
     angles = rng.uniform(-np.pi, np.pi, 30)
@@ -828,7 +840,7 @@ def test_a_state_with_more_hits_than_observations_in_one_cell_is_refused(whole_d
 
 def is_loop_found(localizer):
     """Whether the last keyframes are tied to the first ones round the block."""
-    return any(edge.b - edge.a > 50 for edge in localizer._map.loops.graph.edges)
+    return any(edge.b - edge.a > 50 for edge in localizer._loops.graph.edges)
 
 
 def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed_well():
@@ -872,7 +884,7 @@ def test_the_path_at_the_end_holds_the_loop_that_is_being_closed_and_the_pose_fo
     localizer = at_start(initial_x_m=3.15, initial_y_m=1.2)
     for scan, odom, _ in drive_round_the_block():
         localizer.step(scan, odom)
-        if is_loop_found(localizer) and localizer._map.loops.graph.is_moving:
+        if is_loop_found(localizer) and localizer._loops.graph.is_moving:
             break
     before = localizer.pose
     path = localizer.optimized_trajectory()
@@ -889,7 +901,7 @@ def test_the_map_is_rendered_again_the_nearest_part_first(round_the_block):
 
     def known():
         """Which of the former walls are rendered again."""
-        return localizer._map.local.map.distances(walls) < 0.1
+        return localizer._local.map.distances(walls) < 0.1
 
     localizer.set_pose(localizer.pose, 1e-4 * np.eye(3))
     assert known()[near].mean() > 0.95

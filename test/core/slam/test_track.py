@@ -11,7 +11,7 @@ from thinmap_ros.core.se2 import rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import Anchor
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.odometry import MotionConfig, OdometryPrediction
-from thinmap_ros.core.slam.track import DeadReckoning, LocalizerConfig, MapEvidence, Track
+from thinmap_ros.core.slam.track import DeadReckoning, LocalizerConfig, Tracker
 
 START = np.array([2.0, 2.0, 0.0])
 PERIOD_NS = 200_000_000
@@ -33,25 +33,25 @@ def driven(steps):
     localizer = Localizer(LocalizerConfig(initial_x_m=2.0, initial_y_m=2.0))
     for scan, odom in steps[:300]:
         localizer.step(scan, odom)
-    assert np.hypot(*localizer._tracker.track.T_anchor_base[:2]) > 0.05
+    assert np.hypot(*localizer._tracker.T_anchor_base[:2]) > 0.05
     return localizer
 
 
 def corrected(localizer, by=CORRECTION):
     """The same localizer after all keyframes were moved, and nothing else."""
     other = deepcopy(localizer)
-    loops = other._map.loops
+    loops = other._loops
     moved = np.array([se2.compose(by, T) for T in loops.keyframes.poses()])
     list(loops.keyframes.move(moved, loops.graph.edges))
-    other._map.close_loops()
+    other._close_loops()
     return other
 
 
 def test_the_pose_follows_the_keyframes(driven):
     other = corrected(driven)
     np.testing.assert_allclose(other.pose, se2.compose(CORRECTION, driven.pose), atol=1e-12)
-    before = driven._tracker.track
-    after = other._tracker.track
+    before = driven._tracker
+    after = other._tracker
     np.testing.assert_array_equal(after.reckoned.T_anchor_base, before.reckoned.T_anchor_base)
     np.testing.assert_array_equal(after.T_anchor_update, before.T_anchor_update)
     np.testing.assert_array_equal(after.uncertainty.since_match, before.uncertainty.since_match)
@@ -71,7 +71,7 @@ def test_tracking_continues_in_the_corrected_map_as_if_it_had_always_been_there(
 
 
 def test_a_new_anchor_changes_nothing_in_the_map():
-    track = Track(se2.pose(1.0, 0.5, 0.8), MapEvidence(4.0, 0.6))
+    track = Tracker(LocalizerConfig(initial_x_m=1.0, initial_y_m=0.5, initial_yaw_rad=0.8))
     covariance = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, 0.001], [0.002, 0.001, 0.01]])
     track.uncertainty.since_match = covariance
     track.reckoned = DeadReckoning(se2.pose(0.8, 0.6, 0.7), covariance)

@@ -56,13 +56,18 @@ from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import Correction, Estimate, StartConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-# The local map for scan matching, re-rendered from the keyframes after a loop closure.
+# A scan is added to the local map after so much motion: nearer ones show the same walls again.
+_UPDATE_M = 0.2
+_UPDATE_RAD = 0.2
+
+_VIEW_M = 1.0  # path length after which the errors of two matches are independent
 
 
 class ActiveMap:
     """The local map of a piece, its loaded cells, and the keyframes that are not yet rendered.
 
-    Loaded cells belong to the published map.
+    Loaded cells belong to the published map. After a loop closure the map is re-rendered from the
+    keyframes, some in each step.
     """
 
     def __init__(self, config: LocalMapConfig, pieces: Pieces, render_first: int = 20) -> None:
@@ -96,7 +101,12 @@ class ActiveMap:
 
         Returns False, and counts the scan in `refused`, if the map would become too large.
         """
-        return self._add(points, T_base_laser, T_map_base)
+        try:
+            self.map.add_scan(points, T_base_laser, T_map_base)
+        except InputError:
+            self.refused += 1
+            return False
+        return True
 
     def start_submap(self) -> None:
         """Continue in an empty map."""
@@ -137,7 +147,7 @@ class ActiveMap:
         """Render up to `count` of the pending keyframes."""
         for _ in range(min(count, len(self._pending))):
             frame = keyframes[self._pending.pop()]
-            self._add(frame.points, frame.scan.T_base_laser, frame.T_map_base)
+            self.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
 
     @property
     def _first_rendered(self) -> int:
@@ -152,20 +162,9 @@ class ActiveMap:
             empty.restore(self._loaded)
         return empty
 
-    def _add(self, points: Array, T_base_laser: Array, T_map_base: Array) -> bool:
-        try:
-            self.map.add_scan(points, T_base_laser, T_map_base)
-        except InputError:
-            self.refused += 1
-            return False
-        return True
-
-
-# Manhattan-world heading correction of the scans that are added to the local map.
-
 
 class HeadingCorrection:
-    """Corrects the heading of scans before they are added to the map."""
+    """Corrects the heading of scans by the wall compass before they are added to the map."""
 
     def __init__(
         self,
@@ -220,199 +219,6 @@ class HeadingCorrection:
         return se2.pose(x, y, heading)
 
 
-# The map of the localizer: its local map, keyframes, pose graph and trajectory.
-
-# A scan is added to the local map after so much motion: nearer ones show the same walls again.
-_UPDATE_M = 0.2
-
-_UPDATE_RAD = 0.2
-
-_VIEW_M = 1.0  # path length after which the errors of two matches are independent
-
-
-class LocalizerMap:
-    """Adds the scans of a tracker to the local map and to the keyframes, and closes loops."""
-
-    def __init__(self, config: LocalizerConfig, tracker: Tracker) -> None:
-        self._config = config
-        self._tracker = tracker
-        calibration = tracker.prediction.calibration
-        self._heading = HeadingCorrection(config.lines, calibration)
-        self.loops = LoopClosure(
-            config.loop_closure, config.keyframes, config.matching, config.local_map, calibration
-        )
-        self.atlas = Atlas(self.loops)
-        self.local = ActiveMap(config.local_map, self.loops.pieces)
-        self._path = KeyframeTrajectory()
-
-    @property
-    def surroundings(self) -> Surroundings:
-        """What the next scan is matched with."""
-        keyframes = self.loops.keyframes
-        return Surroundings(
-            self.local.map,
-            self.loops.anchor,
-            keyframes.revision,
-            has_keyframes=len(keyframes) > 0,
-            is_apart=self.loops.pieces.is_apart,
-        )
-
-    @property
-    def pose(self) -> Array:
-        """Current pose T_map_base (3,)."""
-        return self.loops.anchor.pose(self._tracker.track.T_anchor_base)
-
-    def load(self, given: State | None, keyframes: SavedKeyframes | None) -> None:
-        """Begin with the cells of a `LocalMap.state`, and the keyframes that they are made of.
-
-        Without cells, these are rendered from the keyframes.
-        """
-        if keyframes is not None:
-            self.loops.load(keyframes)
-        if given is None:
-            self.local.rerender(self.loops.keyframes.frames, self.pose)
-        else:
-            self.local.load(given, len(self.loops.keyframes))
-
-    def place(self, T_map_base: Array, covariance: Array) -> None:
-        """Place the robot at a given pose (3,) with covariance (3, 3) in the published map."""
-        self.loops.pieces.return_to_published()
-        self.loops.return_to(T_map_base)
-        anchor = self.loops.anchor
-        self._tracker.place(anchor.relative(T_map_base), anchor.turned(covariance))
-
-    def add(self, scan: Scan, points: Array) -> None:
-        """Add a scan with surface points (N, 5) if the robot has moved far enough since the last.
-
-        In a submap of its own if scans contradict the map. The pose stays, whatever of it an error
-        ends.
-        """
-        T_map_base = self.pose
-        try:
-            self._add(scan, points)
-        except Exception:
-            # What it is relative to may be another keyframe.
-            self._tracker.track.T_anchor_base = self.loops.anchor.relative(T_map_base)
-            raise
-
-    def _add(self, scan: Scan, points: Array) -> None:
-        track = self._tracker.track
-        moved = track.since_update
-        path_m = 0.0 if moved is None else math.hypot(moved[0], moved[1])
-        turn = 0.0 if moved is None else abs(float(moved[2]))
-        is_near = path_m < _UPDATE_M and turn < _UPDATE_RAD
-        if moved is not None and is_near:
-            return
-        if track.evidence.needs_submap:
-            self.start_submap()
-        elif track.evidence.forbids_mapping:
-            return
-        self._correct_heading(scan)
-        if not self.local.add_scan(points, scan.T_base_laser, self.pose):
-            # No building is that large: the pose is wrong, or was.
-            self.start_submap()
-            self.local.add_scan(points, scan.T_base_laser, self.pose)
-        track.T_anchor_update = track.T_anchor_base
-        # Motion errors are independent in each step. The error of a match is correlated with that
-        # of the previous match as long as the same walls are observed.
-        track.uncertainty.map_updated(min(1.0, path_m / _VIEW_M + turn))
-        if len(points) >= MIN_POINTS and self.loops.needs_keyframe(track.T_anchor_base):
-            self._add_keyframe(scan, points)
-
-    def start_submap(self) -> None:
-        """Start a new local map at the dead-reckoned pose."""
-        covariance = self._tracker.fall_back()
-        track = self._tracker.track
-        track.uncertainty.start_submap(track.T_anchor_base, covariance)
-        track.evidence.start_submap()
-        self.loops.pieces.begin()
-        self.local.start_submap()
-
-    def close_loops(self) -> Correction | None:
-        """Do one step of loop closure; the local map follows its correction."""
-        self.atlas.step(self._config.loop_closure.join_odds)
-        correction = self.loops.step()
-        if correction is not None:
-            correction = replace(correction, join=self.atlas.take_join())
-        self.local.follow(self.loops.keyframes, self.pose)
-        return correction
-
-    def record_pose(self, stamp_ns: int) -> None:
-        """Store the pose of this step relative to its keyframe."""
-        keyframes = self.loops.keyframes
-        number = keyframes.anchor
-        T_keyframe = np.zeros(3) if number < 0 else keyframes.frames[number].T_map_base
-        self._path.add(stamp_ns, number, se2.between(T_keyframe, self.pose))
-
-    def trajectory(self) -> Array:
-        """Poses (N, 3) of all steps, after all corrections; pending matches are done."""
-        while self.loops.is_busy:
-            self.close_loops()
-        return self._path.poses(self.loops.finish())
-
-    def known_places(self) -> Array:
-        """Places (N, 2) that enclose the published map: cells, and keyframes, m."""
-        frames = self.loops.keyframes.frames
-        is_published = self.loops.pieces.is_published
-        keyframes = [frame.T_map_base[:2] for frame in frames if is_published(frame.submap)]
-        cells = self.local.published(frames).corners()
-        return np.vstack([cells, np.array(keyframes).reshape(-1, 2)])
-
-    def apart_points(self) -> Array:
-        """Scan points (N, 2) of the keyframes that are not in the published map, m."""
-        is_published = self.loops.pieces.is_published
-        points = [
-            se2.transform_points(frame.T_map_base, frame.scan.points_base())
-            for frame in self.loops.keyframes.frames
-            if not is_published(frame.submap)
-        ]
-        return np.vstack([np.zeros((0, 2)), *points])
-
-    def _correct_heading(self, scan: Scan) -> None:
-        """Correct the heading by the wall directions if scans agree with the map."""
-        anchor = self.loops.anchor
-        track = self._tracker.track
-        derivative = np.vstack([np.zeros((2, 4)), self._tracker.systematic(anchor)[2]])
-        variance = float(self._tracker.random_covariance(anchor)[2, 2])
-        corrected = self._heading.correct(
-            scan,
-            anchor.pose(track.T_anchor_base),
-            track.uncertainty,
-            anchor.path_m_at(track.T_anchor_base),
-            track.evidence.agrees,
-            Reference(variance, self._share(derivative)),
-            self.loops.keyframes.revision,
-        )
-        track.turn(anchor.relative(corrected))
-
-    def _add_keyframe(self, scan: Scan, points: Array) -> None:
-        """Make the scan a keyframe, to which the pose is relative from now on."""
-        loops = self.loops
-        tracker = self._tracker
-        anchor = loops.anchor
-        T_map_base = self.pose
-        uncertainty = tracker.track.uncertainty
-        covariance, jump = uncertainty.step()
-        step = Step(covariance, self._share(uncertainty.systematic))
-        # In a new submap the heading is unknown, also by multiples of 90 degrees.
-        is_lost = loops.pieces.is_apart or tracker.track.evidence.is_lost
-        heading = None if is_lost else self._heading.measured
-        (error,) = heading_errors(np.array([heading_row(heading)]), T_map_base[None])
-        covariance, systematic = with_heading(
-            tracker.random_covariance(anchor), tracker.systematic(anchor), error
-        )
-        submap = loops.pieces.current
-        path_m = anchor.path_m_at(tracker.track.T_anchor_base)
-        frame = Keyframe(scan, points, T_map_base, path_m, covariance, submap, heading, systematic)
-        loops.add(frame, step, jump)
-        tracker.track.begin_step()
-
-    def _share(self, derivative: Array) -> Systematic:
-        """Share of the odometry in a relative pose of this step, by its derivative (3, 4)."""
-        calibration = self._tracker.prediction.calibration
-        return Systematic(derivative, calibration.parameters, calibration.spans)
-
-
 class Localizer:
     """Scan matching with a local map, keyframes and loop closure.
 
@@ -426,8 +232,16 @@ class Localizer:
 
     def reset(self) -> None:
         """Discard map, path and pose; the next scan starts at the configured initial pose."""
-        self._tracker = Tracker(self.config)
-        self._map = LocalizerMap(self.config, self._tracker)
+        config = self.config
+        self._tracker = Tracker(config)
+        calibration = self._tracker.prediction.calibration
+        self._heading = HeadingCorrection(config.lines, calibration)
+        self._loops = LoopClosure(
+            config.loop_closure, config.keyframes, config.matching, config.local_map, calibration
+        )
+        self._atlas = Atlas(self._loops)
+        self._local = ActiveMap(config.local_map, self._loops.pieces)
+        self._path = KeyframeTrajectory()
 
     def adjust(self, config: LocalizerConfig) -> None:
         """Continue with other values of `LIVE_PARAMETERS`; map, path and pose stay."""
@@ -438,7 +252,7 @@ class Localizer:
             loop_closure=config.loop_closure,
         )
         self._tracker.adjust(self.config)
-        self._map.loops.adjust(config.loop_closure, config.matching)
+        self._loops.adjust(config.loop_closure, config.matching)
 
     @property
     def rejected(self) -> int:
@@ -446,27 +260,27 @@ class Localizer:
 
         And of scans that lie too far from the others for one map.
         """
-        return self._rejected + self._tracker.prediction.rejected + self._map.local.refused
+        return self._rejected + self._tracker.prediction.rejected + self._local.refused
 
     @property
     def pose(self) -> Array:
         """Current pose T_map_base (3,), a copy."""
-        return self._map.pose
+        return self._loops.anchor.pose(self._tracker.T_anchor_base)
 
     @property
     def keyframes(self) -> list[Keyframe]:
         """The keyframes, at their optimized poses."""
-        return self._map.loops.keyframes.frames
+        return self._loops.keyframes.frames
 
     @property
     def edges(self) -> list[Edge]:
         """Edges of the pose graph between the keyframes: their steps, and those of loops."""
-        return [*self._map.loops.keyframes.steps, *self._map.loops.graph.edges]
+        return [*self._loops.keyframes.steps, *self._loops.graph.edges]
 
     @property
     def published_graph(self) -> LoopClosure | None:
         """The keyframes and their graph; None where the map is made of other cells, too."""
-        return self._map.loops if self._map.local.is_of_keyframes else None
+        return self._loops if self._local.is_of_keyframes else None
 
     @property
     def calibration(self) -> Array:
@@ -493,20 +307,20 @@ class Localizer:
             self._rejected += 1
             return
         T_map_base = se2.pose(*T_map_base.tolist())
-        self._map.place(T_map_base, covariance)
-        self._tracker.track.evidence.place(is_map_given=not self.config.is_mapping)
-        self._map.local.rerender(self.keyframes, T_map_base)
+        self._place(T_map_base, covariance)
+        self._tracker.evidence.place(is_map_given=not self.config.is_mapping)
+        self._local.rerender(self.keyframes, T_map_base)
 
     def state(self) -> State:
         """The published local map as arrays by name, for `from_state`; without the pose."""
-        return self._map.local.published(self.keyframes).state()
+        return self._local.published(self.keyframes).state()
 
     def saved_keyframes(self, since_ns: int = 0) -> SavedKeyframes | None:
         """The keyframes of the published map, for `from_state`, from the one of a stamp on.
 
         None without any, and if the map began with cells that are not made of keyframes.
         """
-        return self._map.loops.saved(since_ns) if self._map.local.is_of_keyframes else None
+        return self._loops.saved(since_ns) if self._local.is_of_keyframes else None
 
     @staticmethod
     def from_state(
@@ -525,7 +339,7 @@ class Localizer:
             possible, 'local map: hits: more than observations', 'no more hits than observations'
         )
         localizer = Localizer(config)
-        localizer._map.local.map.restore(checked)
+        localizer._local.map.restore(checked)
         localizer._start_delocalized(checked, keyframes)
         return localizer
 
@@ -539,7 +353,7 @@ class Localizer:
         until scans on its way confirm the pose.
         """
         localizer = Localizer(config)
-        local = localizer._map.local.map
+        local = localizer._local.map
         local.add_free_cells(*free_cells(patch, local.config.resolution_m))
         for faces in occupied_surface_points(patch):
             local.add_walls(faces.points, faces.normal)
@@ -580,16 +394,16 @@ class Localizer:
         One step: predict, match, update the pose, update the map, close loops.
         """
         points = surface_points(scan)
-        tracked = self._tracker.step(scan, points, T_odom_base, self._map.surroundings)
-        evidence = self._tracker.track.evidence
+        tracked = self._tracker.step(scan, points, T_odom_base, self._surroundings)
+        evidence = self._tracker.evidence
         if not self.config.is_mapping:
             self._detect_loss()
         elif not evidence.is_delocalized:
-            self._map.add(scan, points)
+            self._add_scan(scan, points)
         elif evidence.needs_submap:
-            self._map.start_submap()  # the robot is not where it was placed
-        correction = self._map.close_loops()
-        self._map.record_pose(scan.stamp_ns)
+            self._start_submap()  # the robot is not where it was placed
+        correction = self._close_loops()
+        self._record_pose(scan.stamp_ns)
         return replace(self._estimate(tracked), correction=correction)
 
     def optimized_trajectory(self) -> Array:
@@ -597,22 +411,34 @@ class Localizer:
 
         Pending matches are done, and the pose is corrected by them.
         """
-        return self._map.trajectory()
+        while self._loops.is_busy:
+            self._close_loops()
+        return self._path.poses(self._loops.finish())
 
     def keyframe_trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (N,) in ns and optimized poses (N, 3) of the keyframe scans along the path.
 
         Each other scan keeps its pose relative to the keyframe before it.
         """
-        return self._map.loops.keyframes.path()
+        return self._loops.keyframes.path()
 
     def known_places(self) -> Array:
         """Places (N, 2) that enclose the published map: cells, and keyframes, m."""
-        return self._map.known_places()
+        frames = self.keyframes
+        is_published = self._loops.pieces.is_published
+        keyframes = [frame.T_map_base[:2] for frame in frames if is_published(frame.submap)]
+        cells = self._local.published(frames).corners()
+        return np.vstack([cells, np.array(keyframes).reshape(-1, 2)])
 
     def apart_points(self) -> Array:
         """Scan points (N, 2) of the pieces that are apart, where dead reckoning puts them, m."""
-        return self._map.apart_points()
+        is_published = self._loops.pieces.is_published
+        points = [
+            se2.transform_points(frame.T_map_base, frame.scan.points_base())
+            for frame in self.keyframes
+            if not is_published(frame.submap)
+        ]
+        return np.vstack([np.zeros((0, 2)), *points])
 
     def _start_delocalized(
         self,
@@ -620,30 +446,38 @@ class Localizer:
         keyframes: SavedKeyframes | None = None,
         is_guess: bool = False,
     ) -> None:
-        """Start in a loaded map: delocalized until scans fit."""
+        """Start in the cells of a `LocalMap.state` and the keyframes that they are made of.
+
+        Without cells, these are rendered from the keyframes. Delocalized until scans fit.
+        """
         start = self.pose
-        self._map.load(given, keyframes)
-        self._map.place(start, self._tracker.slip_covariance())
+        if keyframes is not None:
+            self._loops.load(keyframes)
+        if given is None:
+            self._local.rerender(self.keyframes, self.pose)
+        else:
+            self._local.load(given, len(self.keyframes))
+        self._place(start, self._tracker.slip_covariance())
         is_believed = self.config.is_start_given or not self.config.is_mapping
-        self._tracker.track.evidence.start_delocalized(is_believed, is_guess=is_guess)
+        self._tracker.evidence.start_delocalized(is_believed, is_guess=is_guess)
 
     def _detect_loss(self) -> None:
         """In a map that does not change, the robot is delocalized if scans contradict it.
 
         Dead reckoning continues from the last scan that agreed.
         """
-        track = self._tracker.track
+        track = self._tracker
         if track.evidence.is_delocalized or not track.evidence.needs_submap:
             return
-        covariance = self._tracker.fall_back()
+        covariance = track.fall_back()
         track.uncertainty.place(track.T_anchor_base, covariance)
         track.evidence.lose()
 
     def _estimate(self, tracked: Tracked) -> Estimate:
-        evidence = self._tracker.track.evidence
-        anchor = self._map.loops.anchor
+        evidence = self._tracker.evidence
+        anchor = self._loops.anchor
         T_map_base = self.pose
-        apart = self._map.atlas.apart
+        apart = self._atlas.apart
         is_lost = apart is not None or evidence.is_lost
         match = tracked.match
         return Estimate(
@@ -659,8 +493,131 @@ class Localizer:
             scan_information=match.scan_information if match and tracked.fits else None,
         )
 
+    @property
+    def _surroundings(self) -> Surroundings:
+        """What the next scan is matched with."""
+        keyframes = self._loops.keyframes
+        return Surroundings(
+            self._local.map,
+            self._loops.anchor,
+            keyframes.revision,
+            has_keyframes=len(keyframes) > 0,
+            is_apart=self._loops.pieces.is_apart,
+        )
 
-# The available localizers, and their selection by the parameter `slam`.
+    def _place(self, T_map_base: Array, covariance: Array) -> None:
+        """Place the robot at a given pose (3,) with covariance (3, 3) in the published map."""
+        self._loops.pieces.return_to_published()
+        self._loops.return_to(T_map_base)
+        anchor = self._loops.anchor
+        self._tracker.place(anchor.relative(T_map_base), anchor.turned(covariance))
+
+    def _add_scan(self, scan: Scan, points: Array) -> None:
+        """Add a scan with surface points (N, 5) if the robot has moved far enough since the last.
+
+        In a submap of its own if scans contradict the map. The pose stays, whatever of it an error
+        ends.
+        """
+        T_map_base = self.pose
+        try:
+            self._update_map(scan, points)
+        except Exception:
+            # What it is relative to may be another keyframe.
+            self._tracker.T_anchor_base = self._loops.anchor.relative(T_map_base)
+            raise
+
+    def _update_map(self, scan: Scan, points: Array) -> None:
+        track = self._tracker
+        moved = track.since_update
+        path_m = 0.0 if moved is None else math.hypot(moved[0], moved[1])
+        turn = 0.0 if moved is None else abs(float(moved[2]))
+        is_near = path_m < _UPDATE_M and turn < _UPDATE_RAD
+        if moved is not None and is_near:
+            return
+        if track.evidence.needs_submap:
+            self._start_submap()
+        elif track.evidence.forbids_mapping:
+            return
+        self._correct_heading(scan)
+        if not self._local.add_scan(points, scan.T_base_laser, self.pose):
+            # No building is that large: the pose is wrong, or was.
+            self._start_submap()
+            self._local.add_scan(points, scan.T_base_laser, self.pose)
+        track.T_anchor_update = track.T_anchor_base
+        # Motion errors are independent in each step. The error of a match is correlated with that
+        # of the previous match as long as the same walls are observed.
+        track.uncertainty.map_updated(min(1.0, path_m / _VIEW_M + turn))
+        if len(points) >= MIN_POINTS and self._loops.needs_keyframe(track.T_anchor_base):
+            self._add_keyframe(scan, points)
+
+    def _start_submap(self) -> None:
+        """Start a new local map at the dead-reckoned pose."""
+        track = self._tracker
+        covariance = track.fall_back()
+        track.uncertainty.start_submap(track.T_anchor_base, covariance)
+        track.evidence.start_submap()
+        self._loops.pieces.begin()
+        self._local.start_submap()
+
+    def _close_loops(self) -> Correction | None:
+        """Do one step of loop closure; the local map follows its correction."""
+        self._atlas.step(self.config.loop_closure.join_odds)
+        correction = self._loops.step()
+        if correction is not None:
+            correction = replace(correction, join=self._atlas.take_join())
+        self._local.follow(self._loops.keyframes, self.pose)
+        return correction
+
+    def _record_pose(self, stamp_ns: int) -> None:
+        """Store the pose of this step relative to its keyframe."""
+        number = self._loops.keyframes.anchor
+        T_keyframe = np.zeros(3) if number < 0 else self.keyframes[number].T_map_base
+        self._path.add(stamp_ns, number, se2.between(T_keyframe, self.pose))
+
+    def _correct_heading(self, scan: Scan) -> None:
+        """Correct the heading by the wall directions if scans agree with the map."""
+        anchor = self._loops.anchor
+        track = self._tracker
+        derivative = np.vstack([np.zeros((2, 4)), track.systematic(anchor)[2]])
+        variance = float(track.random_covariance(anchor)[2, 2])
+        corrected = self._heading.correct(
+            scan,
+            anchor.pose(track.T_anchor_base),
+            track.uncertainty,
+            anchor.path_m_at(track.T_anchor_base),
+            track.evidence.agrees,
+            Reference(variance, self._share(derivative)),
+            self._loops.keyframes.revision,
+        )
+        track.turn(anchor.relative(corrected))
+
+    def _add_keyframe(self, scan: Scan, points: Array) -> None:
+        """Make the scan a keyframe, to which the pose is relative from now on."""
+        loops = self._loops
+        tracker = self._tracker
+        anchor = loops.anchor
+        T_map_base = self.pose
+        uncertainty = tracker.uncertainty
+        covariance, jump = uncertainty.step()
+        step = Step(covariance, self._share(uncertainty.systematic))
+        # In a new submap the heading is unknown, also by multiples of 90 degrees.
+        is_lost = loops.pieces.is_apart or tracker.evidence.is_lost
+        heading = None if is_lost else self._heading.measured
+        (error,) = heading_errors(np.array([heading_row(heading)]), T_map_base[None])
+        covariance, systematic = with_heading(
+            tracker.random_covariance(anchor), tracker.systematic(anchor), error
+        )
+        submap = loops.pieces.current
+        path_m = anchor.path_m_at(tracker.T_anchor_base)
+        frame = Keyframe(scan, points, T_map_base, path_m, covariance, submap, heading, systematic)
+        loops.add(frame, step, jump)
+        tracker.begin_step()
+
+    def _share(self, derivative: Array) -> Systematic:
+        """Share of the odometry in a relative pose of this step, by its derivative (3, 4)."""
+        calibration = self._tracker.prediction.calibration
+        return Systematic(derivative, calibration.parameters, calibration.spans)
+
 
 AnyLocalizer = Localizer | EkfLocalizer
 

@@ -77,8 +77,9 @@ LIVE_PARAMETERS = (
 )
 
 
-# Walls of the local map that beams would hit, or have passed through.
+_NO_RETURNS = 'no returns from walls of the map'
 
+# Of the walls of the local map that beams would hit, or have passed through.
 _REACH = 0.9  # of range_max: a farther wall may be out of range
 
 _STEP_CELLS = 0.5
@@ -211,8 +212,6 @@ def _count_walls(
                 break
     return count
 
-
-# Evidence against the map: scans agree with it, the robot is lost, or it is delocalized.
 
 # Inliers for each contradicting point with which a match overrides the odometry.
 INLIERS_PER_CONTRADICTION = 3.0
@@ -467,57 +466,6 @@ class DeadReckoning:
         )
 
 
-class Track:
-    """Pose of the robot relative to the anchor, T_anchor_base (3,), and what is known of it.
-
-    uncertainty, reckoned, T_anchor_update: relative to the anchor, too; the last is the pose of the
-    scan that was last added to the map, None before the first. evidence: against the map.
-    """
-
-    def __init__(self, T_anchor_base: Array, evidence: MapEvidence) -> None:
-        self.T_anchor_base = T_anchor_base
-        self.uncertainty = PoseUncertainty(T_anchor_base)
-        self.evidence = evidence
-        self.reckoned = DeadReckoning(T_anchor_base, np.zeros((3, 3)))
-        self.T_anchor_update: Array | None = None
-
-    @property
-    def since_update(self) -> Array | None:
-        """Motion (3,) since the last map update; None before the first."""
-        update = self.T_anchor_update
-        return None if update is None else se2.between(update, self.T_anchor_base)
-
-    def place(self, T_anchor_base: Array, covariance: Array) -> None:
-        """Set the pose (3,) with covariance (3, 3), relative to any anchor, without any motion."""
-        self.T_anchor_base = T_anchor_base
-        self.T_anchor_update = None
-        self.uncertainty.place(T_anchor_base, covariance)
-        self.reckoned = DeadReckoning(T_anchor_base, self.uncertainty.since_match)
-
-    def record_agreement(self) -> None:
-        """Restart dead reckoning at the pose of this scan if the scan agrees with the map."""
-        if self.evidence.agrees:
-            self.reckoned = DeadReckoning(self.T_anchor_base, self.uncertainty.since_match)
-
-    def turn(self, T_anchor_base: Array) -> None:
-        """Set the pose (3,) after its heading was measured by other means than the map."""
-        self.T_anchor_base = T_anchor_base
-        self.uncertainty.T_moved = T_anchor_base
-        self.record_agreement()
-
-    def begin_step(self) -> None:
-        """Make the present pose the anchor: a keyframe scan."""
-        T_old_new = self.T_anchor_base
-        self.T_anchor_base = np.zeros(3)
-        self.uncertainty.start_step(T_old_new)
-        self.reckoned = self.reckoned.seen_from(T_old_new)
-        if self.T_anchor_update is not None:
-            self.T_anchor_update = se2.between(T_old_new, self.T_anchor_update)
-
-
-_NO_RETURNS = 'no returns from walls of the map'
-
-
 @dataclass(frozen=True, eq=False)
 class Surroundings:
     """What a scan is matched with: the local map, and the anchor of the pose in it.
@@ -548,41 +496,53 @@ class Tracked:
 
 
 class Tracker:
-    """Predicts, matches and updates the pose relative to the anchor."""
+    """Predicts, matches and updates the pose relative to the anchor, T_anchor_base (3,).
+
+    uncertainty, reckoned, T_anchor_update: relative to the anchor, too; the last is the pose of the
+    scan that was last added to the map, None before the first. evidence: against the map.
+    """
 
     def __init__(self, config: LocalizerConfig) -> None:
         self._config = config
         self._matcher = Matcher(config.matching)
         self.prediction = OdometryPrediction(config.odometry)
         start = se2.pose(config.initial_x_m, config.initial_y_m, config.initial_yaw_rad)
-        evidence = MapEvidence(config.lost_threshold, config.matching.min_inlier_ratio)
-        self.track = Track(start, evidence)
+        self.T_anchor_base = start
+        self.uncertainty = PoseUncertainty(start)
+        self.evidence = MapEvidence(config.lost_threshold, config.matching.min_inlier_ratio)
+        self.reckoned = DeadReckoning(start, np.zeros((3, 3)))
+        self.T_anchor_update: Array | None = None
 
     def adjust(self, config: LocalizerConfig) -> None:
         """Continue with other values of `LIVE_PARAMETERS`."""
         self._config = config
         self._matcher = Matcher(config.matching)
-        self.track.evidence.adjust(config.lost_threshold, config.matching.min_inlier_ratio)
+        self.evidence.adjust(config.lost_threshold, config.matching.min_inlier_ratio)
+
+    @property
+    def since_update(self) -> Array | None:
+        """Motion (3,) since the last map update; None before the first."""
+        update = self.T_anchor_update
+        return None if update is None else se2.between(update, self.T_anchor_base)
 
     def step(self, scan: Scan, points: Array, T_odom_base: Array, there: Surroundings) -> Tracked:
         """Track a scan with surface points (N, 5), given the odometry pose (3,) at its stamp.
 
         Where an error ends it, the scan is left out, and the motion up to it is not.
         """
-        track = self.track
-        before = track.T_anchor_base
+        before = self.T_anchor_base
         prediction = self.prediction.predict(scan, T_odom_base, before, there.revision)
         is_stationary = self._is_stationary(prediction)
         by_calibration = rotation(float(before[2])) @ prediction.motion.by_calibration
-        track.uncertainty.predict(
+        self.uncertainty.predict(
             before, prediction.prior, prediction.covariance, is_stationary, by_calibration
         )
-        track.reckoned = track.reckoned.moved(prediction)
+        self.reckoned = self.reckoned.moved(prediction)
         try:
             return self._measure(scan, points, prediction, is_stationary, there)
         except Exception:
-            track.T_anchor_base = prediction.prior
-            track.uncertainty.coast(prediction.prior, prediction.covariance, is_stationary)
+            self.T_anchor_base = prediction.prior
+            self.uncertainty.coast(prediction.prior, prediction.covariance, is_stationary)
             raise
 
     def _measure(
@@ -594,25 +554,42 @@ class Tracker:
         there: Surroundings,
     ) -> Tracked:
         """Match a scan at its predicted pose, and update the pose by it."""
-        track = self.track
         before = prediction.before
         match = self._match(scan, points, prediction.prior, there)
         moved_m = 0.0 if is_stationary else float(np.hypot(*(prediction.prior - before)[:2]))
         through = self._seen_through(scan, match, there)
-        track.evidence.update(match, through, is_stationary, moved_m)
+        self.evidence.update(match, through, is_stationary, moved_m)
         own = None if match is None else match.seen_from(there.anchor.T_map)
         fits = self._update(own, prediction, is_stationary)
         if fits and match is not None:
             systematic = self.systematic(there.anchor)
             self.prediction.calibration.update(match.pose, match.scan_information, systematic)
-        track.record_agreement()
+        self._record_agreement()
         blind_reason = self._blind_reason(scan, points, match, there)
         return Tracked(match, fits, prediction.discontinuity, blind_reason)
 
     def place(self, T_anchor_base: Array, covariance: Array) -> None:
-        """Set the pose (3,) with covariance (3, 3), relative to the anchor."""
+        """Set the pose (3,) with covariance (3, 3), relative to any anchor, without any motion."""
         self.prediction.reset_segment()
-        self.track.place(T_anchor_base, covariance)
+        self.T_anchor_base = T_anchor_base
+        self.T_anchor_update = None
+        self.uncertainty.place(T_anchor_base, covariance)
+        self.reckoned = DeadReckoning(T_anchor_base, self.uncertainty.since_match)
+
+    def turn(self, T_anchor_base: Array) -> None:
+        """Set the pose (3,) after its heading was measured by other means than the map."""
+        self.T_anchor_base = T_anchor_base
+        self.uncertainty.T_moved = T_anchor_base
+        self._record_agreement()
+
+    def begin_step(self) -> None:
+        """Make the present pose the anchor: a keyframe scan."""
+        T_old_new = self.T_anchor_base
+        self.T_anchor_base = np.zeros(3)
+        self.uncertainty.start_step(T_old_new)
+        self.reckoned = self.reckoned.seen_from(T_old_new)
+        if self.T_anchor_update is not None:
+            self.T_anchor_update = se2.between(T_old_new, self.T_anchor_update)
 
     def fall_back(self) -> Array:
         """Return to the dead-reckoned pose: later matches, as in a crowd, are not reliable.
@@ -620,9 +597,8 @@ class Tracker:
         Returns its covariance (3, 3).
         """
         self.prediction.reset_segment()
-        reckoned = self.track.reckoned
-        self.track.T_anchor_base = reckoned.T_anchor_base
-        return reckoned.covariance + self.slip_covariance()
+        self.T_anchor_base = self.reckoned.T_anchor_base
+        return self.reckoned.covariance + self.slip_covariance()
 
     def slip_covariance(self) -> Array:
         """Covariance (3, 3) of a pose after the largest expected wheel slip."""
@@ -630,12 +606,12 @@ class Tracker:
 
     def random_covariance(self, anchor: Anchor) -> Array:
         """Covariance (3, 3) of the independent errors of the pose, map frame."""
-        uncertainty = self.track.uncertainty
+        uncertainty = self.uncertainty
         return anchor.covariance_at(uncertainty.T_moved, uncertainty.since_anchor)
 
     def systematic(self, anchor: Anchor) -> Array:
         """Derivative (3, 4) of the pose by the calibration of the odometry, map frame."""
-        uncertainty = self.track.uncertainty
+        uncertainty = self.uncertainty
         return anchor.systematic_at(uncertainty.T_moved, uncertainty.systematic)
 
     def covariance(self, anchor: Anchor) -> Array:
@@ -644,10 +620,15 @@ class Tracker:
         total = self.random_covariance(anchor) + systematic
         return np.asarray(0.5 * (total + total.T))
 
+    def _record_agreement(self) -> None:
+        """Restart dead reckoning at the pose of this scan if the scan agrees with the map."""
+        if self.evidence.agrees:
+            self.reckoned = DeadReckoning(self.T_anchor_base, self.uncertainty.since_match)
+
     def _is_stationary(self, prediction: Prediction) -> bool:
         """Whether the robot has moved by no more than the odometry noise."""
         slip = BOUND_SIGMAS * odometry_slip(self._config.odometry)
-        is_still = self.track.uncertainty.is_stationary(prediction.prior, slip)
+        is_still = self.uncertainty.is_stationary(prediction.prior, slip)
         return prediction.motion.is_stationary and is_still
 
     def _match(self, scan: Scan, points: Array, prior: Array, there: Surroundings) -> Match | None:
@@ -657,7 +638,7 @@ class Tracker:
         if np.ptp(points[:, :2], axis=0).max() < self._config.local_map.resolution_m:
             return None  # all points in one cell do not determine a pose
         T_map = there.anchor.T_map
-        covariance = rotated_covariance(self.track.uncertainty.since_match, float(T_map[2]))
+        covariance = rotated_covariance(self.uncertainty.since_match, float(T_map[2]))
         prior = there.anchor.pose(prior)
         return self._matcher.match(points, scan.T_base_laser, there.local_map, prior, covariance)
 
@@ -670,7 +651,7 @@ class Tracker:
         if match is None or not self._config.is_mapping:
             return NOTHING
         # At a given pose no drift explains them: it is right or wrong.
-        is_given = self.track.evidence.is_delocalized
+        is_given = self.evidence.is_delocalized
         covariance = np.zeros((3, 3)) if is_given else self.covariance(there.anchor)
         return seen_through(scan, there.local_map, match.pose, covariance)
 
@@ -680,17 +661,17 @@ class Tracker:
         match: relative to the anchor. Returns whether it was accepted and fits.
         """
         prior = prediction.prior
-        uncertainty = self.track.uncertainty
+        uncertainty = self.uncertainty
         is_unexpected = match is not None and uncertainty.is_unexpected(match, prior)
         accepted = match is not None and not self._is_rejected(match, is_unexpected)
         # After set_pose an innovation is due to the given pose, and not to the odometry.
-        if match is not None and is_unexpected and not self.track.evidence.is_delocalized:
+        if match is not None and is_unexpected and not self.evidence.is_delocalized:
             self.prediction.contradict(prediction, match, accepted)
         if match is None or not accepted:
-            self.track.T_anchor_base = prior
+            self.T_anchor_base = prior
             uncertainty.coast(prior, prediction.covariance, is_stationary)
             return False
-        self.track.T_anchor_base = match.pose
+        self.T_anchor_base = match.pose
         fits = match.inlier_ratio >= self._config.matching.min_inlier_ratio
         uncertainty.update(match, prior, prediction.covariance, fits, is_stationary)
         if fits:
@@ -703,14 +684,14 @@ class Tracker:
         An unexpected match is, if many of its points contradict the map. After scans that could
         not be matched, one that fits badly is: a few points fit somewhere within a wide prior.
         """
-        if self.track.evidence.is_delocalized:
+        if self.evidence.is_delocalized:
             return False
         if is_unexpected and (
             match.inlier_ratio < INLIERS_PER_CONTRADICTION * match.contradiction_ratio
         ):
             return True
-        is_wide = self._config.matching.is_wide(self.track.uncertainty.since_match)
-        return self.track.evidence.is_unconfirmed and is_wide
+        is_wide = self._config.matching.is_wide(self.uncertainty.since_match)
+        return self.evidence.is_unconfirmed and is_wide
 
     def _blind_reason(
         self, scan: Scan, points: Array, match: Match | None, there: Surroundings
@@ -719,12 +700,12 @@ class Tracker:
         if match is not None or scan.is_blind:
             return scan.blind_reason
         has_confirmed = not self._config.is_mapping or there.has_keyframes
-        is_confirmed = has_confirmed and not self.track.evidence.is_delocalized
+        is_confirmed = has_confirmed and not self.evidence.is_delocalized
         sparse_reason = few_beams_reason(scan) or _sparse_reason(scan, points, is_confirmed)
-        if sparse_reason or there.is_apart or self.track.evidence.is_lost:
+        if sparse_reason or there.is_apart or self.evidence.is_lost:
             return sparse_reason
-        T_map_base = there.anchor.pose(self.track.T_anchor_base)
-        covariance = self.track.uncertainty.since_match
+        T_map_base = there.anchor.pose(self.T_anchor_base)
+        covariance = self.uncertainty.since_match
         misses = misses_walls(scan, there.local_map, T_map_base, covariance)
         return _NO_RETURNS if misses else ''
 
