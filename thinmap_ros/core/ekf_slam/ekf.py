@@ -20,7 +20,7 @@ class EkfSlam:
     """The filter. Features are addressed by their index in the state, 0 to count - 1.
 
     Between pose and features the state may hold `carried` numbers, which no observation or motion
-    model depends on. Updates change them only by their correlations: see ekf_ti for their use.
+    model depends on. Updates change them only by their correlations: see `CompressedEkf`.
     """
 
     def __init__(self, T_map_base: Array, covariance: Array, carried: int = 0) -> None:
@@ -193,29 +193,17 @@ class EkfSlam:
         P -= K H P, eq. (7).
         """
         taken = bool(_correct(0.5 * (S + S.T), HP, v, self._x, self._P))
-        if taken:
-            self._normalise()
+        if taken:  # wrap angles into (-pi, pi]
+            # A negative r is kept: reversing the line would also exchange the ends of its interval.
+            self._x[2] = wrap(float(self._x[2]))
+            self.lines[:, 1] = wrap(self.lines[:, 1])
         return taken
 
     def _reserve(self, size: int) -> None:
-        if size <= self._x.size:
-            return
-        wider = max(size, 2 * self._x.size)
-        x = np.zeros(wider)
-        P = np.zeros((wider, wider))
-        n = self.size
-        x[:n] = self._x[:n]
-        P[:n, :n] = self._P[:n, :n]
-        self._x = x
-        self._P = P
-
-    def _normalise(self) -> None:
-        """Wrap angles into (-pi, pi].
-
-        A negative r is kept: reversing the line would also exchange the ends of its interval.
-        """
-        self._x[2] = wrap(float(self._x[2]))
-        self.lines[:, 1] = wrap(self.lines[:, 1])
+        if size > self._x.size:
+            more = max(size - self._x.size, self._x.size)
+            self._x = np.pad(self._x, (0, more))
+            self._P = np.pad(self._P, (0, more))
 
 
 def _difference(seen: Array, expected: Array) -> Array:
@@ -267,42 +255,38 @@ def _correct(S: Array, HP: Array, v: Array, x: Array, P: Array) -> bool:
     return True
 
 
-# EKF-SLAM/TI: the conventional filter's estimate at a cost independent of the feature count.
-#
-# Each step updates the pose and the features of a local area, A. Its effect on all other features,
-# B, is accumulated in a few numbers, and applied when the area changes. Source: EKF-SLAM/TI paper
-# section 4 for the area; the compressed filter after Guivant and Nebot, "Optimization of the
-# simultaneous localization and map-building algorithm for real-time implementation", 2001 (the
-# paper's reference [4]).
-#
-# Let P_AB and P_BB be the covariances when the area was set. Then after any number of steps there
-# is a vector c and a matrix C with x_B = x_B + P_BA c and P_BB = P_BB + P_BA C P_AB, and each
-# number a of A has the cross covariance P_aB = Phi_a P_AB. A vector e with mean 0, covariance 0 and
-# cov(A, e) = I at that time evolves in the same way (B changes as P_BA e): its mean is c, its
-# covariance C, and its cross covariance Phi. So the local filter is the conventional filter with e
-# as part of its state, without a second set of equations.
-#
-# Adding P_BA C P_AB to P_BB costs the square of the number of features. C is negative semidefinite,
-# so the term is -W' W with few rows. Only the rows of a new area are updated at once. The others
-# follow a few at a time, so that the time of each step is bounded.
-
-_ROOM = 8200  # numbers by which the store grows; memory is used only where it is written
-
-_CHUNK = 256  # numbers by which the used width of the store grows
-
-_SWEEP_STEPS = 384  # steps in which -W' W is added to the whole store
-
+# Of the store of all features.
+_ROOM = 8200  # numbers by which it grows; memory is used only where it is written
+_CHUNK = 256  # numbers by which its used width grows
+_SWEEP_STEPS = 384  # steps in which -W' W is added to all of it
 _BLOCK = 64  # smallest number of rows to update at once
 
 _ROUNDING = 1e-15  # relative size of an eigenvalue below which it is rounding error
 
 
 class CompressedEkf:
-    """Pose and all features; `local` is the filter of the pose and the features of the area.
+    """EKF-SLAM/TI: the conventional filter's estimate at a cost independent of the feature count.
 
-    The caller chooses the ids of features. `area` lists those of the local filter, in its order;
-    change their number only by `add` and `remove` of this class. Until `set_local_area` is called,
-    all features are in the area, and this is the conventional filter.
+    The caller chooses the ids of features. `local` is the filter of the pose and the features of a
+    local area, A. `area` lists their ids, in its order; change their number only by `add` and
+    `remove` of this class. Until `set_local_area` is called, all features are in the area, and this
+    is the conventional filter.
+
+    Each step updates the pose and the features of the area. Its effect on all other features, B, is
+    accumulated in a few numbers, and applied when the area changes. Let P_AB and P_BB be the
+    covariances when the area was set. Then after any number of steps there is a vector c and a
+    matrix C with x_B = x_B + P_BA c and P_BB = P_BB + P_BA C P_AB, and each number a of A has the
+    cross covariance P_aB = Phi_a P_AB. A vector e with mean 0, covariance 0 and cov(A, e) = I at
+    that time evolves in the same way (B changes as P_BA e): its mean is c, its covariance C, and
+    its cross covariance Phi. So the local filter is the conventional filter with e as part of its
+    state, without a second set of equations.
+
+    Adding P_BA C P_AB to P_BB costs the square of the number of features. C is negative
+    semidefinite, so the term is -W' W with few rows. Only the rows of a new area are updated at
+    once. The others follow a few at a time, so that the time of each step is bounded.
+    Source: EKF-SLAM/TI paper section 4 for the area; the compressed filter after Guivant and Nebot,
+    "Optimization of the simultaneous localization and map-building algorithm for real-time
+    implementation", 2001 (the paper's reference [4]).
     """
 
     def __init__(self, T_map_base: Array, covariance: Array) -> None:
@@ -387,9 +371,8 @@ class CompressedEkf:
 
     def lines(self) -> dict[int, Array]:
         """Line (r, alpha) of every feature; outside the area as of when the area was set."""
-        found = {i: self._store.mean[2 * p : 2 * p + 2] for i, p in self._places.items()}
-        found.update(zip(self.area, self.local.lines, strict=True))
-        return found
+        ids, lines = self.line_array()
+        return dict(zip(ids.tolist(), lines, strict=True))
 
     def line_array(self) -> tuple[NDArray[np.int64], Array]:
         """Ids (N,) and lines (N, 2) of all features, as `lines`, in the order of `ids`."""

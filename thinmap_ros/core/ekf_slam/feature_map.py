@@ -8,6 +8,7 @@ state, and removed after several consecutive scans saw through it.
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -33,18 +34,8 @@ from thinmap_ros.core.se2 import Array, compose, transform_points, wrap
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
-# Data association: nearest neighbour of each line of a scan among the features.
-#
-# Source: EKF-SLAM/TI paper eq. (13), with the sign of the gate corrected: v' S^-1 v <= 5.99, two
-# degrees of freedom, 95 %. Collinear walls of different rooms are on one infinite line, so the
-# observed segments have to overlap or be near, too. The two faces of a thin wall are two features,
-# each observed from its own side. Ambiguous lines are associated after the others have updated the
-# pose, so that the scan is considered jointly (the idea of Neira and Tardos, "Data association in
-# stochastic mapping using the joint compatibility test", 2001).
-
 # Only pairs nearer than this are tested by their Mahalanobis distance.
 _NEAR_M = 0.5
-
 _NEAR_RAD = math.radians(15.0)
 
 
@@ -65,6 +56,26 @@ class AssociationConfig(Config):
         '(m); at least the width of a door. Lower it if collinear walls of different rooms merge.',
         low=0.0,
         high=20.0,
+    )
+
+
+@dataclass(frozen=True)
+class FeatureConfig(Config):
+    """Parameters of feature management."""
+
+    min_observations: int = parameter(
+        4,
+        'Number of observations after which a line becomes a feature. Raise it against features '
+        'on moving objects, lower it to use new walls sooner.',
+        low=1,
+        high=100,
+    )
+    candidate_max_misses: int = parameter(
+        15,
+        'Number of observations without a match after which a feature candidate is dropped. Raise '
+        'it for walls that are often hidden.',
+        low=1,
+        high=10_000,
     )
 
 
@@ -89,7 +100,13 @@ def associate(
     """Associate each line of a scan with its nearest feature, independently of other lines.
 
     laser_map (2,): position of the laser, map frame. Ambiguous lines should be associated again
-    after the others have updated the pose.
+    after the others have updated the pose, so that the scan is considered jointly (the idea of
+    Neira and Tardos, "Data association in stochastic mapping using the joint compatibility test",
+    2001). Collinear walls of different rooms are on one infinite line, so the observed segments
+    have to overlap or be near, too. The two faces of a thin wall are two features, each observed
+    from its own side.
+    Source: EKF-SLAM/TI paper eq. (13), with the sign of the gate corrected: v' S^-1 v <= 5.99, two
+    degrees of freedom, 95 %.
     """
     chosen = np.full(len(lines), -1, dtype=np.int64)
     passing = np.zeros(len(lines), dtype=np.int64)
@@ -146,9 +163,6 @@ def mahalanobis(v: Array, S: Array) -> float:
     return float(squares / determinant)
 
 
-# Feature candidates: a line becomes a feature after several observations at one place.
-
-
 @dataclass(eq=False)
 class FeatureCandidate:
     """A line (r, alpha), map frame, and its observed interval.
@@ -165,18 +179,11 @@ class FeatureCandidate:
 
 
 class FeatureCandidates:
-    """The lines with too few observations to be features."""
+    """The lines with too few observations at one place to be features."""
 
-    def __init__(self, min_observations: int, max_misses: int, gate: float, gap_m: float) -> None:
-        """Create an empty set.
-
-        min_observations: number after which a line becomes a feature; max_misses: observations
-        without a match after which a candidate is dropped; gate, gap_m: as in `associate`.
-        """
-        self._min_observations = min_observations
-        self._max_misses = max_misses
-        self._gate = gate
-        self._gap_m = gap_m
+    def __init__(self, config: FeatureConfig, association: AssociationConfig) -> None:
+        self._config = config
+        self._association = association
         self._all: list[FeatureCandidate] = []
         self._observations = 0
 
@@ -190,8 +197,8 @@ class FeatureCandidates:
             self._take(pose, z, covariance, transform_points(pose, ends), laser_map)
             for z, covariance, ends in zip(lines.z, lines.covariances, lines.ends, strict=True)
         ]
-        ripe = [c for c in dict.fromkeys(seen) if c.observations >= self._min_observations]
-        oldest = self._observations - self._max_misses
+        ripe = [c for c in dict.fromkeys(seen) if c.observations >= self._config.min_observations]
+        oldest = self._observations - self._config.candidate_max_misses
         self._all = [c for c in self._all if c.last_observed >= oldest and c not in ripe]
         return ripe
 
@@ -204,7 +211,7 @@ class FeatureCandidates:
         S = 2.0 * by_seen @ covariance @ by_seen.T
         for candidate in self._meeting(ends_map, laser_map):
             v, signs = line_difference(line, candidate.line)
-            if mahalanobis(v, S) <= self._gate:
+            if mahalanobis(v, S) <= self._association.gate:
                 candidate.line = v + signs * candidate.line
                 candidate.span.grow(*interval(candidate.line, ends_map))
                 candidate.z = z
@@ -221,20 +228,16 @@ class FeatureCandidates:
             return []
         lines = np.array([c.line for c in self._all])
         spans = [c.span for c in self._all]
-        near = meeting(lines, spans, ends_map[None], laser_map, self._gap_m)[0]
+        gap_m = self._association.max_gap_m
+        near = meeting(lines, spans, ends_map[None], laser_map, gap_m)[0]
         return [self._all[i] for i in np.flatnonzero(near)]
 
 
-# Detection of removed features, such as an opened door, by beams that pass through them.
-
+# Of features that a scan sees through.
 _BEYOND_M = 0.3  # a beam that ends this far behind a feature has passed through it
-
 _END_M = 0.15  # margin at the ends of a feature where beams are ignored
-
 _MIN_BEAMS = 8
-
 _SHARE = 0.7  # smallest share of passing beams among those that reach the feature
-
 _FLATTEST = 0.17  # smallest sine of the angle between beam and wall
 
 
@@ -243,8 +246,9 @@ def seen_through(
 ) -> NDArray[np.bool_]:
     """Whether the scan passes through each feature with its line (N, 2), map frame; (N,).
 
-    Most of the beams that should hit the feature, and enough of them, end well behind it. Beams
-    without return are ignored: glass and black walls cause them, too.
+    It is removed then, as an opened door. Most of the beams that should hit the feature, and enough
+    of them, end well behind it. Beams without return are ignored: glass and black walls cause them,
+    too.
     """
     if not features:
         return np.zeros(0, dtype=np.bool_)
@@ -267,12 +271,6 @@ def seen_through(
     reaching = (aimed & (ranges > expected - _BEYOND_M)).sum(axis=0)
     return np.asarray((through >= _MIN_BEAMS) & (through > _SHARE * reaching))
 
-
-# Local area: selection of the features near the robot by the topological map.
-#
-# Features are stored at the nodes near which they were observed. The local area consists of the
-# features at the robot's node and at the nodes connected to it, except those out of view.
-# Source: EKF-SLAM/TI paper section 4, Fig. 6-8.
 
 AREA_FIELDS = {
     'stored_at': Field(np.int64, ('s', 2), 1, MAX_ID),
@@ -303,7 +301,10 @@ class LocalAreaConfig:
 class LocalArea:
     """Features by the topological nodes near which they were observed.
 
-    Until `set_topology` is called with nodes, nodes are placed along the robot's path.
+    The local area consists of the features at the robot's node and at the nodes connected to it,
+    except those out of view. Until `set_topology` is called with nodes, nodes are placed along the
+    robot's path.
+    Source: EKF-SLAM/TI paper section 4, Fig. 6-8.
     """
 
     def __init__(self, config: LocalAreaConfig | None = None) -> None:
@@ -459,18 +460,11 @@ class LocalArea:
         self._places = np.array([(n.x, n.y) for n in near]).reshape(-1, 2)
         self._listed_at = T_map_base[:2].copy()
         gone = self._features_at.keys() - topology.nodes.keys()
-        self._note_places(near if topology is self._listed else list(topology.nodes.values()))
+        # In a map that is changed in place, distant nodes do not move.
+        changed = near if topology is self._listed else list(topology.nodes.values())
+        self._place_of.update((n.id, n.position) for n in changed if n.id in self._features_at)
         self._listed = topology
         self._hand_over(sorted(gone))
-
-    def _note_places(self, nodes: list[Node]) -> None:
-        """Store the positions of nodes with features.
-
-        In a map that is changed in place, distant nodes do not move.
-        """
-        self._place_of.update(
-            (node.id, node.position) for node in nodes if node.id in self._features_at
-        )
 
     def _hand_over(self, gone: list[int]) -> None:
         """Move the features of removed nodes to the nodes nearest to their former positions."""
@@ -499,7 +493,7 @@ class _Trail:
         self._map = topology
         self._spacing_m = spacing_m
         self._last: int | None = None
-        self._next_id = 1
+        self._ids = count(1)
 
     def follow(self, T_map_base: Array) -> bool:
         """Update by the robot's pose (3,); returns whether nodes or edges were added."""
@@ -509,18 +503,14 @@ class _Trail:
         last = self._last
         known = len(self._map.nodes) + len(self._map.edges)
         if node is None or math.dist(node.position, (x, y)) > self._spacing_m:
-            node = Node(self._take_id(), NodeKind.CORNER, x, y, 0.0)
+            node = Node(next(self._ids), NodeKind.CORNER, x, y, 0.0)
             self._map.put_node(node)
         if last is not None and last != node.id and node.id not in self._map.neighbours(last):
             path = np.array([self._map.nodes[last].position, node.position])
             length = math.dist(*path)
-            self._map.put_edge(Edge(self._take_id(), last, node.id, path, length, 0.0))
+            self._map.put_edge(Edge(next(self._ids), last, node.id, path, length, 0.0))
         self._last = node.id
         return len(self._map.nodes) + len(self._map.edges) != known
-
-    def _take_id(self) -> int:
-        self._next_id += 1
-        return self._next_id - 1
 
 
 def _from_robot(T_map_base: Array, place: Array) -> tuple[float, float]:
@@ -571,26 +561,6 @@ FIELDS = {
 }
 
 
-@dataclass(frozen=True)
-class FeatureConfig(Config):
-    """Parameters of feature management."""
-
-    min_observations: int = parameter(
-        4,
-        'Number of observations after which a line becomes a feature. Raise it against features '
-        'on moving objects, lower it to use new walls sooner.',
-        low=1,
-        high=100,
-    )
-    candidate_max_misses: int = parameter(
-        15,
-        'Number of observations without a match after which a feature candidate is dropped. Raise '
-        'it for walls that are often hidden.',
-        low=1,
-        high=10_000,
-    )
-
-
 class FeatureMap:
     """All features by id, the local area of the filter, and the feature candidates.
 
@@ -607,12 +577,7 @@ class FeatureMap:
         self._local_areas = local_areas
         self._wall = np.diag(np.square([WALL_FLATNESS_M, _WALL_FLATNESS_RAD]))
         self._features: dict[int, FeatureTrack] = {}
-        self._candidates = FeatureCandidates(
-            config.min_observations,
-            config.candidate_max_misses,
-            association.gate,
-            association.max_gap_m,
-        )
+        self._candidates = FeatureCandidates(config, association)
         # Features outside the local area that were observed, to be added to it.
         self._called: set[int] = set()
         self._next_id = 1
@@ -693,11 +658,10 @@ class FeatureMap:
 
         The error at the ends is the same as elsewhere, so a short line has an uncertain direction.
         """
-        lengths = np.hypot(*(lines.ends[:, 1] - lines.ends[:, 0]).T)
         sigma_m = WALL_FLATNESS_M
         walls = np.zeros((len(lines), 2, 2))
         walls[:, 0, 0] = sigma_m**2
-        walls[:, 1, 1] = np.square(sigma_m / np.maximum(lengths, sigma_m))
+        walls[:, 1, 1] = np.square(sigma_m / np.maximum(lines.lengths_m, sigma_m))
         return walls
 
     def _correct(

@@ -83,14 +83,10 @@ def interval(line: Array, points: Array) -> tuple[float, float]:
     return float(along.min()), float(along.max())
 
 
-def point_on(line: Array, position: float) -> Array:
-    """Point (2,) at a position (m) along a line (r, alpha)."""
-    return np.asarray(line[0] * normals_of(line[None])[0] + position * tangents_of(line[None])[0])
-
-
 def ends_of(feature: FeatureTrack, line: Array) -> Array:
     """Ends (2, 2) of a feature on its line (r, alpha), map frame."""
-    return np.stack([point_on(line, feature.low), point_on(line, feature.high)])
+    positions = np.array([[feature.low], [feature.high]])
+    return np.asarray(line[0] * normals_of(line[None]) + positions * tangents_of(line[None]))
 
 
 def as_seen(
@@ -105,9 +101,6 @@ def as_seen(
     return LineFeature(
         feature.id, float(line[0]), wrap(float(line[1])), covariance, start, end, nodes, local
     )
-
-
-# Motion model of a differential drive and observation model of a line, with Jacobians.
 
 
 @dataclass(frozen=True)
@@ -212,16 +205,7 @@ def place_line(T_map_base: Array, seen: Array) -> tuple[Array, Array, Array]:
     return np.array([r, wrap(alpha)]), by_pose, by_seen
 
 
-# Line extraction from a scan: split and merge, with a weighted least-squares fit.
-#
-# A run of beams ends if two neighbours are farther apart than on a wall at the smallest usable
-# angle of incidence. A run is split at the point farthest from the chord of its ends while this
-# distance exceeds the noise (iterative end point fit). Adjacent parts that fit one line are merged
-# again. A segment is accepted if it has enough points, is long enough, has residuals within the
-# noise, and has no curvature (round columns make short chords). Source: EKF-SLAM/TI paper section 4
-# (least-squares lines, reference [9] there); the breakpoints after Borges and Aldon, "Line
-# extraction in 2D range images", 2004; the fit minimises sum w (rho cos(phi - alpha) - r)^2.
-
+# Of the extraction of lines.
 _FLATTEST_RAD = math.radians(10.0)  # smallest usable angle between wall and beam
 
 _WIDEST_GAP_M = 0.6  # largest gap in a wall: narrower than a door
@@ -236,7 +220,7 @@ _MAX_CHI2 = 3.0  # per degree of freedom: rough walls pass, clutter does not
 
 _TRIM_SIGMAS = 3.0  # end points with a larger distance are mixed pixels or on the next wall
 
-# Columns of a fit.
+# Columns of the fit of a line.
 _R, _ALPHA, _RR, _RA, _AA, _CHI2, _BOW, _BOW_SIGMA, _LOW, _HIGH = range(10)
 
 
@@ -293,6 +277,11 @@ class Lines:
     def __len__(self) -> int:
         return len(self.z)
 
+    @property
+    def lengths_m(self) -> Array:
+        """Lengths (K,) of the segments."""
+        return np.asarray(np.hypot(*(self.ends[:, 1] - self.ends[:, 0]).T))
+
     def select(self, which: NDArray[np.int64]) -> 'Lines':
         """The lines at some indices (M,)."""
         return Lines(self.z[which], self.covariances[which], self.ends[which])
@@ -304,7 +293,17 @@ def no_lines() -> Lines:
 
 
 def extract_lines(scan: Scan, config: LineConfig) -> Lines:
-    """Extract the line segments of a scan, robot frame, in the order of the beams."""
+    """Extract the line segments of a scan, robot frame, in the order of the beams.
+
+    Split and merge, with a weighted least-squares fit that minimises
+    sum w (rho cos(phi - alpha) - r)^2. A run of beams ends if two neighbours are farther apart than
+    on a wall at the smallest usable angle of incidence. A run is split at the point farthest from
+    the chord of its ends while this distance exceeds the noise (iterative end point fit). Adjacent
+    parts that fit one line are merged again. A segment is accepted if it has enough points, is long
+    enough, has residuals within the noise, and has no curvature (round columns make short chords).
+    Source: EKF-SLAM/TI paper section 4 (least-squares lines, reference [9] there); the breakpoints
+    after Borges and Aldon, "Line extraction in 2D range images", 2004.
+    """
     beams = np.flatnonzero(scan.hit & (scan.ranges_m < config.max_range_m))
     if beams.size < config.min_points:
         return no_lines()
