@@ -18,16 +18,10 @@ from thinmap_ros.core.se2 import (
     rotated_covariance,
     rotation,
 )
+from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE
 from thinmap_ros.core.slam.graph.tables import Rows
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 from thinmap_ros.jit import kernel
-
-# The motion that odometry predicts from one scan to the next, and how uncertain it is.
-#
-# The innovations of scan matching scale the noise of the odometry model, separately for translation
-# and rotation. So an odometry that slips, lags or lacks rotation gets a larger covariance.
-# Source: Mehra, "On the identification of variances and adaptive Kalman filtering", 1970;
-# Siegwart and Nourbakhsh, "Introduction to autonomous mobile robots", for the odometry's noise.
 
 
 @dataclass(frozen=True)
@@ -76,7 +70,13 @@ def _distinctness(information: Array, corridor_ratio: float) -> Array:
 
 
 class MotionModel:
-    """Predicts the motion between two scans, and adapts its noise to the innovations of matches."""
+    """Predicts the motion between two scans, and adapts its noise to the innovations of matches.
+
+    They scale the noise of the odometry model, separately for translation and rotation. So an
+    odometry that slips, lags or lacks rotation gets a larger covariance.
+    Source: Mehra, "On the identification of variances and adaptive Kalman filtering", 1970;
+    Siegwart and Nourbakhsh, "Introduction to autonomous mobile robots", for the odometry's noise.
+    """
 
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
@@ -126,17 +126,6 @@ class MotionModel:
         return np.asarray(self._allowed * self._share[[0, 0, 1]])
 
 
-# Online calibration of the systematic odometry error.
-#
-# Its causes are wheels of an unexpected size, unequal wheels, and a laser that is mounted askew.
-#
-# A match corrects only a part of the prediction error. The rest enters the map and bends it.
-# Therefore the systematic part is estimated and removed from the prediction. The model is that of
-# UMBmark, estimated by a Kalman filter while driving. A metre of odometry is `scale` metres, in a
-# direction that is `askew` radians off the heading of the scans. A radian of odometry is
-# `turn_scale` radians, and each metre adds `drift` radians. Source: Borenstein and Feng,
-# "Measurement and correction of systematic odometry errors in mobile robots", 1996.
-
 _OUTLIER_SIGMAS = 3.0  # beyond which all innovations teach the same
 
 
@@ -176,7 +165,16 @@ class _MatchedPose:
 
 
 class OdometryCalibration:
-    """Estimates the systematic odometry error from scan matches, and removes it."""
+    """Estimates the systematic odometry error from scan matches, and removes it.
+
+    Its causes are wheels of an unexpected size, unequal wheels, and a laser that is mounted askew.
+    A match corrects only a part of the prediction error. The rest enters the map and bends it.
+    Therefore the systematic part is estimated, by a Kalman filter while driving, and removed from
+    the prediction. A metre of odometry is `scale` metres, in a direction that is `askew` radians
+    off the heading of the scans. A radian of odometry is `turn_scale` radians, and each metre adds
+    `drift` radians. Source: Borenstein and Feng, "Measurement and correction of systematic odometry
+    errors in mobile robots", 1996 (UMBmark), for the model.
+    """
 
     def __init__(self, config: CalibrationConfig | None = None) -> None:
         self._config = config or CalibrationConfig()
@@ -377,8 +375,7 @@ class _Spans:
 
     def smoothed(self) -> Array:
         """Parameters (N, 4) of each number of spans, given all of them."""
-        found: Array = _smoothed(self._parameters.values, self._gains.values)
-        return found
+        return np.asarray(_smoothed(self._parameters.values, self._gains.values))
 
 
 @kernel
@@ -396,9 +393,6 @@ def _signed_length(increment: Array) -> float:
     chord = math.hypot(increment[0], increment[1])
     half = 0.5 * float(increment[2])
     return -chord if increment[0] * math.cos(half) + increment[1] * math.sin(half) < 0.0 else chord
-
-
-# Pose prediction by calibrated odometry from scan to scan, with its covariance.
 
 
 @dataclass(frozen=True, eq=False)
@@ -429,7 +423,7 @@ class Prediction:
 
 
 class OdometryPrediction:
-    """Predicts the pose of each scan by odometry, and estimates the errors of the odometry."""
+    """Predicts the pose of each scan by calibrated odometry, and estimates its errors."""
 
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
@@ -509,21 +503,8 @@ class OdometryPrediction:
         return MotionPrediction(motion.increment, motion.covariance + unknown, False)
 
 
-# Covariance of the pose since the last match, the last map update, and the anchor keyframe.
-#
-# A match measures the pose relative to the local map. A scan that is added to the map adds its own
-# pose error to it. These errors accumulate along the path until a loop closure corrects them.
-#
-# The systematic error of the odometry is one error in all steps. Where the scans do not measure the
-# pose, it adds up along the path: the covariance is P + S C S', with P of independent errors, C of
-# the calibration, and S the derivative of the pose by it.
-
 CHI2 = 11.34  # 99 % of three degrees of freedom
-
 UNKNOWN = np.diag(np.square([300.0, 300.0, np.pi]))  # covariance of an unknown pose
-
-_NO_DERIVATIVE = np.zeros((3, 4))
-
 _MIN_STEP = np.diag(np.square([2e-3, 2e-3, 5e-4]))  # smallest covariance between keyframes
 
 
@@ -560,6 +541,14 @@ class Contradiction:
 class PoseUncertainty:
     """Covariances (3, 3), frame of the anchor, of the pose relative to several earlier poses.
 
+    Since the last match, the last map update, and the anchor keyframe. A match measures the pose
+    relative to the local map. A scan that is added to the map adds its own pose error to it. These
+    errors accumulate along the path until a loop closure corrects them.
+
+    The systematic error of the odometry is one error in all steps. Where the scans do not measure
+    the pose, it adds up along the path: the covariance is P + S C S', with P of independent errors,
+    C of the calibration, and S the derivative of the pose by it.
+
     T_moved: pose (3,) after the last motion, relative to the anchor.
     """
 
@@ -570,8 +559,8 @@ class PoseUncertainty:
         self._since_keyframe = np.zeros((3, 3))
         self._map_update_covariance = np.zeros((3, 3))  # last update, not in _since_keyframe
         # Since the walls in view were drawn, which matches measure; and besides, from the anchor.
-        self._systematic_in_view = _NO_DERIVATIVE
-        self._systematic_of_step = _NO_DERIVATIVE
+        self._systematic_in_view = NO_SHARE.derivative
+        self._systematic_of_step = NO_SHARE.derivative
         self._contradiction = Contradiction()
         self.T_moved = T_anchor_base
 
@@ -583,8 +572,8 @@ class PoseUncertainty:
         self.since_map_update = own
         self._since_keyframe = np.zeros((3, 3))
         self._map_update_covariance = np.zeros((3, 3))
-        self._systematic_in_view = _NO_DERIVATIVE
-        self._systematic_of_step = _NO_DERIVATIVE
+        self._systematic_in_view = NO_SHARE.derivative
+        self._systematic_of_step = NO_SHARE.derivative
         self._contradiction.add_jump(own + UNKNOWN)
 
     def predict(

@@ -112,7 +112,7 @@ class WallCompass:
         at = (lines.z[:, 1] + yaw - self._turned) % _QUARTER / _QUARTER * _BINS
         bins = at.astype(np.int64)
         fading = 1.0 / (1.0 + (path_m / self._config.fade_m) ** 2)
-        weights = _lengths(lines) * max(fading, self._config.min_weight)
+        weights = lines.lengths_m * max(fading, self._config.min_weight)
         share = float(weights.sum()) / max(float(self._metres.sum() + weights.sum()), 1e-9)
         self._reference = own if self._reference is None else self._reference.mean(own, share)
         np.add.at(self._metres, bins % _BINS, weights)
@@ -145,7 +145,7 @@ class WallCompass:
         """
         config = self._config
         direction = self.direction
-        lengths = _lengths(lines)
+        lengths = lines.lengths_m
         if direction is None or self._reference is None:
             return None
         off = (lines.z[:, 1] + yaw - direction + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER
@@ -157,8 +157,3 @@ class WallCompass:
         seen = float(np.square(weights) @ lines.covariances[near, 1, 1])
         measured = yaw - float(weights @ off[near])
         return Heading(measured, config.wall_sigma_rad**2 + seen, self._reference)
-
-
-def _lengths(lines: Lines) -> Array:
-    """Lengths (K,) of line segments, m."""
-    return np.asarray(np.hypot(*(lines.ends[:, 1] - lines.ends[:, 0]).T))

@@ -520,7 +520,6 @@ def _vanish(lattice: LocalMapView, gone: list[tuple[int, int]], share: float) ->
     while changed:
         changed = False
         for row, col in led:
-            slot = slot_of(lattice, row, col)
             changed |= _ask(lattice, row, col)
 
 

@@ -4,6 +4,13 @@ The cost is a robust loss of the distance of each point to its nearest wall, plu
 Its minimum near the prior is refined (`minimize`). If few points are inliers there, or if
 the prior is wider than the basin of convergence, the poses within three sigmas of the prior are
 searched (`search`). The lower cost is used.
+
+The distance of a point is measured along the wall's normal: a smooth wall has no information along
+itself. If the normals of a cell's hits differ, as in a corner, both directions have information.
+The Gauss-Newton matrix of the minimum is also the information of the match.
+Source: Censi, "An ICP variant using a point-to-line metric", 2008, for the metric; Kohlbrecher et
+al., "A flexible and scalable SLAM system with full 3D motion estimation", 2011, for the match with
+a map.
 """
 
 import heapq
@@ -14,9 +21,10 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.grid.tiles import NO_TILE, TILE
+from thinmap_ros.core.grid.tiles import NO_TILE
 from thinmap_ros.core.se2 import Array, inverse, rotated_covariance
 from thinmap_ros.core.slam.matching.local_map import (
+    TILE_MASK,
     LocalMap,
     LocalMapView,
     cell_of,
@@ -25,14 +33,6 @@ from thinmap_ros.core.slam.matching.local_map import (
     slot_of,
 )
 from thinmap_ros.jit import inlined, kernel
-
-# Cost function of scan matching: point-to-wall distances and the motion prior.
-#
-# The distance of a point is measured along the wall's normal: a smooth wall has no information
-# along itself. If the normals of a cell's hits differ, as in a corner, both directions have
-# information. The Gauss-Newton matrix of the minimum is also the information of the match. Source:
-# Censi, "An ICP variant using a point-to-line metric", 2008, for the metric; Kohlbrecher et al., "A
-# flexible and scalable SLAM system with full 3D motion estimation", 2011, for the match with a map.
 
 SLIP_SIGMAS = 10.0  # scale of the prior's loss: beyond it, wheel slip is more likely than an error
 
@@ -203,20 +203,10 @@ def minimize(
     return pose, H, sums, weight
 
 
-# Global pose search by branch and bound within the uncertainty of a prior.
-#
-# Source: Olson, "Real-time correlative scan matching", 2009; Hess et al., "Real-time loop closure
-# in 2D LIDAR SLAM", 2016, for branch and bound. The lower bound of a node follows from the
-# distances to the nearest walls: a displacement changes a distance by at most its length. A point
-# out of reach of any wall is assumed to stay out of reach.
-
+# Of the search.
 _ROOT = 4.0  # half the size of a root node, in cells
-
 _LEVELS = 2  # levels of nodes below the root
-
 _DIAGONAL = 1.4  # largest translation within a node, per half of its size
-
-_MASK = TILE - 1
 
 
 @inlined
@@ -248,7 +238,7 @@ def _cost(
         share = UNSEEN_COST
         away = np.inf
         if slot != NO_TILE:
-            cell = lattice.pool[slot, row & _MASK, col & _MASK]
+            cell = lattice.pool[slot, row & TILE_MASK, col & TILE_MASK]
             share = 1.0 if cell['seen'] > 0 else UNSEEN_COST
             away = cells_to_wall(cell)
         nearest = (away - slack * scan[i, 3]) * scale
@@ -292,6 +282,12 @@ def search(
     most_nodes: int,
 ) -> Array:
     """Pose (3,) of lowest cost around a prior (3,), or the incumbent (3,) if none is lower.
+
+    By branch and bound. The lower bound of a node follows from the distances to the nearest walls:
+    a displacement changes a distance by at most its length. A point out of reach of any wall is
+    assumed to stay out of reach.
+    Source: Olson, "Real-time correlative scan matching", 2009; Hess et al., "Real-time loop closure
+    in 2D LIDAR SLAM", 2016, for branch and bound.
 
     scan (N, 3): x, y, weight; half (3,): half of the search window, m, m, rad, rounded to whole
     root nodes; information (3, 3) of the prior; sigma, width: as in `evaluate`.
@@ -345,7 +341,7 @@ def search(
     return best
 
 
-MIN_POINTS = 10
+MIN_POINTS = 10  # of a scan that is matched
 
 
 @dataclass(frozen=True)

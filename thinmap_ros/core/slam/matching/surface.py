@@ -1,5 +1,6 @@
-"""Surface points of a scan: normals and spacing, estimated from neighbouring beams.
+"""Surface points of a scan, and of the walls of an occupancy map, for scan matching.
 
+Normals and spacing of those of a scan are estimated from neighbouring beams.
 Only neighbouring beams on the same surface determine a normal: the last beam of one wall and the
 first of the next are neighbours in the scan, but not in space. A point without a neighbour on its
 surface is left out, because the position of a single hit changes with the robot's.
@@ -18,13 +19,9 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import inlined, kernel
 
 COLUMNS = 5  # of surface points: x, y, double angle of the normal (cosine, sine), spacing
-
 WINDOW_M = 0.15  # nearer neighbours are on the same surface and determine its normal
-
 _RANGE_NOISE_M = 0.02  # 1 sigma: points with no more scatter lie on a plane
-
 _ALIGNED = 0.8  # smallest squared cosine between two steps along one surface
-
 _ALIKE = 9.0  # largest squared ratio of their lengths
 
 
@@ -115,8 +112,6 @@ def _surface(points: Array, beams: NDArray[np.int64]) -> Array:
     return found[:used]
 
 
-# Surface points on the walls of an occupancy map, for scan matching.
-
 # (row, col) from an occupied cell to the free one beside it.
 _SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
@@ -144,26 +139,23 @@ def free_cells(patch: GridPatch, cell_m: float) -> tuple[NDArray[np.bool_], int,
     Returns them as (H, W), and row and column of the first one.
     """
     frame = patch.frame
-    rows = _nearest(frame.origin_y, patch.shape[0], frame.resolution, cell_m)
-    cols = _nearest(frame.origin_x, patch.shape[1], frame.resolution, cell_m)
-    free = patch.free[rows.indices][:, cols.indices]
-    return free, rows.first, cols.first
+    row, rows = _nearest(frame.origin_y, patch.shape[0], frame.resolution, cell_m)
+    col, cols = _nearest(frame.origin_x, patch.shape[1], frame.resolution, cell_m)
+    return patch.free[rows][:, cols], row, col
 
 
-class _Axis(NamedTuple):
-    """The first cell of a lattice along an axis, and the cell (N,) of a map at each of them."""
+def _nearest(
+    origin_m: float, count: int, resolution_m: float, cell_m: float
+) -> tuple[int, NDArray[np.int64]]:
+    """Cells of a lattice, along an axis, whose centres lie in a map with `count` cells.
 
-    first: int
-    indices: NDArray[np.int64]
-
-
-def _nearest(origin_m: float, count: int, resolution_m: float, cell_m: float) -> _Axis:
-    """Cells of a lattice whose centres lie in a map with `count` cells from an origin."""
+    The map begins at an origin. Returns the first one, and the cell (N,) of the map at each.
+    """
     first = math.ceil(origin_m / cell_m - 0.5)
     end = math.ceil((origin_m + count * resolution_m) / cell_m - 0.5)
     centres = (np.arange(first, end) + 0.5) * cell_m
     indices = np.floor((centres - origin_m) / resolution_m).astype(np.int64)
-    return _Axis(first, np.clip(indices, 0, count - 1))
+    return first, np.clip(indices, 0, count - 1)
 
 
 def _faces(patch: GridPatch, row: int, col: int, depth_m: float) -> WallFaces:
