@@ -95,7 +95,8 @@ def test_jacobians_are_those_of_numeric_differences(rng):
         Edge(int(a), int(b), se2.between(poses[a], poses[b]) + rng.normal(0.0, 0.3, 3), STEP, True)
         for a, b in pairs
     ]
-    e, by_a, by_b = _linearise(poses, EdgeArrays.of(edges))
+    arrays = EdgeArrays.of(edges)
+    e, by_a, by_b = _linearise(poses, arrays.a, arrays.b, arrays.T_a_b)
     step = 1e-6
     for k, edge in enumerate(edges):
 

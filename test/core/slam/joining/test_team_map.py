@@ -73,7 +73,7 @@ def test_a_link_stays_as_long_as_the_maps_do_not_contradict_it(three):
 @pytest.mark.parametrize(('log_odds', 'is_left'), [(12.0, True), (1000.0, False)])
 def test_a_place_is_left_for_a_surer_one(three, monkeypatch, log_odds, is_left):
     # As in a building that looks alike: scans match at the wrong place, too.
-    monkeypatch.setattr(team_map, '_FEWEST_MATCHES', 0)
+    monkeypatch.setattr(team_map, '_FEWEST_LINKS', 0)
     team, _ = three
     right = team.links.between('/a', '/b')
     wrong = replace(right, T_a_b=right.T_a_b + (50.0, 0.0, 0.0), log_odds=log_odds)

@@ -43,8 +43,6 @@ _NO_COVARIANCE = np.zeros((3, 3))
 
 _DETACHED = 1e-9 * np.eye(3)  # information of a step that says nothing
 
-_NO_DERIVATIVE = np.zeros((3, 4))
-
 _MOVED_PER_SLICE = 2000  # keyframes: 10 ms on a desktop processor
 
 _RADIAN_M = 1.0  # distance that changes the view of a scan as much as a rotation by a radian
@@ -400,7 +398,7 @@ class Start(NamedTuple):
 
     root: int
     covariance: Array = _NO_COVARIANCE
-    derivative: Array = _NO_DERIVATIVE
+    derivative: Array = NO_SHARE.derivative
 
 
 def covariances_from(
@@ -585,23 +583,20 @@ def _covariances(
     return found, derivatives
 
 
-# Keyframes of a published map with the edges between them, as they are saved with a session.
-
 MAX_KEYFRAMES = 1 << 16  # 45 km of new ground
-
 MAX_EDGES = 1 << 18
 
 _WHAT = 'keyframes'
 
 _MAX_YAW_RAD = 4.0
 
-_MAX_VALUE = 1e12  # of covariances, information and lengths
+MAX_VALUE = 1e12  # of covariances, information and lengths
 
 _MIN_VARIANCE = 1e-12
 
-_ROUNDING = 1e-5  # relative error of a covariance in 32 bit
+ROUNDING = 1e-5  # relative error of a covariance in 32 bit
 
-_UPPER = np.triu_indices(3)
+UPPER = np.triu_indices(3)
 
 _LOW_POSE = (-2.0 * MAX_COORDINATE_M, -2.0 * MAX_COORDINATE_M, -_MAX_YAW_RAD)
 
@@ -609,7 +604,7 @@ _HIGH_POSE = (2.0 * MAX_COORDINATE_M, 2.0 * MAX_COORDINATE_M, _MAX_YAW_RAD)
 
 _LOW_HEADING = (-_MAX_YAW_RAD, _MIN_VARIANCE, 0.0)
 
-_HIGH_HEADING = (_MAX_YAW_RAD, _MAX_VALUE, _MAX_VALUE)
+_HIGH_HEADING = (_MAX_YAW_RAD, MAX_VALUE, MAX_VALUE)
 
 # n keyframes with s = n - 1 steps, and m edges between visits. Symmetric matrices: upper triangle.
 FIELDS: Fields = {
@@ -620,16 +615,16 @@ FIELDS: Fields = {
         (-MAX_COORDINATE_M, -MAX_COORDINATE_M, -_MAX_YAW_RAD),
         (MAX_COORDINATE_M, MAX_COORDINATE_M, _MAX_YAW_RAD),
     ),
-    'path_m': Field(np.float32, ('n',), 0.0, _MAX_VALUE),
-    'covariances': Field(np.float32, ('n', 6), -_MAX_VALUE, _MAX_VALUE),
+    'path_m': Field(np.float32, ('n',), 0.0, MAX_VALUE),
+    'covariances': Field(np.float32, ('n', 6), -MAX_VALUE, MAX_VALUE),
     'submaps': Field(np.int32, ('n',), 0, MAX_KEYFRAMES),
     'headings': Field(np.float32, ('n', 3), _LOW_HEADING, _HIGH_HEADING, nan=True),
     'step_from': Field(np.int32, ('s',), 0, MAX_KEYFRAMES),
     'step_poses': Field(np.float32, ('s', 3), _LOW_POSE, _HIGH_POSE),
-    'step_information': Field(np.float64, ('s', 6), -_MAX_VALUE, _MAX_VALUE),
+    'step_information': Field(np.float64, ('s', 6), -MAX_VALUE, MAX_VALUE),
     'edges': Field(np.int32, ('m', 2), 0, MAX_KEYFRAMES),
     'edge_poses': Field(np.float32, ('m', 3), _LOW_POSE, _HIGH_POSE),
-    'edge_information': Field(np.float64, ('m', 6), -_MAX_VALUE, _MAX_VALUE),
+    'edge_information': Field(np.float64, ('m', 6), -MAX_VALUE, MAX_VALUE),
     'edge_inliers': Field(np.float32, ('m',), 0.0, 1.0),
 }
 
@@ -638,6 +633,7 @@ FIELDS: Fields = {
 class SavedKeyframes:
     """Keyframes (n >= 1), the step from its anchor to each but the first, and edges between visits.
 
+    Those of a published map, as they are saved with a session.
     Nothing refers to a calibration of the odometry: its uncertainty when they were saved is part of
     the covariances, in each step by itself. Scans have the stamps 1, 2, 3, ... ns in their order,
     so that they are told from each other and from all scans of a robot. stamps_ns: those that the
@@ -692,10 +688,7 @@ class SavedKeyframes:
             replace(frame, T_map_base=se2.compose(T, frame.T_map_base), submap=last.submap)
             for frame in tail.frames[1:]
         ]
-        steps, edges = (
-            [replace(edge, a=edge.a + by, b=edge.b + by) for edge in own]
-            for own in (tail.steps, tail.edges)
-        )
+        steps, edges = ([edge.shifted(by, by) for edge in own] for own in (tail.steps, tail.edges))
         return SavedKeyframes(
             self.frames + frames,
             self.steps + steps,
@@ -738,11 +731,10 @@ class SavedKeyframes:
     def from_state(state: State, config: None = None) -> 'SavedKeyframes':
         """Restore a saved `state`. Raises InputError if it is invalid."""
         checked = snapshot.validate(state, FIELDS, _WHAT)
-        _check_sizes(checked)
         _check_edges(checked)
         scans = tables.unpacked_scans(checked, _WHAT)
-        covariances = _matrices(checked['covariances'].astype(np.float64))
-        _require_definite(covariances, 'covariances', -_ROUNDING)
+        covariances = symmetric_matrices(checked['covariances'].astype(np.float64))
+        _require_definite(covariances, 'covariances', -ROUNDING)
         submaps = np.unique(checked['submaps'], return_inverse=True)[1].reshape(-1).tolist()
         frames = [
             Keyframe(
@@ -798,22 +790,19 @@ def _frame_with_calibration(
     )
 
 
-def _check_sizes(checked: State) -> None:
+def _check_edges(checked: State) -> None:
+    """Raise InputError unless there are as many steps and edges as allowed, of known keyframes."""
     count = len(checked['poses'])
-    edges = len(checked['edges'])
+    edges = checked['edges']
     snapshot.require(
         1 <= count <= MAX_KEYFRAMES, f'{_WHAT}: {count}', f'1 to {MAX_KEYFRAMES} keyframes'
     )
     steps = len(checked['step_from'])
     snapshot.require(steps == count - 1, f'{_WHAT}: {steps} steps', f'{count - 1}')
-    snapshot.require(edges <= MAX_EDGES, f'{_WHAT}: {edges} edges', f'at most {MAX_EDGES}')
-
-
-def _check_edges(checked: State) -> None:
-    count = len(checked['poses'])
+    is_few = len(edges) <= MAX_EDGES
+    snapshot.require(is_few, f'{_WHAT}: {len(edges)} edges', f'at most {MAX_EDGES}')
     is_before = checked['step_from'] < np.arange(1, count)
     snapshot.require(bool(is_before.all()), f'{_WHAT}: step_from', 'an earlier keyframe each')
-    edges = checked['edges']
     are_two = (edges < count).all() and (edges[:, 0] != edges[:, 1]).all()
     snapshot.require(bool(are_two), f'{_WHAT}: edges', f'two of the {count} keyframes each')
 
@@ -829,7 +818,7 @@ def _require_definite(matrices: Array, name: str, least: float) -> None:
 def _edges_of(
     checked: State, name: str, ends: NDArray[Any], inliers: NDArray[Any], is_robust: bool
 ) -> list[Edge]:
-    information = _matrices(checked[f'{name}_information'])
+    information = symmetric_matrices(checked[f'{name}_information'])
     _require_definite(information, f'{name}_information', _MIN_VARIANCE)
     poses = checked[f'{name}_poses'].astype(np.float64)
     rows = zip(ends.tolist(), poses, information, inliers.tolist(), strict=True)
@@ -861,12 +850,12 @@ def _relative_poses(edges: Sequence[Edge]) -> NDArray[np.float32]:
 def _triangles(matrices: Sequence[Array]) -> Array:
     """Upper triangles (N, 6) of symmetric matrices (N, 3, 3)."""
     whole = np.array(matrices, dtype=np.float64).reshape(-1, 3, 3)
-    return np.asarray(0.5 * (whole + whole.transpose(0, 2, 1)))[:, _UPPER[0], _UPPER[1]]
+    return np.asarray(0.5 * (whole + whole.transpose(0, 2, 1)))[:, UPPER[0], UPPER[1]]
 
 
-def _matrices(triangles: Array) -> Array:
-    """Symmetric matrices (N, 3, 3) of their upper triangles (N, 6)."""
+def symmetric_matrices(triangles: Array) -> Array:
+    """Matrices (N, 3, 3) of their upper triangles (N, 6)."""
     whole = np.zeros((len(triangles), 3, 3))
-    whole[:, _UPPER[0], _UPPER[1]] = triangles
-    whole[:, _UPPER[1], _UPPER[0]] = triangles
+    whole[:, UPPER[0], UPPER[1]] = triangles
+    whole[:, UPPER[1], UPPER[0]] = triangles
     return whole

@@ -40,13 +40,14 @@ from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 from thinmap_ros.core.slam.odometry import CHI2, OdometryCalibration
 from thinmap_ros.core.stage import Correction
 
-# Submaps around keyframes, with which the scans of later visits are matched.
-
 AGAIN_M = 8.0  # smallest path length between two visits of a place
 
 
 class Submaps:
-    """Cache of submaps around keyframes; consecutive keyframes often match the same submap."""
+    """Cache of submaps around keyframes, with which the scans of later visits are matched.
+
+    Consecutive keyframes often match the same submap.
+    """
 
     def __init__(
         self, config: LocalMapConfig, around: int = 4, stride: int = 4, capacity: int = 3
@@ -99,16 +100,12 @@ class Submaps:
         return base, submap
 
 
-# Loop-closure candidates that agree on the same correction.
-#
-# Source: Mangelson et al., "Pairwise consistent measurement set maximization for robust multi-robot
-# map merging", 2018.
-
-
 def largest_consistent(candidates: Iterable[Edge], frames: Sequence[Keyframe]) -> list[Edge]:
     """Largest set of candidates that agree on the same correction (greedy).
 
     Of keyframes that are in the graph; none if two of the set are of the same keyframe.
+    Source: Mangelson et al., "Pairwise consistent measurement set maximization for robust
+    multi-robot map merging", 2018.
     """
     edges = [edge for edge in candidates if edge.b < len(frames)]
     if not edges:
@@ -142,8 +139,6 @@ def _are_consistent(one: Edge, other: Edge, frames: Sequence[Keyframe]) -> bool:
     return float(off @ np.linalg.solve(covariance, off)) < CHI2
 
 
-# Pieces of map: submaps whose places relative to each other are known.
-
 _PUBLISHED = 0
 
 # Distance between two views of which each says something new. Of eight kidnapped robots that drove
@@ -157,6 +152,7 @@ _RECENT_SUBMAPS = 24  # matches among which consistent ones are searched
 class Pieces:
     """The submaps by number, each in a piece; one of the pieces is the published map.
 
+    A piece holds submaps whose places relative to each other are known.
     A submap that begins because scans contradict the map is a piece of its own. Matches of the
     robot's piece with another one are stored; enough that agree are loop edges, which join the two.
     """
@@ -239,14 +235,13 @@ def _count_views(poses: list[Array]) -> int:
     return len(views)
 
 
-# The pose graph of the keyframes, and its optimization, a slice of an iteration per step.
-
 _MIN_MOVE_M = 0.1  # smallest move of a keyframe for which the map follows the calibration
 
 
 class KeyframeGraph:
     """Moves the keyframes as the edges between them and the calibration of the odometry have it.
 
+    A slice of an iteration of the optimization per step.
     edges: those between visits; the keyframes hold their steps and headings.
     """
 

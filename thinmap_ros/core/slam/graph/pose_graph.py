@@ -18,12 +18,6 @@ from numpy.typing import NDArray
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.jit import inlined, kernel
 
-# Cholesky factorization of sparse symmetric matrices of blocks (3, 3), in slices of work.
-#
-# The order of elimination and the blocks of the factor follow from the pattern alone: they are
-# found once for all matrices of a pattern. Source: George and Liu, "Computer solution of large
-# sparse positive definite systems", 1981. The order is by minimum degree, as SuperLU finds it.
-
 # Pivots below this share of the diagonal are rounding errors: nothing measures that direction.
 _MIN_PIVOT = 1e-13
 
@@ -32,7 +26,11 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Blocks of the lower triangle of a factor with N block columns, in order of elimination.
+    """Blocks (3, 3) of the lower triangle of a Cholesky factor with N block columns.
+
+    In order of elimination, which is by minimum degree, as SuperLU finds it. They follow from the
+    pattern of a sparse symmetric matrix alone, and are found once for all matrices of that.
+    Source: George and Liu, "Computer solution of large sparse positive definite systems", 1981.
 
     place (N,): column of each unknown; first (N + 1,): number of the first block of each column,
     which is the diagonal one; rows (L,): row of each block, ascending in a column; slots (M,):
@@ -62,7 +60,7 @@ class Pattern:
 
 
 class Factorization:
-    """The factor L of a matrix H = L L', as far as it is computed."""
+    """The Cholesky factor L of a matrix H = L L', as far as it is computed, in slices of work."""
 
     def __init__(self, pattern: Pattern, blocks: Array) -> None:
         """Blocks (L, 3, 3): of H, by the numbers of the pattern; they become those of the factor.
@@ -273,9 +271,7 @@ _CONFIG = OptimizerConfig()
 # Work of a slice, in products of blocks: 2 ms on a desktop processor. An iteration of a graph of
 # up to 2,000 keyframes is one slice.
 _SLICE = 60_000
-
 _PER_EDGE = 15  # products that take as long as the share of an edge in the equations
-
 _PER_POSE = 40  # and that of a pose in the order of elimination
 
 
@@ -319,6 +315,10 @@ class Edge:
     systematic: Systematic = NO_SHARE
     inlier_ratio: float = 0.0
 
+    def shifted(self, by_a: int, by_b: int) -> 'Edge':
+        """The edge between keyframes with other numbers."""
+        return replace(self, a=self.a + by_a, b=self.b + by_b)
+
     def weight_at(self, T_a_b: Array) -> float:
         """The weight, 0 to 1, that the robust loss leaves it at a relative pose (3,)."""
         if not self.robust:
@@ -336,8 +336,8 @@ class EdgeArrays:
     a, b (M,), T_a_b (M, 3), information (M, 3, 3), robust (M,): as in `Edge`.
     """
 
-    a: NDArray[np.int64]
-    b: NDArray[np.int64]
+    a: Indices
+    b: Indices
     T_a_b: Array
     information: Array
     robust: NDArray[np.bool_]
@@ -369,7 +369,7 @@ class EdgeArrays:
 
     def settled(self, poses: Array) -> 'EdgeArrays':
         """The edges as the poses (N, 3) have them, with the robust weights that they have there."""
-        e, _, _ = _linearise(poses, self)
+        e, _, _ = _linearise(poses, self.a, self.b, self.T_a_b)
         squared = _squared(e, self.information)
         weight = np.where(self.robust, (1.0 + squared / _CONFIG.large) ** -2, 1.0)
         information = weight[:, None, None] * self.information
@@ -401,7 +401,7 @@ def rounds(poses: Array, edges: EdgeArrays) -> Iterator[Array]:
         yield poses
     width: float | None = None
     for _ in range(_CONFIG.max_iterations):
-        e, by_a, by_b = _linearise(poses, edges)
+        e, by_a, by_b = _linearise(poses, edges.a, edges.b, edges.T_a_b)
         squared = _squared(e, edges.information)
         width = 2.0 * float(squared.max()) if width is None else width / _CONFIG.narrowing
         scale = np.where(edges.robust, (1.0 + squared / max(width, _CONFIG.large)) ** -2, 1.0)
@@ -466,16 +466,16 @@ class _Equations:
 
 @kernel
 def _assemble(
-    a: NDArray[np.int64],
-    b: NDArray[np.int64],
+    a: Indices,
+    b: Indices,
     e: Array,
     by_a: Array,
     by_b: Array,
     information: Array,
     weights: Array,
-    place: NDArray[np.int64],
-    diagonal: NDArray[np.int64],
-    slots: NDArray[np.int64],
+    place: Indices,
+    diagonal: Indices,
+    slots: Indices,
     blocks: Array,
     gradient: Array,
 ) -> None:
@@ -517,16 +517,9 @@ def _squared(e: Array, information: Array) -> Array:
     return squared
 
 
-def _linearise(poses: Array, edges: EdgeArrays) -> tuple[Array, Array, Array]:
-    """Error (M, 3) of each edge, frame of a, and its Jacobians (M, 3, 3) w.r.t. a and b."""
-    found: tuple[Array, Array, Array] = _errors(poses, edges.a, edges.b, edges.T_a_b)
-    return found
-
-
 @kernel
-def _errors(
-    poses: Array, a: NDArray[np.int64], b: NDArray[np.int64], T_a_b: Array
-) -> tuple[Array, Array, Array]:
+def _linearise(poses: Array, a: Indices, b: Indices, T_a_b: Array) -> tuple[Array, Array, Array]:
+    """Error (M, 3) of each edge, frame of a, and its Jacobians (M, 3, 3) w.r.t. a and b."""
     e = np.empty((len(a), 3))
     by_a = np.zeros((len(a), 3, 3))
     by_b = np.zeros((len(a), 3, 3))

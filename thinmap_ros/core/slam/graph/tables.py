@@ -13,15 +13,13 @@ from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.errors import MAX_BEAMS, InputError
 from thinmap_ros.core.scan import MAX_MOUNT_OFFSET_M, Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.pose_graph import Edge, EdgeArrays, Systematic
+from thinmap_ros.core.slam.graph.pose_graph import NO_SHARE, Edge, EdgeArrays, Systematic
 from thinmap_ros.core.slam.wall_compass import Heading, Reference
 from thinmap_ros.core.snapshot import Field, Fields, State
 
-# Arrays that grow by rows.
-
 
 class Rows:
-    """Rows of an array; adding one takes constant time on average."""
+    """Rows of an array that grows; adding one takes constant time on average."""
 
     def __init__(self, *shape: int, dtype: DTypeLike = np.float64) -> None:
         """shape: of a row."""
@@ -44,25 +42,25 @@ class Rows:
         return self._room[: self._count]
 
 
-# Edges of a graph that grows, as arrays: of a long drive there are tens of thousands.
-
-
 class EdgeTable(Sequence[Edge]):
-    """A sequence of edges, each made of its row of the arrays."""
+    """A sequence of edges, each made of its row of arrays: a long drive has tens of thousands."""
 
     def __init__(self, edges: Iterable[Edge] = ()) -> None:
-        self._ends = Rows(2, dtype=np.int64)
-        self._T_a_b = Rows(3)
-        self._information = Rows(3, 3)
-        self._robust = Rows(dtype=np.bool_)
-        self._inlier_ratio = Rows()
-        self._derivative = Rows(3, 4)
-        self._parameters = Rows(4)
-        self._spans = Rows(dtype=np.int64)
+        columns = [
+            ('ends', np.int64, 2),
+            ('T_a_b', np.float64, 3),
+            ('information', np.float64, (3, 3)),
+            ('robust', np.bool_),
+            ('inlier_ratio', np.float64),
+            ('derivative', np.float64, (3, 4)),
+            ('parameters', np.float64, 4),
+            ('spans', np.int64),
+        ]
+        self._rows = Rows(dtype=np.dtype(columns, align=True))
         self.extend(edges)
 
     def __len__(self) -> int:
-        return len(self._ends)
+        return len(self._rows)
 
     @overload
     def __getitem__(self, index: int) -> Edge: ...
@@ -71,32 +69,34 @@ class EdgeTable(Sequence[Edge]):
     def __getitem__(self, index: int | slice) -> Edge | list[Edge]:
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
-        a, b = self._ends.values[index].tolist()
-        share = Systematic(
-            self._derivative.values[index].copy(),
-            self._parameters.values[index].copy(),
-            int(self._spans.values[index]),
-        )
+        row = self._rows.values[index].copy()
+        a, b = row['ends'].tolist()
+        share = Systematic(row['derivative'], row['parameters'], int(row['spans']))
         return Edge(
             a,
             b,
-            self._T_a_b.values[index].copy(),
-            self._information.values[index].copy(),
-            bool(self._robust.values[index]),
+            row['T_a_b'],
+            row['information'],
+            bool(row['robust']),
             share,
-            float(self._inlier_ratio.values[index]),
+            float(row['inlier_ratio']),
         )
 
     def append(self, edge: Edge) -> None:
         """Add an edge."""
-        self._ends.append((edge.a, edge.b))
-        self._T_a_b.append(edge.T_a_b)
-        self._information.append(edge.information)
-        self._robust.append(edge.robust)
-        self._inlier_ratio.append(edge.inlier_ratio)
-        self._derivative.append(edge.systematic.derivative)
-        self._parameters.append(edge.systematic.parameters)
-        self._spans.append(edge.systematic.spans)
+        share = edge.systematic
+        self._rows.append(
+            (
+                (edge.a, edge.b),
+                edge.T_a_b,
+                edge.information,
+                edge.robust,
+                edge.inlier_ratio,
+                share.derivative,
+                share.parameters,
+                share.spans,
+            )
+        )
 
     def extend(self, edges: Iterable[Edge]) -> None:
         """Add edges."""
@@ -106,74 +106,73 @@ class EdgeTable(Sequence[Edge]):
     @property
     def ends(self) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
         """Keyframes a and b of each edge, (M, 2)."""
-        return self._ends.values
+        return self._rows.values['ends']
 
     @property
     def information(self) -> Array:
         """Information (M, 3, 3) of each edge, which may be changed in place."""
-        return self._information.values
+        return self._rows.values['information']
 
     @property
     def derivatives(self) -> Array:
         """Derivative (M, 3, 4) of each relative pose by the calibration."""
-        return self._derivative.values
+        return self._rows.values['derivative']
 
     def arrays(self, parameters: Array | None = None) -> EdgeArrays:
         """The edges, as they are or would be with parameters (N, 4) of the calibration."""
-        a, b = self._ends.values.T.copy()
-        T_a_b = self._T_a_b.values + (0.0 if parameters is None else self._change(parameters))
-        return EdgeArrays(a, b, T_a_b, self.information.copy(), self._robust.values.copy())
+        rows = self._rows.values
+        a, b = rows['ends'].T.copy()
+        T_a_b = rows['T_a_b'] + (0.0 if parameters is None else self._change(parameters))
+        return EdgeArrays(a, b, T_a_b, self.information.copy(), rows['robust'].copy())
 
     def calibrate(self, parameters: Array) -> None:
         """Correct the edges by parameters (N, 4) of the calibration, by the number of spans."""
-        self._T_a_b.values[:] += self._change(parameters)
-        self._parameters.values[:] = parameters[self._spans.values]
+        rows = self._rows.values
+        rows['T_a_b'] += self._change(parameters)
+        rows['parameters'] = parameters[rows['spans']]
 
     def _change(self, parameters: Array) -> Array:
         """Change (M, 3) of the relative poses with parameters (N, 4), by the number of spans."""
-        by = parameters[self._spans.values] - self._parameters.values
+        rows = self._rows.values
+        by = parameters[rows['spans']] - rows['parameters']
         return np.asarray((self.derivatives @ by[:, :, None])[:, :, 0])
-
-
-# Headings of the keyframes that wall directions measure, as arrays.
-
-_UNMEASURED = (0.0, math.inf, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def heading_row(heading: Heading | None) -> tuple[float, ...]:
     """Yaw; its variance, infinite without one; variance and derivative (4,) of the direction."""
-    return _UNMEASURED if heading is None else heading.row
+    return (0.0, math.inf, 0.0, 0.0, 0.0, 0.0, 0.0) if heading is None else heading.row
 
 
 class HeadingTable:
-    """The measured headings by keyframe."""
+    """The headings that wall directions measure, by keyframe, as arrays."""
 
     def __init__(self) -> None:
-        self._rows = Rows(7)
-        self._parameters = Rows(4)
-        self._spans = Rows(dtype=np.int64)
+        columns = [
+            ('row', np.float64, 7),
+            ('parameters', np.float64, 4),
+            ('spans', np.int64),
+        ]
+        self._rows = Rows(dtype=np.dtype(columns, align=True))
 
     def append(self, heading: Heading | None) -> None:
         """Add the heading of the next keyframe, or that it has none."""
-        self._rows.append(heading_row(heading))
-        share = None if heading is None else heading.reference.systematic
-        self._parameters.append(0.0 if share is None else share.parameters)
-        self._spans.append(0 if share is None else share.spans)
+        share = NO_SHARE if heading is None else heading.reference.systematic
+        self._rows.append((heading_row(heading), share.parameters, share.spans))
 
     @property
     def rows(self) -> Array:
         """A row of `heading_row` for each keyframe, (N, 7)."""
-        return self._rows.values
+        return self._rows.values['row']
 
     def of(self, number: int) -> Heading | None:
         """Heading of a keyframe; None without one."""
-        yaw, variance, of_reference, *by = self._rows.values[number].tolist()
+        saved = self._rows.values[number].copy()
+        yaw, variance, of_reference, *by = saved['row'].tolist()
         if not math.isfinite(variance):
             return None
         derivative = np.zeros((3, 4))
         derivative[2] = by
-        spans = int(self._spans.values[number])
-        share = Systematic(derivative, self._parameters.values[number].copy(), spans)
+        share = Systematic(derivative, saved['parameters'], int(saved['spans']))
         return Heading(yaw, variance, Reference(of_reference, share))
 
     def edges(self, first: float, parameters: Array | None = None) -> EdgeArrays:
@@ -195,22 +194,19 @@ class HeadingTable:
 
     def _turns(self, parameters: Array) -> Array:
         """Turn (N,) of each heading with parameters (N, 4), by the number of spans, rad."""
-        by = parameters[self._spans.values] - self._parameters.values
+        by = parameters[self._rows.values['spans']] - self._rows.values['parameters']
         return np.asarray(np.einsum('ki,ki->k', self.rows[:, 3:], by))
 
     def calibrate(self, parameters: Array) -> None:
         """Correct the headings by parameters (N, 4) of the calibration, by the number of spans."""
         self.rows[:, 0] += self._turns(parameters)
-        self._parameters.values[:] = parameters[self._spans.values]
-
-
-# Trajectory relative to keyframes, so that corrections of keyframes move all poses.
+        self._rows.values['parameters'] = parameters[self._rows.values['spans']]
 
 
 class KeyframeTrajectory:
     """Stamped poses, each relative to a keyframe, or to the map before the first keyframe.
 
-    Needs 36 bytes per pose.
+    Corrections of keyframes move all poses. Needs 36 bytes per pose.
     """
 
     def __init__(self) -> None:
@@ -253,8 +249,6 @@ class KeyframeTrajectory:
         return np.column_stack([x, y, se2.wrap(anchors[:, 2] + moved[:, 2])])
 
 
-# Scans in little memory: ranges as 16 bit numbers of millimetres, and each laser once.
-
 # Of all scans together: 16,000 scans of 1,000 beams need about 1 GB once they are keyframes.
 MAX_BEAMS_IN_ALL = 1 << 24
 
@@ -262,11 +256,8 @@ _MILLIMETRES = 1000.0
 
 # Numbers that are no range, and the largest that is one.
 _NO_RETURN = 65535
-
 _BELOW_RANGE_MIN = 65534
-
 _INVALID = 65533
-
 _MAX_NUMBER = 65532
 
 _MAX_UNIT_MM = 1000  # for ranges up to 65 km, and shorter ones to a metre
@@ -289,6 +280,7 @@ FIELDS: Fields = {
 def packed_scans(scans: Sequence[Scan]) -> State:
     """The scans as arrays by name, for `unpacked_scans`; without stamps, and the times of beams.
 
+    Ranges are 16 bit numbers, and each laser is stored once.
     ranges: in units of unit_mm, 1 mm unless the scan has ranges beyond 65 m; 0 stays 0, and
     numbers from 65533 on are: invalid, below range_min, no return.
     """

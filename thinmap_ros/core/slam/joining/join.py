@@ -1,4 +1,4 @@
-"""Pieces of map are joined: one is published, the robot may be in another, links hold them."""
+"""Joins two pieces of map: while a robot drives in one that is apart, and of saved maps."""
 
 import math
 from collections import deque
@@ -31,8 +31,6 @@ from thinmap_ros.core.stage import Apart, Join
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import Ids, TopologyBuilder, join_topologies, moved_map
 
-# Edges between the keyframes of two pieces: matches of scans of one with submaps of the other.
-
 _CONFIG = LoopClosureConfig()
 
 # How far the place of a view is off at its other keyframes.
@@ -41,9 +39,8 @@ _PRIOR = np.diag(np.square([DRIFT.match_m, DRIFT.match_m, DRIFT.match_rad]))
 # Less than of a loop: the place is known. With 0.75, errors between real halves were a fifth more.
 _MIN_INLIER_RATIO = 0.7
 
+# A keyframe by its number, and its predicted pose (3,) in the known piece.
 Prior = tuple[int, Array]
-
-"""A keyframe by its number, and its predicted pose (3,) in the known piece."""
 
 
 def placed_keyframes(
@@ -101,12 +98,6 @@ def _nearest(poses: Array, T: Array) -> int | None:
     return int(min(near, key=lambda j: view_difference_m(poses[j], T)))
 
 
-# Pieces of map: one is published, and the one that the robot is in may be apart from it.
-#
-# A piece that is apart is looked for in the published map, a little with each scan, by the views
-# along its path. Where the odds are high enough, both are joined by matches of its keyframes.
-# Source: Elvira, Tardos and Montiel, "ORBSLAM-Atlas: a robust and accurate multi-map system", 2019.
-
 # Of the published map, with each scan: its grid and graph are made again from its keyframes.
 _KEYFRAMES_PER_SCAN = 2
 
@@ -122,7 +113,13 @@ class _Matching:
 
 
 class Atlas:
-    """Joins the piece that the robot is in with the published map once its place is recognized."""
+    """Joins the piece that the robot is in with the published map once its place is recognized.
+
+    A piece that is apart is looked for in the published map, a little with each scan, by the views
+    along its path. Where the odds are high enough, both are joined by matches of its keyframes.
+    Source: Elvira, Tardos and Montiel, "ORBSLAM-Atlas: a robust and accurate multi-map system",
+    2019.
+    """
 
     def __init__(self, loops: LoopClosure) -> None:
         """loops: the keyframes, their graph and the pieces."""
@@ -265,8 +262,6 @@ class _PieceSearch:
         return Join(T, matching.log_odds, self._query.path_m, len(matching.links))
 
 
-# One transform between two pieces of map that do not bend, by matches between both.
-
 _MAX_LINKS = 100  # for one transform; more take time
 
 
@@ -312,11 +307,6 @@ def _between_bodies(link: Edge, first: SlamPiece, second: SlamPiece) -> Edge:
     return Edge(0, 1, T_first_second, inverse(covariance), robust=True)
 
 
-# One map of two pieces: one pose graph, one grid, one topological map whose ids continue.
-
-_ORIGIN = np.zeros((1, 3))
-
-
 @dataclass(frozen=True, eq=False)
 class JoinConfig:
     """Configurations of the joined grid and topological map."""
@@ -346,7 +336,7 @@ class JoinedMap:
 def join(
     first: SlamPiece, second: SlamPiece, placement: Placement, config: JoinConfig | None = None
 ) -> JoinedMap:
-    """Join two pieces, given where the second lies in the first.
+    """Join two pieces, given where the second lies in the first: one graph, grid and topology.
 
     If both have edges, all keyframes are optimized together, and the grid is rendered from their
     scans. Otherwise both stay rigid.
@@ -374,7 +364,10 @@ def _optimized_together(
     frames = _at(frames, poses)
     motions = (MapMotion(first.poses, poses[:count]), MapMotion(second.poses, poses[count:]))
     erased = _erased(first, second, motions)
-    grid = _rendered(frames, erased, OccupancyGrid(config.grid, first.patch.frame))
+    grid = OccupancyGrid(config.grid, first.patch.frame)
+    for frame in frames:  # with its scan, but for what was erased after that was made
+        later = [each.corners for each in erased if each.stamp_ns >= frame.scan.stamp_ns]
+        add_scan_outside(grid, frame.scan, frame.T_map_base, later)
     patch = grid.known_area()
     topology, ids = join_topologies(
         patch,
@@ -401,21 +394,11 @@ def _erased(
     ]
 
 
-def _rendered(
-    frames: Sequence[Keyframe], erased: Sequence[Erasure], grid: OccupancyGrid
-) -> OccupancyGrid:
-    """The grid with all scans, but for what was erased after they were made."""
-    for frame in frames:
-        later = [each.corners for each in erased if each.stamp_ns >= frame.scan.stamp_ns]
-        add_scan_outside(grid, frame.scan, frame.T_map_base, later)
-    return grid
-
-
 def _all_edges(first: SlamPiece, second: SlamPiece, links: Sequence[Edge]) -> list[Edge]:
     """Edges of both pieces and between them; keyframes of the second count after the first."""
     count = len(first.frames)
-    shifted = [replace(edge, a=edge.a + count, b=edge.b + count) for edge in second.edges]
-    return [*first.edges, *shifted, *(replace(link, b=link.b + count) for link in links)]
+    shifted = (edge.shifted(count, count) for edge in second.edges)
+    return [*first.edges, *shifted, *(link.shifted(0, count) for link in links)]
 
 
 def _bent(poses: Array, first: SlamPiece, second: SlamPiece, links: Sequence[Edge]) -> Array:
@@ -431,15 +414,15 @@ def _joined_rigidly(
     first: SlamPiece, second: SlamPiece, T: Array, links: Sequence[Edge], config: JoinConfig
 ) -> JoinedMap:
     T = rigid_transform(first, second, T, links)
+    motions = (MapMotion.rigid(np.zeros(3)), MapMotion.rigid(T))
     patch = overlaid(first.patch, second.patch, T)
     topology, ids = join_topologies(
         patch,
-        moved_map(first.graph, _ORIGIN, _ORIGIN),
-        moved_map(second.graph, _ORIGIN, T[None]),
+        moved_map(first.graph, motions[0].before, motions[0].after),
+        moved_map(second.graph, motions[1].before, motions[1].after),
         first.next_id,
         config.topology,
     )
     piece = SlamPiece.of_bare_map(patch, topology.map, topology.next_id)
     grid = OccupancyGrid.from_patch(patch, config.grid)
-    motions = (MapMotion.rigid(np.zeros(3)), MapMotion.rigid(T))
     return JoinedMap(piece, grid, topology, T, ids, len(links), motions)

@@ -17,7 +17,15 @@ from thinmap_ros.core.errors import MAX_BEAMS, InputError, one_line_reason
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, inverse
 from thinmap_ros.core.slam.graph import tables
-from thinmap_ros.core.slam.graph.keyframes import MAX_EDGES, MAX_KEYFRAMES, with_calibration
+from thinmap_ros.core.slam.graph.keyframes import (
+    MAX_EDGES,
+    MAX_KEYFRAMES,
+    MAX_VALUE,
+    ROUNDING,
+    UPPER,
+    symmetric_matrices,
+    with_calibration,
+)
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.odometry import UNKNOWN
@@ -25,16 +33,10 @@ from thinmap_ros.core.snapshot import MAX_COORDINATE_M, State
 
 _WHAT = 'keyframe'
 
-_ROUNDING = 1e-5  # relative error of an information matrix in 32 bit
-
-_MAX_INFORMATION = 1e12
-
 # Number, revision, edges, unit of the ranges, pose, laser.
 _HEADER = struct.Struct('<IIIH3f10f')
 
 _EDGE = struct.Struct('<II6f')
-
-_UPPER = np.triu_indices(3)
 
 _MOST_BYTES = _HEADER.size + MAX_EDGES * _EDGE.size + 2 * MAX_BEAMS
 
@@ -74,7 +76,7 @@ class KeyframeMessage:
             *packed['lasers'][0].tolist(),
         )
         edges = [
-            _EDGE.pack(edge.a, edge.b, *edge.information[_UPPER].tolist()) for edge in self.edges
+            _EDGE.pack(edge.a, edge.b, *edge.information[UPPER].tolist()) for edge in self.edges
         ]
         return zlib.compress(head + b''.join(edges) + _differences(packed['ranges']), 9)
 
@@ -97,7 +99,9 @@ class KeyframeMessage:
             for k in range(count)
         )
         scan = _scan(np.array(numbers[3:]), unit_mm, _ranges(plain[first:]))
-        return KeyframeMessage(_known_number(number), revision, T_map_base, scan, edges)
+        if number >= MAX_KEYFRAMES:
+            raise InputError(f'{_WHAT} {number}: expected at most {MAX_KEYFRAMES}')
+        return KeyframeMessage(number, revision, T_map_base, scan, edges)
 
 
 def checked_poses(values: Array) -> Array:
@@ -140,27 +144,20 @@ def _scan(laser: Array, unit_mm: int, ranges: NDArray[np.uint16]) -> Scan:
     return tables.unpacked_scans(checked, _WHAT)[0]
 
 
-def _known_number(number: int) -> int:
-    if number >= MAX_KEYFRAMES:
-        raise InputError(f'{_WHAT} {number}: expected at most {MAX_KEYFRAMES}')
-    return number
-
-
 def _edge(values: tuple[int | float, ...], number: int) -> SentEdge:
     """An edge between keyframes up to a number."""
     a, b = (int(value) for value in values[:2])
     if a == b or max(a, b) > number:
         raise InputError(f'{_WHAT} {number}: edge from {a} to {b}: expected two up to it')
-    information = np.zeros((3, 3))
-    information[_UPPER] = values[2:]
-    return SentEdge(a, b, _definite(information + np.triu(information, 1).T))
+    (information,) = symmetric_matrices(np.array([values[2:]]))
+    return SentEdge(a, b, _definite(information))
 
 
 def _definite(information: Array) -> Array:
     """The matrix (3, 3). Raises InputError unless it is bounded and positive, but for rounding."""
-    if (np.abs(information) <= _MAX_INFORMATION).all():
+    if (np.abs(information) <= MAX_VALUE).all():
         values = np.linalg.eigvalsh(information)
-        if values[2] > 0.0 and values[0] > -_ROUNDING * values[2]:
+        if values[2] > 0.0 and values[0] > -ROUNDING * values[2]:
             return information
     raise InputError(f'{_WHAT}: information of an edge: expected a positive definite matrix')
 
@@ -171,9 +168,6 @@ def _pose(T: Array) -> Array:
             f'{_WHAT}: pose {T.tolist()}: expected finite numbers up to {MAX_COORDINATE_M:g} m'
         )
     return T
-
-
-# Which keyframes, edges and corrected poses of its map a robot has yet to tell others.
 
 
 class KeyframeSender:
@@ -215,8 +209,9 @@ class KeyframeSender:
         pieces = self.loops.pieces
         ready = (k for k in self._waiting if pieces.is_published(frames[k].submap))
         k = next(ready, None)
-        if k is None:
-            return self._edges_of_loops()
+        if k is None:  # edges of a loop that no new keyframe has told
+            edges = self._edges() if self._is_corrected else []
+            return self._last(edges) if edges else None
         self._waiting.remove(k)
         self._told.append(k)
         if k:
@@ -226,13 +221,6 @@ class KeyframeSender:
         if last and not any(last in (edge.a, edge.b) for edge in edges):
             edges.append(SentEdge(last - 1, last, inverse(UNKNOWN)))
         return self._last(edges)
-
-    def _edges_of_loops(self) -> KeyframeMessage | None:
-        """The last keyframe again, with the edges of a loop that no new one has told."""
-        if not self._is_corrected:
-            return None
-        edges = self._edges()
-        return self._last(edges) if edges else None
 
     def _last(self, edges: list[SentEdge]) -> KeyframeMessage:
         """The keyframe that was told last, with edges."""

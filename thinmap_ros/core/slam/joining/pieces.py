@@ -1,4 +1,4 @@
-"""Pieces of map from keyframes: those that grow, and those of other robots."""
+"""Pieces of map from keyframes: those that grow, those that are joined, those of other robots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,16 +21,14 @@ from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import TopologyBuilder
 
-# A piece of map that grows keyframe by keyframe, with all that recognition needs of it.
-
 # Coarser than the map: recognition compares pieces, and nobody sees them.
 _CELL_M = 0.1
 
 
 class GrowingPiece:
-    """Keyframes in the frame of the first of them, with their grid, graph and views.
+    """A piece that grows: keyframes in the frame of the first of them, grid, graph and views.
 
-    numbers: of the keyframes in the pose graph.
+    That is all that recognition needs of it. numbers: of the keyframes in the pose graph.
     """
 
     def __init__(self) -> None:
@@ -91,12 +89,9 @@ class GrowingPiece:
         return bool(np.hypot(*(moved - own)[:, :2].T).max() > SAME_M)
 
 
-# A piece of map that can be joined: keyframes and edges, grid and topological map.
-
-
 @dataclass(frozen=True, eq=False)
 class SlamPiece:
-    """A piece of map.
+    """A piece of map that can be joined: keyframes and edges, grid and topological map.
 
     edges: between keyframes, by their numbers; without any the piece is rigid. next_id: smallest
     number that no node or edge of the graph has had. erased: parts of which no earlier scan shows
@@ -142,9 +137,6 @@ class SlamPiece:
     def places(self) -> MapPiece:
         """The piece for recognition."""
         return MapPiece(self.frames, self.patch, self.graph)
-
-
-# The keyframes of a robot's map as another program receives them.
 
 
 @dataclass(frozen=True, eq=False)

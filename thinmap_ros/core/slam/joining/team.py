@@ -19,13 +19,11 @@ from thinmap_ros.core.places.recognition import JOIN_ODDS, recognize
 from thinmap_ros.core.se2 import Array, inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
-from thinmap_ros.core.slam.joining.join import match_keyframes, refined
+from thinmap_ros.core.slam.joining.join import found, match_keyframes, refined
 from thinmap_ros.core.slam.joining.pieces import RobotKeyframes, SlamPiece
 from thinmap_ros.core.slam.odometry import CHI2
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import TopologyBuilder, build, join_topologies, moved_map
-
-# One pose graph of the keyframes of several robots: their maps bend to agree in the overlap.
 
 _FEWEST_LINKS = LoopClosureConfig().min_consistent_matches
 
@@ -80,7 +78,7 @@ class Bend:
 
 
 class TeamGraph:
-    """Moves the keyframes of robots that are joined so that their scans agree."""
+    """One pose graph of the keyframes of robots that are joined: their maps bend to agree."""
 
     def __init__(self) -> None:
         self._last = Bend()
@@ -152,8 +150,7 @@ class TeamGraph:
                 for frame, T in zip(maps[a].frames, start[a], strict=True)
             ]
             priors = ((k, start[b][k]) for k in near)
-            found = match_keyframes(known, maps[b].frames, priors)
-            links.edges += [link for link in found if link is not None]
+            links.edges += found(match_keyframes(known, maps[b].frames, priors))
             links.tried.update(near)
 
     def _optimized(self, group: Sequence[str], start: Mapping[str, Array]) -> dict[str, Array]:
@@ -165,10 +162,10 @@ class TeamGraph:
         first = dict(zip(group, ends, strict=False))
         edges: list[Edge] = []
         for name in group:
-            edges += _shifted(self._maps[name].edges, first[name], first[name])
+            edges += (edge.shifted(first[name], first[name]) for edge in self._maps[name].edges)
         for (a, b), links in self._links.items():
             if a in first and b in first:
-                edges += _shifted(links.edges, first[a], first[b])
+                edges += (edge.shifted(first[a], first[b]) for edge in links.edges)
         if not _are_connected(ends[-1], edges):
             return {}  # a robot has not told all of its edges
         poses = optimized(np.vstack([start[name] for name in group]), edges)
@@ -199,11 +196,6 @@ def _are_connected(count: int, edges: Sequence[Edge]) -> bool:
     return bool(parts == 1)
 
 
-def _shifted(edges: Sequence[Edge], by_a: int, by_b: int) -> Iterator[Edge]:
-    """The edges with other numbers."""
-    return (replace(edge, a=edge.a + by_a, b=edge.b + by_b) for edge in edges)
-
-
 def _groups(names: Sequence[str], pairs: Sequence[Pair]) -> list[list[str]]:
     """Names that are connected by pairs, each group in their order."""
     group = {name: name for name in names}
@@ -215,9 +207,6 @@ def _groups(names: Sequence[str], pairs: Sequence[Pair]) -> list[list[str]]:
     for name in names:
         found.setdefault(group[name], []).append(name)
     return list(found.values())
-
-
-# Links between the maps of several robots: which are joined, and where each lies.
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,11 +340,7 @@ class MapLinks:
         return chains
 
 
-# The maps of several robots: searches for links between them, and one map of all.
-
 WORLD = 'world'  # a map without cells, in whose frame a person gives the poses of others
-
-_FEWEST_MATCHES = LoopClosureConfig().min_consistent_matches
 
 _MATCHED = np.diag(np.square([0.05, 0.05, 0.01]))  # of the place of a map, by many scans
 
@@ -448,7 +433,7 @@ class LinkSearch:
     def _link_near(self, T: Array, log_odds: float) -> MapLink | None:
         """Link near a pose (3,); None where too few scans match there."""
         T, matches = refined(self.first.piece, self.second.piece, T)
-        if matches < _FEWEST_MATCHES:
+        if matches < _FEWEST_LINKS:
             return None
         return MapLink(self.a, self.b, T, _MATCHED, log_odds, matches)
 
