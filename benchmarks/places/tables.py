@@ -12,7 +12,7 @@ from benchmarks.places import cases
 from benchmarks.places.recorded import RecordedPiece
 from benchmarks.places.truth import relative_errors, rigid_errors
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
-from thinmap_ros.core.places.piece import MapPiece, drawn_piece
+from thinmap_ros.core.places.piece import MapPiece, drawn_scans
 from thinmap_ros.core.places.recognition import JoinDecision, Recognition, decide, recognize
 from thinmap_ros.core.slam.joining.join import JoinConfig, join
 from thinmap_ros.core.slam.joining.pieces import SlamPiece
@@ -98,9 +98,13 @@ def foreign(pieces: Pieces) -> Table:
     return Table('foreign', ('pair', 'log odds', 'of both directions'), rows, timed=True)
 
 
+def _drawn(piece: RecordedPiece) -> MapPiece:
+    return MapPiece(drawn_scans(piece.patch, piece.graph), piece.patch, piece.graph)
+
+
 def bare(pieces: Pieces) -> Table:
     """Grid and graph alone: scans are drawn. All pairs with shared ground, as many without."""
-    maps = {piece.name: drawn_piece(piece.patch, piece.graph) for piece in pieces}
+    maps = {piece.name: _drawn(piece) for piece in pieces}
     rows = []
     right = cases.with_shared_ground(pieces)
     wrong = cases.without_shared_ground(pieces)

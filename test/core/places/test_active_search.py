@@ -18,7 +18,8 @@ from thinmap_ros.core.places.global_localizer import (
     Result,
     SearchState,
 )
-from thinmap_ros.core.places.place_database import FREE, GlobalLocalizationConfig, Places
+from thinmap_ros.core.places.place_database import GlobalLocalizationConfig, Places
+from thinmap_ros.core.places.wall_field import FREE
 from thinmap_ros.core.planning.navigator import NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig

@@ -8,7 +8,7 @@ from support.driven_pieces import driven_piece, true_transform
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
-from thinmap_ros.core.places.piece import drawn_piece, drawn_scans
+from thinmap_ros.core.places.piece import MapPiece, drawn_scans
 from thinmap_ros.core.places.recognition import recognize
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
@@ -69,9 +69,13 @@ def test_a_walk_takes_each_edge_once_and_goes_on_where_it_is():
     assert [round(scan.T_map_base[0], 1) for scan in scans] == [3.0, 2.3, 2.0, 1.3]
 
 
+def bare(piece):
+    return MapPiece(drawn_scans(piece.patch, piece.graph), piece.patch, piece.graph)
+
+
 def test_bare_maps_are_recognized_and_foreign_ones_are_not():
     known, query, foreign = (driven_piece(*key) for key in ((3, 1), (3, 2), (13, 1)))
-    pieces = [drawn_piece(one.piece.patch, one.piece.graph) for one in (known, query, foreign)]
+    pieces = [bare(one.piece) for one in (known, query, foreign)]
     decision = recognize(pieces[1], pieces[0])
     assert decision.is_joined
     off = se2.between(true_transform(known, query), decision.placement.T_map_piece)

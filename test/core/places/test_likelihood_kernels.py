@@ -25,6 +25,7 @@ from thinmap_ros.core.places.place_database import (
     observed_beams,
     profile,
 )
+from thinmap_ros.core.places.wall_field import FREE, UNKNOWN, WALL
 
 CONFIG = GlobalLocalizationConfig()
 
@@ -86,7 +87,7 @@ def test_nodes_in_sight_of_a_block_are_those_of_the_map_that_nothing_hides(place
             node
             for node, cell in zip(places.nodes, cells, strict=True)
             if np.abs(cell - lead).max() <= reach
-            and line_is_clear(places.states == 0, *lead, *cell)
+            and line_is_clear(places.states == FREE, *lead, *cell)
         ]
         found = nodes_in_sight(places, block)
         assert len(found) == len(expected)
@@ -125,10 +126,10 @@ def marched(states, x, y, angle, most):
         row = math.floor(y + way * math.sin(angle))
         col = math.floor(x + way * math.cos(angle))
         if not (0 <= row < states.shape[0] and 0 <= col < states.shape[1]):
-            return way, 2
-        if states[row, col]:
+            return way, UNKNOWN
+        if states[row, col] != FREE:
             return way, int(states[row, col])
-    return most, 0
+    return most, FREE
 
 
 def test_free_way_ends_where_small_steps_do(places):
@@ -163,7 +164,7 @@ def test_the_true_pose_explains_nearly_all_and_one_behind_a_wall_little(places, 
 
 
 def test_of_the_unknown_the_map_says_nothing(places, seen):
-    states = np.where(places.states == 1, np.uint8(2), places.states)
+    states = np.where(places.states == WALL, np.uint8(UNKNOWN), places.states)
     near = np.full_like(places.near, 255)
     # Each hit is slightly inside unknown space: if noise shortens the range, the
     # map is informative.
@@ -231,7 +232,7 @@ def test_spots_are_those_whose_ranges_agree_best(places, seen):
 
 
 def test_distances_to_walls_are_exact_where_they_fit_a_byte(places):
-    exact = distance_cells(places.states == 1) * CELL_M
+    exact = distance_cells(places.states == WALL) * CELL_M
     near = places.near * NEAR_UNIT_M
     fits = exact < 1.0
     assert np.abs(near - exact)[fits].max() <= NEAR_UNIT_M

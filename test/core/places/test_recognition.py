@@ -76,25 +76,6 @@ def test_views_may_be_fed_as_the_piece_grows():
     assert decide(recognition, query, known).is_joined
 
 
-def test_a_corrected_piece_moves_with_its_keyframes():
-    known = driven_piece(1, 1)
-    query = driven_piece(1, 2)
-    recognition = fed(query.piece, known.piece)
-    before = recognition.placement()
-    shift = np.array([3.0, -2.0, 0.7])
-    moved = [se2.compose(shift, frame.T_map_base) for frame in query.piece.keyframes]
-    recognition.correct(np.array(moved))
-    after = recognition.placement()
-    assert after.log_odds == before.log_odds
-    T = se2.compose(after.T_map_piece, shift)
-    np.testing.assert_allclose(T, before.T_map_piece, atol=1e-9)
-    view = recognition.views[-1]
-    recognition.add(
-        replace(view, number=len(recognition.views)), query.piece.landmarks.around(view)
-    )
-    assert recognition.placement().log_odds >= before.log_odds
-
-
 def test_both_maps_must_be_sure():
     """The map fits into the piece no more: its rooms were seen to be solid."""
     known = driven_piece(1, 1).piece

@@ -12,14 +12,12 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.places.global_localizer import Result
 from thinmap_ros.core.places.hypotheses import distinct_indices
 from thinmap_ros.core.places.place_database import (
-    FREE,
-    UNKNOWN,
-    WALL,
     Bytes,
     GlobalLocalizationConfig,
     Places,
     free_way,
 )
+from thinmap_ros.core.places.wall_field import FREE, UNKNOWN, WALL
 from thinmap_ros.core.planning.grid_search import escape_cells, traversable_cells
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
 from thinmap_ros.core.planning.wavefront import START_ESCAPE_M, WavefrontConfig, navigation_function
@@ -31,7 +29,7 @@ _LIKELY = 0.05  # of the weight of the best
 # A goal stands so long, or until it is reached, or the number of places in question changes.
 _REPLAN_PERIOD_S = 4.0
 _CHANGED_S = 1.0  # but for so long at least
-# A look from elsewhere
+# A look from elsewhere.
 _LOOK_M = 0.4
 _LOOK_RAD = 0.4
 _MAX_PLACES = 8  # the likeliest, which are compared

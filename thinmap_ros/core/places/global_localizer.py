@@ -1,7 +1,4 @@
-"""Where is the robot? Samples all over a finished map, until one place is left.
-
-They are matched with what each scan shows.
-"""
+"""Global localization: samples all over a finished map, weighed by scans until one is left."""
 
 import math
 from dataclasses import dataclass, replace
@@ -26,7 +23,6 @@ from thinmap_ros.core.places.hypotheses import (
 from thinmap_ros.core.places.likelihood import HEADING_NOISE_RAD, Judge
 from thinmap_ros.core.places.place_database import (
     GlobalLocalizationConfig,
-    NodeModel,
     Observation,
     Places,
     calibrate,
@@ -39,9 +35,8 @@ from thinmap_ros.core.scan import Scan, few_beams_reason
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-# Share of a scan that a map explains from the right place, by scans simulated in that map.
-
-_TRIALS = 400  # where walls are smooth, few places leave anything unexplained
+# Scans simulated in the map: where walls are smooth, few places leave anything unexplained.
+_TRIALS = 400
 
 _MIN_RATIO = 0.7  # whatever the map looks like: what explains less is not the right place
 
@@ -75,23 +70,13 @@ def usual_share(
     return max(counts / max(asked, 1.0), _MIN_RATIO)
 
 
-__all__ = [
-    'GlobalLocalization',
-    'GlobalLocalizationConfig',
-    'PoseHypothesis',
-    'Result',
-    'SearchState',
-]
-
 # Nearer to the last update, a scan shows the same again.
 _LOOK_M = 0.1
-
 _LOOK_RAD = 0.1
 
 # Updates from about the same place meet the same errors of the map; they are independent after so
 # much motion.
 _NEW_WAY_M = 0.5
-
 _NEW_TURN_RAD = 0.5
 
 # Independent updates that a place must have explained: more for each e-fold of places that looked
@@ -100,30 +85,21 @@ _NEW_TURN_RAD = 0.5
 # the right one leaves unexplained there (no less than the least, as few scans were made in the map;
 # no more than the most), and more in rough maps, which draw things in part.
 _SURE_UPDATES = 1.0
-
 _SURE_UPDATES_CROWD = 0.75
-
 _SURE_UPDATES_LATE = 2.0
-
 _WORTHLESS_TIMES = 10.0
-
 _MIN_WORTHLESS = 0.0075
-
 _MAX_WORTHLESS = 0.03
-
 _WORTHLESS_ROUGH = 0.5
 
 # After so many independent updates, a place that explains must have lasted for this share of them,
 # but not for ever.
 _MANY_UPDATES = 16.0
-
 _LASTING_SHARE = 0.4
-
 _LASTING_UPDATES = 20.0
 
 # Largest standard deviations of an accepted pose: half the basin of convergence of scan matching.
 _SURE_M = 0.15
-
 _SURE_RAD = 0.07
 
 _VIEWS = 6
@@ -137,7 +113,6 @@ _LOOKED_ALONG = 300
 
 # Odometry that moves farther from one scan to the next has been reset, or the robot was carried.
 _JUMP_M = 1.5
-
 _JUMP_RAD = 2.0
 
 _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
@@ -234,7 +209,6 @@ class GlobalLocalization:
         self.config = config_or_default(config, GlobalLocalizationConfig)
         self.places = Places.of(patch, topology, self.config)
         self._rng = np.random.default_rng(seed)
-        self._model: NodeModel | None = None
         self._judge: Judge | None = None
         self._drops_out = False  # whether the laser does
         self._usual = 1.0  # share that the right place explains in this map
@@ -347,8 +321,8 @@ class GlobalLocalization:
     def _ready(self, scan: Scan) -> Judge:
         """The judge; the first scan tells which laser it is for."""
         if self._judge is None:
-            self._model = calibrate(self.places, scan, self.config, self._rng)
-            self._judge = Judge(self.places, self.config, self._model)
+            nodes = calibrate(self.places, scan, self.config, self._rng)
+            self._judge = Judge(self.places, self.config, nodes)
             self._usual = usual_share(self.places, self._judge, scan, self.config, self._rng)
         return self._judge
 
@@ -368,7 +342,8 @@ class GlobalLocalization:
     def _search(self, judge: Judge, seen: Observation, T_odom_base: Array) -> None:
         """Search for places all over the map that explain this scan and those before it."""
         self._since_search = 0.0
-        self._drawn = self._draw(self.config.samples if not len(self._known) else self._fresh)
+        fresh = max(1, round(_FRESH_SHARE * self.config.samples))
+        self._drawn = self._draw(fresh if len(self._known) else self.config.samples)
         logs = judge.log_likelihoods(self._drawn, seen)
         drawn = self._drawn[np.argsort(-logs, kind='stable')[:_FRESH_BEST]]
         found, complete = candidates(self.places, judge, seen, drawn, self._rng)
@@ -405,10 +380,6 @@ class GlobalLocalization:
     def _fits(self) -> Array:
         """Share that each hypothesis explains of what the right place should, (H,)."""
         return np.minimum(self._known.shares_explained / self._usual, 1.0)
-
-    @property
-    def _fresh(self) -> int:
-        return max(1, round(_FRESH_SHARE * self.config.samples))
 
     def _draw(self, count: int) -> Array:
         """Samples (N, 3) of all poses at which the robot can stand."""

@@ -19,21 +19,15 @@ from thinmap_ros.core.places.place_database import (
 from thinmap_ros.core.se2 import BOUND_SIGMAS, Array
 from thinmap_ros.jit import kernel
 
-# An update at all of the map for places where the last few scans could have been made.
-
 # Standard deviation of odometry per metre and radian: of wheels that slip a little.
 ODOMETRY_NOISE = 0.05
 
+# Of the search for candidates.
 _MIN_WALLS = 6  # beams that met something, below which a scan could be anywhere
-
 _MAX_SPOTS = 3000
-
 _MAX_REFINED = 600
-
 _MIN_SHARE = 0.6  # of the directions that must show what was measured
-
 _CLEARLY_WORSE = 0.1  # share of the directions
-
 _BELOW_BEST = 0.2  # share of the beams that a candidate may explain less than the best one
 
 
@@ -60,9 +54,8 @@ def candidates(
     counts, silent = judge.explained(poses, seen)
     counts += SILENT_COUNTS * silent
     good = counts >= counts.max() - _BELOW_BEST * len(seen.ranges_m)
-    poses = poses[good]
-    counts = counts[good]
-    found = distinct(poses[np.argsort(-counts, kind='stable')], 0.3, 0.15, _MAX_REFINED)
+    poses = poses[good][np.argsort(-counts[good], kind='stable')]
+    found = poses[distinct_indices(poses, _SAME_M, _SAME_RAD, _MAX_REFINED)]
     return found, complete and len(found) < _MAX_REFINED
 
 
@@ -87,11 +80,6 @@ def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> 
     margin = _CLEARLY_WORSE * int(known.sum())
     cut = len(counts) > _MAX_SPOTS and counts[order[-1]] > counts.max() - margin
     return np.column_stack([places.spots[spots[order]], turns]), not cut
-
-
-def distinct(poses: Array, apart_m: float, apart_rad: float, most: int) -> Array:
-    """The first of each group of poses (N, 3) that lie near each other, at most so many."""
-    return poses[distinct_indices(poses, apart_m, apart_rad, most)]
 
 
 def distinct_indices(poses: Array, apart_m: float, apart_rad: float, most: int) -> list[int]:
@@ -164,16 +152,12 @@ _MAX_MISSING_BEAMS = 14.0  # beams
 _MIN_LOG_WEIGHT = -14.0
 
 _MAX_HYPOTHESES = 400
-
 _SAME_M = 0.3
-
 _SAME_RAD = 0.15
-
 _MIN_COMPARED_SHARE = 0.6  # share of the beams
 
 # Of those this near to each other one is kept: the place may be anywhere between.
 _NEW_SIGMA_M = 0.5 * _SAME_M
-
 _NEW_SIGMA_RAD = 0.5 * _SAME_RAD
 
 _MEMORY = 0.85  # of what was explained, from one independent update to the next
@@ -220,13 +204,12 @@ class Hypotheses:
     @staticmethod
     def none() -> 'Hypotheses':
         """No hypothesis."""
-        empty = np.empty(0)
-        covariances = np.empty((0, 3, 3))
+        none = np.empty(0)
         poses = np.empty((0, 3))
-        samples = np.empty((0, 3))
+        covariances = np.empty((0, 3, 3))
         owners = np.empty(0, dtype=np.int64)
         return Hypotheses(
-            poses, empty, empty, empty, covariances, empty, empty, empty, empty, samples, owners
+            poses, none, none, none, covariances, none, none, none, none, poses, owners
         )
 
     def __len__(self) -> int:

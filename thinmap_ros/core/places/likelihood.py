@@ -1,7 +1,4 @@
-"""What poses are worth in view of one scan.
-
-The map's arrays and the noise are bound to the loops over them.
-"""
+"""How well poses in a map explain one scan: loops over samples, beams and nodes, and a judge."""
 
 import math
 
@@ -11,8 +8,6 @@ from numpy.typing import NDArray
 from thinmap_ros.core.places.place_database import (
     NEAR_UNIT_M,
     SIGHT_UNIT_M,
-    UNKNOWN,
-    WALL,
     Bytes,
     GlobalLocalizationConfig,
     NodeModel,
@@ -21,17 +16,14 @@ from thinmap_ros.core.places.place_database import (
     Short,
     free_way,
 )
+from thinmap_ros.core.places.wall_field import UNKNOWN, WALL
 from thinmap_ros.core.se2 import BOUND_SIGMAS, Array
 from thinmap_ros.jit import inlined, kernel
-
-# How well poses agree with what was observed: the loops over samples, beams and nodes.
 
 _ASIDE_M = 0.12  # a beam is blocked only if parallel ones at this distance are blocked too
 
 _NO = 0
-
 _YES = 1
-
 _SAYS_NOTHING = 2
 
 # Nodes lie within 13,000 units of their block; squares of differences from what is farther off than
@@ -396,7 +388,7 @@ _MIN_COVARIANCE = np.diag([0.02**2, 0.02**2, 0.01**2])
 
 
 class Judge:
-    """Compares poses with observations.
+    """Compares poses with observations: binds the arrays of a map and the noise to the loops.
 
     Tolerances follow from the cells of the grid and the noise of the sensor.
     """

@@ -18,19 +18,11 @@ from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.jit import inlined, kernel
 
-# Loops over pairs of landmarks.
-#
-# A pair has a key that does not depend on where the pair lies: bins of its length, and of the
-# clearances of both landmarks.
-
+# Of pairs of landmarks.
 MAX_LENGTH_M = 12.0
-
 _MIN_LENGTH_M = 1.0  # a shorter pair hardly has a direction
-
 _LENGTH_BIN_M = 0.3
-
 _CLEARANCE_BIN_M = 0.2
-
 _CLEARANCE_BINS = 20  # the last one holds all larger clearances
 
 _MAX_POSES = 200_000  # the rarest pairs first: bounds the time of a search
@@ -57,6 +49,7 @@ def _room(clearance: float) -> int:
 
 @inlined
 def _key(length: int, first: int, second: int) -> int:
+    """Key of a pair, wherever it lies, by bins of its length and of both clearances."""
     return (length * _CLEARANCE_BINS + first) * _CLEARANCE_BINS + second
 
 
@@ -160,14 +153,12 @@ def poses_by_pairs(
     return poses, weights
 
 
-# Landmarks of a topological map: its branch nodes.
-#
-# They are found again in the map of another visit. Of end and corner nodes a tenth are.
-
-
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Landmarks at xy (N, 2), m, with clearances (N,), m."""
+    """Branch nodes of a topological map at xy (N, 2), m, with clearances (N,), m.
+
+    They are found again in the map of another visit. Of end and corner nodes a tenth are.
+    """
 
     xy: Array
     clearances: Array
@@ -199,11 +190,8 @@ def _landmarks(nodes: Iterable[Node]) -> Landmarks:
     return Landmarks(xy, np.array([node.clearance_m for node in branches]))
 
 
-# Which poses are the same: near each other, or as far apart as maps drift over a path.
-
 # A view tells poses farther apart from each other.
 SAME_M = 0.5
-
 SAME_RAD = 0.1
 
 
@@ -242,15 +230,15 @@ def are_same(poses: Array, T: Array) -> NDArray[np.bool_]:
     return np.asarray(is_near & (np.abs(se2.wrap(off[:, 2])) <= SAME_RAD))
 
 
-# Pose candidates of a view by constellations: pairs of landmarks, of which each gives a pose.
-
 _HEADING_BINS = math.ceil(2.0 * math.pi / SAME_RAD)
-
 _CANDIDATES = 60
 
 
 class ConstellationIndex:
-    """Pairs of the landmarks of a map, sorted by what does not depend on where they lie."""
+    """Pairs of the landmarks of a map, sorted by what does not depend on where they lie.
+
+    A pair of a view that may be the same gives a pose of the view: constellations.
+    """
 
     def __init__(self, landmarks: Landmarks) -> None:
         self._landmarks = landmarks
@@ -381,12 +369,9 @@ def _distinct(poses: Array, count: int) -> Array:
     return kept
 
 
-# Scans drawn from a grid along its topological map, for a map without keyframes.
-
+# Of drawn scans.
 _BEAMS = 360
-
 _SPACING_M = 0.7  # of path, as of keyframes
-
 _INSIDE = 1e-6  # of a cell: a ray ends on the edge of the cell that it enters
 
 
@@ -399,15 +384,10 @@ class DrawnScan:
     T_map_base: Array
 
 
-def drawn_piece(patch: GridPatch, graph: TopologicalMap) -> MapPiece:
-    """Piece of a bare map: grid, topological map, and the scans drawn along this."""
-    return MapPiece(drawn_scans(patch, graph), patch, graph)
-
-
 def drawn_scans(patch: GridPatch, graph: TopologicalMap) -> list[DrawnScan]:
     """Scans along the edges of a topological map, as a laser with a range of 8 m makes them.
 
-    Beams into unknown cells are invalid.
+    For a map without keyframes. Beams into unknown cells are invalid.
     """
     margin = patch.padded((1, 1, 1, 1))
     obstacles = (~margin.free).astype(np.uint8)

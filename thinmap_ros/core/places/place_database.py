@@ -13,13 +13,12 @@ from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup, line_is_clear
+from thinmap_ros.core.places.wall_field import FREE, UNKNOWN, WALL
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.jit import kernel
-
-# Parameters of global localization.
 
 # A better laser meets walls that are rougher than it measures; the results were measured with this.
 _MIN_BEAM_NOISE_M = 0.02
@@ -87,10 +86,7 @@ class GlobalLocalizationConfig(Config):
         return max(self.laser_range_noise_m, _MIN_BEAM_NOISE_M)
 
 
-Mask = NDArray[np.bool_]
-
 Bytes = NDArray[np.uint8]
-
 Short = NDArray[np.int16]
 
 DIRECTIONS = 72
@@ -99,24 +95,14 @@ DIRECTIONS = 72
 NODE_WINDOW_M = 10.0
 
 NEAR_UNIT_M = 0.004  # of the distance to the nearest wall: up to 1.02 m in a byte
-
 RANGE_UNIT_M = 0.05  # of the ranges all round: up to 12.75 m in a byte
 
-_NEAR_CAP = 255
-
 _SPACING_M = 0.3
-
 _MAX_PLACES = 100_000
 
 _BLOCK_M = 0.5  # nodes in sight are listed for blocks of this size
 
 SIGHT_UNIT_M = 0.002  # of where these lie, from the corner of their block: up to 65 m in two bytes
-
-FREE = 0
-
-WALL = 1
-
-UNKNOWN = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +207,7 @@ def _near_walls(states: Bytes, resolution: float) -> Bytes:
     In NEAR_UNIT_M, at most 255.
     """
     units = distance_cells(states == WALL) * resolution / NEAR_UNIT_M
-    return np.minimum(units + 0.5, _NEAR_CAP).astype(np.uint8)
+    return np.minimum(units + 0.5, 255).astype(np.uint8)
 
 
 @kernel
@@ -296,7 +282,7 @@ def _sights(
 
 @kernel
 def _list_sights(
-    free: Mask, places: NDArray[np.int64], nodes: NDArray[np.int64], reach: float
+    free: NDArray[np.bool_], places: NDArray[np.int64], nodes: NDArray[np.int64], reach: float
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Of the nodes (M, 2) within a square round each place (N, 2), those in line of sight.
 
@@ -324,17 +310,14 @@ def _list_sights(
     return first, in_sight[:count].copy()
 
 
-# What one scan shows: some of its beams, and the nodes of its own topological map.
-
 # One scan alone has to make cells free and occupied.
 _P_FREE = 0.2
-
 _P_OCCUPIED = 0.8
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Beams and nodes of one scan in the robot frame.
+    """What one scan shows: some of its beams, and the nodes of its own map, in the robot frame.
 
     laser (3,): its pose on the robot; ranges_m, bearings_rad (B,): beams from there, ranges cut at
     what is usable; ends (B, 2): where they end; met (B,): whether they met something there; nodes
@@ -422,12 +405,9 @@ def profile(observation: Observation) -> tuple[Array, NDArray[np.bool_], NDArray
     return result, known, met
 
 
-# Reliability of the nodes that a single scan shows, by scans simulated in the map.
-
+# Of the reliability of nodes, by scans simulated in the map.
 _TRIALS = 60
-
 _SAME_NODE_M = 1.0
-
 _RAYLEIGH_MEDIAN = 1.1774  # median distance of points with 1 sigma on each axis
 
 _VIEW_SHARE = 0.25  # of the active window: where an observed node may lie

@@ -27,12 +27,9 @@ from thinmap_ros.core.places.piece import (
 from thinmap_ros.core.places.views import SPACING_M, WINDOW_M, View
 from thinmap_ros.core.se2 import Array, inverse
 
-# Evidence of a view for a place in a map, against the other places of the map.
-
 # Share of its walls that a view finds again at the right place, in the map of another visit.
 # Measured: median 0.80, 5 % quantile 0.54.
 _FOUND = 0.8
-
 _FOUND_SIGMA = 0.12
 
 _MIN_KNOWN = 0.3  # share of its walls of which the map must tell
@@ -101,21 +98,17 @@ class ViewJudge:
         None if the map tells of too few places.
         """
         if view.number not in self._elsewhere:
-            self._elsewhere[view.number] = self._measured(view)
+            field = self._field
+            anywhere = field.random_poses(_OTHER_PLACES, self._rng)
+            poses, _ = field.refined_widely(view, anywhere)
+            pairs = [field.agreement(view, T) for T in poses]
+            shares = [found for found, known in pairs if known >= _MIN_KNOWN]
+            self._elsewhere[view.number] = (
+                None
+                if len(shares) < _MIN_OTHER_PLACES
+                else (float(np.mean(shares)), max(float(np.std(shares)), _FOUND_SIGMA))
+            )
         return self._elsewhere[view.number]
-
-    def _measured(self, view: View) -> tuple[float, float] | None:
-        poses, _ = self._field.refined_widely(
-            view, self._field.random_poses(_OTHER_PLACES, self._rng)
-        )
-        shares = [
-            found
-            for found, known in (self._field.agreement(view, T) for T in poses)
-            if known >= _MIN_KNOWN
-        ]
-        if len(shares) < _MIN_OTHER_PLACES:
-            return None
-        return float(np.mean(shares)), max(float(np.std(shares)), _FOUND_SIGMA)
 
 
 def _starts(T: Array, path_m: float) -> Array:
@@ -135,11 +128,8 @@ _INDEPENDENT = SPACING_M / WINDOW_M  # share of a view that is in no other one
 
 # How often a search over the whole map leads to the right place, and again to a wrong one.
 _FOUND_AGAIN = 0.9
-
 _WRONG_AGAIN = 0.05
-
 _FOUND_BY_SEARCH = math.log(_FOUND_AGAIN / _WRONG_AGAIN)
-
 _NOT_FOUND_BY_SEARCH = math.log((1.0 - _FOUND_AGAIN) / (1.0 - _WRONG_AGAIN))
 
 _PLACES_OF_A_VIEW = 3
@@ -236,10 +226,6 @@ class Recognition:
             self._propose(view, T_map_view)
         self._prune()
 
-    def correct(self, poses: Array) -> None:
-        """Follow a correction of the piece: its keyframes are at these poses (N, 3) now."""
-        self.views = [view.moved(poses[view.frames[1]]) for view in self.views]
-
     def placement(self) -> Placement | None:
         """The most likely place, and its odds against all others and none; None without one."""
         if not self.hypotheses:
@@ -327,8 +313,6 @@ def log_odds_back(
     return own.evidence - log_alternatives(query)
 
 
-# Whether two pieces of map are joined: each of the two must be sure by itself.
-
 JOIN_ODDS = 100_000.0
 
 
@@ -349,7 +333,7 @@ class JoinDecision:
 def decide(
     recognition: Recognition, query: MapPiece, known: MapPiece, join_odds: float = JOIN_ODDS
 ) -> JoinDecision:
-    """Decide whether a piece lies in a map.
+    """Decide whether a piece lies in a map: by the views of each of the two.
 
     recognition: of the views of the piece in the map so far; query: the piece as it is now.
     """

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -13,11 +13,9 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import kernel
 
-# Loops over the beams of the scans of a view.
-
 
 @kernel
-def passed_cells(
+def _passed_cells(
     poses: Array, ranges: Array, bearings: Array, cell_m: float, half: int
 ) -> NDArray[np.bool_]:
     """Which cells of a lattice (2 half, 2 half) around the origin the beams of scans pass.
@@ -89,10 +87,6 @@ class View:
     T_piece_view: Array
     frames: tuple[int, int, int]
     path_m: float
-
-    def moved(self, T_piece_view: Array) -> 'View':
-        """The view after a correction of the piece, at another pose (3,)."""
-        return replace(self, T_piece_view=T_piece_view)
 
 
 class ViewBuilder:
@@ -198,5 +192,5 @@ def _free_places(scans: Sequence[Scan], poses: Array) -> Array:
         [se2.compose(T, scan.T_base_laser) for T, scan in zip(poses, scans, strict=True)]
     )
     half = round(_MAX_OFFSET_M / LATTICE_M)
-    cells = np.argwhere(passed_cells(lasers, ranges, bearings, LATTICE_M, half))
+    cells = np.argwhere(_passed_cells(lasers, ranges, bearings, LATTICE_M, half))
     return np.asarray((cells[:, ::-1] - half + 0.5) * LATTICE_M)

@@ -12,29 +12,20 @@ from thinmap_ros.core.places.views import LATTICE_M, View
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import inlined, kernel
 
-# Loops over the points of a view at poses in a field of wall distances.
-
+# States of a cell.
 UNKNOWN = 0
-
 FREE = 1
-
 WALL = 2
-
 FAR = 3  # from all keyframes: known in part only
 
 _POINT_SIGMA_M = 0.05  # of a point around its wall, once it is matched
 
 # Levenberg-Marquardt: a view without information in a direction does not move that way.
 _DAMPING = 1.0
-
 _MAX_STEP_M = 0.3
-
 _MAX_STEP_RAD = 0.08
-
 _MIN_STEP_M = 0.002
-
 _MIN_STEP_RAD = 0.001
-
 _ITERATIONS = 5  # for each width
 
 
@@ -146,7 +137,7 @@ def refine(
 
 
 @kernel
-def refine_all(
+def _refine_all(
     field: FieldArrays, poses: Array, walls: Array, widths: Array
 ) -> tuple[Array, Array]:
     """Refine poses (N, 3); returns them, and the mean weights (N,) of the points."""
@@ -168,7 +159,7 @@ def _state_at(field: FieldArrays, x: float, y: float) -> tuple[int, float]:
 
 
 @kernel
-def count_agreement(
+def _count_agreement(
     field: FieldArrays, pose: Array, walls: Array, free: Array, tolerance_m: float
 ) -> tuple[int, int, int]:
     """Count what a map says of the wall points (N, 2) and free places (M, 2) of a view at a pose.
@@ -245,25 +236,25 @@ class WallField:
 
     def refined_widely(self, view: View, poses: Array) -> tuple[Array, Array]:
         """Poses (N, 3) of a view moved to walls up to half a metre away; how well it fits (N,)."""
-        return refine_all(self._arrays, poses, thinned(view.walls), _WIDE)
+        return _refine_all(self._arrays, poses, _thinned(view.walls), _WIDE)
 
     def refined(self, view: View, pose: Array) -> tuple[Array, Array, float]:
         """Pose (3,) of a view moved to the nearest walls; information (3, 3); how well it fits."""
-        return refine(self._arrays, pose, thinned(view.walls), _NARROW)
+        return refine(self._arrays, pose, _thinned(view.walls), _NARROW)
 
     def agreement(self, view: View, T_map_view: Array) -> tuple[float, float]:
         """Share of the walls that the map shows again, of those of which it tells, at a pose (3,).
 
         And of how many of the walls of the view it tells, as a share.
         """
-        matched, contrary, blocked = count_agreement(
+        matched, contrary, blocked = _count_agreement(
             self._arrays, T_map_view, view.walls, view.free, LATTICE_M
         )
         told = matched + contrary + blocked
         return matched / max(told, 1), (matched + contrary) / max(len(view.walls), 1)
 
 
-def thinned(walls: Array) -> Array:
+def _thinned(walls: Array) -> Array:
     """At most _MAX_POINTS of the points (N, 2), evenly."""
     step = -(-len(walls) // _MAX_POINTS)
     return np.ascontiguousarray(walls[:: max(1, step)])
