@@ -8,8 +8,7 @@ from typing import NamedTuple
 import thinmap_ros.startup  # isort: skip  # noqa: F401  before all other modules
 from thinmap_ros import __version__
 from thinmap_ros.core.errors import ThinmapError
-from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import BAD_INPUT, require_ros
+from thinmap_ros.tools.arguments import BAD_INPUT, is_asked, require_ros, subcommand
 
 
 class _Program(NamedTuple):
@@ -86,7 +85,7 @@ def main() -> None:
 
     Ends with 2, after one line on what is wrong, where there is no such subcommand.
     """
-    if cli.is_asked():
+    if is_asked():
         _complete()
     arguments = sys.argv[1:]
     if not arguments:
@@ -112,7 +111,7 @@ def _full(name: str) -> str:
 
 def _complete() -> None:
     """Complete the command line with Tab, and end."""
-    name = _full(cli.subcommand([*PROGRAMS, 'help']))
+    name = _full(subcommand([*PROGRAMS, 'help']))
     # The nodes have no parser: running their module would start them.
     if name in PROGRAMS and name != 'nodes':
         _run(name, ['--help'])  # which needs no ROS

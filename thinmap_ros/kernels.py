@@ -10,6 +10,7 @@ import ctypes
 import gc
 import mmap
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -107,7 +108,7 @@ class CompilationReport(event.Listener):
 
     def on_start(self, event: Any) -> None:
         """Handle the start of a compilation, possibly nested in another one."""
-        now = monotonic()
+        now = time.monotonic()
         if self._depth == 0:
             self._began_at = now
         self._depth += 1
@@ -122,7 +123,7 @@ class CompilationReport(event.Listener):
         """Handle the end of a compilation."""
         self._depth -= 1
         if self._depth == 0:
-            self._seconds += monotonic() - self._began_at
+            self._seconds += time.monotonic() - self._began_at
 
     def end(self) -> None:
         """Report duration and cache folder, if any kernels were compiled."""

@@ -8,7 +8,7 @@ from thinmap_ros.logs.bag_writer import temporary_bag
 from thinmap_ros.logs.repair import RepairReport, repair
 from thinmap_ros.logs.storage import bag_files, is_mcap, mcap_files_in, refuse_foreign
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser
+from thinmap_ros.tools.arguments import Parser
 
 
 def files_of(bag: Path) -> list[Path]:

@@ -8,7 +8,7 @@ from thinmap_ros.logs.bag_writer import BagObjects, BagWriter
 from thinmap_ros.logs.log import Event, LaserOptions, OdometryEvent
 from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser
+from thinmap_ros.tools.arguments import Parser
 
 
 def convert(log: CarmenLog, bag: Path) -> int:

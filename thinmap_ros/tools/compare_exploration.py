@@ -30,7 +30,7 @@ from thinmap_ros.files.worlds import read_starts, read_world
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import NAMES, check_strategy
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser, add_out, out_folder
+from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 from thinmap_ros.tools.explore_world import WORLD_HELP, add_options, options_from
 from thinmap_ros.view import figures
 

@@ -30,7 +30,7 @@ from thinmap_ros.sim.other_robots import MAX_ROBOTS, starts_in
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser, add_out, out_folder, require_ros
+from thinmap_ros.tools.arguments import Parser, add_out, out_folder, require_ros
 from thinmap_ros.view import report_page, rerun_sinks
 
 # On a busy machine nodes need time to exit; a killed recorder leaves a truncated bag.

@@ -8,7 +8,7 @@ import sys
 
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser, require_ros
+from thinmap_ros.tools.arguments import Parser, require_ros
 
 _QUESTION = (
     'The robot turns in place, by up to 2 rad, also without a stop by this program. '

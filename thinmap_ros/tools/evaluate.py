@@ -15,7 +15,7 @@ from thinmap_ros.evaluation.trajectory_errors import (
 )
 from thinmap_ros.files.safe import write_text
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser, check_place
+from thinmap_ros.tools.arguments import Parser, check_place
 
 # Of a folder of replay: live poses, and the same after all corrections.
 _TRAJECTORIES = ('trajectory.tum', 'trajectory_final.tum')

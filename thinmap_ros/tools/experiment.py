@@ -31,7 +31,7 @@ from thinmap_ros.experiments.topological_map import (
 )
 from thinmap_ros.files.safe import write_text
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser, add_out, out_folder
+from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 from thinmap_ros.view.plot_writer import write_plot
 
 # In the order of the papers; the longest are started first.

@@ -24,7 +24,7 @@ from thinmap_ros.strategies import DEFAULT, NAMES, check_strategy
 from thinmap_ros.team.loop import TeamLoop
 from thinmap_ros.team.radio import Trouble
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser, add_out, out_folder
+from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.run_folder import RunResult, write_report, write_run
 

@@ -18,7 +18,7 @@ from thinmap_ros.files.safe import PIECE_BYTES, atomic_write, write_text
 from thinmap_ros.logs.log import OdometryEvent
 from thinmap_ros.logs.readers.carmen import CarmenLog, open_unpacked
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser
+from thinmap_ros.tools.arguments import Parser
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from thinmap_ros.evaluation.parallel_jobs import Report, add_run_options
 from thinmap_ros.files import graphs, occupancy_maps
 from thinmap_ros.files.sessions import REGIONS, load_edits
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser, check_place
+from thinmap_ros.tools.arguments import Parser, check_place
 from thinmap_ros.view.summary import summary_figure
 
 _DEFAULTS = TopologyConfig()

@@ -19,7 +19,7 @@ from thinmap_ros.files.merging import (
 )
 from thinmap_ros.files.sessions import GRID, maps_in, require_own_files, stem_of
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser, check_place
+from thinmap_ros.tools.arguments import Parser, check_place
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import merged_figure
 

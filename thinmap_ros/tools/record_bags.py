@@ -19,7 +19,7 @@ from thinmap_ros.logs.bag_writer import BagObjects, BagWriter
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser, add_out, out_folder
+from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 
 _MAP_EVERY = 300  # scans: a minute
 _TYPES = {

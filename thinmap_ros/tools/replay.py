@@ -27,7 +27,7 @@ from thinmap_ros.logs.log import Event, Log, SkippedRecords, known_formats
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.replaying import Replay, Watcher, replay, write_outputs
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser, add_out, check_place, out_folder
+from thinmap_ros.tools.arguments import Parser, add_out, check_place, out_folder
 from thinmap_ros.tools.parameter_file import NodeParameters, read_parameter_file
 from thinmap_ros.view.interface import NullView
 from thinmap_ros.view.rerun_view import View

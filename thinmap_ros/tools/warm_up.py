@@ -11,7 +11,7 @@ from thinmap_ros.files.worlds import read_world
 from thinmap_ros.jit import cache
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.cli import Parser
+from thinmap_ros.tools.arguments import Parser
 
 
 def main() -> None:
