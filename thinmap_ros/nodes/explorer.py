@@ -37,7 +37,8 @@ from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.services import SaveDirectory, offer
+from thinmap_ros.ros.save_directory import SaveDirectory
+from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.session_services import offer_saving
 from thinmap_ros.ros.stop_topic import StopTopic
 

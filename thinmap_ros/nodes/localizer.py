@@ -61,7 +61,7 @@ from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_msg
 from thinmap_ros.ros.maps import UNKNOWN, new_map_id
-from thinmap_ros.ros.services import SaveDirectory
+from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.session_services import offer_loading, offer_saving, save_on_exit
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.tf import MapBroadcaster, OdometrySource

@@ -24,7 +24,8 @@ from thinmap_ros.files.sessions import (
 )
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.services import SaveDirectory, call, offer
+from thinmap_ros.ros.save_directory import SaveDirectory
+from thinmap_ros.ros.services import call, offer
 from thinmap_ros.ros.time_jumps import STEADY
 
 Part = SessionPart[Any, Any]

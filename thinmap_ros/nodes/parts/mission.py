@@ -37,6 +37,7 @@ from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.action_server import InvalidGoalError
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.services import action_servers
 from thinmap_ros.strategies import DEFAULT, NAMES, check_strategy, make_strategy
 
 _ACTIVE = (
@@ -46,12 +47,6 @@ _ACTIVE = (
 )
 _THROUGH_POSES = 'navigate_through_poses'
 PREFIX_BYTES = 8
-
-
-def action_servers(node: Node, action: str) -> set[bytes]:
-    """Ids of the servers of an action that the graph knows: of their status publishers."""
-    infos = node.get_publishers_info_by_topic(f'{action}/_action/status')
-    return {bytes(info.endpoint_gid) for info in infos}
 
 
 class _GoalStatuses:

@@ -13,6 +13,7 @@ from geometry_msgs.msg import PoseStamped
 from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import LaserScan
@@ -28,15 +29,65 @@ from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.worlds import read_starts
 from thinmap_ros.logs.transforms import parse_pose
-from thinmap_ros.nodes.parts.drives import GoalResult
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
 from thinmap_ros.ros.maps import received_map, received_update, updates_topic
+from thinmap_ros.ros.services import action_servers
+from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.ros.velocity import TOPIC as COMMANDS
 from thinmap_ros.ros.velocity import VelocitySubscription
 from thinmap_ros.sim.other_robots import starts_in, starts_side_by_side
 from thinmap_ros.sim.simulation import SensorReadings, Simulation
 from thinmap_ros.sim.world import World
+
+_RESULT_PERIOD_S = 1.0
+# A request before the new server has discovered its client is lost.
+_REQUESTS = 20
+
+
+class GoalResult:
+    """Requests the result of a goal, and requests it again when there is another server.
+
+    What was requested of a server is lost when it is killed. One that takes its place continues
+    the goal, or answers that it does not know it, with STATUS_UNKNOWN.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        action: str,
+        handle: ClientGoalHandle,
+        on_result: Callable[[Any], None],
+    ) -> None:
+        """handle: of the goal, just accepted; on_result: receives status and result, once."""
+        self._node = node
+        self._action = action
+        self._handle = handle
+        self._on_result = on_result
+        self._servers = action_servers(node, action)
+        self._requests_left = 0
+        self._timer = node.create_timer(_RESULT_PERIOD_S, self._check, clock=STEADY)
+        self._request()
+
+    def _check(self) -> None:
+        servers = action_servers(self._node, self._action)
+        if servers - self._servers:
+            self._servers |= servers
+            self._requests_left = _REQUESTS
+        if self._requests_left > 0:
+            self._requests_left -= 1
+            self._request()
+
+    def _request(self) -> None:
+        self._handle.get_result_async().add_done_callback(self._on_done)
+
+    def _on_done(self, future: Future) -> None:
+        if self._timer is None:
+            return  # another answer
+        self._node.destroy_timer(self._timer)
+        self._timer = None
+        self._on_result(future.result())
+
 
 # Without an answer for this time, the goal is sent again: an explorer that has just been discovered
 # may be unable to answer.
