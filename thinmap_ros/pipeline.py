@@ -141,7 +141,7 @@ class Pipeline:
         if estimate.correction is not None:
             self.corrections += 1
             trajectory = Trajectory(*self.localizer.keyframe_trajectory(), scan.stamp_ns)
-        return LocalizedScan(scan, estimate.T_map_base, estimate.placement, trajectory=trajectory)
+        return LocalizedScan(scan, estimate.T_map_base, estimate.destination, trajectory=trajectory)
 
     def _set_topology(self, topology: TopologicalMap | None) -> None:
         if topology is not None:

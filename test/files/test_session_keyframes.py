@@ -31,7 +31,7 @@ def run(localizer: Localizer, grid: CorrectableGrid, steps: list[Step]) -> int:
         estimate = localizer.step(scan, T_odom_base)
         if estimate.correction is not None:
             corrections += grid.apply_correction(*localizer.keyframe_trajectory(), scan.stamp_ns)
-        grid.update(scan, estimate.T_map_base, estimate.placement)
+        grid.update(scan, estimate.T_map_base, estimate.destination)
     return corrections
 
 

@@ -366,7 +366,7 @@ def check_grid(message):
 def check_localized_scan(message):
     found = localized_scan_from_msg(message)
     assert np.isfinite(found.scan.points_base()).all() and np.isfinite(found.T_map_base).all()
-    assert found.corrected_ns >= 0 and found.placement in Destination
+    assert found.corrected_ns >= 0 and found.destination in Destination
 
 
 def check_local_grid(message):

@@ -126,7 +126,7 @@ class Estimate:
         return self.apart is not None
 
     @property
-    def placement(self) -> Destination:
+    def destination(self) -> Destination:
         """Where the scan belongs: a blind or misaligned laser shows nothing."""
         if self.blind_reason or self.mount_fault:
             return Destination.NOWHERE
@@ -173,7 +173,7 @@ class LocalizedScan:
 
     scan: Scan
     T_map_base: Array
-    placement: Destination
+    destination: Destination
     trajectory: Trajectory | None = None
 
 

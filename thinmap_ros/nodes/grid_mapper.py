@@ -219,11 +219,11 @@ class GridMapperNode(ThinmapNode):
         stamp_ns = localized.scan.stamp_ns
         if self._stamp.is_restarted_by(stamp_ns):
             self.reset_state()
-        placement = localized.placement if self._settings.mapping else Destination.NOWHERE
+        destination = localized.destination if self._settings.mapping else Destination.NOWHERE
         with self.diagnostics.time_step('map update'):
             scan = self._team.without(localized.scan, localized.T_map_base)
             update = self._mapper.step(
-                replace(localized, scan=scan, placement=placement, trajectory=None)
+                replace(localized, scan=scan, destination=destination, trajectory=None)
             )
         self._stamp.latest_ns = stamp_ns
         if update is not None and update.whole is not None:

@@ -68,13 +68,13 @@ def localized_scan_from_msg(message: LocalizedScanMsg) -> ReceivedScan:
     return ReceivedScan(
         replace(scan, drops_out=message.status.no_return_is_unknown),
         messages.pose_from_msg(message.pose.pose),
-        _placement(message.status),
+        _destination(message.status),
         corrected_ns=messages.stamp_ns(message.correction_stamp),
         message=message,
     )
 
 
-def _placement(status: SlamStatus) -> Destination:
+def _destination(status: SlamStatus) -> Destination:
     """Where the scan belongs: nowhere if the robot is lost, or the laser shows nothing."""
     if status.state == SlamStatus.MAPPING_APART:
         return Destination.APART

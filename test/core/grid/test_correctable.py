@@ -382,18 +382,18 @@ def test_scans_that_a_correction_moves_too_far_away_are_left_out_and_named():
     assert (grid.shown.known_area().cells != UNKNOWN).sum() > 1000
 
 
-def occupied_after(placements, correct_at=None):
-    """Occupied cells of a grid after scans with these placements, each 50 scans later."""
+def occupied_after(destinations, correct_at=None):
+    """Occupied cells of a grid after scans with these destinations, each 50 scans later."""
     grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
-    for k, placement in enumerate(placements):
+    for k, destination in enumerate(destinations):
         number = 50 * k
         if k == correct_at:
             numbers = [50 * i for i in range(k)]
             stamps = np.array([SCANS[i].stamp_ns for i in numbers], dtype=np.int64)
             grid.apply_correction(stamps, TRUE[numbers], SCANS[number].stamp_ns)
         # Where the place is unknown, so is the pose.
-        at = TRUE[number] + (100.0 if placement is Destination.APART else 0.0)
-        grid.update(SCANS[number], at, placement)
+        at = TRUE[number] + (100.0 if destination is Destination.APART else 0.0)
+        grid.update(SCANS[number], at, destination)
     grid.finish()
     return grid.shown.known_area().occupied.sum(), grid
 

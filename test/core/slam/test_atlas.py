@@ -78,7 +78,7 @@ def test_a_session_is_not_changed_from_an_unknown_start_until_the_robot_recogniz
             for name, array in continued.state().items():
                 np.testing.assert_array_equal(array, state[name])
     assert len(waiting) > 200
-    assert Destination.OPEN in [estimate.placement for estimate in waiting[:100]]
+    assert Destination.OPEN in [estimate.destination for estimate in waiting[:100]]
     assert waiting[-1].is_mapping_apart
     assert all(off_m < 0.5 for estimate, off_m in later if is_mapped(estimate))
     last, off_m = later[-1]

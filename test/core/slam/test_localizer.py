@@ -524,7 +524,7 @@ def test_a_carried_robot_sees_through_walls_where_its_scans_fit_the_map_that_gro
     apart = [estimate.is_mapping_apart for _, estimate in carried]
     assert any(apart[:60])
     assert all(apart[60:])
-    mapped = [row for row in carried if row[1].placement is Destination.MAP]
+    mapped = [row for row in carried if row[1].destination is Destination.MAP]
     assert not any(np.hypot(*(e.T_map_base - truth)[:2]) > 0.5 for truth, e in mapped)
 
 
@@ -553,7 +553,7 @@ def test_what_is_mapped_apart_is_not_saved_and_the_pose_of_a_user_leaves_it():
     back = on(localizer, 10, truth, carried[-1][2], rng)
     assert not any(estimate.is_mapping_apart for _, estimate, _ in back)
     assert worst(back) < 0.1
-    assert all(estimate.placement is Destination.MAP for _, estimate, _ in back[-5:])
+    assert all(estimate.destination is Destination.MAP for _, estimate, _ in back[-5:])
 
 
 def test_a_robot_that_was_lost_in_a_crowd_joins_its_map_again():
@@ -579,7 +579,7 @@ def test_a_loaded_map_in_which_the_robot_is_elsewhere_stays_as_it_is(whole_drive
     second = Localizer.from_state(state, LocalizerConfig(**AT_START))
     estimates = [estimate for _, estimate in driven_elsewhere(second, (4.1, 7.0, 1.5))]
     assert all(estimate.is_mapping_apart for estimate in estimates[60:])
-    assert not any(estimate.placement is Destination.MAP for estimate in estimates)
+    assert not any(estimate.destination is Destination.MAP for estimate in estimates)
     after = second.state()
     for name, array in state.items():
         np.testing.assert_array_equal(after[name], array)
@@ -808,7 +808,7 @@ def test_a_guessed_start_pose_is_confirmed_by_the_way_alone(guess, is_right):
         estimate = localizer.step(scan, odom)
         off_m = np.hypot(*(estimate.T_map_base - truth)[:2])
         assert estimate.is_lost or (off_m < 0.1 and k > 100)
-        assert estimate.placement is not Destination.MAP or off_m < 0.1
+        assert estimate.destination is not Destination.MAP or off_m < 0.1
     assert estimate.is_lost != is_right
 
 

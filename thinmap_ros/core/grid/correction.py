@@ -460,7 +460,7 @@ class CorrectableGrid:
     `shown` is the published map. It is always complete: each tile shows the old rendering until its
     new one is complete. `corrected_ns` is the stamp of the newest correction that has been
     applied to the whole map.
-    Scans whose placement is open wait: they are added once a scan belongs in the map, and dropped
+    Scans whose destination is open wait: they are added once a scan belongs in the map, and dropped
     if the robot was lost. Those of a robot that maps apart are stored and not shown. They join the
     map if a correction comes before the robot is in the map again; otherwise they are dropped.
     `erasures` are the parts of the map of which only later scans show anything, whenever it is
@@ -527,7 +527,7 @@ class CorrectableGrid:
         return True
 
     def update(
-        self, scan: Scan | None, T_map_base: Array, placement: Destination = Destination.MAP
+        self, scan: Scan | None, T_map_base: Array, destination: Destination = Destination.MAP
     ) -> CorrectedPoses | None:
         """Continue the re-rendering, then add a scan made at a robot pose (3,).
 
@@ -537,24 +537,24 @@ class CorrectableGrid:
         """
         self._T_map_base = T_map_base
         if scan is None:
-            placement = Destination.NOWHERE
-        if placement is Destination.MAP:
+            destination = Destination.NOWHERE
+        if destination is Destination.MAP:
             self._end_apart()
         moved = self._render_slice()
         if scan is not None:
-            self._place(scan, T_map_base, placement)
+            self._place(scan, T_map_base, destination)
         return moved
 
-    def _place(self, scan: Scan, T_map_base: Array, placement: Destination) -> None:
-        if placement is Destination.MAP:
+    def _place(self, scan: Scan, T_map_base: Array, destination: Destination) -> None:
+        if destination is Destination.MAP:
             self._set_drops_out(scan.drops_out)
             for earlier, T_earlier in self._open:
                 self._add_scan(earlier, T_earlier)
             self._open.clear()
             self._add_scan(scan, T_map_base)
-        elif placement is Destination.OPEN:
+        elif destination is Destination.OPEN:
             self._open.append((scan, T_map_base))
-        elif placement is Destination.APART:
+        elif destination is Destination.APART:
             self._open.clear()
             self._store_apart(scan, T_map_base)
 

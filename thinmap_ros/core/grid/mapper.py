@@ -128,7 +128,7 @@ class Mapper(Stage[LocalizedScan, MapUpdate]):
         if localized.trajectory is not None:
             self.correct(localized.trajectory)
         before_ns = self.grid.corrected_ns
-        moved = self.grid.update(localized.scan, localized.T_map_base, localized.placement)
+        moved = self.grid.update(localized.scan, localized.T_map_base, localized.destination)
         self.refusals = self.grid.take_refusals()
         is_due = self._scans % self._scans_per_update == 0
         self._scans += 1
