@@ -470,7 +470,7 @@ def is_rejected(message):
 
 
 def is_plain(message):
-    """Whether a sound message is as it was before strange values were put into it."""
+    """Whether a message is without the strange values that are put into sound ones."""
     if isinstance(message, LaserScan):
         return (
             message.header.frame_id == 'laser'

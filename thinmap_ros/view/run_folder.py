@@ -1,4 +1,4 @@
-"""The folder of the results of a run, with the same files whoever made it."""
+"""The folder of the results of a run: the same files from each program."""
 
 import json
 from collections.abc import Mapping, Sequence

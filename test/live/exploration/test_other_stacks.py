@@ -154,7 +154,7 @@ def small_dungeon(shared_data, folder):
     return occupancy_maps.write_map(folder / 'small_dungeon', GridPatch(frame, cells))
 
 
-@pytest.mark.cpu_budget(20.0, 'a whole exploration, and the way home')
+@pytest.mark.cpu_budget(20.0, 'a whole exploration, and the path back')
 def test_a_foreign_slam_and_nav2_are_enough(graph, niches):
     niches.start_foreign_slam()
     niches.start_nav2()
