@@ -43,6 +43,7 @@ class Relay:
         self.spoiled = 0
 
 
+@pytest.mark.cpu_budget(20.0, 'an exploration that waits')
 @pytest.mark.parametrize('values', [(math.nan, 0.0), pytest.param((-1.0,), marks=pytest.mark.slow)])
 def test_a_blind_laser_pauses_an_exploration_until_ranges_return(graph, values):
     truth = graph.heard('ground_truth', PoseStamped)
