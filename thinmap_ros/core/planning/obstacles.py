@@ -1,4 +1,4 @@
-"""Obstacles near the robot: points of the scan, blind sectors, and what only blocked wheels tell."""
+"""Obstacles near the robot: points of the scan, blind sectors, what only blocked wheels tell."""
 
 import math
 from collections import deque
