@@ -37,6 +37,16 @@ def test_a_late_copy_of_an_earlier_message_does_not_count():
     assert sources.add(A, (2, 5), False, '/a')
 
 
+def test_a_source_that_ends_at_once_is_no_news_when_its_own_message_comes():
+    sources = StopSources()
+    sources.add(b'own', (1, 10), True, '/navigator')
+    sources.add(b'other', (1, 11), True, '/button')
+    assert sources.end({b'own', b'silent'})
+    assert list(sources.names.values()) == ['/button']
+    assert not sources.add(b'own', (2, 20), False, '/navigator')
+    assert not sources.end({b'own'})
+
+
 def test_a_source_that_is_gone_is_released_by_its_name_and_no_other():
     sources = StopSources()
     sources.add(A, (1, 10), True, 'a node')

@@ -77,6 +77,11 @@ class StopSources:
         gone = [g for g, own in self.names.items() if g not in alive and name in ('', own)]
         return [self.names.pop(gid) for gid in gone]
 
+    def end(self, gids: Collection[bytes]) -> bool:
+        """Remove sources; returns whether there were any."""
+        ended = [gid for gid in gids if self.names.pop(gid, None) is not None]
+        return bool(ended)
+
     def state(self) -> State:
         """The sources, to be restored."""
         gids = np.frombuffer(b''.join(self.names), np.uint8).reshape(-1, GID_SIZE)
@@ -166,6 +171,7 @@ class StopTopic:
         if self._is_protective and name in ('', self._name):
             self._is_protective = False
             self.publish(False)
+            self._end_own()
             released.append(self._name)
         still = f'still stopped by {self.others}' if self.others else ''
         if not released:
@@ -174,6 +180,12 @@ class StopTopic:
                 + (f': {still}' if still else '')
             )
         return f'released: {", ".join(released)}' + (f'; {still}' if still else '')
+
+    def _end_own(self) -> None:
+        """End the stop of this node at once: a goal may come before its own message does."""
+        alive = self._alive()
+        if self._sources.end({gid for gid, name in alive.items() if name == self._name}):
+            self._changed()
 
     def _restore(self) -> None:
         saved = self._file.load()
