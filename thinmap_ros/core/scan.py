@@ -63,7 +63,8 @@ class Scan:
     laser often has no return from surfaces in range, so that a beam without return says nothing;
     fault: why the ranges of the laser were replaced by invalid ones; warning: how the angles of its
     message contradict its beams; odometry_silence_s: by how much the odometry was silent for longer
-    than usual since the previous scan; None: unknown. Use `Scan.create` to make one.
+    than usual since the previous scan; None: unknown; frame: that of the laser, by which the lasers
+    of a robot differ. Use `Scan.create` to make one.
 
     Each range is one of `hit`, a hit beyond the usable range, `no_return`, `below_range_min`, or
     invalid (`valid` is False).
@@ -86,6 +87,7 @@ class Scan:
     fault: str = ''
     warning: str = ''
     odometry_silence_s: float | None = None
+    frame: str = ''
 
     @staticmethod
     def create(

@@ -86,7 +86,7 @@ def scan(
     warning = errors.angle_warning(
         message.angle_min, message.angle_max, message.angle_increment, count
     )
-    return replace(made, warning=warning)
+    return replace(made, warning=warning, frame=message.header.frame_id.lstrip('/'))
 
 
 def patch(message: Any) -> GridPatch:

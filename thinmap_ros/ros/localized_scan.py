@@ -42,7 +42,7 @@ def localized_scan_msg(
     T_map_base = messages.estimate_msg(estimate, frame_id, scan.stamp_ns)
     return LocalizedScanMsg(
         header=T_map_base.header,
-        scan=messages.scan_msg(scan, '', scan.scan_time_s),
+        scan=messages.scan_msg(scan, scan.frame, scan.scan_time_s),
         max_range_m=scan.max_range_m,
         zero_is_no_return=scan.zero_is_no_return,
         laser_pose=messages.pose_msg(scan.T_base_laser),
