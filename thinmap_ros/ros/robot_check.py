@@ -13,6 +13,7 @@ import rclpy
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
@@ -284,6 +285,7 @@ class BaseTrial:
             publisher.publish(TwistStamped(header=header, twist=twist) if is_stamped else twist)
 
         try:
+            self._await_subscriptions(publisher)
             rate = self._turn_rate_after(_COMMANDED_S, lambda: command(TURN_RAD_S))
             if rate < _TURNS_RAD_S:
                 seen = f'told to turn at {TURN_RAD_S:g} rad/s, it does not: not tried'
@@ -313,6 +315,15 @@ class BaseTrial:
         if not kinds:
             raise InputError(f'{name}: nobody subscribes: expected the driver of the base')
         return velocity.KINDS[kinds[0]]
+
+    def _await_subscriptions(self, publisher: Publisher) -> None:
+        """Wait until those who subscribe receive what is published: the base would miss it."""
+        end = time.monotonic() + _PATIENCE * _COMMANDED_S
+        infos = self._node.get_subscriptions_info_by_topic(publisher.topic_name)
+        kinds = [velocity.KINDS.get(info.topic_type) for info in infos]
+        expected = kinds.count(publisher.msg_type)
+        while publisher.get_subscription_count() < expected and time.monotonic() < end:
+            self._spin()
 
     def _on_odometry(self, message: Odometry) -> None:
         yaw = float(messages.pose_from_msg(message.pose.pose)[2])
