@@ -3,20 +3,27 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from time import perf_counter
 
 from thinmap_ros.core.config import Config, config_or_default, parameter, part
-from thinmap_ros.core.errors import pose_of, require_type
+from thinmap_ros.core.errors import InputError, pose_of, require_type
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
-from thinmap_ros.core.slam.localizer import localizer_class
+from thinmap_ros.core.slam.localizer import Localizer, localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import Estimate, LocalizedScan, StartConfig, Trajectory
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
-from thinmap_ros.core.topology.topology import Topology, TopologyBuilder
+from thinmap_ros.core.topology.segmentation import RegionConfig, RegionTracker
+from thinmap_ros.core.topology.topology import Topology, TopologyBuilder, build
+from thinmap_ros.files import sessions
+from thinmap_ros.files.occupancy_maps import warn
+from thinmap_ros.files.safe import path_of
+from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, SessionMap
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,8 @@ class Pipeline:
         self.corrections = 0
         self.refusals: list[str] = []  # why scans are not on the map, a reason for each
         self.stage_seconds: dict[str, list[float]] = {}
-        self._locate = pose_source or self.localizer.step
+        self._pose_source = pose_source
+        self._regions = self._new_regions()
         self._consistency = ConsistencyMonitor()
 
     def __repr__(self) -> str:
@@ -118,12 +126,15 @@ class Pipeline:
 
     def _step(self, scan: Scan, T_odom_base: Array) -> PipelineResult:
         with self._timed('localizer'):
-            estimate = self._locate(scan, T_odom_base)
+            locate = self._pose_source or self.localizer.step
+            estimate = locate(scan, T_odom_base)
             estimate = self._consistency.checked(scan, T_odom_base, estimate)
         with self._timed('grid'):
             update = self._mapper.step(self._localized(scan, estimate))
         self.refusals += self._mapper.refusals
         if update is not None:
+            if update.whole is not None:
+                self._regions.follow(update.whole)
             with self._timed('rebuild' if update.whole else 'topology'):
                 self._set_topology(self._topology.step(update))
         return PipelineResult(estimate)
@@ -133,8 +144,51 @@ class Pipeline:
         whole = self._mapper.finish()
         self.refusals += self._mapper.refusals
         if whole is not None:
+            self._regions.follow(whole)
             with self._timed('rebuild'):
                 self._set_topology(self._topology.add_map(whole))
+
+    def load_session(self, path: str | Path) -> None:
+        """Continue in a session, or a map_server map (YAML file), as live nodes do.
+
+        The localizer begins at its initial pose in that map, and is lost until scans fit. The map
+        has the cells of the file. Raises InputError where a file is missing or broken, or the
+        session has no map of this localizer.
+        """
+        path = str(path_of(path))
+        localizer = sessions.load_localizer(path, self.config.localizer)
+        if localizer is None:
+            raise InputError(
+                f'{sessions.LOCALIZER.file(path)}: no such file: expected the line features of a '
+                f'session of slam: {self.config.localizer.slam}'
+            )
+        if isinstance(localizer, Localizer) and localizer.published_graph is None:
+            warn(f'{path}: no keyframes: the map is extended, and not corrected when a loop closes')
+        keeps_scans = not self._pose_source
+        grid, keep_out = sessions.load_map(path, self.config.grid, keeps_scans)
+        builder = _graph_of(path, grid.shown.known_area(), self.config.topology)
+        regions = REGIONS.load_optional(path, self._regions.config)
+        self.localizer = localizer
+        self._mapper.replace(grid, keep_out)
+        self._topology.replace(builder)
+        self.localizer.set_topology(builder.map)
+        self._regions = regions or self._new_regions()
+        self._regions.follow(self._mapper.whole_map())
+
+    def save_session(self, path: str | Path) -> list[str]:
+        """Save map, graph, and what a localizer continues with; returns what was written.
+
+        All files or none, as `sessions.save_session`. Raises InputError, and OSError.
+        """
+        self.finish()
+        self._regions.update(self.grid.known_area())
+        known = SessionMap(
+            self.grid, self.topology, self._regions, self._mapper.edits, self.localizer
+        )
+        return sessions.save_session(str(path_of(path)), known)
+
+    def _new_regions(self) -> RegionTracker:
+        return RegionTracker(RegionConfig(robot_radius_m=self.config.topology.robot_radius_m))
 
     def _localized(self, scan: Scan, estimate: Estimate) -> LocalizedScan:
         trajectory = None
@@ -152,3 +206,12 @@ class Pipeline:
         started = perf_counter()
         yield
         self.stage_seconds.setdefault(stage, []).append(perf_counter() - started)
+
+
+def _graph_of(path: str, patch: GridPatch, config: TopologyConfig) -> TopologyBuilder:
+    """The graph of a session; that of its map where it has none."""
+    if TOPOLOGY.exists(path):
+        return sessions.load_topology(path, config)
+    graph = build(patch, None, config)
+    next_id = 1 + max([*graph.nodes, *graph.edges], default=0)
+    return TopologyBuilder.continued(patch, graph, next_id, config)

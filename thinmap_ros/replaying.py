@@ -72,6 +72,8 @@ class Replay:
     warnings: contradictions within the log, a line each. odometry_jumps: discontinuities of the
     odometry, a line each.
     ended_by: what ended the replay before the end of the log; None if nothing did.
+    session, continued: path STEM of the session that was saved, and of the one that was continued;
+    '': none.
     """
 
     pipeline: Pipeline
@@ -85,6 +87,8 @@ class Replay:
     warnings: list[str] = field(default_factory=list)
     odometry_jumps: list[str] = field(default_factory=list)
     ended_by: Exception | KeyboardInterrupt | None = None
+    session: str = ''
+    continued: str = ''
 
 
 class Watcher(Protocol):
@@ -103,13 +107,16 @@ def replay(
     show_progress: bool = False,
     watcher: Watcher | None = None,
     keep_partial: bool = False,
+    continued: str = '',
 ) -> Replay:
     """Replay a log through the pipeline. Raises InputError if it has no scan with odometry.
 
     keep_partial: an error, or Ctrl-C, after the first scan ends the replay there
-    (`Replay.ended_by`) instead of being raised.
+    (`Replay.ended_by`) instead of being raised. continued: session in which the replay continues.
     """
-    result = Replay(Pipeline(config))
+    result = Replay(Pipeline(config), continued=continued)
+    if continued:
+        result.pipeline.load_session(continued)
     pairing = ScanOdometrySynchronizer(WAITING_SCANS)
     unused = UnusedScans()
     tidy_up = compiler_memory_releaser()
@@ -256,6 +263,8 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'refused': len(refusals),
         'first_refused': refusals[0] if refusals else '',
         'warnings': result.warnings,
+        'continued': result.continued,
+        'session': result.session,
         'ended_by': '' if result.ended_by is None else one_line_reason(result.ended_by),
         'wall_s': round(seconds[0], 3),
         'cpu_s': round(seconds[1], 3),

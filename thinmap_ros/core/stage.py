@@ -1,7 +1,7 @@
 """The chain from scans to the graph: its stages, how it starts, and what it estimates."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
@@ -238,3 +238,9 @@ class StartConfig(Config):
     def is_mapping(self) -> bool:
         """Whether scans change the map."""
         return self.mode == MAPPING
+
+
+def config_at(config: StartConfig, T_map_base: Array) -> StartConfig:
+    """The configuration with a start pose (3,)."""
+    x, y, yaw = T_map_base.tolist()
+    return replace(config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)

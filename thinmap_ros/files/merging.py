@@ -18,7 +18,7 @@ from thinmap_ros.core.topology.topology import TopologyBuilder, build
 from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import Report, read_map, warn
 from thinmap_ros.files.safe import atomic_write, path_of
-from thinmap_ros.files.sessions import EXPLORATION, GRID, KEYFRAMES, LOCALIZER, REGIONS, TOPOLOGY
+from thinmap_ros.files.sessions import GRID, KEYFRAMES, REGIONS, TOPOLOGY
 
 MIN_MAPS = 2
 
@@ -64,22 +64,11 @@ class MergedMap:
     joins: list[MapJoin]
 
     def save(self, path: str) -> list[str]:
-        """Write a session, all files or none; returns what was written, a line each.
-
-        What an earlier session of that name has besides is renamed. Raises InputError where a file
-        of another program would be replaced, OSError where the disk is full.
-        """
-        sessions.require_own_files(path, GRID)
-        with (
-            atomic_write(TOPOLOGY.file(path)) as topology,
-            atomic_write(REGIONS.file(path)) as regions,
-        ):
-            TOPOLOGY.write(topology, self.topology)
-            REGIONS.write(regions, self.regions)
-            grid = sessions.save_grid(path, self.grid, edits=MapEdits(self.keep_out))
-        lines = [f'{grid}, {TOPOLOGY.ending} and {REGIONS.ending}']
-        lines += [part.archive(path) for part in (LOCALIZER, EXPLORATION)]
-        return [line for line in lines if line]
+        """Write a session, as `sessions.save_session`; returns what was written, a line each."""
+        edits = MapEdits(self.keep_out)
+        return sessions.save_session(
+            path, sessions.SessionMap(self.grid, self.topology, self.regions, edits)
+        )
 
 
 def merge_maps(

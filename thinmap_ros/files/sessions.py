@@ -5,6 +5,7 @@ same grid as a map_server map, STEM.pgm and STEM.yaml, and STEM.edits.npz of a m
 """
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
@@ -13,7 +14,8 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer
-from thinmap_ros.core.grid.edits import MapEdits
+from thinmap_ros.core.grid.correction import CorrectableGrid
+from thinmap_ros.core.grid.edits import KeepOut, MapEdits
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
@@ -155,7 +157,15 @@ class SessionPart(Generic[Value, PartConfig]):
 
 def _restore_localizer(state: State, config: StartConfig | None) -> AnyLocalizer:
     own = config or LocalizerConfig()
+    _require_own_map(state, own)
     return localizer_class(own).from_state(state, own)
+
+
+def _require_own_map(state: State, config: StartConfig) -> None:
+    """Raise InputError where a map is that of another localizer than the configured one."""
+    foreign = 'ids' if isinstance(config, LocalizerConfig) else 'hits'
+    if foreign in state:
+        raise InputError(f'map of another localizer: expected one of slam: {config.slam}')
 
 
 GRID = SessionPart(
@@ -306,6 +316,24 @@ def load_edits(path: str) -> MapEdits:
     return edits or MapEdits()
 
 
+def load_map(
+    path: str,
+    config: OccupancyConfig | None = None,
+    is_mapping: bool = True,
+    folder: Path | None = None,
+    report: Report = warn,
+) -> tuple[CorrectableGrid, KeepOut]:
+    """The map of a session, or any map_server map, and its keep-out areas.
+
+    It is corrected if the session has keyframes, and is_mapping. folder, report: as in `read_map`.
+    Raises InputError as `load_grid`.
+    """
+    grid = load_grid(path, config, folder, report)
+    scans = load_scans(path) if is_mapping else []
+    edits = load_edits(path)
+    return CorrectableGrid(grid, bool(scans), scans=scans, erasures=edits.erasures), edits.keep_out
+
+
 def load_scans(path: str) -> list[tuple[Scan, Array]]:
     """Scans of the keyframes, with their poses (3,), that STEM.grid.npz can be rendered from.
 
@@ -323,7 +351,7 @@ def save_localizer(path: str, localizer: AnyLocalizer, overwrite: bool = False) 
     `SessionPart.save`.
     """
     LOCALIZER.require_no_loss(path, localizer, overwrite)
-    keyframes = localizer.saved_keyframes() if isinstance(localizer, Localizer) else None
+    keyframes = _keyframes_of(localizer)
     # Neither file takes its name before both are written.
     with atomic_write(LOCALIZER.file(path)) as aside:
         LOCALIZER.write(aside, localizer)
@@ -334,19 +362,73 @@ def save_localizer(path: str, localizer: AnyLocalizer, overwrite: bool = False) 
     return f'{LOCALIZER.file(path)} and {KEYFRAMES.ending}'
 
 
-def load_localizer(path: str, config: StartConfig) -> AnyLocalizer | None:
-    """Localizer in the map of a session; None where it has no map of the localizer.
+def _keyframes_of(localizer: AnyLocalizer | None) -> SavedKeyframes | None:
+    """The keyframes of a map that is made of such; its local map is complete with them."""
+    if not isinstance(localizer, Localizer):
+        return None
+    localizer.complete_map()
+    return localizer.saved_keyframes()
+
+
+@dataclass(frozen=True, eq=False)
+class SessionMap:
+    """What a session holds of a map. localizer: None where there is none in it."""
+
+    grid: OccupancyGrid
+    topology: TopologyBuilder
+    regions: RegionTracker
+    edits: MapEdits
+    localizer: AnyLocalizer | None = None
+
+
+def save_session(path: str, session: SessionMap) -> list[str]:
+    """Write a session, all files or none; returns what was written, a line each.
+
+    What an earlier session of that name has besides is archived. Raises InputError where a file of
+    another program, or a map by an empty one, would be replaced, OSError where the disk is full.
+    """
+    require_own_files(path, GRID)
+    parts: list[tuple[SessionPart[Any, Any], _HasState | None]] = [
+        (TOPOLOGY, session.topology),
+        (REGIONS, session.regions),
+        (KEYFRAMES, _keyframes_of(session.localizer)),
+        (LOCALIZER, session.localizer),
+        (EXPLORATION, None),
+    ]
+    written = [(part, value) for part, value in parts if value is not None]
+    with ExitStack() as stack:
+        for part, value in written:
+            part.write(stack.enter_context(atomic_write(part.file(path))), value)
+        grid = save_grid(path, session.grid, edits=session.edits)
+    *endings, last = [part.ending for part, _ in written]
+    archived = [part.archive(path) for part, value in parts if value is None]
+    return [f'{grid}, {", ".join(endings)} and {last}', *filter(None, archived)]
+
+
+def load_localizer(
+    path: str, config: StartConfig, folder: Path | None = None, report: Report = warn
+) -> AnyLocalizer | None:
+    """Localizer in the map of a session, or in its grid: any map_server map.
 
     One that maps by scan matching has the keyframes of the session, if there are any.
-    Raises InputError as `SessionPart.load`.
+    folder, report: as in `read_map`. None: no map that this localizer can use.
+    Raises InputError where a file is broken, or the path names no map.
     """
-    if not LOCALIZER.exists(path):
+    if LOCALIZER.exists(path):
+        return _load_own_localizer(path, config)
+    if not isinstance(config, LocalizerConfig):
         return None
+    grid = load_grid(path, None, folder, report)
+    return Localizer.in_occupancy_map(grid.known_area(), config)
+
+
+def _load_own_localizer(path: str, config: StartConfig) -> AnyLocalizer:
     if not (isinstance(config, LocalizerConfig) and config.is_mapping):
         return LOCALIZER.load(path, config)
     keyframes = KEYFRAMES.load_optional(path)
 
     def restore(state: State, own: StartConfig | None) -> AnyLocalizer:
+        _require_own_map(state, config)
         return Localizer.from_state(state, config, keyframes)
 
     return replace(LOCALIZER, restore=restore).load(path, config)

@@ -173,12 +173,9 @@ class GridMapperNode(ThinmapNode):
         self, path: str, folder: pathlib.Path | None = None
     ) -> tuple[CorrectableGrid, KeepOut]:
         """The map of a session, or any map_server map; corrected if the session has keyframes."""
-        grid = sessions.load_grid(path, self._settings.grid, folder, self.get_logger().warning)
-        scans = sessions.load_scans(path) if self._settings.mapping else []
-        edits = sessions.load_edits(path)
-        erased = edits.erasures
-        correctable = CorrectableGrid(grid, bool(scans), scans=scans, erasures=erased)
-        return correctable, edits.keep_out
+        settings = self._settings
+        report = self.get_logger().warning
+        return sessions.load_map(path, settings.grid, settings.mapping, folder, report)
 
     def _state(self) -> State | None:
         if self._stamp.latest_ns is None:

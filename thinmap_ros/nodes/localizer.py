@@ -36,17 +36,15 @@ from thinmap_ros.core.slam.localizer import (
 )
 from thinmap_ros.core.slam.track import LIVE_PARAMETERS, LocalizerConfig
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.stage import SCAN_MATCHING, Correction, Estimate, StartConfig
+from thinmap_ros.core.stage import SCAN_MATCHING, Correction, Estimate, StartConfig, config_at
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.core.topology.graph import topology_from_msg
-from thinmap_ros.files.sessions import LOCALIZER, save_localizer
+from thinmap_ros.files.sessions import LOCALIZER, load_localizer, save_localizer
 from thinmap_ros.logs.frames import NONE
 from thinmap_ros.nodes.parts.given_map import (
     GivenMap,
     InitialPoses,
     LivingMap,
-    config_at,
-    load_localizer,
 )
 from thinmap_ros.nodes.parts.localization import (
     KeyframeOutput,
@@ -384,9 +382,7 @@ class LocalizerNode(ThinmapNode):
         """Localizer in a saved map, at the present pose; None where there is no such map."""
         config = config_at(self._config, self._localizer.pose)
         folder = self._save_directory
-        return load_localizer(
-            folder.resolve(path), config, folder.path, report=self.get_logger().warning
-        )
+        return load_localizer(folder.resolve(path), config, folder.path, self.get_logger().warning)
 
     def _load(self, path: str) -> str:
         """Replace the map by that of a session, or by any map_server map; lost until scans fit."""

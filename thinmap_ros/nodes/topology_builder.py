@@ -98,7 +98,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._regions = RegionUpdates(
             self, self._output.frame_id, self._config.robot_radius_m, lambda: self._topology.map
         )
-        self._naming = RegionNaming(self, self._regions)
+        RegionNaming(self, self._regions)
         parameters.reject_unknown(self)
         kernels.topology_builder()
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
@@ -177,7 +177,7 @@ class TopologyBuilderNode(ThinmapNode):
             return
         stamp_ns = messages.stamp_ns(message.header.stamp)
         whole = messages.whole_map_from_msg(message)
-        self._naming.follow(whole)
+        self._regions.tracker.follow(whole)
         self._regions.add_grid(stamp_ns, whole.patch)
         with self.diagnostics.time_step('whole map'):
             changed = self._topology.add_map(whole)

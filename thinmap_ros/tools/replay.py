@@ -18,12 +18,14 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import default_config
-from thinmap_ros.core.stage import Estimate, StartConfig
+from thinmap_ros.core.stage import Estimate, StartConfig, config_at
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.evaluation.batch import REASON, Batch, FileJob, jobs_of, reported, run_batch
 from thinmap_ros.evaluation.parallel_jobs import Report, add_run_options
 from thinmap_ros.files.safe import atomic_write, read_text
+from thinmap_ros.files.sessions import GRID, require_own_files, stem_of
 from thinmap_ros.logs.log import Event, Log, SkippedRecords, known_formats
+from thinmap_ros.logs.transforms import parse_pose
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.replaying import Replay, Watcher, replay, write_outputs
 from thinmap_ros.tools import cli
@@ -35,7 +37,8 @@ from thinmap_ros.view.rerun_view import View
 # Whose parameters replay takes from a file.
 _NODES = ('localizer', 'grid_mapper', 'topology_builder')
 # Arguments that do not decide about the result.
-_ASIDE = ('logs', 'out', 'jobs', 'dask', 'quiet', 'view', 'recording', 'command')
+_OF_ONE = ('view', 'recording', 'session', 'continued', 'start')  # expect one log
+_ASIDE = ('logs', 'out', 'jobs', 'dask', 'quiet', *_OF_ONE, 'command')
 _COLUMNS = ('scans', 'distance_m', 'ms_per_scan', 'loops', 'lost', 'apart')
 Opened = Callable[[Log], AbstractContextManager[Any]]
 
@@ -57,8 +60,17 @@ def replay_log(
     cpu = time.process_time()
     with opened(cli.open_log(path, arguments, parameters)) as log:
         result = replay(
-            log, config, show_progress=not arguments.quiet, watcher=shown, keep_partial=True
+            log,
+            config,
+            show_progress=not arguments.quiet,
+            watcher=shown,
+            keep_partial=True,
+            continued=arguments.continued,
         )
+    if arguments.session:
+        result.session = str(stem_of(arguments.session))
+        for line in result.pipeline.save_session(result.session):
+            print(line)
     result.notes = [*parameters.notes, *result.notes]
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{path.name}: {len(result.poses)} scans'
@@ -107,8 +119,11 @@ def _config(arguments: argparse.Namespace, parameters: NodeParameters) -> Pipeli
     """Parameters of all stages: those of the command line come before those of a file."""
     slam = parameters.value('localizer', 'slam', StartConfig.slam)
     grid = parameters.config('grid_mapper', OccupancyConfig())
+    localizer = parameters.config('localizer', default_config(slam))
+    if arguments.start:
+        localizer = config_at(localizer, parse_pose(arguments.start, '--start', 'X,Y,YAW'))
     return PipelineConfig(
-        localizer=parameters.config('localizer', default_config(slam)),
+        localizer=localizer,
         grid=cli.config_from(arguments, OccupancyConfig, grid),
         topology=parameters.config('topology_builder', TopologyConfig()),
     )
@@ -174,6 +189,11 @@ def _work(arguments: argparse.Namespace) -> None:
     arguments.out = out_folder(arguments.out, arguments.logs[0].stem if is_one else 'logs')
     if arguments.recording:
         check_place(arguments.recording)
+    if arguments.session:
+        check_place(stem_of(arguments.session))
+        require_own_files(arguments.session, GRID)  # report a wrong name before the work
+    if arguments.start and not arguments.continued:
+        raise InputError(f'--start {arguments.start}: expected --continue, in whose map it is')
     if len(arguments.logs) > 1:
         _replay_many(arguments)
     else:
@@ -267,8 +287,8 @@ def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> Replay:
 
 def _replay_many(arguments: argparse.Namespace) -> None:
     """Replay several logs, each into a folder of its own."""
-    if arguments.view or arguments.recording:
-        raise InputError('--view, --recording: expected one log')
+    if any(getattr(arguments, name) for name in _OF_ONE):
+        raise InputError('--view, --recording, --session, --continue: expected one log')
     # A job shows no bar of its own.
     jobs = jobs_of(
         arguments.logs, arguments.out, options_of(arguments), {**vars(arguments), 'quiet': True}
@@ -306,6 +326,8 @@ def _print_notes(result: Replay) -> None:
     scans = len(result.poses) + sum(result.counts.without_odometry.values())
     if 2 * unused > scans:
         reasons = '; '.join(result.counts.unpaired() + result.counts.unmapped())
+        if result.continued and result.counts.lost:
+            reasons += f'; --start X,Y,YAW: where in {result.continued} it starts'
         print(
             f'replay: warning: only {scans - unused} of {scans} scans were used: {reasons}',
             file=sys.stderr,
@@ -337,6 +359,28 @@ def main() -> None:
         '--view', action='store_true', help='show it in rerun, until the viewer is closed'
     )
     parser.add_argument('--recording', type=Path, help="file for rerun's recording (.rrd)")
+    parser.add_argument(
+        '--session',
+        default='',
+        metavar='STEM',
+        help='save map, graph and keyframes as a session, for --continue, merge_sessions and '
+        'session_path of the nodes; one of that name is replaced',
+    )
+    parser.add_argument(
+        '--continue',
+        dest='continued',
+        default='',
+        metavar='SESSION',
+        help='continue in the map of a session (path STEM) or of map_server (YAML file), which '
+        'stays as it is unless --session names it, too',
+    )
+    parser.add_argument(
+        '--start',
+        default='',
+        metavar='X,Y,YAW',
+        help='with --continue: where the robot starts in that map, m, m, rad (default 0,0,0: where '
+        'the session began, which is believed once scans fit along 6 m of path)',
+    )
     cli.add_config(parser, StartConfig, ['slam'])
     cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_clear_range_m'])
     cli.run(_work, parser)

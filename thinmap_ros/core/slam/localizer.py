@@ -143,6 +143,10 @@ class ActiveMap:
                     rendered.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
         return rendered
 
+    def complete(self, keyframes: Sequence[Keyframe]) -> None:
+        """Render all keyframes that are pending."""
+        self._render(keyframes, len(self._pending))
+
     def _render(self, keyframes: Sequence[Keyframe], count: int = 2) -> None:
         """Render up to `count` of the pending keyframes."""
         for _ in range(min(count, len(self._pending))):
@@ -310,6 +314,10 @@ class Localizer:
         self._place(T_map_base, covariance)
         self._tracker.evidence.place(is_map_given=not self.config.is_mapping)
         self._local.rerender(self.keyframes, T_map_base)
+
+    def complete_map(self) -> None:
+        """Render what a correction has left to be rendered: a map that is saved lacks nothing."""
+        self._local.complete(self.keyframes)
 
     def state(self) -> State:
         """The published local map as arrays by name, for `from_state`; without the pose."""

@@ -13,6 +13,8 @@ from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.fields import distance_cells, label, root_of
+from thinmap_ros.core.grid.mapper import WholeMap
+from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.snapshot import MAX_COUNT, MAX_ID, Field
@@ -573,6 +575,7 @@ class RegionTracker:
         self.names = RegionNames()
         self._memory: _Memory | None = None
         self._next_id = 1
+        self._corrected_ns = -1  # of the map that the names follow; unknown at first
 
     def update(self, patch: GridPatch) -> RegionMap:
         """Regions of a grid, which need not have the frame or size of the last one."""
@@ -582,6 +585,13 @@ class RegionTracker:
         self.regions = describe(found, self._ids(found.labels, memory), self.config)
         self._memory = memory.updated(self.regions.labels)
         return self.regions
+
+    def follow(self, whole: WholeMap) -> None:
+        """Move the names as a correction has moved the map."""
+        is_next = self._corrected_ns == whole.previous_ns
+        if is_next and whole.corrected_ns > self._corrected_ns and len(whole.moved.before):
+            self.names.move(MapMotion(*whole.moved))
+        self._corrected_ns = whole.corrected_ns
 
     def skip_ids(self, count: int) -> None:
         """Never assign the next so many ids: they may be in use elsewhere."""

@@ -4,7 +4,6 @@ import math
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array, rotated_covariance
 from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
-from thinmap_ros.core.stage import Estimate, StartConfig
+from thinmap_ros.core.stage import Estimate, StartConfig, config_at
 from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import Report, read_map
 from thinmap_ros.files.safe import read_mapping, write_text
@@ -282,7 +281,7 @@ class MapSource:
         if self.patch is not None and isinstance(config, LocalizerConfig):
             return Localizer.in_occupancy_map(self.patch, config)
         if self._session:
-            loaded = load_localizer(self._session, config, report=self._report)
+            loaded = sessions.load_localizer(self._session, config, report=self._report)
             if loaded is not None:
                 return loaded
         return localizer_class(config)(config)
@@ -312,21 +311,6 @@ class MapSource:
                 changed()
 
         subscribe_to_map(node, 'map', on_map)
-
-
-def load_localizer(
-    path: str, config: StartConfig, folder: Path | None = None, *, report: Report
-) -> AnyLocalizer | None:
-    """Localizer in the map of a session, or in its grid: any map_server map.
-
-    folder, report: as in `read_map`. None: no map that this localizer can use.
-    Raises InputError where a file is broken, or the path names no map.
-    """
-    loaded = sessions.load_localizer(path, config)
-    if loaded is not None or not isinstance(config, LocalizerConfig):
-        return loaded
-    grid = sessions.load_grid(path, None, folder, report)
-    return Localizer.in_occupancy_map(grid.known_area(), config)
 
 
 class InitialPoses:
@@ -470,9 +454,3 @@ class GivenMap:
         localizer = self.create_localizer_at(T_map_base)
         localizer.set_pose(T_map_base, covariance)
         return localizer
-
-
-def config_at(config: StartConfig, T_map_base: Array) -> StartConfig:
-    """The configuration with a start pose (3,)."""
-    x, y, yaw = T_map_base.tolist()
-    return replace(config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)

@@ -20,8 +20,6 @@ from thinmap_msgs.srv import NameRegion
 from thinmap_ros.core import errors
 from thinmap_ros.core.config import Config, parameter, part
 from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.core.grid.mapper import WholeMap
-from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -249,18 +247,7 @@ class RegionNaming:
     def __init__(self, node: ThinmapNode, regions: RegionUpdates) -> None:
         self._node = node
         self._regions = regions
-        self._corrected_ns = 0
-        self._of: RegionTracker | None = None  # whose names follow this correction
         offer(node.create_active_service, NameRegion, 'name_region', self._name)
-
-    def follow(self, whole: WholeMap) -> None:
-        """Move the names as a correction has moved the map."""
-        tracker = self._regions.tracker
-        is_next = self._of is tracker and self._corrected_ns == whole.previous_ns
-        if is_next and whole.corrected_ns > self._corrected_ns and len(whole.moved.before):
-            tracker.names.move(MapMotion(*whole.moved))
-        self._of = tracker
-        self._corrected_ns = whole.corrected_ns
 
     def _name(self, request: NameRegion.Request) -> str:
         tracker = self._regions.tracker
