@@ -290,16 +290,18 @@ def _sense() -> None:
 
 @cache
 def grid_mapper() -> None:
-    """Warm up the map update, its windows, and the keyframes of a session that is loaded."""
+    """Warm up the map update, its windows, keyframes of a loaded session, and keep-out masks."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
     from thinmap_ros.core.slam.matching.surface import surface_points
+    from thinmap_ros.core.topology.segmentation import outline_of
 
     rehearsed = OccupancyGrid()
     for scan, T_map_base in _drive():
         surface_points(scan)
         rehearsed.add_scan(scan, T_map_base)
         rehearsed.window(T_map_base[0], T_map_base[1], WindowConfig().local_map_size_m)
-    rehearsed.known_area()
+    known = rehearsed.known_area()
+    outline_of(known.occupied, known.frame)
 
 
 @cache

@@ -120,6 +120,55 @@ def test_nodes_are_fewer_the_larger_the_node_spacing(
     assert nodes('--detail-m', 3.0) == nodes('--detail-m', 3.0, '--node-spacing-m', 3.0)
 
 
+def test_the_graph_stays_out_of_a_keep_out_mask(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The mask has other cells than the map, and closes the foot of the T."""
+    path = written(tmp_path, corridors())
+    grey = np.full((20, 20), 254, dtype=np.uint8)
+    grey[5:13, :] = 0
+    (tmp_path / 'mask').mkdir()
+    mask = written(tmp_path / 'mask', grey, resolution=0.15, origin=[2.5, 3.5, 0.0])
+    out = tmp_path / 'g.geojson'
+
+    def found(*words: object) -> tuple[float, list[object]]:
+        """Lowest y of the graph's nodes and edges, and the regions."""
+        assert run(monkeypatch, path, '-o', out, *words) == 0
+        features = json.loads(out.read_text())['features']
+        shapes = [f['geometry'] for f in features]
+        graph = [np.ravel(s['coordinates'])[1::2] for s in shapes if s['type'] != 'Polygon']
+        return float(np.concatenate(graph).min()), [s for s in shapes if s['type'] == 'Polygon']
+
+    open_y, regions = found()
+    kept_y, regions_kept = found('--keep-out', mask)
+    assert capsys.readouterr().out.endswith('keep-out mask: 3.6 m2\n')
+    assert open_y < 5.5 and kept_y > 5.75 + 0.25
+    assert regions == regions_kept
+
+
+@pytest.mark.parametrize(
+    ('origin', 'others', 'expected'),
+    [
+        ([50.0, 2.0, 0.0], [], 'mask.yaml: mask of x 50.0 to 59.0 m, y 2.0 to 8.0 m: expected one'),
+        ([-1.0, 2.0, 0.0], ['m.yaml'], '--keep-out: expected one map'),
+    ],
+)
+def test_a_mask_beside_the_map_is_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    origin: list[float],
+    others: list[str],
+    expected: str,
+) -> None:
+    path = written(tmp_path, corridors(), origin=origin).rename(tmp_path / 'mask.yaml')
+    written(tmp_path, corridors())
+    maps = [tmp_path / name for name in ('m.yaml', *others)]
+    assert run(monkeypatch, *maps, '-o', tmp_path / 'out.geojson', '--keep-out', path) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('map_to_graph: error: ') and expected in line
+
+
 def test_no_edge_of_a_file_crosses_the_unknown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -91,7 +91,8 @@ class GridMapperNode(ThinmapNode):
     update; where it has more than 400 kB, later, so that this is at most 40 kB/s.
 
     Services save_map, load_map; map and dynamic_map return the present map. add_keep_out and
-    remove_keep_out edit areas in which no robot is to drive; erase_area sets cells to unknown.
+    remove_keep_out edit areas in which no robot is to drive, load_keep_out adds those of a mask for
+    Nav2; erase_area sets cells to unknown.
     /keepout_filter_mask and /costmap_filter_info are for Nav2's keepout filter.
 
     After a /trajectory the map is re-rendered, a slice with each scan, near tiles first; meanwhile
@@ -116,6 +117,7 @@ class GridMapperNode(ThinmapNode):
         self._editing = MapEditing(
             self,
             self._output.frame_id,
+            self._save_directory,
             self._mapper,
             lambda: self._stamp.latest_ns,
             self._publish_map,

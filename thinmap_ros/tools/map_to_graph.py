@@ -10,7 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.edits import with_walls
+from thinmap_ros.core.grid.moved import resampled
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Mask
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.regions import membership_of
 from thinmap_ros.core.topology.routes import DETAIL_M, MIN_NODE_SPACING_M, route_graph
@@ -27,6 +30,7 @@ from thinmap_ros.evaluation.batch import (
 )
 from thinmap_ros.evaluation.parallel_jobs import Report, add_run_options
 from thinmap_ros.files import graphs, occupancy_maps
+from thinmap_ros.files.keep_out_masks import read_mask
 from thinmap_ros.files.sessions import REGIONS, load_edits
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser, check_place
@@ -103,7 +107,8 @@ def _check_node_spacing(arguments: argparse.Namespace) -> None:
 class _Graph:
     """What was found in a map: counts, and why there is nothing, if so.
 
-    keep_out: number of the keep-out areas of its session, which are walls for the graph.
+    keep_out: number of the keep-out areas of its session, and masked_m2: what the mask forbids in
+    the map; both are walls for the graph.
     """
 
     nodes: int
@@ -111,6 +116,7 @@ class _Graph:
     parts: int
     regions: int
     keep_out: int
+    masked_m2: float
     empty: str
 
 
@@ -127,13 +133,21 @@ def _graph_of(
     return route_graph(whole, patch, standing, config, detail_m, arguments.node_spacing_m)
 
 
+def _masked(path: Path | None, patch: GridPatch) -> Mask:
+    """Cells (H, W) of a map that a keep-out mask forbids."""
+    if path is None:
+        return np.zeros(patch.shape, dtype=np.bool_)
+    return resampled(read_mask(path, patch), patch).occupied
+
+
 def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Namespace) -> _Graph:
     """Write the graph of a map, and a picture of it."""
     start = _start(arguments.start)
     config = _config(arguments)
     patch = occupancy_maps.read_map(path, keeps_unknown=True)
     keep_out = load_edits(str(path)).keep_out
-    drivable = keep_out.as_walls(patch)
+    forbidden = _masked(arguments.keep_out, patch)
+    drivable = with_walls(keep_out.as_walls(patch), forbidden)
     topology = _graph_of(drivable, config, arguments)
     found = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius_m))
     session = REGIONS.load_optional(str(path))
@@ -157,6 +171,7 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
         len(topology.components()),
         len(regions.regions),
         len(keep_out.areas),
+        np.count_nonzero(forbidden) * patch.frame.resolution**2,
         '' if topology.nodes else empty,
     )
 
@@ -203,6 +218,8 @@ def _work(arguments: argparse.Namespace) -> None:
         return
     if arguments.picture is not None:
         raise InputError('--picture: expected one map: of several, each has a summary.png')
+    if arguments.keep_out is not None:
+        raise InputError('--keep-out: expected one map, in whose frame the mask is')
     arguments.command = cli.command_line()
     options = {name: getattr(arguments, name) for name in _OPTIONS}
     jobs = jobs_of(maps, arguments.out, options, vars(arguments))
@@ -227,6 +244,8 @@ def _convert_one(path: Path, arguments: argparse.Namespace) -> None:
     if found.empty:
         print(f'map_to_graph: warning: {path}: {found.empty}', file=sys.stderr)
     kept_out = f', keep-out areas: {found.keep_out}' if found.keep_out else ''
+    if arguments.keep_out is not None:
+        kept_out += f', keep-out mask: {found.masked_m2:.1f} m2'
     print(
         f'{arguments.out}: {found.nodes} nodes, {found.edges} edges, '
         f'connected parts: {found.parts}, regions: {found.regions}{kept_out}'
@@ -281,6 +300,13 @@ def main() -> None:
     parser.add_argument('--speed-limit', help=speed_help)
     parser.add_argument(
         '--start', help='X,Y in m: only what a robot can reach from there (default: all parts)'
+    )
+    parser.add_argument(
+        '--keep-out',
+        type=Path,
+        metavar='MASK',
+        help="map_server YAML file of a mask for Nav2's KeepoutFilter, in the frame of the map: "
+        'its cells of 100 are walls for the graph',
     )
     parser.add_argument('--picture', type=Path, help='FILE.png: the graph drawn on the map')
     cli.run(_work, parser)

@@ -86,6 +86,12 @@ def aligned_patch(
     return GridPatch(frame, _resampled(patch, motion, frame, (rows, cols)))
 
 
+def resampled(patch: GridPatch, like: GridPatch) -> GridPatch:
+    """A map on the cells of another one, which may be larger or smaller; see `aligned_patch`."""
+    cells = _resampled(patch, MapMotion.rigid(np.zeros(3)), like.frame, like.shape)
+    return GridPatch(like.frame, cells)
+
+
 def overlaid(base: GridPatch, other: GridPatch, T_base_other: Array) -> GridPatch:
     """A map with what another one knows besides, whose frame has a pose (3,) in it.
 

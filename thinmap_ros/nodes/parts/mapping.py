@@ -15,7 +15,7 @@ from rclpy.node import Node
 from thinmap_msgs.msg import KeepOut as KeepOutMsg
 from thinmap_msgs.msg import KeepOutArea as KeepOutAreaMsg
 from thinmap_msgs.msg import LocalGrid, ProbabilityGrid
-from thinmap_msgs.srv import AddKeepOut, EraseArea, RemoveKeepOut
+from thinmap_msgs.srv import AddKeepOut, EraseArea, LoadMap, RemoveKeepOut
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError, InputError, counted
 from thinmap_ros.core.grid.edits import KeepOut
@@ -25,11 +25,13 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.beams import without_robots
 from thinmap_ros.core.stage import Trajectory
+from thinmap_ros.files.keep_out_masks import outlines_of, read_mask
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import diagnostics, messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import ReceivedScan
 from thinmap_ros.ros.maps import FollowedMap, updates_topic
+from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response, offer
 from thinmap_ros.ros.team import heard_robots
 
@@ -39,7 +41,7 @@ _KEEPOUT_FILTER = 0  # type of Nav2's filter
 
 
 class MapEditing:
-    """Services add_keep_out, remove_keep_out and erase_area; publishes keep_out for all who plan.
+    """Services add_keep_out, load_keep_out, remove_keep_out and erase_area; publishes keep_out.
 
     keepout_filter_mask and costmap_filter_info are those of Nav2's keepout filter.
     is_edited: whether anything was edited since the node was started.
@@ -49,17 +51,20 @@ class MapEditing:
         self,
         node: ThinmapNode,
         frame_id: str,
+        directory: SaveDirectory,
         mapper: Mapper,
         latest_ns: Callable[[], int | None],
         on_erased: Callable[[], None],
     ) -> None:
-        """frame_id: of the map; latest_ns: stamp of the newest scan in it, None without a map.
+        """frame_id: of the map; directory: of masks that are loaded.
 
-        on_erased: is called when cells have become unknown.
+        latest_ns: stamp of the newest scan in the map, None without a map. on_erased: is called
+        when cells have become unknown.
         """
         self.is_edited = False
         self._node = node
         self._frame_id = frame_id
+        self._directory = directory
         self._mapper = mapper
         self._latest_ns = latest_ns
         self._on_erased = on_erased
@@ -68,6 +73,7 @@ class MapEditing:
         self._mask = node.create_publisher(OccupancyGrid, 'keepout_filter_mask', qos.LATCHED)
         self._info = node.create_publisher(CostmapFilterInfo, 'costmap_filter_info', qos.LATCHED)
         node.create_active_service(AddKeepOut, 'add_keep_out', self._on_add)
+        offer(node.create_active_service, LoadMap, 'load_keep_out', self._on_load)
         offer(node.create_active_service, RemoveKeepOut, 'remove_keep_out', self._on_remove)
         offer(node.create_active_service, EraseArea, 'erase_area', self._on_erase)
 
@@ -125,6 +131,18 @@ class MapEditing:
             return f'{added} added'
 
         return fill_response(response, add)
+
+    def _on_load(self, request: LoadMap.Request) -> str:
+        patch = self._mapper.grid.shown.known_area()
+        directory = self._directory
+        mask = read_mask(directory.resolve(request.path), patch, directory.path)
+        keep_out = self._mapper.keep_out
+        before = len(keep_out.areas)
+        for corners in outlines_of(mask, patch):
+            keep_out = keep_out.with_area(corners, is_wall=False)
+        keep_out.bounds(patch.frame)  # raises for a mask that is too large
+        self._replace(keep_out)
+        return f'{counted(len(keep_out.areas) - before, "keep-out area")} added'
 
     def _on_remove(self, request: RemoveKeepOut.Request) -> str:
         before = len(self._mapper.keep_out.areas)
