@@ -16,7 +16,13 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
 from thinmap_ros.core.slam.localizer import Localizer, localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
-from thinmap_ros.core.stage import Estimate, LocalizedScan, StartConfig, Trajectory
+from thinmap_ros.core.stage import (
+    Destination,
+    Estimate,
+    LocalizedScan,
+    StartConfig,
+    Trajectory,
+)
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.segmentation import RegionConfig, RegionTracker
 from thinmap_ros.core.topology.topology import Topology, TopologyBuilder, build
@@ -152,8 +158,8 @@ class Pipeline:
         """Continue in a session, or a map_server map (YAML file), as live nodes do.
 
         The localizer begins at its initial pose in that map, and is lost until scans fit. The map
-        has the cells of the file. Raises InputError where a file is missing or broken, or the
-        session has no map of this localizer.
+        has the cells of the file; in mode localization it stays as it is. Raises InputError where
+        a file is missing or broken, or the session has no map of this localizer.
         """
         path = str(path_of(path))
         localizer = sessions.load_localizer(path, self.config.localizer)
@@ -162,10 +168,10 @@ class Pipeline:
                 f'{sessions.LOCALIZER.file(path)}: no such file: expected the line features of a '
                 f'session of slam: {self.config.localizer.slam}'
             )
-        if isinstance(localizer, Localizer) and localizer.published_graph is None:
+        is_corrected = self.config.localizer.is_mapping and not self._pose_source
+        if is_corrected and isinstance(localizer, Localizer) and localizer.published_graph is None:
             warn(f'{path}: no keyframes: the map is extended, and not corrected when a loop closes')
-        keeps_scans = not self._pose_source
-        grid, keep_out = sessions.load_map(path, self.config.grid, keeps_scans)
+        grid, keep_out = sessions.load_map(path, self.config.grid, is_corrected)
         builder = _graph_of(path, grid.shown.known_area(), self.config.topology)
         regions = REGIONS.load_optional(path, self._regions.config)
         self.localizer = localizer
@@ -195,7 +201,9 @@ class Pipeline:
         if estimate.correction is not None:
             self.corrections += 1
             trajectory = Trajectory(*self.localizer.keyframe_trajectory(), scan.stamp_ns)
-        return LocalizedScan(scan, estimate.T_map_base, estimate.destination, trajectory=trajectory)
+        is_mapping = self.config.localizer.is_mapping
+        destination = estimate.destination if is_mapping else Destination.NOWHERE
+        return LocalizedScan(scan, estimate.T_map_base, destination, trajectory=trajectory)
 
     def _set_topology(self, topology: TopologicalMap | None) -> None:
         if topology is not None:

@@ -233,7 +233,8 @@ def place(tmp_path: Path) -> Path:
     _, patch, _ = read_world(package_data.world_path('room_10x10'))
     (tmp_path / 'maps').mkdir()
     occupancy_maps.write_map(tmp_path / 'maps' / 'office', patch)
-    occupancy_maps.write_map(tmp_path / 'office', patch)
+    for name in ('office', 'keepout_mask'):
+        occupancy_maps.write_map(tmp_path / name, patch)
     _, floor, _ = read_world(package_data.world_path('office'))
     for name in ('maps/east', 'maps/west', 'other_program'):
         occupancy_maps.write_map(tmp_path / name, floor)

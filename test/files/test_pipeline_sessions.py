@@ -13,7 +13,7 @@ from thinmap_ros.core.grid.edits import KeepOut
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.track import LocalizerConfig
-from thinmap_ros.core.stage import config_at
+from thinmap_ros.core.stage import LOCALIZATION, config_at
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.files import sessions
 from thinmap_ros.files.merging import merge_maps
@@ -71,10 +71,14 @@ def test_sessions_of_two_days_are_merged(
     pipeline = Pipeline()
     mapped(pipeline, second_day)
     pipeline.save_session(tmp_path / 'second')
-    (joined,) = merge_maps([session, tmp_path / 'second']).joins
+    merged = merge_maps([session, tmp_path / 'second'])
+    (joined,) = merged.joins
     truth = true_poses(first_day[0], second_day[:1])[0]
     x, y, yaw = (joined.T_merged_map - truth).tolist()
     assert np.hypot(x, y) < 0.12 and abs(se2.wrap(yaw)) < 0.01
+    merged.save(str(tmp_path / 'second'))
+    for part in (LOCALIZER, KEYFRAMES):  # they are not of the merged map
+        assert not part.exists(str(tmp_path / 'second'))
 
 
 def test_the_same_way_again_does_not_double_the_walls(
@@ -102,6 +106,20 @@ def test_a_given_start_elsewhere_continues_at_once(
     assert errors_m(poses, truths)[2:].max() < 0.12
     assert pipeline.grid.known_area().free.sum() > 1.2 * free
     assert len(nodes & pipeline.topology.map.nodes.keys()) > len(nodes) / 2
+
+
+def test_in_mode_localization_the_map_stays(
+    session: Path, first_day: list[DriveSample], second_day: list[DriveSample]
+) -> None:
+    truths = true_poses(first_day[0], second_day[:60])
+    start = config_at(LocalizerConfig(mode=LOCALIZATION), truths[0])
+    pipeline = Pipeline(PipelineConfig(localizer=start))
+    pipeline.load_session(session)
+    before = pipeline.grid.known_area()
+    poses = mapped(pipeline, second_day[:60])
+    assert errors_m(poses, truths).max() < 0.12
+    after = pipeline.grid.known_area()
+    assert after.frame == before.frame and np.array_equal(after.cells, before.cells)
 
 
 def test_keep_out_areas_and_names_of_a_session_stay(

@@ -120,6 +120,7 @@ WRONG = {
     'continued by several': (['log.clf', '--continue', 'scans'], 'expected one log'),
     'start of nothing': (['--start', '1,2,0'], '--start 1,2,0: expected --continue'),
     'start of two numbers': (['--continue', 'scans', '--start', '1,2'], 'expected "X,Y,YAW"'),
+    'no mapping': (['--session', 'new', '--params-file', 'given.yaml'], 'expected mode: mapping'),
     'foreign file': (['--session', 'foreign'], 'foreign.grid.npz: exists, and was not written by'),
     'below a file': (['--session', 'log.clf/a'], 'log.clf is a file: expected a folder'),
     'no name': (['--session', '/'], "'/': expected the path of a session"),
@@ -134,6 +135,7 @@ def test_wrong_sessions_are_one_line_and_nothing_is_written(
     words, expected = WRONG[case]
     monkeypatch.chdir(folder)
     Path('foreign.grid.npz').write_text('mine')
+    Path('given.yaml').write_text('/**: {ros__parameters: {mode: localization}}')
     before = sorted(folder.rglob('*'))
     done = run('log.clf', *words, '-o', 'wrong')
     assert done.returncode == 2

@@ -56,6 +56,8 @@ def replay_log(
     """
     parameters = _parameters(arguments)
     config = _config(arguments, parameters)
+    if arguments.session and not config.localizer.is_mapping:
+        raise InputError(f'--session {arguments.session}: expected mode: mapping, not localization')
     wall = time.perf_counter()
     cpu = time.process_time()
     with opened(cli.open_log(path, arguments, parameters)) as log:
