@@ -1,5 +1,6 @@
 """One revolution of a planar laser scanner."""
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -8,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, config_or_default, parameter
-from thinmap_ros.core.errors import InputError, one_line_reason
+from thinmap_ros.core.errors import InputError, one_line_reason, quoted_name
 from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 
 # With a smaller share of valid beams, the space in front of the laser is unobserved.
@@ -265,3 +266,19 @@ def few_beams_reason(scan: Scan) -> str:
     if scan.is_blind or valid >= MIN_HITS:
         return ''
     return f'{valid} valid beams of {scan.ranges_m.size}: expected at least {MIN_HITS}'
+
+
+def laser_names(frames: Collection[str], form: str = '{}: ') -> dict[str, str]:
+    """How a text on a laser begins, by its frame; form: with the frame, if there are several."""
+    several = len(frames) > 1
+    return {frame: form.format(quoted_name(frame)) if several else '' for frame in frames}
+
+
+def of_lasers(texts: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
+    """Texts by kind on all lasers, from those on each, by its frame."""
+    names = laser_names(texts.keys())
+    return {
+        names[frame] + kind: names[frame] + text
+        for frame, own in texts.items()
+        for kind, text in own.items()
+    }

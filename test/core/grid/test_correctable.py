@@ -309,6 +309,40 @@ def test_a_laser_proves_to_drop_out_while_a_correction_is_rendered(small_slices)
     assert (shown.cells == clean.known_area().cells).mean() > 0.999
 
 
+def test_one_laser_that_drops_out_clears_nothing_and_the_other_does():
+    rng = np.random.default_rng(5)
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
+    expected = OccupancyGrid(PAPER_GRID)
+    rebuilt = 0
+    for k in range(40):
+        good = replace(SCANS[k], frame='front')
+        bad = replace(dropped(SCANS[k], rng), frame='rear')
+        expected.add_scan(good, TRUE[k])
+        expected.add_scan(replace(bad, drops_out=True), TRUE[k])
+        for scan in (good, replace(bad, drops_out=k >= 20)):
+            rebuilt += grid.update(scan, TRUE[k]) is not None
+    grid.finish()
+    assert rebuilt == 1, 'once, and not at each scan'
+    shown = grid.shown.known_area()
+    assert shown.frame == expected.known_area().frame
+    assert (shown.cells == expected.known_area().cells).mean() > 0.999
+
+
+def test_a_map_that_is_rendered_again_shows_what_each_laser_has_seen():
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
+    for k in range(40):
+        behind = replace(SCANS[k], T_base_laser=se2.pose(0.0, 0.0, np.pi))
+        for frame, scan in (('front', SCANS[k]), ('rear', behind)):
+            grid.update(replace(scan, frame=frame), TRUE[k])
+    before = grid.shown.known_area()
+    grid.apply_correction(np.arange(40), TRUE[:40], 40)
+    grid.update(None, TRUE[39])
+    grid.finish()
+    after = grid.shown.known_area()
+    assert after.frame == before.frame
+    assert np.array_equal(after.cells >= 0, before.cells >= 0)
+
+
 def test_a_grid_whose_scans_are_not_known_stays_as_it_is():
     grid = CorrectableGrid(OccupancyGrid(PAPER_GRID), keeps_scans=False)
     grid.update(SCANS[0], TRUE[0])

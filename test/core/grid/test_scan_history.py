@@ -122,3 +122,22 @@ def test_a_correction_that_names_no_scan_changes_nothing(stamps):
         )
         np.testing.assert_array_equal(history.kept_poses(), poses)
         np.testing.assert_array_equal(history.accept_corrections().before, poses)
+
+
+def test_scans_of_several_lasers_are_stored_beside_each_other():
+    history = PoseHistory()
+    for k in range(12):
+        for frame in ('front', 'rear'):
+            history.add_pose(k, POSES[0] if k % 2 else POSES[4], (k, frame), frame)
+    of = [[k for k, own in history.kept() if own == frame] for frame in ('front', 'rear')]
+    assert of[0] == of[1] and len(of[0]) == 8, 'four of each place'
+
+
+def test_scans_of_an_unknown_laser_are_those_of_the_first_that_is_known():
+    """Those of a session make room for new ones at their place."""
+    history = PoseHistory()
+    for k in range(8):
+        history.add_pose(k, POSES[0] if k % 2 else POSES[4], k)
+    for k in range(8, 16):
+        history.add_pose(k, POSES[0] if k % 2 else POSES[4], k, 'laser')
+    assert history.kept() == list(range(8, 16))

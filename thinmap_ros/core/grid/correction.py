@@ -55,41 +55,56 @@ class CorrectedPoses(NamedTuple):
 class PoseHistory(Generic[Kept]):
     """The pose of every scan, and stored data of some scans.
 
-    Of the scans that are 0.25 m or 0.25 rad apart, the newest four of each place and direction are
-    stored: their number grows with the area, not with time. A correction gives the poses of some
-    scans, by their stamps. Every other scan moves with the last of these before it, in the order in
-    which the scans were added: stamps of real robots step back now and then.
+    Of the scans of a laser that are 0.25 m or 0.25 rad apart, the newest four of each place and
+    direction are stored: their number grows with the area, not with time. A correction gives the
+    poses of some scans, by their stamps. Every other scan moves with the last of these before it,
+    in the order in which the scans were added: stamps of real robots step back now and then.
     """
 
     def __init__(self, config: HistoryConfig | None = None) -> None:
         self._config = config or HistoryConfig()
         self._stamps = array('q')
         self._poses = array('d')
-        self._last_apart = -1
-        self._kept: dict[int, Kept] = {}  # by the index of the scan
-        self._at_place: dict[int, deque[int]] = {}
+        self._last_apart: dict[str, int] = {}  # by the frame of the laser
+        self._kept: dict[int, tuple[str, Kept]] = {}  # frame and data, by the index of the scan
+        self._at_place: dict[tuple[str, int], deque[int]] = {}
         # All poses before the first correction that has not been accepted yet.
         self._before: Array | None = None
 
-    def add_pose(self, stamp_ns: int, T_map_base: Array, kept: Kept) -> None:
-        """Add the pose (3,) of a scan; `kept` is stored if the scan is far enough from others."""
+    def add_pose(self, stamp_ns: int, T_map_base: Array, kept: Kept, frame: str = '') -> None:
+        """Add the pose (3,) of a scan; `kept` is stored if the scan is far enough from others.
+
+        frame: of its laser.
+        """
         number = len(self._stamps)
         self._stamps.append(stamp_ns)
         self._poses.extend(T_map_base.tolist())
-        if self._last_apart >= 0:
-            last = np.array(self._poses[3 * self._last_apart : 3 * self._last_apart + 3])
+        if frame not in self._last_apart:
+            self._adopt(frame)
+        before = self._last_apart.get(frame)
+        if before is not None:
+            last = np.array(self._poses[3 * before : 3 * before + 3])
             moved = se2.between(last, T_map_base)
             is_near = math.hypot(moved[0], moved[1]) < self._config.apart_m
             if is_near and abs(float(moved[2])) < self._config.apart_rad:
                 return
-        self._last_apart = number
-        self._kept[number] = kept
+        self._last_apart[frame] = number
+        self._kept[number] = (frame, kept)
         at_place = self._at_place.setdefault(
-            int(_places_of(T_map_base[None], self._config)[0]), deque()
+            (frame, int(_places_of(T_map_base[None], self._config)[0])), deque()
         )
         at_place.append(number)
         while len(at_place) > self._config.scans_per_place:
             del self._kept[at_place.popleft()]
+
+    def _adopt(self, frame: str) -> None:
+        """Take the scans of an unknown laser, as of a session, for those of one that is new."""
+        last = self._last_apart.pop('', None)
+        if last is None:
+            return
+        self._last_apart[frame] = last
+        self._kept = {number: (own or frame, kept) for number, (own, kept) in self._kept.items()}
+        self._sort_by_place()
 
     def last_pose(self) -> Array | None:
         """Pose (3,) of the newest scan; None before the first."""
@@ -100,13 +115,13 @@ class PoseHistory(Generic[Kept]):
         first = len(self._stamps)
         self._stamps.extend(other._stamps)
         self._poses.extend(other._poses)
-        self._last_apart = first + other._last_apart
+        self._last_apart |= {frame: first + last for frame, last in other._last_apart.items()}
         self._kept |= {first + number: kept for number, kept in other._kept.items()}
         self._sort_by_place()
 
     def kept(self) -> list[Kept]:
         """The stored data, in the order in which it was added."""
-        return list(self._kept.values())
+        return [kept for _, kept in self._kept.values()]
 
     def kept_poses(self) -> Array:
         """Current poses (N, 3) of the stored scans."""
@@ -141,7 +156,8 @@ class PoseHistory(Generic[Kept]):
         self._at_place = {}
         places = _places_of(self._all_poses()[kept], self._config)
         for number, place in zip(kept.tolist(), places.tolist(), strict=True):
-            self._at_place.setdefault(place, deque()).append(number)
+            frame, _ = self._kept[number]
+            self._at_place.setdefault((frame, place), deque()).append(number)
 
     def accept_corrections(self) -> CorrectedPoses:
         """Poses of the stored scans before and after the corrections since the last call.
@@ -364,16 +380,17 @@ class Rerendering:
         kept: Sequence[StoredScan],
         poses: Array,
         T_map_base: Array,
-        drops_out: bool = False,
+        dropping: frozenset[str] = frozenset(),
         erased: Sequence[Array] = (),
     ) -> None:
         """Start with the stored scans at their poses (N, 3).
 
         like: a grid with the same cells and configuration; T_map_base (3,): pose of the robot;
-        drops_out: of the laser, as is known now, for all scans; those that have it, keep it;
+        dropping: frames of the lasers that drop out, as is known now, for all their scans, and for
+        those of an unknown laser; those that have it, keep it;
         erased: polygons (M, 2), m, of which only scans since show anything.
         """
-        self._drops_out = drops_out
+        self._dropping = dropping
         self._erased = erased
         self.grid = OccupancyGrid(like.config, like.frame)
         self._added = OccupancyGrid(like.config, like.frame)  # scans that arrived meanwhile
@@ -412,7 +429,8 @@ class Rerendering:
             task = self._queue.pop()
             try:
                 scan = task.stored.scan
-                scan = replace(scan, drops_out=self._drops_out or scan.drops_out)
+                drops_out = scan.frame in self._dropping or bool(self._dropping and not scan.frame)
+                scan = replace(scan, drops_out=drops_out or scan.drops_out)
                 erased = self._erased[task.stored.erasures :]
                 add_scan_outside(self.grid, scan, task.T_map_base, erased)
             except InputError as error:
@@ -465,7 +483,7 @@ class CorrectableGrid:
     map if a correction comes before the robot is in the map again; otherwise they are dropped.
     `erasures` are the parts of the map of which only later scans show anything, whenever it is
     rendered again; a correction moves them.
-    The stored scans take 10 kB per metre of new ground, at most 30 kB per square metre.
+    The stored scans of a laser take 10 kB per metre of new ground, at most 30 kB per square metre.
     """
 
     def __init__(
@@ -484,12 +502,13 @@ class CorrectableGrid:
         self.shown = grid
         self.corrected_ns = corrected_ns
         self.erasures = erasures or Erasures()
-        self._drops_out = False
+        self._dropping: frozenset[str] = frozenset()  # frames of the lasers that drop out
         self._refusals: list[str] = []
         history: PoseHistory[StoredScan] = PoseHistory()
         for scan, T_scan in scans:
             count = self.erasures.count_before(scan.stamp_ns)
-            history.add_pose(scan.stamp_ns, T_scan, StoredScan.of(scan, grid.config, count))
+            kept = StoredScan.of(scan, grid.config, count)
+            history.add_pose(scan.stamp_ns, T_scan, kept, scan.frame)
         self._history = history if keeps_scans else None
         # With the poses (3,) at which they were made.
         self._open: deque[tuple[Scan, Array]] = deque(maxlen=MAX_OPEN)
@@ -547,7 +566,7 @@ class CorrectableGrid:
 
     def _place(self, scan: Scan, T_map_base: Array, destination: Destination) -> None:
         if destination is Destination.MAP:
-            self._set_drops_out(scan.drops_out)
+            self._set_drops_out(scan)
             for earlier, T_earlier in self._open:
                 self._add_scan(earlier, T_earlier)
             self._open.clear()
@@ -587,7 +606,7 @@ class CorrectableGrid:
             self._apart = PoseHistory()
         self._is_joined = False
         kept = self._stored(scan)
-        self._apart.add_pose(scan.stamp_ns, T_map_base, kept)
+        self._apart.add_pose(scan.stamp_ns, T_map_base, kept, scan.frame)
 
     def _end_apart(self) -> None:
         """Add the scans that are apart to the map if they were joined, and drop them otherwise."""
@@ -596,11 +615,11 @@ class CorrectableGrid:
             self._render_again()
         self._apart = None
 
-    def _set_drops_out(self, drops_out: bool) -> None:
+    def _set_drops_out(self, scan: Scan) -> None:
         """Render the stored scans again if what their beams without return say has changed."""
-        if drops_out == self._drops_out:
+        if scan.drops_out == (scan.frame in self._dropping):
             return
-        self._drops_out = drops_out
+        self._dropping ^= {scan.frame}
         if self._history is not None:
             self._render_again()
 
@@ -626,7 +645,7 @@ class CorrectableGrid:
         if self._history is None:
             return
         kept = self._stored(scan)
-        self._history.add_pose(scan.stamp_ns, T_map_base, kept)
+        self._history.add_pose(scan.stamp_ns, T_map_base, kept, scan.frame)
         if self._rerendering is not None:
             self._rerendering.add_scan(kept, T_map_base)
 
@@ -646,7 +665,7 @@ class CorrectableGrid:
                 kept,
                 poses,
                 self._T_map_base,
-                self._drops_out,
+                self._dropping,
                 [item.corners for item in self.erasures.items],
             )
             # The step that closes a loop is already long: rendering starts with the next one.

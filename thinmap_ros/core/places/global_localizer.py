@@ -210,7 +210,7 @@ class GlobalLocalization:
         self.places = Places.of(patch, topology, self.config)
         self._rng = np.random.default_rng(seed)
         self._judge: Judge | None = None
-        self._drops_out = False  # whether the laser does
+        self._dropping: set[str] = set()  # frames of the lasers that drop out
         self._usual = 1.0  # share that the right place explains in this map
         self.restart()
 
@@ -245,11 +245,12 @@ class GlobalLocalization:
             self._T_step = T_odom_base
             return self._waiting('odometry has jumped: the search is reset')
         self._T_step = T_odom_base
-        if scan.drops_out and not self._drops_out:
+        if scan.drops_out and scan.frame not in self._dropping:
             # So far beams without return have spoken for open space.
             self.restart()
             self._T_step = T_odom_base
-        self._drops_out = scan.drops_out
+        others = self._dropping - {scan.frame}
+        self._dropping = others | {scan.frame} if scan.drops_out else others
         blind_reason = scan.blind_reason or few_beams_reason(scan)
         if blind_reason or not (scan.returned | scan.no_return).any():
             reason = blind_reason or 'no beam shows anything'

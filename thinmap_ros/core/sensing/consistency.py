@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.scan import MIN_HITS, Scan
+from thinmap_ros.core.scan import MIN_HITS, Scan, laser_names, of_lasers
 from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, rotation
 from thinmap_ros.core.stage import Estimate
 
@@ -419,8 +419,39 @@ _LIMITS = MountLimits()
 class ConsistencyMonitor:
     """Checks each scan with its estimate; warns of contradictions between laser and odometry.
 
-    warnings: those that hold now, by kind; reported: the last text of each kind so far.
+    Each laser is checked on its own, by the frame of its scans.
     """
+
+    def __init__(self) -> None:
+        self._lasers: dict[str, _LaserConsistency] = {}
+
+    @property
+    def warnings(self) -> dict[str, str]:
+        """Those that hold now, by kind."""
+        return of_lasers({frame: own.warnings for frame, own in self._lasers.items()})
+
+    @property
+    def reported(self) -> dict[str, str]:
+        """The last text of each kind so far."""
+        return of_lasers({frame: own.reported for frame, own in self._lasers.items()})
+
+    def checked(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> Estimate:
+        """The estimate of a scan with odometry pose (3,), with `mount_fault` where there is one.
+
+        A pose that no match has set, or that a loop closure has moved, says nothing of the mount,
+        and neither does an odometry that has jumped.
+        """
+        if estimate.correction is not None or estimate.odometry_discontinuity:
+            for laser in self._lasers.values():
+                laser.reset_span()
+        own = self._lasers.setdefault(scan.frame, _LaserConsistency())
+        fault = own.check(scan, T_odom_base, estimate)
+        name = laser_names(self._lasers.keys())[scan.frame]
+        return replace(estimate, mount_fault=fault and name + fault)
+
+
+class _LaserConsistency:
+    """The same for one laser."""
 
     def __init__(self) -> None:
         self.warnings: dict[str, str] = {}
@@ -429,18 +460,18 @@ class ConsistencyMonitor:
         self._mount_errors = MountErrorEstimator()
         self._by_window: list[MountError] = []
 
-    def checked(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> Estimate:
-        """The estimate of a scan with odometry pose (3,), with `mount_fault` where there is one.
+    def reset_span(self) -> None:
+        """Discard the current span of motion."""
+        self._mount_errors.reset_span()
 
-        A pose that no match has set, or that a loop closure has moved, says nothing of the mount,
-        and neither does an odometry that has jumped.
-        """
+    def check(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> str:
+        """Check a scan; returns why the robot must not drive with this laser, '' for no reason."""
         if se2.is_finite(T_odom_base):
             self._turns.add(scan, T_odom_base)
             self._add_to_mount(scan, T_odom_base, estimate)
         self.warnings = dict(self._found(scan))
         self.reported |= self.warnings
-        return replace(estimate, mount_fault=self._fault)
+        return self._fault
 
     def _add_to_mount(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> None:
         information = estimate.scan_information

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, OdometryBuffer
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import Scan, of_lasers
 from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 from thinmap_ros.core.sensing.beams import LaserMonitor
 from thinmap_ros.jit import inlined, kernel
@@ -158,19 +158,64 @@ def _moved_beams(ranges: Array, hit: Mask, moved: Array, fan: tuple[float, float
     return found
 
 
+@dataclass(frozen=True, eq=False)
+class _Laser:
+    """What is known of a laser; first: its first scan."""
+
+    first: Scan
+    monitor: LaserMonitor = field(default_factory=LaserMonitor)
+    timing: SweepTiming = field(default_factory=SweepTiming)
+
+    def has_made(self, scan: Scan) -> bool:
+        """Whether a scan of another frame has the same beams, from the same place."""
+        first = self.first
+        return (
+            np.array_equal(first.T_base_laser, scan.T_base_laser)
+            and first.angle_min_rad == scan.angle_min_rad
+            and first.angle_increment_rad == scan.angle_increment_rad
+        )
+
+
+class Lasers:
+    """What is known of each laser of a robot, by the frame of its scans.
+
+    A laser of several echoes publishes each in a frame of its own: what the first one shows is
+    missing in the others.
+    """
+
+    def __init__(self) -> None:
+        self._by_frame: dict[str, _Laser] = {}
+
+    def of(self, scan: Scan) -> _Laser:
+        """What is known of the laser of a scan."""
+        known = self._by_frame.get(scan.frame)
+        if known is None:
+            same = (laser for laser in self._by_frame.values() if laser.has_made(scan))
+            known = next(same, None) or _Laser(scan)
+            self._by_frame[scan.frame] = known
+        return known
+
+    @property
+    def warnings(self) -> dict[str, str]:
+        """What the lasers or their drivers do otherwise than REP 117, by kind."""
+        lasers = self._by_frame.values()
+        return of_lasers({laser.first.frame: laser.monitor.warnings for laser in lasers})
+
+
 class ScanOdometrySynchronizer:
     """Interpolates odometry at the stamp of each scan, in the order of the scans.
 
-    A scan waits until newer odometry has arrived. One that the laser did not measure is blind (see
-    `LaserMonitor`). Live nodes and replay use it alike, so that both process the same pairs.
+    A scan waits until newer odometry has arrived; those of several lasers do so in the order of
+    their stamps. One that the laser did not measure is blind (see `LaserMonitor`). Live nodes and
+    replay use it alike, so that both process the same pairs.
     """
 
     def __init__(self, capacity: int = 20) -> None:
+        """capacity: scans of a laser that may wait."""
         self._buffer = OdometryBuffer(max_gap_ns=MAX_ODOMETRY_GAP_NS)
-        self._laser = LaserMonitor()
-        self._timing = SweepTiming()
+        self._lasers = Lasers()
         self._silence_s = 0.0  # since the last scan
-        self._waiting: deque[Scan] = deque()
+        self._waiting: list[Scan] = []
         self._capacity = capacity
         self.dropped = 0
 
@@ -181,8 +226,8 @@ class ScanOdometrySynchronizer:
 
     @property
     def warnings(self) -> dict[str, str]:
-        """What the laser or its driver do otherwise than REP 117, by kind."""
-        return self._laser.warnings
+        """What the lasers or their drivers do otherwise than REP 117, by kind."""
+        return self._lasers.warnings
 
     @property
     def waiting(self) -> int:
@@ -199,27 +244,41 @@ class ScanOdometrySynchronizer:
 
     def add_scan(self, scan: Scan) -> list[tuple[Scan, Array]]:
         """Add a scan; returns the scans that are ready now, each with its T_odom_base (3,)."""
+        own = [waiting for waiting in self._waiting if waiting.frame == scan.frame]
         # A scan with a stamp more than a second ahead would block all later ones.
-        while self._waiting and self._waiting[-1].stamp_ns > scan.stamp_ns + SECOND_NS:
-            self._waiting.pop()
-            self.dropped += 1
-        self._timing.add(scan)
-        self._waiting.append(scan)
-        if len(self._waiting) > self._capacity:
-            self._waiting.popleft()
-            self.dropped += 1
+        while own and own[-1].stamp_ns > scan.stamp_ns + SECOND_NS:
+            self._drop(own.pop())
+        if len(own) >= self._capacity:
+            self._drop(own[0])
+        self._lasers.of(scan).timing.add(scan)
+        self._waiting.insert(self._place(scan), scan)
         return self._ready()
 
     def finish(self) -> list[tuple[Scan, Array]]:
         """Scans at the end of a log, for whose last beams the odometry has ended."""
         ready = []
+        waiting = []
         for scan in self._waiting:
             T_odom_base = self._buffer.interpolate(scan.stamp_ns)
-            if T_odom_base is not None:
+            if T_odom_base is None:
+                waiting.append(scan)
+            else:
                 ready.append(self._complete(scan, T_odom_base))
-        paired = {scan.stamp_ns for scan, _ in ready}
-        self._waiting = deque(scan for scan in self._waiting if scan.stamp_ns not in paired)
+        self._waiting = waiting
         return ready
+
+    def _place(self, scan: Scan) -> int:
+        """Where a scan belongs among those that wait: before later ones of other lasers."""
+        place = len(self._waiting)
+        for waiting in reversed(self._waiting):
+            if waiting.frame == scan.frame or waiting.stamp_ns <= scan.stamp_ns:
+                break
+            place -= 1
+        return place
+
+    def _drop(self, scan: Scan) -> None:
+        self._waiting.remove(scan)
+        self.dropped += 1
 
     def _ready(self) -> list[tuple[Scan, Array]]:
         ready = []
@@ -231,26 +290,27 @@ class ScanOdometrySynchronizer:
                 T_odom_base is None and scan.stamp_ns > latest
             ):
                 break
-            self._waiting.popleft()
             if T_odom_base is None:
-                self.dropped += 1
-            else:
-                ready.append(self._complete(scan, T_odom_base))
+                self._drop(scan)
+                continue
+            self._waiting.pop(0)
+            ready.append(self._complete(scan, T_odom_base))
         return ready
 
     def _complete(self, scan: Scan, T_odom_base: Array) -> tuple[Scan, Array]:
         scan = replace(scan, odometry_silence_s=self._silence_s)
         self._silence_s = 0.0
-        checked = self._laser.checked(scan, T_odom_base)
+        checked = self._lasers.of(scan).monitor.checked(scan, T_odom_base)
         return self._deskewed(checked), T_odom_base
 
     def _needed_until(self, scan: Scan) -> int:
         """Time until which a scan needs odometry, ns."""
-        return scan.end_ns if self._timing.is_plausible(scan) else scan.stamp_ns
+        is_plausible = self._lasers.of(scan).timing.is_plausible(scan)
+        return scan.end_ns if is_plausible else scan.stamp_ns
 
     def _deskewed(self, scan: Scan) -> Scan:
         """The scan with all beams at its stamp, if their times and the motion are known."""
-        if scan.is_blind or not self._timing.is_plausible(scan):
+        if scan.is_blind or not self._lasers.of(scan).timing.is_plausible(scan):
             return scan
         sweep = self._buffer.between(scan.begin_ns, scan.end_ns)
         return scan if sweep is None else deskewed(scan, *sweep)
