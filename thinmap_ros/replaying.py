@@ -11,14 +11,20 @@ from typing import Any, Protocol
 import numpy as np
 
 from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import Scan, laser_names
 from thinmap_ros.core.se2 import Array, path_length_m
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.core.topology.segmentation import RegionConfig
 from thinmap_ros.kernels import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.logs.log import Log
-from thinmap_ros.logs.reading import WAITING_SCANS, UnusedScans, complete_scans, recording_events
+from thinmap_ros.logs.reading import (
+    WAITING_SCANS,
+    SilentLasers,
+    UnusedScans,
+    complete_scans,
+    recording_events,
+)
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.run_folder import RunResult, Trajectory, write_report, write_run
@@ -35,15 +41,23 @@ class ScanCounts:
     """
 
     without_odometry: dict[str, int] = field(default_factory=dict)
-    blind: Counter[str] = field(default_factory=Counter)
     lost: int = 0
     apart: int = 0
     records: Counter[str] = field(default_factory=Counter)
+    _blind: dict[str, Counter[str]] = field(default_factory=dict)  # by the frame of the laser
 
-    def add(self, estimate: Estimate) -> None:
-        """Count the estimate of a scan."""
+    @property
+    def blind(self) -> Counter[str]:
+        """Number of blind scans by reason."""
+        names = laser_names(self._blind.keys())
+        counts = ((names[frame], own.items()) for frame, own in self._blind.items())
+        return Counter({name + text: count for name, own in counts for text, count in own})
+
+    def add(self, estimate: Estimate, frame: str) -> None:
+        """Count the estimate of a scan of the laser of a frame."""
+        blind = self._blind.setdefault(frame, Counter())
         if estimate.blind_reason:
-            self.blind[estimate.blind_reason] += 1
+            blind[estimate.blind_reason] += 1
         elif estimate.is_lost:
             self.lost += 1
             self.apart += estimate.is_mapping_apart
@@ -119,21 +133,23 @@ def replay(
         result.pipeline.load_session(continued)
     pairing = ScanOdometrySynchronizer(WAITING_SCANS)
     unused = UnusedScans()
+    lasers = SilentLasers()
     tidy_up = compiler_memory_releaser()
     with _errors_kept(result, keep_partial), ProgressBar('replay', not show_progress) as bar:
         expected = None
         for number, event in enumerate(recording_events(log)):
             unused.add(event)
-            for stamp_ns in _process(result, complete_scans(pairing, event), watcher):
-                unused.pair(stamp_ns)
+            lasers.add(event)
+            for scan in _process(result, complete_scans(pairing, event), watcher):
+                unused.pair(scan.stamp_ns, scan.frame)
             tidy_up()
             if show_progress:
                 # Of a bag it is known once the bag has been opened.
                 expected = log.expected_scans if number == 0 else expected
                 _show(bar, len(result.poses), expected)
     with _errors_kept(result, keep_partial):
-        for stamp_ns in _process(result, pairing.finish(), watcher):
-            unused.pair(stamp_ns)
+        for scan in _process(result, pairing.finish(), watcher):
+            unused.pair(scan.stamp_ns, scan.frame)
         result.pipeline.finish()
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
@@ -141,7 +157,7 @@ def replay(
     result.counts.records = log.skipped.reasons
     result.notes = log.skipped.notes
     result.warnings = [*pairing.warnings.values(), *result.pipeline.warnings]
-    result.warnings += _jump_warnings(result.odometry_jumps)
+    result.warnings += [*_jump_warnings(result.odometry_jumps), *lasers.warnings()]
     if not result.poses:
         reasons = '; '.join(result.counts.unpaired())
         raise InputError(
@@ -182,19 +198,19 @@ def _errors_kept(result: Replay, keep_partial: bool) -> Iterator[None]:
 
 def _process(
     result: Replay, ready: list[tuple[Scan, Array]], watcher: Watcher | None
-) -> Iterator[int]:
-    """Process scans with their odometry poses (3,); yields the stamp of each."""
+) -> Iterator[Scan]:
+    """Process scans with their odometry poses (3,); yields each."""
     for scan, T_odom_base in ready:
         step = result.pipeline.step(scan, T_odom_base)
         result.stamps_ns.append(scan.stamp_ns)
         result.poses.append(step.estimate.T_map_base)
         result.local_features.append(step.estimate.n_local_features)
-        result.counts.add(step.estimate)
+        result.counts.add(step.estimate, scan.frame)
         if step.estimate.odometry_discontinuity:
             result.odometry_jumps.append(step.estimate.odometry_discontinuity)
         if watcher is not None:
             watcher.step(scan, T_odom_base, step.estimate, result.pipeline)
-        yield scan.stamp_ns
+        yield scan
 
 
 def write_outputs(

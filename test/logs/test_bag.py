@@ -183,6 +183,55 @@ def test_topics_are_chosen_or_asked_for(tmp_path: Path) -> None:
         read(path, scan_topic='/front')
 
 
+def two_lasers(writer: BagWriter, make: Maker, rear: int = 3) -> None:
+    """Both measure at the same times, the rear one `rear` times; its messages are 60 ms late."""
+    for frame, x in (('front', 0.2), ('rear', -0.2)):
+        writer.write(
+            '/tf_static', TF, 1, make.transform('base_link', frame, (x, 0.0, 0.3), UPRIGHT)
+        )
+    for i in range(3):
+        ns = 10**9 + i * 2 * 10**8
+        writer.write('/odom', ODOMETRY, ns, make.odometry(ns, 0.1 * i))
+        writer.write('/front/scan', SCAN, ns + 1, make.scan(ns, RANGES, 'front'))
+        ranges = RANGES if i < rear else []
+        late_ns = ns + 6 * 10**7
+        writer.write('/rear/scan', SCAN, late_ns, make.scan(ns, ranges, 'rear'))
+
+
+BOTH = ('/front/scan', '/rear/scan')
+
+
+def test_each_scan_of_several_lasers_is_one_of_its_own(tmp_path: Path) -> None:
+    log = BagLog(write(tmp_path / 'bag', two_lasers), BOTH)
+    found = scans(list(log.events()))
+    assert [scan.frame for scan in found] == ['front', 'rear'] * 3
+    assert [scan.T_base_laser[0] for scan in found] == [0.2, -0.2] * 3
+    assert log.expected_scans == 6 and log.skipped.notes == []
+
+
+def test_a_topic_without_usable_scans_is_named_and_the_others_are_used(tmp_path: Path) -> None:
+    path = write(tmp_path / 'bag', lambda writer, make: two_lasers(writer, make, rear=0))
+    log = BagLog(path, BOTH)
+    assert [scan.frame for scan in scans(list(log.events()))] == ['front'] * 3
+    assert log.skipped.notes == ['/rear/scan: no usable message: mapped by the other lasers']
+    with pytest.raises(InputError, match=r'/rear/scan: no usable message: .*0 beams'):
+        read(path, scan_topic=('/rear/scan', '/rear/scan'))
+    with pytest.raises(InputError, match=r'no laser scans \(/x\)'):
+        read(path, scan_topic=('/front/scan', '/x'))
+
+
+def test_what_is_asked_of_several_lasers(tmp_path: Path) -> None:
+    path = write(tmp_path / 'bag', two_lasers)
+    with pytest.raises(
+        InputError, match='several topics: give those of several lasers, or choose one of /front'
+    ):
+        read(path)
+    with pytest.raises(InputError, match='one pose for the lasers of /front/scan, /rear/scan: exp'):
+        read(path, scan_topic=BOTH, T_base_laser=np.zeros(3))
+    one = read(path, scan_topic='/rear/scan', T_base_laser=np.zeros(3))
+    assert len(scans(one)) == 3
+
+
 def without_odometry(writer: BagWriter, make: Maker) -> None:
     writer.write('/scan', SCAN, 5, make.scan(5, RANGES))
 

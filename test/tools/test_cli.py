@@ -1,6 +1,7 @@
 """Common behaviour of all command line programs."""
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from thinmap_ros.logs.log import LaserOptions, Log
 from thinmap_ros.logs.readers.bag import BagLog
 from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.arguments import Parser
 
 
 @pytest.fixture(autouse=True)
@@ -104,7 +106,29 @@ def test_logs_and_bags_are_told_apart(tmp_path: Path) -> None:
     assert isinstance(opened('a.mcap'), BagLog)
     bag = opened(str(tmp_path), '--scan-topic', '/front', '--base-frame', 'base')
     assert isinstance(bag, BagLog)
-    assert (bag.scan_topic, bag.base_frame, bag.T_base_laser) == ('/front', 'base', None)
+    assert (bag.scan_topic, bag.base_frame, bag.T_base_laser) == (('/front',), 'base', None)
+
+
+def test_several_scan_topics_are_those_of_several_lasers(tmp_path: Path) -> None:
+    bag = opened(str(tmp_path), '--scan-topic', '/front', '/rear')
+    assert isinstance(bag, BagLog) and bag.scan_topic == ('/front', '/rear')
+
+
+@pytest.mark.parametrize(
+    ('given', 'topics'), [(['/front'], ['/front']), (['/front', '/rear'], ['/front', '/rear'])]
+)
+def test_a_bag_may_follow_the_scan_topics(
+    tmp_path: Path, given: list[str], topics: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[argparse.Namespace] = []
+    words = ['replay', '--scan-topic', *given, str(tmp_path), '--odom-topic', '/odom']
+    monkeypatch.setattr(sys, 'argv', words)
+    parser = Parser('replay', '')
+    parser.add_argument('logs', type=Path, nargs='+')
+    cli.add_log_options(parser)
+    cli.run(found.append, parser)
+    assert (found[0].logs, found[0].scan_topic) == ([tmp_path], topics)
+    assert found[0].odom_topic == '/odom'
 
 
 @pytest.mark.parametrize(('word', 'offset'), [('--offset-m=0.78', 0.78), ('--offset-m=0', 0.0)])

@@ -125,7 +125,7 @@ class LogOptions:
     """
 
     carmen: LaserOptions = field(default_factory=LaserOptions)
-    scan_topic: str = ''
+    scan_topic: str | tuple[str, ...] = ''
     odometry_topic: str = ''
     T_base_laser: Array | None = None
     base_frame: str = ''

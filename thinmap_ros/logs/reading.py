@@ -4,7 +4,7 @@ import dataclasses
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import config_or_default
-from thinmap_ros.core.errors import InputError, pose_of, quoted
+from thinmap_ros.core.errors import InputError, pose_of, quoted, quoted_name
 from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS
-from thinmap_ros.core.scan import LaserConfig, Scan
+from thinmap_ros.core.scan import LaserConfig, Scan, laser_names
 from thinmap_ros.core.se2 import CLOCK_JUMP_NS, SECOND_NS, Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.files.safe import path_of
@@ -33,6 +33,7 @@ from thinmap_ros.logs.log import (
 _STEPS = 3
 _REST_M = 0.02
 _REST_RAD = 0.02
+_SILENT_PERIODS = 3.0  # of a laser: a message or two may be lost
 
 
 class ClockJumpError(InputError):
@@ -260,7 +261,7 @@ WAITING_SCANS = 200
 def open_log(
     path: Path | str,
     laser: LaserOptions | None = None,
-    scan_topic: str = '',
+    scan_topic: str | Sequence[str] = '',
     odometry_topic: str = '',
     T_base_laser: Array | None = None,
     base_frame: str = '',
@@ -273,14 +274,14 @@ def open_log(
 
     laser describes the laser of a CARMEN log; T_base_laser (3,): the laser on the robot, None for
     that of the log; laser_config: parameters of the laser. For a bag: scan_topic and
-    odometry_topic, empty for the only topic of their type; base_frame and odom_frame, empty for
-    those of the bag; odometry_source: topic, tf or none, empty for topic, or tf without one. The
-    log is read when its events are. Raises InputError for a path of no known format, and for a
-    source that a CARMEN log does not have.
+    odometry_topic, empty for the only topic of their type; several scan topics for several lasers;
+    base_frame and odom_frame, empty for those of the bag; odometry_source: topic, tf or none, empty
+    for topic, or tf without one. The log is read when its events are. Raises InputError for a path
+    of no known format, and for a source that a CARMEN log does not have.
     """
     options = LogOptions(
         config_or_default(laser, LaserOptions),
-        scan_topic,
+        scan_topic if isinstance(scan_topic, str) else tuple(scan_topic),
         odometry_topic,
         None if T_base_laser is None else pose_of('T_base_laser', T_base_laser),
         base_frame,
@@ -334,22 +335,30 @@ class UnusedScans:
 
     def __init__(self) -> None:
         self._odometry: list[int] = []
-        self._unused: Counter[int] = Counter()
+        self._unused: dict[str, Counter[int]] = {}  # stamps, by the frame of the laser
 
     def add(self, event: Event) -> None:
         """Add an event of the log."""
         if isinstance(event, OdometryEvent):
             self._odometry.append(event.stamp_ns)
         else:
-            self._unused[event.scan.stamp_ns] += 1
+            self._unused.setdefault(event.scan.frame, Counter())[event.scan.stamp_ns] += 1
 
-    def pair(self, stamp_ns: int) -> None:
-        """A scan with this stamp was paired."""
-        self._unused[stamp_ns] -= 1
+    def pair(self, stamp_ns: int, frame: str = '') -> None:
+        """A scan with this stamp, of the laser of a frame, was paired."""
+        self._unused[frame][stamp_ns] -= 1
 
     def reasons(self) -> dict[str, int]:
-        """Number of unused scans by reason."""
-        scans = np.array(sorted(self._unused.elements()), dtype=np.int64)
+        """Number of unused scans by reason, of each laser where there are several."""
+        names = laser_names(self._unused.keys(), 'of {} ')
+        return {
+            names[frame] + text: count
+            for frame, own in self._unused.items()
+            for text, count in self._reasons(own).items()
+        }
+
+    def _reasons(self, unused: Counter[int]) -> dict[str, int]:
+        scans = np.array(sorted(unused.elements()), dtype=np.int64)
         odometry = np.array(sorted(self._odometry), dtype=np.int64)
         if not (scans.size and odometry.size):
             return {'without any odometry': scans.size} if scans.size else {}
@@ -373,6 +382,47 @@ class UnusedScans:
         }
         rest = scans.size - sum(found.values())
         return found | ({'too late, or with a stamp ahead of later ones': rest} if rest else {})
+
+
+class SilentLasers:
+    """Which of several lasers of a log was silent while another one measured."""
+
+    def __init__(self) -> None:
+        self._stamps: dict[str, list[int]] = {}
+
+    def add(self, event: Event) -> None:
+        """Add an event of the log."""
+        if isinstance(event, ScanEvent):
+            self._stamps.setdefault(event.scan.frame, []).append(event.scan.stamp_ns)
+
+    def warnings(self) -> list[str]:
+        """A line on the longest silence of each laser that had one."""
+        return [text for frame in self._stamps if (text := self._silence(frame))]
+
+    def _silence(self, frame: str) -> str:
+        own = np.sort(self._stamps[frame])
+        others = np.sort([ns for f, stamps in self._stamps.items() if f != frame for ns in stamps])
+        if not others.size:
+            return ''
+        steps = np.diff(others, prepend=others[0])
+        steps[steps > _longest_ns(others)] = 0  # the others were silent, too
+        before = np.searchsorted(own, others)  # own scans before each of the others
+        steps[np.diff(before, prepend=before[0]) > 0] = 0
+        silent_ns = np.bincount(before, steps)
+        most = int(silent_ns.argmax())
+        if silent_ns[most] <= _longest_ns(own):
+            return ''
+        since_s = (others[before == most][0] - min(own[0], others[0])) / SECOND_NS
+        return (
+            f'{quoted_name(frame)}: no scan for {silent_ns[most] / SECOND_NS:.1f} s, from '
+            f'{since_s:.1f} s on, while another laser measured'
+        )
+
+
+def _longest_ns(stamps: NDArray[np.int64]) -> float:
+    """Longest time between two scans of a laser that measures, by its sorted stamps (N,), ns."""
+    usual_ns = float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
+    return max(SECOND_NS, _SILENT_PERIODS * usual_ns)
 
 
 def _gaps(odometry: NDArray[np.int64], scans: NDArray[np.int64]) -> NDArray[np.int64]:

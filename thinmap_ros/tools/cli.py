@@ -24,6 +24,7 @@ from thinmap_ros.tools.arguments import BAD_INPUT
 from thinmap_ros.tools.parameter_file import NodeParameters
 
 _INTERRUPTED = 130
+_TOPICS = '--scan-topic'
 _NO_PARAMETERS = NodeParameters()
 # argparse's base class of parsers and groups of options.
 Options = argparse._ActionsContainer
@@ -34,7 +35,7 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
 
     0, 2 after one line on what is wrong, or 130 on Ctrl-C.
     """
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(_files_first(sys.argv[1:]))
     _print_warnings(parser.prog)
     compilation = report_compilation()
     try:
@@ -48,6 +49,17 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
         sys.exit(_INTERRUPTED)
     finally:
         compilation.end()
+
+
+def _files_first(words: list[str]) -> list[str]:
+    """The words of a command line, where files behind a scan topic come before the options."""
+    if _TOPICS not in words:
+        return words
+    begin = words.index(_TOPICS) + 2
+    end = next((k for k in range(begin, len(words)) if words[k].startswith('-')), len(words))
+    files = [word for word in words[begin:end] if Path(word).exists()]
+    topics = [word for word in words[begin:end] if word not in files]
+    return [*files, *words[:begin], *topics, *words[end:]]
 
 
 def _print_warnings(program: str) -> None:
@@ -136,7 +148,11 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     )
     add_config(parser, LaserConfig)
     parser.add_argument(
-        '--scan-topic', default='', help='bag: topic of the scans, if there are several'
+        '--scan-topic',
+        default='',
+        nargs='+',
+        metavar='TOPIC',
+        help='bag: topic of the scans, if there are several; those of several lasers',
     )
     parser.add_argument(
         '--odom-topic', default='', help='bag: topic of the odometry, if there are several'

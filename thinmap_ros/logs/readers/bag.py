@@ -204,6 +204,7 @@ def _storage_of(path: Path) -> Storage:
 class BagLog:
     """Scans and odometry of a bag. Empty topic name: the only topic of that type, /scan or /odom.
 
+    scan_topic: one, or those of several lasers.
     T_base_laser (3,): pose of the laser on the robot; None: from the transforms. base_frame,
     odom_frame: frames of robot and odometry; empty: those of the bag (see `BagFrames`).
     odometry_source: topic, tf or none as for the nodes; empty: the topic, or tf without one.
@@ -211,7 +212,7 @@ class BagLog:
     """
 
     path: Path
-    scan_topic: str = ''
+    scan_topic: str | tuple[str, ...] = ''
     odometry_topic: str = ''
     T_base_laser: Array | None = None
     base_frame: str = ''
@@ -226,7 +227,7 @@ class BagLog:
         """Odometry and scans in the order of the log. Unusable messages are skipped and counted.
 
         Raises InputError if the bag has no scans or no odometry (with the list of its topics), or
-        if the laser pose is unknown.
+        if the laser pose is unknown, or given for lasers on several topics.
         """
         bag = Bag(self.path)
         self.skipped = SkippedRecords()
@@ -238,26 +239,32 @@ class BagLog:
             raise
 
     def _events(self, bag: Bag) -> Iterator[Event]:
-        scan_topic = self._topic(bag, SCAN, self.scan_topic, 'laser scans')
-        self.expected_scans = bag.message_count(scan_topic)
+        scan_topics = self._scan_topics(bag)
+        counts = [bag.message_count(topic) for topic in scan_topics]
+        self.expected_scans = None if None in counts else sum(filter(None, counts))
         frames = BagFrames(
             bag, FrameOptions(self.T_base_laser, self.base_frame, self.odom_frame), self.skipped
         )
         odometry = self._odometry(bag, frames)
         used = Counter[str]()
-        for message in bag.messages({scan_topic, *odometry.topics}):
+        for message in bag.messages({*scan_topics, *odometry.topics}):
             for event in self._of_message(bag, message, frames, odometry):
-                used[scan_topic if isinstance(event, ScanEvent) else odometry.name] += 1
+                used[message.topic if isinstance(event, ScanEvent) else odometry.name] += 1
                 yield event
         if bag.repair_hint:
             self.skipped.add_first(bag.repair_hint)
         if bag.note:
             self.skipped.note(bag.note)
-        for name in (scan_topic, odometry.name):
-            if used[name] == 0:
+        for names in (scan_topics, [odometry.name]):
+            unused = [name for name in names if used[name] == 0]
+            if unused == names:
                 first = f': {self.skipped.first}' if self.skipped.first else odometry.missing
                 raise InputError(
-                    f'{self.path}: {errors.quoted_name(name)}: no usable message{first}'
+                    f'{self.path}: {errors.quoted_names(unused)}: no usable message{first}'
+                )
+            for name in unused:
+                self.skipped.note(
+                    f'{errors.quoted_name(name)}: no usable message: mapped by the other lasers'
                 )
 
     def _of_message(
@@ -294,6 +301,18 @@ class BagLog:
         topic = self._topic(bag, _ODOMETRY, self.odometry_topic, 'odometry')
         return OdometryOnTopic(topic, frames.of_odometry(topic))
 
+    def _scan_topics(self, bag: Bag) -> list[str]:
+        """The topics of the lasers."""
+        wanted = (self.scan_topic,) if isinstance(self.scan_topic, str) else self.scan_topic
+        found = [self._topic(bag, SCAN, topic, 'laser scans') for topic in wanted]
+        topics = list(dict.fromkeys(found))
+        if len(topics) > 1 and self.T_base_laser is not None:
+            raise InputError(
+                f'{self.path}: one pose for the lasers of {errors.quoted_names(topics)}: expected '
+                'their poses on /tf_static'
+            )
+        return topics
+
     def _topic(self, bag: Bag, type_name: str, wanted: str, what: str) -> str:
         found = sorted(topic for topic, name in bag.topics.items() if name == type_name)
         if wanted and wanted in found:
@@ -311,7 +330,8 @@ class BagLog:
             )
             raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {has}')
         names = errors.quoted_names(found)
-        raise InputError(f'{self.path}: {what} on several topics: choose one of {names}')
+        several = 'give those of several lasers, or ' if type_name == SCAN else ''
+        raise InputError(f'{self.path}: {what} on several topics: {several}choose one of {names}')
 
 
 def _log(path: Path, options: LogOptions) -> Log:
