@@ -53,14 +53,82 @@ def test_messages_of_a_ros1_bag_are_those_of_ros2(tmp_path: Path) -> None:
     assert not hasattr(scan.header, 'seq'), 'its bytes are not those of a ROS 2 message'
 
 
-@pytest.mark.parametrize('share', [0.0, 0.3, 0.6, 0.99])
-def test_a_ros1_bag_that_was_cut_off_is_refused_in_one_line(tmp_path: Path, share: float) -> None:
+@pytest.mark.parametrize('share', [0.0, 0.1])
+def test_a_ros1_bag_that_was_cut_off_before_its_messages_is_refused_in_one_line(
+    tmp_path: Path, share: float
+) -> None:
     whole = converted(write(tmp_path / 'bag.mcap', drive), tmp_path / 'old.bag').read_bytes()
     cut = tmp_path / 'cut.bag'
     cut.write_bytes(whole[: 13 + int(share * (len(whole) - 13))])
     with pytest.raises(InputError, match=r'cut\.bag: ROS 1 bag: .*`rosbag reindex`') as error:
         list(open_log(cut).events())
     assert '\n' not in str(error.value)
+
+
+# In the header of each chunk, after the sizes of the header and of this field.
+CHUNK_MARK = b'op=\x05'
+
+
+@pytest.fixture(scope='module', params=['', 'bz2', 'lz4'])
+def chunked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drive as a ROS 1 bag of several chunks, beside the same as an MCAP file."""
+    folder = tmp_path_factory.mktemp('chunked')
+    source = write(folder / 'bag.mcap', lambda writer, make: drive(writer, make, 60))
+    return converted(source, folder / 'old.bag', request.param, chunk_bytes=3000)
+
+
+def read_to_the_cut(path: Path, whole: Path) -> int:
+    """Number of events of a cut bag, which are the first ones of the whole bag."""
+    log = open_log(path)
+    found = list(log.events())
+    assert_equal(found, list(BagLog(whole.with_name('bag.mcap')).events())[: len(found)])
+    hint = f'{path}: cut off: only the intact part is read; `rosbag reindex {path}` of ROS 1'
+    assert log.skipped.first == f'{hint} repairs it'
+    return len(found)
+
+
+@pytest.mark.parametrize('share', [0.7, 0.8, 0.9, 0.99, 0.9999])
+def test_a_ros1_bag_is_read_up_to_where_it_was_cut_off(
+    tmp_path: Path, chunked: Path, share: float
+) -> None:
+    data = chunked.read_bytes()
+    end = int(share * len(data))
+    assert data.count(CHUNK_MARK) > 4
+    index_at = int.from_bytes(data.partition(b'index_pos=')[2][:8], 'little')
+    cut = tmp_path / 'cut.bag'
+    cut.write_bytes(data[:end])
+    events = len(list(BagLog(chunked).events()))
+    messages_share = (end - 4109) / (index_at - 4109)
+    assert read_to_the_cut(cut, chunked) >= 0.9 * min(messages_share, 1.0) * events - 10
+
+
+def test_a_ros1_bag_is_read_up_to_the_end_of_a_chunk_where_it_was_cut_off(
+    tmp_path: Path, chunked: Path
+) -> None:
+    data = chunked.read_bytes()
+    third = [at for at in range(len(data)) if data.startswith(CHUNK_MARK, at)][3] - 8
+    cut = tmp_path / 'cut.bag'
+    cut.write_bytes(data[:third])
+    assert read_to_the_cut(cut, chunked) > 3
+
+
+def test_a_ros1_bag_that_was_not_closed_is_read(tmp_path: Path) -> None:
+    """The recorder was killed: no index, and the size of the last chunk is 0."""
+    source = write(tmp_path / 'bag.mcap', lambda writer, make: drive(writer, make, 40))
+    whole = converted(source, tmp_path / 'old.bag')
+    data = bytearray(whole.read_bytes())
+    at = data.index(b'index_pos=') + len(b'index_pos=')
+    chunk_end = int.from_bytes(data[at : at + 8], 'little')
+    data[at : at + 8] = bytes(8)
+    header_at = data.index(CHUNK_MARK) - 8
+    size_at = header_at + 4 + int.from_bytes(data[header_at : header_at + 4], 'little')
+    chunk_bytes = int.from_bytes(data[size_at : size_at + 4], 'little')
+    data[size_at : size_at + 4] = bytes(4)
+    active = tmp_path / 'old.bag.active'
+    active.write_bytes(data[: size_at + 4 + chunk_bytes - 7])
+    assert size_at + 4 + chunk_bytes < chunk_end
+    expected = len(list(BagLog(source).events()))
+    assert read_to_the_cut(active, whole) == expected - 1
 
 
 @pytest.mark.parametrize('compression', ['bz2', 'lz4'])

@@ -36,13 +36,23 @@ def ros1_bag(path: Path) -> None:
         writer.write(connection, 10**9, typestore.serialize_ros1(scan, scan.__msgtype__))
 
 
-def converted(source: Path, target: Path, compression: str = '', tf_type: str = NEW_TF) -> Path:
-    """A bag of ROS 2 as one of ROS 1; compression: bz2 or lz4; tf_type: that of transforms."""
+def converted(
+    source: Path,
+    target: Path,
+    compression: str = '',
+    tf_type: str = NEW_TF,
+    chunk_bytes: int = 1 << 20,
+) -> Path:
+    """A bag of ROS 2 as one of ROS 1; compression: bz2 or lz4; tf_type: that of transforms.
+
+    chunk_bytes: size from which on a chunk ends.
+    """
     typestore = get_typestore(Stores.ROS1_NOETIC)
     for name in (NEW_TF, OLD_TF):
         typestore.register(get_types_from_msg(_TF, name))
     new = get_typestore(Stores.ROS2_JAZZY)
     writer = Writer(target)
+    writer.chunk_threshold = chunk_bytes
     if compression:
         writer.set_compression(Writer.CompressionFormat[compression.upper()])
     connections = {}

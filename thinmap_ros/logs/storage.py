@@ -6,11 +6,13 @@ Also the message types that a file defines.
 import bz2
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory, TemporaryFile
-from typing import IO, Any, cast
+from typing import IO, Any, BinaryIO, cast
 
 import zstandard
 from mcap.records import Channel, Schema
@@ -27,7 +29,15 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag1 import Reader
-from rosbags.rosbag1.reader import decompressors
+from rosbags.rosbag1.reader import (
+    Chunk,
+    Header,
+    IndexData,
+    ReaderError,
+    RecordType,
+    decompressors,
+    read_uint32,
+)
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -288,6 +298,7 @@ class Storage(ABC):
     """
 
     has_messages = True
+    repair = '`bag_repair {}` writes a repaired bag'  # of a damaged file; '' where nothing does
 
     def __init__(self) -> None:
         self.damage = Damage()
@@ -337,6 +348,8 @@ class McapStorage(Storage):
 
 class SqliteStorage(Storage):
     """An SQLite file of a rosbag2 folder; it defines all of its types together."""
+
+    repair = ''
 
     def __init__(self, path: Path) -> None:
         """Raises InputError if it cannot be opened."""
@@ -448,39 +461,149 @@ def _parsed(name: str, encoding: str, text: str) -> Typestore:
 _HEADER = 'std_msgs/msg/Header'
 _TIMES = ('builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
 # Types of ROS 1 that have another name in ROS 2.
+_LONGEST_MAGIC = 64
 _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
+
+
+@dataclass(frozen=True, eq=False)
+class _Ros1Index:
+    """Chunks of a ROS 1 bag, and its connections with their messages, as rosbags describes them."""
+
+    connections: list[Connection] = field(default_factory=list)
+    chunks: dict[int, Chunk] = field(default_factory=dict)
+    messages: dict[int, list[IndexData]] = field(default_factory=dict)
+
+
+class _IndexedReader(Reader):
+    """A reader with a given index."""
+
+    def __init__(self, path: Path, index: _Ros1Index) -> None:
+        super().__init__(path)
+        self._index = index
+
+    def open(self) -> None:
+        """Open the bag; nothing of it is read."""
+        self.bio = self.path.open('rb')
+        self.connections = list(self._index.connections)
+        self.chunks = dict(self._index.chunks)
+        self.indexes = dict(self._index.messages)
+
+
+def _ros1_index(path: Path) -> _Ros1Index:
+    """Index of a ROS 1 bag, from its chunks: a recorder writes the index when it ends.
+
+    The last chunk may be cut off, or without its size, as of a recorder that was killed.
+    """
+    index = _Ros1Index()
+    size = path.stat().st_size
+    with open_regular_file(path) as stream:
+        stream.readline(_LONGEST_MAGIC)
+        for at, header, length in _ros1_records(stream, size):
+            if header.get_uint8('op') != RecordType.CHUNK:
+                continue
+            data_at = stream.tell()
+            left = size - data_at
+            unpack = _bounded(decompressors.get(header.get_string('compression'), bytes))
+            chunk = Chunk(min(length or left, left, LOGS.chunk_bytes), data_at, unpack)
+            index.chunks[at] = chunk
+            with suppress(Exception):  # rosbags raises many types for corrupt records
+                _add_chunk(index, at, unpack(stream.read(chunk.datasize)))
+            if length == 0:
+                break
+    counts = {number: len(messages) for number, messages in index.messages.items()}
+    index.connections[:] = [c._replace(msgcount=counts.get(c.id, 0)) for c in index.connections]
+    for messages in index.messages.values():
+        messages.sort()
+    return index
+
+
+def _add_chunk(index: _Ros1Index, at: int, content: bytes) -> None:
+    """Add the whole records of a chunk at a byte of the file."""
+    reader = Reader('/dev/null')
+    reader.bio = BytesIO(content)
+    known = {connection.id for connection in index.connections}
+    for offset, header, length in _ros1_records(reader.bio, len(content)):
+        kind = header.get_uint8('op')
+        if reader.bio.tell() + length > len(content):
+            break
+        if kind == RecordType.CONNECTION and header.get_uint32('conn') not in known:
+            reader.bio.seek(offset)
+            index.connections.append(reader.read_connection())
+            known.add(index.connections[-1].id)
+        elif kind == RecordType.MSGDATA and header.get_uint32('conn') in known:
+            number = header.get_uint32('conn')
+            entry = IndexData(header.get_time('time'), at, offset)
+            index.messages.setdefault(number, []).append(entry)
+
+
+def _ros1_records(stream: BinaryIO, size: int) -> Iterator[tuple[int, Header, int]]:
+    """First byte, header and length of the data of each record, with the stream at the data.
+
+    Up to the end, or to bytes that are no record.
+    """
+    at = stream.tell()
+    while at < size:
+        stream.seek(at)
+        try:
+            if read_uint32(stream) > PIECE_BYTES:
+                return
+            stream.seek(at)
+            header = Header.read(stream)
+            length = read_uint32(stream)
+            header.get_uint8('op')
+        except (ReaderError, ValueError):
+            return
+        data_at = stream.tell()
+        yield at, header, length
+        at = data_at + length
 
 
 class Ros1Storage(Storage):
     """A ROS 1 bag, read by rosbags, with messages of ROS 2.
 
-    Topics whose types ROS 2 does not have, or defines otherwise, are left out.
+    Topics whose types ROS 2 does not have, or defines otherwise, are left out. One without an
+    index is read up to where it was cut off.
     """
+
+    repair = '`rosbag reindex {}` of ROS 1 repairs it'
 
     def __init__(self, path: Path) -> None:
         """Raises InputError if it cannot be opened."""
         super().__init__()
         self._path = path
+        self._index: _Ros1Index | None = None
         try:
-            with Reader(path) as reader:
-                for connection in reader.connections:
-                    type_name = _type_of(connection)
-                    if type_name:
-                        topic = connection.topic
-                        self.topics[topic] = type_name
-                        count = self.message_counts.get(topic, 0) + connection.msgcount
-                        self.message_counts[topic] = count
+            self._read_topics()
         except Exception as error:  # rosbags raises many types for corrupt files
-            raise InputError(
-                f'{path}: ROS 1 bag: {one_line_reason(error)}: `rosbag reindex` of ROS 1 repairs a '
-                'bag that was cut off'
-            ) from error
+            self._index = _ros1_index(path)
+            self._read_topics()
+            self.damage.is_truncated = True
+            if not self._index.messages:
+                raise InputError(
+                    f'{path}: ROS 1 bag: {one_line_reason(error)}: no intact message: `rosbag '
+                    'reindex` of ROS 1 repairs a bag that was cut off'
+                ) from error
         self.has_messages = any(self.message_counts.values())
+
+    def _reader(self) -> Reader:
+        return (
+            Reader(self._path) if self._index is None else _IndexedReader(self._path, self._index)
+        )
+
+    def _read_topics(self) -> None:
+        with self._reader() as reader:
+            for connection in reader.connections:
+                type_name = _type_of(connection)
+                if type_name:
+                    topic = connection.topic
+                    self.topics[topic] = type_name
+                    count = self.message_counts.get(topic, 0) + connection.msgcount
+                    self.message_counts[topic] = count
 
     def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
         """Messages in the order of the log; up to the first damaged chunk."""
         try:
-            with Reader(self._path) as reader:
+            with self._reader() as reader:
                 for position, chunk in reader.chunks.items():
                     unpack = _bounded(chunk.decompressor)
                     reader.chunks[position] = chunk._replace(decompressor=unpack)

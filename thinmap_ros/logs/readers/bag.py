@@ -52,6 +52,7 @@ _IDL_NAMES = {
 }
 _ZSTD = b'\x28\xb5\x2f\xfd'  # begin of a message that is compressed by itself
 _MAX_WARNINGS = 8
+_WITHOUT_ODOMETRY = '; --odom-source none maps by scan matching alone'
 _USUAL_TOPICS = {SCAN: '/scan', _ODOMETRY: '/odom'}
 
 
@@ -107,8 +108,9 @@ class Bag:
         """Damage and how to repair it, in one line; empty if the bag is intact."""
         if not self.damage:
             return ''
-        read = 'only the intact part is read'
-        return f'{self.path}: {self.damage}: {read}; `bag_repair {self.path}` writes a repaired bag'
+        hint = f'{self.path}: {self.damage}: only the intact part is read'
+        repair = self._storages[0].repair.format(self.path)
+        return f'{hint}; {repair}' if repair else hint
 
     def message_count(self, topic: str) -> int | None:
         """Recorded number of messages of a topic; None if a file does not record it."""
@@ -259,8 +261,9 @@ class BagLog:
             unused = [name for name in names if used[name] == 0]
             if unused == names:
                 first = f': {self.skipped.first}' if self.skipped.first else odometry.missing
+                remedy = '' if names is scan_topics else _WITHOUT_ODOMETRY
                 raise InputError(
-                    f'{self.path}: {errors.quoted_names(unused)}: no usable message{first}'
+                    f'{self.path}: {errors.quoted_names(unused)}: no usable message{first}{remedy}'
                 )
             for name in unused:
                 self.skipped.note(
@@ -328,7 +331,10 @@ class BagLog:
             has = errors.quoted_names(
                 [f'{topic} ({name})' for topic, name in sorted(bag.topics.items())]
             )
-            raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {has}')
+            remedy = '' if type_name == SCAN else _WITHOUT_ODOMETRY
+            raise InputError(
+                f'{self.path}: no {what} ({wanted or type_name}); it has {has}{remedy}'
+            )
         names = errors.quoted_names(found)
         several = 'give those of several lasers, or ' if type_name == SCAN else ''
         raise InputError(f'{self.path}: {what} on several topics: {several}choose one of {names}')
