@@ -195,10 +195,11 @@ def read_piece(path: str, report: Report = warn) -> SlamPiece:
     if GRID.exists(path):
         patch = GRID.load(path).known_area()
     else:
-        description = sessions.stem_of(path)
-        patch = read_map(
-            description.with_name(f'{description.name}.yaml'), report=report, keeps_unknown=True
-        )
+        stem = sessions.stem_of(path)
+        description = stem.with_name(f'{stem.name}.yaml')
+        if Path(path).is_file() and not description.exists():
+            description = Path(path)  # the error names what it is
+        patch = read_map(description, report=report, keeps_unknown=True)
     if TOPOLOGY.exists(path):
         builder = sessions.load_topology(path)
         saved = KEYFRAMES.load_optional(path) if GRID.exists(path) else None

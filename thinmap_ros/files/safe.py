@@ -303,7 +303,42 @@ def _parse(text: str, loader: type['_BoundedLoader']) -> object:
         raise _YamlError(one_line_reason(error)) from error
 
 
+# Bytes near the begin of files that are given for a YAML file, and what they are.
+_BEGIN_BYTES = 64
+_FOREIGN = (
+    (
+        b'serialization::archive',
+        'a pose graph of slam_toolbox, whose service save_map writes a map',
+    ),
+    (
+        bytes.fromhex('db01f55b7b1f1d7b'),
+        'a state of Cartographer, of which cartographer_pbstream_to_ros_map makes a map',
+    ),
+    (b'#ROSBAG V', 'a ROS 1 bag, of which `replay` makes a map'),
+    (b'MCAP0\r\n', 'a bag, of which `replay` makes a map'),
+    (b'SQLite format 3\0', 'a bag, of which `replay` makes a map'),
+    (b'PK\x03\x04', 'a NumPy archive, as of a session'),
+    (b'PNG\r\n', 'an image, which a YAML file beside it names'),
+    (b'\xff\xd8\xff', 'an image, which a YAML file beside it names'),
+    (b'P5', 'an image, which a YAML file beside it names'),
+    (b'P2', 'an image, which a YAML file beside it names'),
+)
+
+
+def _foreign_kind(path: Path) -> str:
+    """What a file is that cannot be YAML; '' where it may be, or cannot be read."""
+    try:
+        with open_regular_file(path) as stream:
+            begin = stream.read(_BEGIN_BYTES)
+    except (OSError, ValueError):
+        return ''
+    # A magic number is at the begin, or after a byte or a size.
+    return next((kind for magic, kind in _FOREIGN if magic in begin[: 8 + len(magic)]), '')
+
+
 def _read_mapping(path: Path, expected: str, loader: type['_BoundedLoader']) -> dict[str, Any]:
+    if kind := _foreign_kind(path):
+        raise InputError(f'{path}: {kind}: expected {expected}')
     try:
         content = _parse(read_text(path, FILES.yaml_bytes), loader)
     except _YamlError as error:
