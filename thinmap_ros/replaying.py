@@ -21,7 +21,6 @@ from thinmap_ros.logs.log import Log
 from thinmap_ros.logs.reading import (
     WAITING_SCANS,
     SilentLasers,
-    UnusedScans,
     complete_scans,
     recording_events,
 )
@@ -34,13 +33,15 @@ _REPEATED = 0.01  # m and rad: the pose of a scan that was matched twice differs
 
 @dataclass(eq=False)
 class ScanCounts:
-    """Scans that did not change the map, by reason: without odometry, blind, and of a lost robot.
+    """Scans that did not change the map, by reason.
 
+    They are without odometry, blind, of a misaligned laser, or of a lost robot.
     apart: those of a lost robot that were mapped apart; they are in the map if it was joined.
     records: unusable records of the log, by reason.
     """
 
     without_odometry: dict[str, int] = field(default_factory=dict)
+    misaligned: int = 0
     lost: int = 0
     apart: int = 0
     records: Counter[str] = field(default_factory=Counter)
@@ -58,6 +59,8 @@ class ScanCounts:
         blind = self._blind.setdefault(frame, Counter())
         if estimate.blind_reason:
             blind[estimate.blind_reason] += 1
+        elif estimate.mount_fault:
+            self.misaligned += 1
         elif estimate.is_lost:
             self.lost += 1
             self.apart += estimate.is_mapping_apart
@@ -65,7 +68,9 @@ class ScanCounts:
     @property
     def unused(self) -> int:
         """Number of scans that did not change the map."""
-        return sum(self.without_odometry.values()) + self.blind.total() + self.lost
+        return (
+            sum(self.without_odometry.values()) + self.blind.total() + self.misaligned + self.lost
+        )
 
     def unpaired(self) -> list[str]:
         """Reasons of the scans without odometry, with their number, the most frequent first."""
@@ -75,7 +80,8 @@ class ScanCounts:
     def unmapped(self) -> list[str]:
         """Reasons of the processed scans that did not change the map, with their number."""
         reasons = [f'{count} blind: {text}' for text, count in self.blind.most_common()]
-        return reasons + ([f'{self.lost} of a lost robot'] if self.lost else [])
+        others = ((self.misaligned, 'of a misaligned laser'), (self.lost, 'of a lost robot'))
+        return reasons + [f'{count} {text}' for count, text in others if count]
 
 
 @dataclass(eq=False)
@@ -132,28 +138,24 @@ def replay(
     if continued:
         result.pipeline.load_session(continued)
     pairing = ScanOdometrySynchronizer(WAITING_SCANS)
-    unused = UnusedScans()
     lasers = SilentLasers()
     tidy_up = compiler_memory_releaser()
     with _errors_kept(result, keep_partial), ProgressBar('replay', not show_progress) as bar:
         expected = None
         for number, event in enumerate(recording_events(log)):
-            unused.add(event)
             lasers.add(event)
-            for scan in _process(result, complete_scans(pairing, event), watcher):
-                unused.pair(scan.stamp_ns, scan.frame)
+            _process(result, complete_scans(pairing, event), watcher)
             tidy_up()
             if show_progress:
                 # Of a bag it is known once the bag has been opened.
                 expected = log.expected_scans if number == 0 else expected
                 _show(bar, len(result.poses), expected)
     with _errors_kept(result, keep_partial):
-        for scan in _process(result, pairing.finish(), watcher):
-            unused.pair(scan.stamp_ns, scan.frame)
+        _process(result, pairing.finish(), watcher)
         result.pipeline.finish()
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
-    result.counts.without_odometry = unused.reasons()
+    result.counts.without_odometry = pairing.reasons()
     result.counts.records = log.skipped.reasons
     result.notes = log.skipped.notes
     result.warnings = [*pairing.warnings.values(), *result.pipeline.warnings]
@@ -196,10 +198,8 @@ def _errors_kept(result: Replay, keep_partial: bool) -> Iterator[None]:
         result.ended_by = result.ended_by or error
 
 
-def _process(
-    result: Replay, ready: list[tuple[Scan, Array]], watcher: Watcher | None
-) -> Iterator[Scan]:
-    """Process scans with their odometry poses (3,); yields each."""
+def _process(result: Replay, ready: list[tuple[Scan, Array]], watcher: Watcher | None) -> None:
+    """Process scans with their odometry poses (3,)."""
     for scan, T_odom_base in ready:
         step = result.pipeline.step(scan, T_odom_base)
         result.stamps_ns.append(scan.stamp_ns)
@@ -210,7 +210,6 @@ def _process(
             result.odometry_jumps.append(step.estimate.odometry_discontinuity)
         if watcher is not None:
             watcher.step(scan, T_odom_base, step.estimate, result.pipeline)
-        yield scan
 
 
 def write_outputs(
@@ -268,6 +267,7 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'first_skipped': result.first_skipped,
         'without_odometry': sum(result.counts.without_odometry.values()),
         'blind': result.counts.blind.total(),
+        'misaligned': result.counts.misaligned,
         'lost': result.counts.lost,
         'apart': result.counts.apart,
         'reasons': {

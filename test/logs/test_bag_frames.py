@@ -176,3 +176,65 @@ def test_a_range_of_zero_means_what_the_user_says(tmp_path: Path) -> None:
     for is_set in (False, True):
         _, scans = events_of(BagLog(path, laser=LaserConfig(zero_is_no_return=is_set)))
         assert scans[0].scan.zero_is_no_return == is_set
+
+
+PITCH_RAD = 0.15
+PITCHED: Quaternion = (0.0, math.sin(PITCH_RAD / 2), 0.0, math.cos(PITCH_RAD / 2))
+ROLLED_OVER: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize('source', ['topic', 'tf'])
+@pytest.mark.parametrize(
+    ('measured', 'mounted', 'expected_rad'),
+    [
+        (UPRIGHT, UPRIGHT, 0.0),
+        (LEFT, UPRIGHT, 0.0),
+        (PITCHED, UPRIGHT, PITCH_RAD),
+        (PITCHED, LEFT, PITCH_RAD),
+        (ROLLED_OVER, UPRIGHT, 0.0),
+        # A sensor that is mounted askew on a level robot, and on a tilted one.
+        (PITCHED, PITCHED, 0.0),
+        (UPRIGHT, PITCHED, PITCH_RAD),
+    ],
+)
+def test_odometry_tells_the_tilt_of_the_robot(
+    tmp_path: Path, source: str, measured: Quaternion, mounted: Quaternion, expected_rad: float
+) -> None:
+    """The odometry is that of a sensor, mounted on the robot as static transforms say."""
+
+    def fill(writer: BagWriter, make: Maker) -> None:
+        static(writer, make, ('base_link', 'laser', (0.0, 0.0, 0.2)))
+        x, y, z, w = mounted
+        if source == 'topic':
+            static(writer, make, ('base_link', 'sensor', (0.0, 0.0, 0.3), mounted))
+        else:
+            inverse = (-x, -y, -z, w)
+            static(writer, make, ('sensor', 'base_link', (0.0, 0.0, -0.3), inverse))
+        for i in range(3):
+            ns = 10**9 + i * STEP_NS
+            if source == 'topic':
+                odometry = make.odometry(ns, 0.1 * i, measured, ('odom', 'sensor'))
+                writer.write('/odom', ODOMETRY, ns, odometry)
+            else:
+                pose = make.transform('odom', 'sensor', (0.1 * i, 1.0, 0.0), measured, ns)
+                writer.write('/tf', TF, ns, pose)
+            writer.write('/scan', SCAN, ns + 1, make.scan(ns, RANGES))
+
+    log = BagLog(write(tmp_path / 'bag.mcap', fill), odometry_source=source)
+    odometry, _ = events_of(log)
+    assert [event.tilt_rad for event in odometry] == pytest.approx([expected_rad] * 3, abs=1e-6)
+
+
+@pytest.mark.parametrize('has_pose', [False, True])
+def test_a_bag_without_odometry_names_the_way_without(tmp_path: Path, has_pose: bool) -> None:
+    def fill(writer: BagWriter, make: Maker) -> None:
+        static(writer, make, ('base_link', 'laser', (0.0, 0.0, 0.2)))
+        writer.write('/scan', SCAN, 10**9, make.scan(10**9, RANGES))
+        if has_pose:
+            writer.write('/odom', ODOMETRY, 10**9, make.odometry(10**9, math.nan))
+
+    path = write(tmp_path / 'bag.mcap', fill)
+    with pytest.raises(InputError, match='; --odom-source none maps by scan matching alone'):
+        list(BagLog(path).events())
+    _, scans = events_of(BagLog(path, odometry_source='none'))
+    assert len(scans) == 1

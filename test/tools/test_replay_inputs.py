@@ -245,3 +245,23 @@ def test_wrong_options_are_named_in_one_line(tmp_path: Path, options: list[str],
     done = run(tmp_path / 'log.clf', '-o', tmp_path / 'out', *options)
     assert done.returncode == 2
     assert said in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.programs
+def test_scans_of_a_misaligned_laser_are_counted_and_told(tmp_path: Path) -> None:
+    def backwards(make: Maker) -> list[Made]:
+        made: list[Made] = []
+        for k in range(3 * SCANS):
+            ns = SECOND_NS + k * PERIOD_NS // 3
+            scan = make.scan(ns, box_ranges(0.03 * k - 2.6, 0.0).tolist())
+            scan.angle_min = -np.pi / 2
+            scan.angle_max = np.pi / 2
+            scan.angle_increment = np.pi / 180
+            made.append(('/scan', SCAN, ns + 1, scan))
+            made.append(('/odom', ODOMETRY, ns, make.odometry(ns, -0.03 * k)))
+        return made
+
+    done, report = replayed(tmp_path, bag(tmp_path / 'bag', backwards))
+    assert 0 < report['misaligned'] < report['scans']
+    assert f'{report["scans"]} scans ({report["misaligned"]} of a misaligned laser)' in done.stdout
+    assert 'laser turned by' in done.stderr

@@ -24,6 +24,7 @@ MAX_ODOMETRY_GAP_NS = 2 * SECOND_NS
 _SHORTEST_GAP_NS = SECOND_NS
 _GAP_PERIODS = 3.0
 _USUAL_SAMPLES = 15
+_UNITS = (('s', 1.0), ('h', 3600.0), ('days', 86400.0), ('years', 365.25 * 86400.0))
 
 FIELDS = {
     'stamp_ns': Field(np.int64, (), 0, MAX_COUNT),
@@ -68,6 +69,27 @@ class OdometryLimits:
 _LIMITS = OdometryLimits()
 
 
+@dataclass(frozen=True)
+class Missing:
+    """Why a scan has no odometry: reason with {} for words, and the amount that these tell."""
+
+    reason: str
+    amount: float = 0.0
+    words: str = ''
+
+    @staticmethod
+    def by_time(reason: str, ns: int) -> 'Missing':
+        """A reason whose words are a time."""
+        return Missing(reason, ns, _duration(ns))
+
+
+def _duration(ns: int) -> str:
+    """A time in the unit that suits it."""
+    seconds = ns / SECOND_NS
+    name, size = next(((n, s) for n, s in reversed(_UNITS) if seconds >= 2.0 * s), _UNITS[0])
+    return f'{seconds / size:.3g} {name}'
+
+
 class OdometryBuffer:
     """The last few seconds of odometry, looked up by stamp.
 
@@ -85,6 +107,7 @@ class OdometryBuffer:
         self.discarded = 0
         self._span_ns = span_ns
         self._max_gap_ns = max_gap_ns
+        self._is_begin_kept = True
         self._silence = SilenceDetector()
         self._stamps: list[int] = []
         self._poses: list[Array] = []
@@ -108,6 +131,7 @@ class OdometryBuffer:
             )
         if self._stamps and stamp_ns < self._stamps[-1] - (self._max_gap_ns or self._span_ns):
             self.discarded += len(self._stamps) - bisect_left(self._stamps, stamp_ns)
+            self._is_begin_kept = False
             self._stamps = []
             self._poses = []
             self._silences_s = []
@@ -137,13 +161,48 @@ class OdometryBuffer:
             return None
         before = self._stamps[index - 1]
         after = self._stamps[index]
-        if self._max_gap_ns is not None and after - before > self._max_gap_ns:
-            return None
-        moved = se2.between(self._poses[index - 1], self._poses[index])
-        if not _LIMITS.allow(moved, (after - before) / SECOND_NS - self._silences_s[index]):
+        if self._is_gap(after - before) or self._jump(index) is not None:
             return None
         share = (stamp_ns - before) / (after - before)
         return se2.interpolate(self._poses[index - 1], self._poses[index], share)
+
+    def missing(self, stamp_ns: int) -> Missing:
+        """Why there is no pose at a stamp."""
+        index = bisect_left(self._stamps, stamp_ns)
+        if not self._stamps:
+            return Missing('without any odometry')
+        if index == len(self._stamps):
+            late_ns = stamp_ns - self._stamps[-1]
+            return Missing.by_time('after the last odometry, by up to {}', late_ns)
+        if index == 0 and self._is_begin_kept:
+            early_ns = self._stamps[0] - stamp_ns
+            return Missing.by_time('before the first odometry, by up to {}', early_ns)
+        if index == 0:
+            late_ns = self._stamps[-1] - stamp_ns
+            return Missing.by_time('received too late, by up to {} after their odometry', late_ns)
+        gap_ns = self._stamps[index] - self._stamps[index - 1]
+        if self._is_gap(gap_ns):
+            limit = f'at most {MAX_ODOMETRY_GAP_NS / SECOND_NS:g} s'
+            return Missing.by_time(
+                f'in gaps of the odometry of up to {{}}: expected {limit}', gap_ns
+            )
+        jump = self._jump(index)
+        if jump is None:
+            return Missing('for an unknown reason')
+        words = f'{jump[0]:.3g} m, {math.degrees(jump[1]):.0f} deg within {_duration(gap_ns)}'
+        text = 'in jumps of the odometry of up to {}: reset, in mm or in degrees?'
+        return Missing(text, sum(jump), words)
+
+    def _is_gap(self, ns: int) -> bool:
+        return self._max_gap_ns is not None and ns > self._max_gap_ns
+
+    def _jump(self, index: int) -> tuple[float, float] | None:
+        """Distance (m) and turn (rad) up to a sample that no robot can make; None otherwise."""
+        moved = se2.between(self._poses[index - 1], self._poses[index])
+        seconds = (self._stamps[index] - self._stamps[index - 1]) / SECOND_NS
+        if _LIMITS.allow(moved, seconds - self._silences_s[index]):
+            return None
+        return math.hypot(moved[0], moved[1]), abs(float(moved[2]))
 
     def between(self, begin_ns: int, end_ns: int) -> tuple[NDArray[np.int64], Array] | None:
         """Stamps (K,) and poses (K, 3) of samples that cover a period; None where none do.
@@ -166,7 +225,33 @@ class OdometryBuffer:
         first = bisect_left(self._stamps, self._stamps[-1] - self._span_ns)
         # In blocks, so that a long buffer is not shifted at every sample.
         if first > 256:
+            self._is_begin_kept = False
             del self._stamps[:first], self._poses[:first], self._silences_s[:first]
+
+
+class TiltBuffer:
+    """How far a robot is tilted, in the last ten seconds, looked up by stamp."""
+
+    def __init__(self, span_ns: int = 10 * SECOND_NS) -> None:
+        self._span_ns = span_ns
+        self._samples: deque[tuple[int, float]] = deque()
+
+    def add(self, stamp_ns: int, tilt_rad: float) -> None:
+        """Add a sample: angle between the vertical and that of the robot, rad."""
+        if self._samples and stamp_ns < self._samples[-1][0] - self._span_ns:
+            self._samples.clear()
+        self._samples.append((stamp_ns, tilt_rad))
+        while self._samples[0][0] < stamp_ns - self._span_ns:
+            self._samples.popleft()
+
+    def at(self, stamp_ns: int) -> float:
+        """Larger tilt of the samples before and after a stamp, rad; 0 where it is unknown."""
+        later_rad = 0.0
+        for sample_ns, tilt_rad in reversed(self._samples):
+            if sample_ns <= stamp_ns:
+                return max(tilt_rad, later_rad)
+            later_rad = tilt_rad
+        return 0.0
 
 
 @dataclass(frozen=True, eq=False)

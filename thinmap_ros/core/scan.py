@@ -20,6 +20,8 @@ MIN_HITS = 10
 MAX_MOUNT_OFFSET_M = 100.0
 # Range up to which a beam without return shows free space.
 NO_RETURN_CLEAR_RANGE_M = 8.0
+# Fault of the scans that are left out by max_tilt_rad: the laser works.
+TILTED = 'robot tilted by more than max_tilt_rad'
 # What the stamp of a scan is the time of.
 AT_START = 'start'
 AT_END = 'end'
@@ -49,6 +51,15 @@ class LaserConfig(Config):
         'matters where the driver publishes time_increment.',
         choices=(AT_START, AT_END),
     )
+    max_tilt_rad: float = parameter(
+        0.08,
+        'Tilt of the robot, by the orientation of its odometry or IMU, above which scans are left '
+        'out (rad): on a ramp they show the floor. 0.08 is above the noise of the odometry of a '
+        'level robot and below a ramp of 1:12. Raise it where the orientation is noisier, lower it '
+        'for a laser near the floor.',
+        low=0.01,
+        high=1.5,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +69,8 @@ class Scan:
     stamp_ns: time of the scan; ranges_m (N,): raw, may hold inf, NaN and nonsense; beam i points to
     angle_min_rad + i * angle_increment_rad in the laser frame (a negative increment is a clockwise
     laser); T_base_laser (3,): the laser's pose on the robot; zero_is_no_return: whether this
-    laser's driver publishes 0 for a beam without return; max_range_m: usable range of the laser.
+    laser's driver publishes 0 for a beam without return; max_range_m: usable range of the laser;
+    max_tilt_rad: tilt of the robot above which the scan is left out.
     first_beam_s, beam_period_s: time of beam 0 since the stamp, and from each beam to the next (s),
     as the driver states them; scan_time_s: time of a whole scan; each 0 if unknown. drops_out: this
     laser often has no return from surfaces in range, so that a beam without return says nothing;
@@ -81,6 +93,7 @@ class Scan:
     T_base_laser: Array
     zero_is_no_return: bool = False
     max_range_m: float = LaserConfig.max_range_m
+    max_tilt_rad: float = LaserConfig.max_tilt_rad
     first_beam_s: float = 0.0
     beam_period_s: float = 0.0
     scan_time_s: float = 0.0
@@ -139,6 +152,7 @@ class Scan:
             mount,
             laser.zero_is_no_return,
             laser.max_range_m,
+            laser.max_tilt_rad,
             first_beam_s=-time_increment_s * (ranges.size - 1) if is_at_end else 0.0,
             beam_period_s=time_increment_s,
             scan_time_s=scan_time_s,

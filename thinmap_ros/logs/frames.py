@@ -247,7 +247,8 @@ class OdometryOnTopic(BagOdometry):
                 f'pose {T_odom_base.tolist()}: expected finite numbers, at most '
                 f'{se2.MAX_COORDINATE_M:g} m'
             )
-        yield OdometryEvent(decode.stamp_ns(message), T_odom_base)
+        tilt_rad = self._frames.tilt_rad(message)
+        yield OdometryEvent(decode.stamp_ns(message), T_odom_base, tilt_rad=tilt_rad)
 
 
 class OdometryByTransforms(BagOdometry):
@@ -272,7 +273,8 @@ class OdometryByTransforms(BagOdometry):
                 invalid = error
         sample = self._transforms.next_sample()
         if sample is not None:
-            yield OdometryEvent(*sample)
+            stamp_ns, T_odom_base, tilt_rad = sample
+            yield OdometryEvent(stamp_ns, T_odom_base, tilt_rad=tilt_rad)
         if invalid is not None:
             raise invalid
 
@@ -282,7 +284,11 @@ class NoOdometry(BagOdometry):
 
     def __init__(self) -> None:
         super().__init__('scans', set())
+        self._last_ns: int | None = None
 
     def at_scan(self, stamp_ns: int) -> Iterator[OdometryEvent]:
-        """A sample at the origin."""
+        """A sample at the origin, at each new stamp."""
+        if stamp_ns == self._last_ns:
+            return
+        self._last_ns = stamp_ns
         yield OdometryEvent(stamp_ns, np.zeros(3), is_measured=False)

@@ -22,12 +22,14 @@ _OTHER = 'other reasons'
 class OdometryEvent:
     """An odometry sample: T_odom_base (3,) at stamp_ns.
 
-    is_measured: False in a log without odometry, in which the robot never moves in its frame.
+    is_measured: False in a log without odometry, in which the robot never moves in its frame;
+    tilt_rad: of the robot, 0 where it is unknown.
     """
 
     stamp_ns: int
     T_odom_base: Array
     is_measured: bool = True
+    tilt_rad: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

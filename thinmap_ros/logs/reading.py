@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import warnings
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -14,8 +13,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import config_or_default
 from thinmap_ros.core.errors import InputError, pose_of, quoted, quoted_name
-from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS
-from thinmap_ros.core.scan import LaserConfig, Scan, laser_names
+from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import CLOCK_JUMP_NS, SECOND_NS, Array
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.files.safe import path_of
@@ -323,65 +321,8 @@ def paired_scans(log: Log) -> Iterator[tuple[Scan, Array]]:
 def complete_scans(pairing: ScanOdometrySynchronizer, event: Event) -> list[tuple[Scan, Array]]:
     """Scans that are complete with an event, each with its odometry pose T_odom_base (3,)."""
     if isinstance(event, OdometryEvent):
-        return pairing.add_odometry(event.stamp_ns, event.T_odom_base)
+        return pairing.add_odometry(event.stamp_ns, event.T_odom_base, event.tilt_rad)
     return pairing.add_scan(event.scan)
-
-
-_UNITS = (('s', 1.0), ('h', 3600.0), ('days', 86400.0), ('years', 365.25 * 86400.0))
-
-
-class UnusedScans:
-    """The scans of a log that were not paired with odometry."""
-
-    def __init__(self) -> None:
-        self._odometry: list[int] = []
-        self._unused: dict[str, Counter[int]] = {}  # stamps, by the frame of the laser
-
-    def add(self, event: Event) -> None:
-        """Add an event of the log."""
-        if isinstance(event, OdometryEvent):
-            self._odometry.append(event.stamp_ns)
-        else:
-            self._unused.setdefault(event.scan.frame, Counter())[event.scan.stamp_ns] += 1
-
-    def pair(self, stamp_ns: int, frame: str = '') -> None:
-        """A scan with this stamp, of the laser of a frame, was paired."""
-        self._unused[frame][stamp_ns] -= 1
-
-    def reasons(self) -> dict[str, int]:
-        """Number of unused scans by reason, of each laser where there are several."""
-        names = laser_names(self._unused.keys(), 'of {} ')
-        return {
-            names[frame] + text: count
-            for frame, own in self._unused.items()
-            for text, count in self._reasons(own).items()
-        }
-
-    def _reasons(self, unused: Counter[int]) -> dict[str, int]:
-        scans = np.array(sorted(unused.elements()), dtype=np.int64)
-        odometry = np.array(sorted(self._odometry), dtype=np.int64)
-        if not (scans.size and odometry.size):
-            return {'without any odometry': scans.size} if scans.size else {}
-        early_ns = odometry[0] - scans
-        late_ns = scans - odometry[-1]
-        gap_ns = _gaps(odometry, scans)
-        limit = f'at most {MAX_ODOMETRY_GAP_NS / SECOND_NS:g} s'
-        parts = (
-            (early_ns, early_ns > 0, 'before the first odometry, by up to {}'),
-            (late_ns, late_ns > 0, 'after the last odometry, by up to {}'),
-            (
-                gap_ns,
-                gap_ns > MAX_ODOMETRY_GAP_NS,
-                f'in gaps of the odometry of up to {{}}: expected {limit}',
-            ),
-        )
-        found = {
-            text.format(_duration(int(values[chosen].max()))): int(np.count_nonzero(chosen))
-            for values, chosen, text in parts
-            if chosen.any()
-        }
-        rest = scans.size - sum(found.values())
-        return found | ({'too late, or with a stamp ahead of later ones': rest} if rest else {})
 
 
 class SilentLasers:
@@ -423,19 +364,3 @@ def _longest_ns(stamps: NDArray[np.int64]) -> float:
     """Longest time between two scans of a laser that measures, by its sorted stamps (N,), ns."""
     usual_ns = float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
     return max(SECOND_NS, _SILENT_PERIODS * usual_ns)
-
-
-def _gaps(odometry: NDArray[np.int64], scans: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Time between the samples around each scan, ns; 0 before the first and after the last."""
-    after = np.searchsorted(odometry, scans)
-    inside = (after > 0) & (after < odometry.size)
-    after = np.clip(after, 1, max(odometry.size - 1, 1))
-    ends = odometry[np.minimum(after, odometry.size - 1)]
-    return np.where(inside, ends - odometry[after - 1], 0)
-
-
-def _duration(ns: int) -> str:
-    """A time in the unit that suits it."""
-    seconds = ns / SECOND_NS
-    name, size = next(((n, s) for n, s in reversed(_UNITS) if seconds >= 2.0 * s), _UNITS[0])
-    return f'{seconds / size:.3g} {name}'

@@ -43,6 +43,11 @@ def rotation_matrix(q: Any) -> Array:
     )
 
 
+def tilt_of(rotation: Array) -> float:
+    """Angle between the vertical and that of a rotation (3, 3), rad; upside down is level, too."""
+    return math.acos(min(abs(float(rotation[2, 2])), 1.0))
+
+
 def parse_pose(text: str, name: str = 'laser_pose', form: str = 'x,y,yaw') -> Array:
     """Pose (3,), m, m, rad, of the text of an option. Raises ConfigError with its name and form."""
     try:
@@ -161,6 +166,11 @@ class StaticTransforms:
         found = _connection(self._first, target_frame, source_frame)
         return None if found is None else found.pose
 
+    def rotation(self, target_frame: str, source_frame: str) -> Array:
+        """Rotation (3, 3) of the source frame in the target frame; none if not connected."""
+        found = _connection(self._first, target_frame, source_frame)
+        return np.eye(3) if found is None else found.rotation
+
     def laser_mount(self, laser_frame: str, base_frame: str) -> Mount | None:
         """Mount of a laser; None if no transforms connect its frame to that of the robot.
 
@@ -239,6 +249,7 @@ class _Edge:
 
     def __init__(self, parent: str) -> None:
         self.parent = parent
+        self.rotation: Array = np.eye(3)  # (3, 3), the newest
         self._fixed: Array | None = None
         self._samples = OdometryBuffer()
 
@@ -281,7 +292,8 @@ class TransformBuffer:
         """Add a geometry_msgs/TransformStamped. Raises InputError where it is invalid."""
         child = _without_slash(transform.child_frame_id)
         parent = _without_slash(transform.header.frame_id)
-        T_parent_child = _planar_pose(transform)
+        rotation = rotation_matrix(transform.transform.rotation)
+        T_parent_child = _planar_pose(transform, rotation)
         edge = self._edges.get(child)
         if edge is None or edge.parent != parent:
             if edge is None and len(self._edges) >= _MAX_FRAMES:
@@ -289,6 +301,7 @@ class TransformBuffer:
             edge = _Edge(parent)
             self._edges[child] = edge
         edge.add(decode.stamp_ns(transform), T_parent_child, is_static)
+        edge.rotation = rotation
 
     def lookup(self, target_frame: str, source_frame: str, stamp_ns: int | None = None) -> Array:
         """Pose of the source frame in the target frame, T_target_source (3,).
@@ -300,6 +313,21 @@ class TransformBuffer:
         self._used.update(up, down)
         ns = (self._latest_common_ns(up + down) or 0) if stamp_ns is None else stamp_ns
         return se2.compose(se2.invert(self._chain(up, ns)), self._chain(down, ns))
+
+    def newest_tilt(self, target_frame: str, source_frame: str) -> float:
+        """Tilt of the source frame against the target frame, by the newest transforms, rad.
+
+        Raises InputError where the frames are not connected.
+        """
+        up, down = self._path(target_frame, source_frame)
+        return tilt_of(self._rotation(up).T @ self._rotation(down))
+
+    def _rotation(self, frames: list[str]) -> Array:
+        """Rotation (3, 3) of the first frame in the parent of the last one."""
+        R = np.eye(3)
+        for frame in frames:
+            R = self._edges[frame].rotation @ R
+        return R
 
     def latest_common_ns(self, target_frame: str, source_frame: str) -> int | None:
         """Newest stamp at which all transforms between two frames are known; None: never."""
@@ -362,11 +390,10 @@ class TransformBuffer:
         return 'they are in trees that are not connected'
 
 
-def _planar_pose(transform: Any) -> Array:
+def _planar_pose(transform: Any, rotation: Array) -> Array:
     moved = transform.transform.translation
     name = f'transform to {quoted(transform.child_frame_id)}'
     errors.require_bounded(name, (moved.x, moved.y, moved.z))
-    rotation = rotation_matrix(transform.transform.rotation)
     return se2.pose(moved.x, moved.y, math.atan2(rotation[1, 0], rotation[0, 0]))
 
 
@@ -400,8 +427,8 @@ class TransformOdometry:
         if is_static:
             self._static.add(child)
 
-    def next_sample(self) -> tuple[int, Array] | None:
-        """Stamp in ns and T_odom_base (3,) of the newest time; None if there is no new one.
+    def next_sample(self) -> tuple[int, Array, float] | None:
+        """Stamp in ns, T_odom_base (3,) and tilt (rad) of the newest time; None if it is not new.
 
         Raises InputError where a transform is not known at that time.
         """
@@ -409,7 +436,8 @@ class TransformOdometry:
         if stamp_ns is None or stamp_ns == self._last_ns:
             return None
         self._last_ns = stamp_ns
-        return stamp_ns, self._buffer.lookup(self._odom_frame, self._base_frame, stamp_ns)
+        tilt_rad = self._buffer.newest_tilt(self._odom_frame, self._base_frame)
+        return stamp_ns, self._buffer.lookup(self._odom_frame, self._base_frame, stamp_ns), tilt_rad
 
     @property
     def missing(self) -> str:
@@ -469,6 +497,15 @@ class OdometryFrames:
             T_base_child = self._fixed('child_frame_id', child, 'base_frame', self._base_frame)
             T_parent_child = se2.compose(T_parent_child, se2.invert(T_base_child))
         return T_parent_child
+
+    def tilt_rad(self, message: Any) -> float:
+        """Tilt of the robot by a nav_msgs/Odometry, rad.
+
+        The odometry frame is level. Raises InputError where the orientation is no rotation.
+        """
+        R_odom_child = rotation_matrix(message.pose.pose.orientation)
+        child = message.child_frame_id.lstrip('/')
+        return tilt_of(R_odom_child @ self._static.rotation(child, self._base_frame))
 
     def _fixed(self, field: str, frame: str, parameter: str, expected: str) -> Array:
         """Pose (3,) of a frame in the expected one."""

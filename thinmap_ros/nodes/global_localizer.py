@@ -375,7 +375,8 @@ class GlobalLocalizerNode(ThinmapNode):
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         self._received.add('odom')
         self._driver.add_odometry(stamp_ns, T_odom_base)
-        self._process(self._pairing.add_odometry(stamp_ns, T_odom_base))
+        tilt_rad = self._odometry.tilt_rad
+        self._process(self._pairing.add_odometry(stamp_ns, T_odom_base, tilt_rad))
 
     def _on_scan(self, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(message)

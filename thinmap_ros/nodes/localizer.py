@@ -23,7 +23,7 @@ from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import TILTED, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
@@ -209,6 +209,7 @@ class LocalizerNode(ThinmapNode):
         if self._map_ids is not None:
             LivingMap(self, self._on_living_map)
         self.create_pause_service()
+        self.diagnostics.add_update_callback(self._report_unpaired)
         self.diagnostics.check_sole_publisher('pose')
         self.diagnostics.add_check(WARN, lambda: '; '.join(self._input.warnings.values()))
         # Before the scans: of messages that wait together, the executor processes the graph of the
@@ -274,7 +275,8 @@ class LocalizerNode(ThinmapNode):
         self._recovery = Recovery(last)
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
-        self._process(self._input.pairing.add_odometry(stamp_ns, T_odom_base))
+        tilt_rad = self._odometry.tilt_rad
+        self._process(self._input.pairing.add_odometry(stamp_ns, T_odom_base, tilt_rad))
 
     def _on_scan(self, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(message)
@@ -310,6 +312,12 @@ class LocalizerNode(ThinmapNode):
         discarded = self._input.pairing.discarded_odometry
         diagnostics.set_drop_total('odometry with stamps ahead of those after it', discarded)
         diagnostics.set_drop_total('invalid scans or odometry', self._localizer.rejected)
+
+    def _report_unpaired(self) -> None:
+        """Report on /diagnostics why scans were not paired with odometry."""
+        reasons = [f'{n} {reason}' for reason, n in self._input.pairing.reasons().items()]
+        if reasons:
+            self.diagnostics.set_value('scans without odometry', '; '.join(reasons))
 
     def _step(self, scan: Scan, T_odom_base: Array) -> None:
         """Localize a scan, and publish its pose."""
@@ -424,8 +432,11 @@ class LocalizerNode(ThinmapNode):
 
 
 def _state_of(estimate: Estimate) -> int:
-    """State of a SlamStatus; of a blind laser it is unknown whether the robot is lost."""
-    if estimate.blind_reason:
+    """State of a SlamStatus; of a blind laser it is unknown whether the robot is lost.
+
+    A tilted robot drives on: it would never leave its ramp.
+    """
+    if estimate.blind_reason and estimate.blind_reason != TILTED:
         return int(SlamStatus.BLIND)
     if estimate.mount_fault:
         return int(SlamStatus.MISALIGNED)
@@ -440,6 +451,8 @@ def _health(state: int, estimate: Estimate) -> tuple[bytes, str]:
         return ERROR, f'laser blind ({estimate.blind_reason}): dead reckoning'
     if state == SlamStatus.MISALIGNED:
         return ERROR, f'laser misaligned: {estimate.mount_fault}'
+    if estimate.blind_reason == TILTED:
+        return WARN, f'{TILTED}: dead reckoning'
     if estimate.apart is not None and state == SlamStatus.MAPPING_APART:
         return ERROR, (
             f'lost: maps a piece apart, {estimate.apart.path_m:.0f} m, best odds '

@@ -45,6 +45,7 @@ ROBOT = (
     'max_range_m',
     'laser_range_noise_m',
     'scan_stamp',
+    'max_tilt_rad',
     'map_frame',
     'odom_frame',
     'odom_source',

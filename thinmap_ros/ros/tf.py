@@ -279,6 +279,8 @@ class OdometryInputConfig(Config):
 class OdometrySource:
     """Calls `process` with the stamp in ns and T_odom_base (3,) of each sample of the odometry.
 
+    tilt_rad: of the robot at that sample; 0 where it is unknown.
+
     Without odometry the robot never moves in the odometry frame: there is a sample at the stamp of
     each scan, which the node reports by `add_scan_stamp`.
     """
@@ -286,6 +288,8 @@ class OdometrySource:
     def __init__(
         self, node: ThinmapNode, base_frame: str, process: Callable[[int, Array], None]
     ) -> None:
+        self.tilt_rad = 0.0
+        self._scan_ns: int | None = None
         self._node = node
         self._process = process
         self.odom_frame = str(
@@ -323,12 +327,15 @@ class OdometrySource:
 
     def add_scan_stamp(self, stamp_ns: int) -> None:
         """A scan was made: without odometry, the robot is where it was."""
-        if self.source == NONE:
+        if self.source == NONE and stamp_ns != self._scan_ns:
+            self._scan_ns = stamp_ns
             self._process(stamp_ns, np.zeros(3))
 
     def _on_odometry(self, message: Odometry) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._process(stamp_ns, self._frames.pose(message))
+        T_odom_base = self._frames.pose(message)
+        self.tilt_rad = self._frames.tilt_rad(message)
+        self._process(stamp_ns, T_odom_base)
 
     def _subscribe_static(self) -> None:
         AdaptiveSubscription(
@@ -347,7 +354,8 @@ class OdometrySource:
         try:
             sample = self._transforms.next_sample()
             if sample is not None:
-                self._process(*sample)
+                stamp_ns, T_odom_base, self.tilt_rad = sample
+                self._process(stamp_ns, T_odom_base)
         except InputError as error:
             self._node.diagnostics.message_rejected('/tf', str(error))
 

@@ -109,6 +109,7 @@ _FIGURES = (
     _Figure(('first_skipped',), 'First record skipped'),
     _Figure(('without_odometry',), 'Scans without odometry'),
     _Figure(('blind',), 'Blind scans'),
+    _Figure(('misaligned',), 'Scans of a misaligned laser'),
     _Figure(('lost',), 'Scans of a lost robot'),
     _Figure(('apart',), 'Scans mapped apart'),
     _Figure(('refused',), 'Scans not mapped'),

@@ -24,7 +24,7 @@ from thinmap_ros.logs.log import (
     SkippedRecords,
 )
 from thinmap_ros.logs.readers.bag import Bag
-from thinmap_ros.logs.reading import ClockJumpError, UnusedScans, open_log, recording_events
+from thinmap_ros.logs.reading import ClockJumpError, open_log, recording_events
 from thinmap_ros.tools.parameter_file import read_parameter_file
 
 _PRESETS = sorted((Path(__file__).resolve().parents[3] / 'config').glob('*/*.yaml'))
@@ -82,28 +82,25 @@ def order_events(shared: None, rng: np.random.Generator, folder: Path) -> None:
     """No event is lost or comes twice, and each scan is used or has a reason."""
     log = StrangeLog(rng)
     given = list(log.events())
-    unused = UnusedScans()
     pairing = ScanOdometrySynchronizer(len(given) + 1)
     scans = used = passed = 0
     is_whole = True
     try:
         for event in recording_events(log):
             passed += 1
-            unused.add(event)
             if isinstance(event, ScanEvent):
                 scans += 1
                 ready = pairing.add_scan(event.scan)
             else:
                 ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
-            for scan, T_odom_base in ready:
+            for _, T_odom_base in ready:
                 finite(T_odom_base)
                 used += 1
-                unused.pair(scan.stamp_ns)
     except ClockJumpError as error:
         assert str(error).isprintable()
         is_whole = False
     assert passed == len(given) if is_whole else passed < len(given)
-    reasons = unused.reasons()
+    reasons = pairing.reasons()
     assert used + sum(reasons.values()) == scans
     assert all(text.isprintable() for text in [*reasons, *log.skipped.notes])
 

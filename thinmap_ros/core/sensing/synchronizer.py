@@ -2,6 +2,8 @@
 
 import math
 from collections import deque
+from collections.abc import Collection
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from statistics import median
 
@@ -9,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, OdometryBuffer
-from thinmap_ros.core.scan import Scan, of_lasers
+from thinmap_ros.core.errors import counted
+from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, Missing, OdometryBuffer, TiltBuffer
+from thinmap_ros.core.scan import TILTED, Scan, laser_names, of_lasers
 from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 from thinmap_ros.core.sensing.beams import LaserMonitor
 from thinmap_ros.jit import inlined, kernel
 
+_MAX_OVERDUE = 10_000  # stamps of scans whose odometry may still come
 # Largest relative difference between the stated and the measured time of a revolution.
 _TOLERANCE = 0.2
 _USUAL_SCANS = 15
@@ -202,12 +206,79 @@ class Lasers:
         return of_lasers({laser.first.frame: laser.monitor.warnings for laser in lasers})
 
 
+class PacketStamps:
+    """Stamps of the scans of one laser, several of which may arrive in one packet with one stamp.
+
+    The later ones are taken as made a period after each other. The period is the usual time between
+    two stamps, over the number of scans with the first of them. A scan that comes twice keeps its
+    stamp, and so do sectors of one revolution, which begin at other angles. moved: number of scans
+    whose stamp was moved on.
+    """
+
+    def __init__(self) -> None:
+        self.moved = 0
+        self._last: Scan | None = None
+        self._count = 0  # scans with the last stamp
+        self._periods_ns: deque[float] = deque(maxlen=_USUAL_SCANS)
+
+    @property
+    def period_ns(self) -> int:
+        """Usual time from scan to scan; 0 before two stamps differ."""
+        return round(median(self._periods_ns)) if self._periods_ns else 0
+
+    def moved_on(self, scan: Scan, is_kept: bool = False) -> Scan | None:
+        """The next scan, at a stamp of its own; None where its time is unknown.
+
+        is_kept: whether it keeps its stamp.
+        """
+        last = self._last
+        if last is None or scan.stamp_ns != last.stamp_ns:
+            if last is not None and scan.stamp_ns > last.stamp_ns:
+                self._periods_ns.append((scan.stamp_ns - last.stamp_ns) / self._count)
+            self._last = scan
+            self._count = 1
+            return scan
+        is_kept |= scan.angle_min_rad != last.angle_min_rad
+        if is_kept or np.array_equal(scan.ranges_m, last.ranges_m, equal_nan=True):
+            return scan
+        self._last = scan
+        later_ns = self._count * self.period_ns
+        self._count += 1
+        if not 0 < later_ns <= SECOND_NS:
+            return None
+        self.moved += 1
+        return replace(scan, stamp_ns=scan.stamp_ns + later_ns)
+
+
+class _UnpairedScans:
+    """Number of scans without odometry by laser and reason, with the words of the worst case."""
+
+    def __init__(self) -> None:
+        self.total = 0
+        self._found: dict[str, dict[str, tuple[int, Missing]]] = {}
+
+    def add(self, scan: Scan, missing: Missing) -> None:
+        self.total += 1
+        own = self._found.setdefault(scan.frame, {})
+        count, worst = own.get(missing.reason, (0, missing))
+        own[missing.reason] = (count + 1, max(worst, missing, key=lambda m: m.amount))
+
+    def reasons(self, frames: Collection[str]) -> dict[str, int]:
+        """Number by reason, of each laser where there are several frames."""
+        names = laser_names(frames, 'of {} ')
+        return {
+            names[frame] + reason.format(worst.words): count
+            for frame, own in self._found.items()
+            for reason, (count, worst) in own.items()
+        }
+
+
 class ScanOdometrySynchronizer:
     """Interpolates odometry at the stamp of each scan, in the order of the scans.
 
     A scan waits until newer odometry has arrived; those of several lasers do so in the order of
-    their stamps. One that the laser did not measure is blind (see `LaserMonitor`). Live nodes and
-    replay use it alike, so that both process the same pairs.
+    their stamps. One that the laser did not measure is blind (see `LaserMonitor`), and so is one of
+    a tilted robot. Live nodes and replay use it alike, so that both process the same pairs.
     """
 
     def __init__(self, capacity: int = 20) -> None:
@@ -217,7 +288,18 @@ class ScanOdometrySynchronizer:
         self._silence_s = 0.0  # since the last scan
         self._waiting: list[Scan] = []
         self._capacity = capacity
-        self.dropped = 0
+        self._since_scan_ns: int | None = None  # stamp of the odometry since the last scan
+        self._packets: dict[str, PacketStamps] = {}  # by frame of the laser
+        self._tilts = TiltBuffer()
+        self._least_tilt_rad = math.inf
+        self._askew_rad = 0.0  # the least tilt, while that is above its limit
+        self._unpaired = _UnpairedScans()
+        self._overdue: deque[Scan] = deque()  # which have waited for too long
+
+    @property
+    def dropped(self) -> int:
+        """Scans that were not paired, and do not wait."""
+        return self._unpaired.total + len(self._overdue)
 
     @property
     def discarded_odometry(self) -> int:
@@ -226,33 +308,81 @@ class ScanOdometrySynchronizer:
 
     @property
     def warnings(self) -> dict[str, str]:
-        """What the lasers or their drivers do otherwise than REP 117, by kind."""
-        return self._lasers.warnings
+        """What the laser, its driver or the odometry do otherwise than expected, by kind."""
+        found = self._lasers.warnings
+        moved = {packets.period_ns: packets.moved for packets in self._packets.values()}
+        count = sum(moved.values())
+        if count:
+            periods = ', '.join(f'{ns / SECOND_NS:.3f} s' for ns, n in moved.items() if n)
+            found['stamps'] = (
+                f'{counted(count, "scan")} with the stamp of the scan before and other ranges: '
+                f'taken as made a period later ({periods})'
+            )
+        if self._askew_rad:
+            found['tilt'] = (
+                f'robot tilted by {math.degrees(self._askew_rad):.0f} deg or more since the start: '
+                'is its IMU askew? No scan is left out for it'
+            )
+        return found
 
     @property
     def waiting(self) -> int:
         """Scans that wait for odometry."""
         return len(self._waiting)
 
-    def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> list[tuple[Scan, Array]]:
-        """Take an odometry sample.
+    def reasons(self) -> dict[str, int]:
+        """Number of scans that were not paired, or wait, by reason."""
+        found = deepcopy(self._unpaired)
+        for scan in [*self._overdue, *self._waiting]:
+            found.add(scan, self._buffer.missing(scan.stamp_ns))
+        return found.reasons(self._packets.keys())
+
+    def add_odometry(
+        self, stamp_ns: int, T_odom_base: Array, tilt_rad: float = 0.0
+    ) -> list[tuple[Scan, Array]]:
+        """Take an odometry sample; tilt_rad: of the robot, 0 where it is unknown.
 
         Returns the scans that are ready now, each with its T_odom_base (3,).
         """
         self._silence_s += self._buffer.add(stamp_ns, T_odom_base)
+        self._tilts.add(stamp_ns, tilt_rad)
+        self._since_scan_ns = stamp_ns
+        while self._overdue and self._overdue[0].stamp_ns <= stamp_ns:
+            self._end_overdue()
         return self._ready()
 
     def add_scan(self, scan: Scan) -> list[tuple[Scan, Array]]:
         """Add a scan; returns the scans that are ready now, each with its T_odom_base (3,)."""
+        # Odometry with that stamp came in between: by a coarse clock each scan has its own pose.
+        has_own_pose = self._since_scan_ns == scan.stamp_ns
+        self._since_scan_ns = None
+        stamped = self._packets.setdefault(scan.frame, PacketStamps()).moved_on(scan, has_own_pose)
+        if stamped is None:
+            self._unpaired.add(scan, Missing('with the stamp of the scan before'))
+            return []
+        scan = stamped
         own = [waiting for waiting in self._waiting if waiting.frame == scan.frame]
         # A scan with a stamp more than a second ahead would block all later ones.
         while own and own[-1].stamp_ns > scan.stamp_ns + SECOND_NS:
-            self._drop(own.pop())
+            ahead_ns = own[-1].stamp_ns - scan.stamp_ns
+            reason = 'with a stamp ahead of later ones, by up to {}'
+            self._drop(own.pop(), Missing.by_time(reason, ahead_ns))
         if len(own) >= self._capacity:
-            self._drop(own[0])
+            self._waiting.remove(own[0])
+            self._overdue.append(own[0])
+        if len(self._overdue) > _MAX_OVERDUE:
+            self._end_overdue()
         self._lasers.of(scan).timing.add(scan)
         self._waiting.insert(self._place(scan), scan)
         return self._ready()
+
+    def _end_overdue(self) -> None:
+        """Count the scan that has waited longest; it waits no more."""
+        scan = self._overdue.popleft()
+        missing = Missing('with too many others between two samples of the odometry')
+        if self._buffer.interpolate(scan.stamp_ns) is None:
+            missing = self._buffer.missing(scan.stamp_ns)
+        self._unpaired.add(scan, missing)
 
     def finish(self) -> list[tuple[Scan, Array]]:
         """Scans at the end of a log, for whose last beams the odometry has ended."""
@@ -276,9 +406,9 @@ class ScanOdometrySynchronizer:
             place -= 1
         return place
 
-    def _drop(self, scan: Scan) -> None:
+    def _drop(self, scan: Scan, missing: Missing) -> None:
         self._waiting.remove(scan)
-        self.dropped += 1
+        self._unpaired.add(scan, missing)
 
     def _ready(self) -> list[tuple[Scan, Array]]:
         ready = []
@@ -291,7 +421,7 @@ class ScanOdometrySynchronizer:
             ):
                 break
             if T_odom_base is None:
-                self._drop(scan)
+                self._drop(scan, self._buffer.missing(scan.stamp_ns))
                 continue
             self._waiting.pop(0)
             ready.append(self._complete(scan, T_odom_base))
@@ -300,8 +430,21 @@ class ScanOdometrySynchronizer:
     def _complete(self, scan: Scan, T_odom_base: Array) -> tuple[Scan, Array]:
         scan = replace(scan, odometry_silence_s=self._silence_s)
         self._silence_s = 0.0
+        if self._is_tilted(scan):
+            return scan.blinded(TILTED), T_odom_base
         checked = self._lasers.of(scan).monitor.checked(scan, T_odom_base)
         return self._deskewed(checked), T_odom_base
+
+    def _is_tilted(self, scan: Scan) -> bool:
+        """Whether the scan shows the floor; not of a robot that was never level: its IMU is askew.
+
+        It may also have started on a ramp.
+        """
+        tilt_rad = self._tilts.at(scan.stamp_ns)
+        least_rad = min(self._least_tilt_rad, tilt_rad)
+        self._least_tilt_rad = least_rad
+        self._askew_rad = least_rad if least_rad > scan.max_tilt_rad else 0.0
+        return least_rad <= scan.max_tilt_rad < tilt_rad
 
     def _needed_until(self, scan: Scan) -> int:
         """Time until which a scan needs odometry, ns."""
