@@ -18,6 +18,8 @@ MIN_VALID_BEAM_RATIO = 0.1
 MIN_HITS = 10
 # Maximum distance of a laser from the centre of its robot.
 MAX_MOUNT_OFFSET_M = 100.0
+# A robot stands while one of its lasers is silent for so long: what it saw then is past.
+SILENT_LASER_NS = SECOND_NS
 # Range up to which a beam without return shows free space.
 NO_RETURN_CLEAR_RANGE_M = 8.0
 # Fault of the scans that are left out by max_tilt_rad: the laser works.
@@ -260,6 +262,16 @@ def _require_mount(T_base_laser: Array) -> None:
     raise InputError(
         f'laser mounted at {mount}: expected three finite numbers, at most {MAX_MOUNT_OFFSET_M:g} m'
     )
+
+
+def with_newest(scans: tuple[Scan, ...], scan: Scan) -> tuple[Scan, ...]:
+    """The newest scan of each laser, after the next one of a laser; a silent laser has none."""
+    others = (
+        each
+        for each in scans
+        if each.frame != scan.frame and abs(each.stamp_ns - scan.stamp_ns) <= SILENT_LASER_NS
+    )
+    return (*others, scan)
 
 
 def is_most_missed(scan: Scan, missed: int) -> bool:

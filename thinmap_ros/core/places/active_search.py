@@ -1,6 +1,7 @@
 """A lost robot that drives where the places in question differ most, to find itself sooner."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,8 +111,8 @@ class ActiveSearch:
         if not (near & (np.abs(se2.wrap(away[:, 2])) < _LOOK_RAD)).any():
             self._looked = np.concatenate([self._looked, T_odom_base[None]])
 
-    def step(self, T_odom_base: Array, scan: Scan, dt_s: float) -> Command:
-        """Command for the next dt_s of a robot at an odometry pose (3,).
+    def step(self, T_odom_base: Array, scan: Scan | Sequence[Scan], dt_s: float) -> Command:
+        """Command for the next dt_s of a robot at an odometry pose (3,); scan: as for `Navigator`.
 
         Idle where there is nothing to drive to.
         """

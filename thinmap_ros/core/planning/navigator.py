@@ -221,12 +221,16 @@ class Navigator:
         self.path = None
         self._progress.remaining_m = 0.0
 
-    def step(self, T_map_base: Array, patch: GridPatch, scan: Scan | None, dt_s: float) -> Command:
+    def step(
+        self, T_map_base: Array, patch: GridPatch, scan: Scan | Sequence[Scan] | None, dt_s: float
+    ) -> Command:
         """Command for the next dt_s from the pose (3,), the current map and the newest scan.
 
-        The same scan may be given again while the robot moves.
+        scan: of several lasers the newest of each. The same may be given again while the robot
+        moves.
         """
-        self._obstacles.add_scan(T_map_base, scan)
+        for each in [scan] if scan is None or isinstance(scan, Scan) else scan:
+            self._obstacles.add_scan(T_map_base, each)
         self._recent_path.add_pose(T_map_base)
         self._stuck_places.add_pose(T_map_base)
         is_stuck = self._stuck_detector.add(T_map_base, self._follower.v, self._follower.w, dt_s)

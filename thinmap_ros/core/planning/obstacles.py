@@ -2,13 +2,16 @@
 
 import math
 from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import Scan, with_newest
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.jit import kernel
 
@@ -30,54 +33,74 @@ class _Observation(NamedTuple):
     T_map_laser: Array
 
 
+@dataclass(frozen=True)
+class _Views:
+    """The newest scan of a laser, and earlier ones."""
+
+    newest: _Observation
+    earlier: deque[_Observation]
+
+    def near(self, remembered_m: float) -> Iterator[_Observation]:
+        """Earlier scans made within this distance of the newest one, the last ones first."""
+        here = self.newest.T_map_laser[:2]
+        for earlier in reversed(self.earlier):
+            if math.dist(earlier.T_map_laser[:2], here) <= remembered_m:
+                yield earlier
+
+
 class BlindSectors:
-    """Sectors of invalid beams in the newest scan, behind which an obstacle may stand.
+    """Sectors of invalid beams in the newest scans, behind which an obstacle may stand.
 
     Between two valid beams an angle D apart, an obstacle of width w cannot hide closer than w / D.
-    The space beyond that in a sector of invalid beams is unobserved, unless a recent scan, made
-    near by, has observed it.
+    The space beyond that in a sector of invalid beams is unobserved, unless another laser, or a
+    recent scan, made near by, has observed it.
     """
 
     def __init__(self, scans: int = 32, apart_m: float = 0.05, apart_rad: float = 0.1) -> None:
         """Remember so many scans, made at least some distance or angle apart."""
         self._apart_m = apart_m
         self._apart_rad = apart_rad
-        self._newest: _Observation | None = None
-        self._earlier: deque[_Observation] = deque(maxlen=scans)
+        self._remembered = scans
+        self._scans: tuple[Scan, ...] = ()
+        self._views: dict[str, _Views] = {}
 
     def add_scan(self, T_map_laser: Array, scan: Scan) -> None:
         """Add a scan made by a laser at a pose (3,), map frame."""
         seen_m = np.where(scan.hit, scan.ranges_m, np.where(scan.valid, np.inf, np.nan))
         seen_m = np.where(scan.below_range_min, 0.0, seen_m)
         newest = _Observation(seen_m, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser)
-        last = self._newest
-        self._newest = newest
+        last = self._views.get(scan.frame)
+        earlier = deque[_Observation](maxlen=self._remembered) if last is None else last.earlier
         if last is not None and (
-            not self._earlier
+            not earlier
             or se2.are_apart(
-                self._earlier[-1].T_map_laser, last.T_map_laser, self._apart_m, self._apart_rad
+                earlier[-1].T_map_laser, last.newest.T_map_laser, self._apart_m, self._apart_rad
             )
         ):
-            self._earlier.append(last)
+            earlier.append(last.newest)
+        self._scans = with_newest(self._scans, scan)
+        views = self._views | {scan.frame: _Views(newest, earlier)}
+        self._views = {each.frame: views[each.frame] for each in self._scans}
 
     def points(self, reach_m: float, remembered_m: float) -> Array:
         """Points (K, 2), map frame, in unobserved space up to reach_m from the laser.
 
         remembered_m: earlier scans count if they were made within this distance.
         """
-        if self._newest is None:
-            return np.empty((0, 2))
-        newest = self._newest
-        invalid = np.isnan(newest.seen_m)
-        points = _sector_points(
-            invalid, newest.first_rad, newest.step_rad, newest.T_map_laser, reach_m
-        )
-        for earlier in reversed(self._earlier):
-            if not len(points):
-                break
-            if math.dist(earlier.T_map_laser[:2], newest.T_map_laser[:2]) <= remembered_m:
-                points = points[~_is_seen(points, *earlier)]
-        return points
+        found = [np.empty((0, 2))]
+        for laser in self._views.values():
+            newest = laser.newest
+            invalid = np.isnan(newest.seen_m)
+            points = _sector_points(
+                invalid, newest.first_rad, newest.step_rad, newest.T_map_laser, reach_m
+            )
+            others = [each.newest for each in self._views.values() if each is not laser]
+            for seen in chain(others, *(each.near(remembered_m) for each in self._views.values())):
+                if not len(points):
+                    break
+                points = points[~_is_seen(points, *seen)]
+            found.append(points)
+        return np.concatenate(found)
 
 
 @kernel
@@ -139,9 +162,10 @@ def _is_seen(points: Array, seen: Array, first: float, step: float, laser: Array
 
 
 class ObstaclePoints:
-    """Hits of the newest scan, and earlier hits near the robot outside its field of view.
+    """Hits of the newest scan of each laser, and earlier ones near the robot outside their view.
 
-    A laser that looks ahead does not see the corner around which the robot is turning.
+    A laser that looks ahead does not see the corner around which the robot is turning. What one
+    sees now stays where another one does not see it: that may look over it, or be shaded.
     points (N, 2): map frame, m; they stay where they were first observed.
     is_hidden: whether a blind sector, not a point, limited the last `free_arc_length_m`.
     """
@@ -150,20 +174,29 @@ class ObstaclePoints:
         self.points: Array = np.empty((0, 2))
         self.is_hidden = False
         self._blind_sectors = BlindSectors()
-        self._scan: Scan | None = None
+        self._scans: tuple[Scan, ...] = ()
+        self._hits: dict[str, Array] = {}  # of the newest scan by the frame of its laser
+        self._remembered: Array = np.empty((0, 2))
 
     def add_scan(self, T_map_base: Array, scan: Scan | None) -> None:
-        """Add a scan made at a pose (3,). The newest one may be given again."""
-        if scan is None or scan is self._scan:
+        """Add a scan made at a pose (3,). The newest one of a laser may be given again."""
+        if scan is None or any(scan is each for each in self._scans):
             return
-        self._scan = scan
+        self._scans = with_newest(self._scans, scan)
         first = scan.angle_min_rad
         step = scan.angle_increment_rad
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
         hits = np.where(scan.hit, scan.ranges_m, np.nan)
         hits = np.where(scan.below_range_min, scan.range_min_m, hits)
         self._blind_sectors.add_scan(T_map_laser, scan)
-        self.points = _points_around(hits, first, step, T_map_laser, self.points, T_map_base)
+        others = {each.frame: self._hits[each.frame] for each in self._scans[:-1]}
+        past = [points for frame, points in self._hits.items() if frame not in others]
+        earlier = np.concatenate([*past, self._remembered])
+        points = _points_around(hits, first, step, T_map_laser, earlier, T_map_base)
+        count = int(np.count_nonzero(~np.isnan(hits)))
+        self._hits = {**others, scan.frame: points[:count]}
+        self._remembered = points[count:]
+        self.points = np.concatenate([*self._hits.values(), self._remembered])
 
     def query_radius(self, T_map_base: Array, reach_m: float) -> Array:
         """Points (M, 2), m, within reach_m of a pose (3,)."""
