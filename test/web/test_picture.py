@@ -1,6 +1,7 @@
 """Messages become items in words and numbers that the page draws; invalid ones are refused."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -79,6 +80,22 @@ def test_a_scan_is_drawn_at_the_pose_of_its_stamp():
     laser = items_of(board)['laser']
     assert laser == {'pose': [1.0, 2.0, 0.5], 'points_cm': [110, 0, 10, 200]}
     assert items_of(board)['robot']['covariance'] == [0.01, 0.0, 0.04, 0.001]
+
+
+def test_the_newest_scans_of_two_lasers_are_drawn_together():
+    board = Board()
+    picture = Picture(board)
+
+    def see(ns, frame, x):
+        scan = Scan.create(ns, np.array([1.0]), 0.0, 1.0, 0.05, 8.0)
+        picture.scan(replace(scan, frame=frame))
+        picture.pose(ns, np.array([x, 0.0, 0.0]), np.eye(3))
+        return items_of(board)['laser']['points_cm']
+
+    assert see(0, 'front', 0.0) == [100, 0]
+    assert see(10**8, 'rear', 0.5) == [50, 0, 100, 0]
+    assert see(2 * 10**8, 'front', 0.5) == [100, 0, 100, 0]
+    assert see(2 * 10**9, 'front', 0.5) == [100, 0], 'the other one is silent'
 
 
 def region(number, **fields):

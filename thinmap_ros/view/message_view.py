@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.logs import decode
-from thinmap_ros.logs.readers.bag import Bag
+from thinmap_ros.logs.readers.bag import SCAN, Bag
 from thinmap_ros.logs.transforms import StaticTransforms
 from thinmap_ros.view import palette
 from thinmap_ros.view.interface import ApartScans, NullView, StampMatcher
@@ -98,7 +99,8 @@ class MessageView:
             return
         angles = (message.angle_min, message.angle_increment)
         limits = (message.range_min, message.range_max)
-        self._view.scan(ns, Scan.create(ns, message.ranges, *angles, *limits, T_base_laser))
+        scan = Scan.create(ns, message.ranges, *angles, *limits, T_base_laser)
+        self._view.scan(ns, replace(scan, frame=message.header.frame_id))
 
     def _on_pose(self, ns: int, message: Any) -> None:
         T_map_base = _pose(message.pose.pose)
@@ -220,9 +222,11 @@ def recording_from_bag(bag_path: Path, out_rrd: Path) -> None:
 
 
 def _tell(bag: Bag, feed: MessageView) -> None:
-    for raw in bag.messages({f'/{topic}' for topic in feed.topics}):
+    names = {f'/{topic}': topic for topic in feed.topics}
+    names |= {topic: 'scan' for topic, kind in bag.topics.items() if kind == SCAN}
+    for raw in bag.messages(set(names)):
         try:
-            feed.show(raw.topic.removeprefix('/'), bag.decode(raw))
+            feed.show(names[raw.topic], bag.decode(raw))
         except InputError:
             continue
 

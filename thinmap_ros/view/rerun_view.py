@@ -228,6 +228,7 @@ class View(NullView):
         self._drawn_ns: dict[str, int] = {}
         self._waiting: dict[str, tuple[int, Callable[[], None]]] = {}
         self._trail_ends: dict[str, Array] = {}
+        self._lasers: dict[str, str] = {}  # paths, by frame
         self._target = np.zeros((0, 2))
         self._patch: GridPatch | None = None
         self._framed_m = 0.0
@@ -269,12 +270,16 @@ class View(NullView):
             self._frame(patch)
 
     def scan(self, ns: int, scan: Scan) -> None:
-        """Show a scan at the pose of the robot; it replaces the previous scan."""
+        """Show a scan at the pose of the robot; it replaces the previous scan of its laser."""
         self._at(ns)
         points = self._rr.Points3D(
             _lifted(scan.points_base(), 0.0), colors=[rgb(_SCAN)], radii=[self._px(1.8)]
         )
-        self._log('map/robot/scan', points)
+        # The path of the first laser is that of the only one.
+        path = self._lasers.setdefault(
+            scan.frame, f'map/robot/scan/{len(self._lasers)}' if self._lasers else 'map/robot/scan'
+        )
+        self._log(path, points)
 
     def pose(self, ns: int, T_map_base: Array, covariance: Array) -> None:
         """Show the robot pose with its covariance (3, 3) over x, y, theta.

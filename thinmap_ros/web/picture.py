@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import errors
+from thinmap_ros.core import errors, se2
 from thinmap_ros.core.errors import one_line
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.path_follower import Motion
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import Scan, with_newest
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.core.topology.regions import RegionKind
@@ -292,7 +292,9 @@ class Picture:
         self._tiles = MapTiles(board)
         self._table = DiagnosticsTable()
         self._apart = ApartScans()
-        self._pairs: StampMatcher[Array, Array] = StampMatcher()
+        self._pairs: dict[str, StampMatcher[Array, Scan]] = {}  # by the frame of the laser
+        self._scans: tuple[Scan, ...] = ()
+        self._poses: dict[str, Array] = {}  # of the robot, when they were made
         board.put('key', colours())
 
     def grid(self, patch: GridPatch) -> None:
@@ -311,16 +313,29 @@ class Picture:
             },
         )
         self.path.add(ns, x, y)
-        self._laser(self._pairs.add_left(ns, T_map_base))
+        for pairs in self._pairs.values():
+            self._laser(pairs.add_left(ns, T_map_base))
 
     def scan(self, scan: Scan) -> None:
         """Show the points of a scan, once the pose at its stamp is known."""
-        self._laser(self._pairs.add_right(scan.stamp_ns, scan.points_base()))
+        pairs = self._pairs.setdefault(scan.frame, StampMatcher())
+        self._laser(pairs.add_right(scan.stamp_ns, scan))
 
-    def _laser(self, pair: tuple[Array, Array] | None) -> None:
+    def _laser(self, pair: tuple[Array, Scan] | None) -> None:
+        """Show a scan at a pose (3,), with the newest one of each other laser."""
         if pair is None:
             return
-        T_map_base, points = pair
+        T_map_base, scan = pair
+        self._scans = with_newest(self._scans, scan)
+        self._poses[scan.frame] = T_map_base
+        points = np.concatenate(
+            [
+                se2.transform_points(
+                    se2.between(T_map_base, self._poses[each.frame]), each.points_base()
+                )
+                for each in self._scans
+            ]
+        )
         self.board.put(
             'laser',
             {
