@@ -239,6 +239,38 @@ def test_a_loop_begins_again_with_the_clock(graph, bag):
     assert graph.stop('bag_player') == 0
 
 
+def test_lockstep_plays_the_scans_of_two_lasers_before_what_both_wait_for(graph, tmp_path):
+    """A localizer answers both once the odometry after them has come."""
+    writer = BagWriter(tmp_path / 'bag', live=True)
+    make = writer.typestore.types
+    for i in range(10):
+        ns = 10**12 + i * 10**9
+        writer.write('/front/scan', SCAN, ns + 1, scan(make, ns + 1))
+        writer.write('/rear/scan', SCAN, ns + 2, scan(make, ns + 2))
+        writer.write('/said', STRING, ns + 3, make[STRING](data=f'{i}'))
+    writer.close()
+    waiting = []
+    answers = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+
+    def answer(_):
+        while waiting:
+            answers.publish(PoseWithCovarianceStamped(header=waiting.pop(0).header))
+
+    for topic in ('/front/scan', '/rear/scan'):
+        graph.node.create_subscription(LaserScan, topic, waiting.append, qos.STREAM)
+    graph.node.create_subscription(String, '/said', answer, qos.STREAM)
+    player = graph.start(
+        'bag_player',
+        bag=str(tmp_path / 'bag'),
+        rate=50.0,
+        lockstep='pose',
+        lockstep_timeout_s=2.0 * PATIENCE_S,
+    )
+    graph.until(lambda: player.poll() == 0, 'the end')
+    assert '30 messages sent: /front/scan 10, /rear/scan 10, /said 10' in graph.log('bag_player')
+    assert 'continuing without it' not in graph.log('bag_player')
+
+
 def test_a_bag_that_ends_before_the_offset_is_refused(graph, bag):
     player = graph.start('bag_player', bag=str(bag), start_offset_s=60.0)
     assert graph.ended(player) == 2

@@ -55,10 +55,11 @@ class Playback:
         return self._take()
 
     @property
-    def is_scan_due(self) -> bool:
-        """Whether the next message is a scan that is due."""
+    def due_scan(self) -> str:
+        """Topic of the next message where it is a scan that is due; else ''."""
         following = self._next
-        return following is not None and is_scan(following) and following.log_ns <= self.played_ns
+        is_due = following is not None and following.log_ns <= self.played_ns
+        return following.topic if following is not None and is_due and is_scan(following) else ''
 
     def hold(self) -> None:
         """Stop the time of the bag at the next message: it is held back."""

@@ -120,6 +120,7 @@ class BagPlayerNode(Node):
         self._paused = self._config.start_paused
         self._last_tick_s = 0.0
         self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_timeout_s)
+        self._unanswered: set[str] = set()  # topics of scans
         self._sent: Counter[str] = Counter()
         self._diagnostics = NodeDiagnostics(self)
         self._diagnostics.add_update_callback(self._publish_diagnostics)
@@ -208,17 +209,19 @@ class BagPlayerNode(Node):
     def _play(self, passed_s: float) -> None:
         """Send what is due. In lockstep, the next scan is held back until the result of the last.
 
-        What is between them is sent: a scan may need odometry that follows it.
+        What is between them is sent: a scan may need odometry that follows it, and the scans of
+        other lasers.
         """
         self._playback.advance(1e9 * passed_s * self._config.rate)
         while not self._is_held() and (message := self._playback.pop_due()) is not None:
             self._send(message)
 
     def _is_held(self) -> bool:
-        """Whether a scan is due and the result of the last one is missing."""
-        if not (self._playback.is_scan_due and self._lockstep.is_waiting):
+        """Whether a scan is due and a result is missing since the last one of its topic."""
+        if self._playback.due_scan not in self._unanswered:
             return False
-        if self._lockstep.timed_out():
+        if not self._lockstep.is_waiting or self._lockstep.timed_out():
+            self._unanswered.clear()
             return False
         # Time spent waiting does not count: the messages keep their intervals.
         self._playback.hold()
@@ -229,6 +232,7 @@ class BagPlayerNode(Node):
         self._publishers_by_topic[message.topic].publish(message.data)
         self._sent[message.topic] += 1
         if is_scan(message) and self._config.lockstep != NONE:
+            self._unanswered.add(message.topic)
             with contextlib.suppress(InputError):  # nothing is published for an invalid scan
                 self._lockstep.scan_published(
                     messages.stamp_ns(self._bag.decode(message).header.stamp)

@@ -145,9 +145,9 @@ class Lockstep:
             node.create_subscription(_TYPES[topic], self._name, self._on_message, qos.STREAM)
 
     def scan_published(self, stamp_ns: int) -> None:
-        """Wait for the result of a scan that was published."""
+        """Wait for the result of a scan that was published, and of those before it."""
         if self._topic != NONE:
-            self._awaited_ns = stamp_ns
+            self._awaited_ns = max(stamp_ns, self._awaited_ns or stamp_ns)
             self._since = monotonic()
 
     @property
