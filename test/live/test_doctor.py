@@ -36,6 +36,44 @@ def test_a_robot_that_has_all_is_told_so(graph):
     assert 'geometry_msgs/msg/Twist to /sim; nobody publishes it yet' in table
 
 
+def test_each_of_several_lasers_has_its_rows(graph):
+    publishers = {name: graph.node.create_publisher(LaserScan, name, qos.SENSOR) for name in 'ab'}
+    frames = dict.fromkeys(publishers, 'laser')
+    beats = [0]
+
+    def publish():
+        beats[0] += 1
+        for name, publisher in publishers.items():
+            scan = LaserScan(angle_increment=0.01, range_max=8.0, ranges=[2.0] * 100)
+            scan.header.frame_id = frames[name]
+            scan.header.stamp = messages.time_msg(beats[0] * 10**8)
+            publisher.publish(scan)
+
+    timer = graph.node.create_timer(0.1, publish)
+    thread = threading.Thread(target=graph.executor.spin)
+    thread.start()
+    try:
+        code, said = lines('--seconds', '3', '--scan-topic', 'a', 'b', 'c')
+        table = '\n'.join(said)
+        assert code == 1
+        for name in 'ab':
+            assert f'✓ topic /{name}' in table, table
+        assert table.count('100 beams over') == 2
+        assert '✗ topic /c' in table and 'no publisher; of its type: /a, /b' in table
+        assert '✗ frames of the lasers' in table and "2 lasers in 'laser'" in table
+        frames['b'] = 'other'
+        _, said = lines('--seconds', '3', '--scan-topic', 'a', 'b')
+        table = '\n'.join(said)
+        assert 'frames of the lasers' not in table
+        for frame in ('laser', 'other'):
+            assert f'✗ transform base_link -> {frame}' in table
+        assert 'set laser_pose' not in table
+    finally:
+        timer.cancel()
+        graph.executor.shutdown()
+        thread.join()
+
+
 def test_what_a_robot_lacks_is_named_with_what_to_do(graph):
     """Scans under another name, odometry of another type, and no frames."""
     scans = graph.node.create_publisher(LaserScan, 'front/scan', qos.SENSOR)

@@ -20,7 +20,7 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import messages, qos, stop_topic, velocity
 from thinmap_ros.ros.diagnostics import full_name, publisher_names, subscriber_names
@@ -36,7 +36,7 @@ _LISTENING = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 class RobotNames:
     """Topics and frames of a robot, as of the parameters of the nodes."""
 
-    scan_topic: str
+    scan_topics: tuple[str, ...]
     odom_topic: str
     base_frame: str
     odom_frame: str
@@ -81,11 +81,12 @@ class RobotCheck:
     def __init__(self, node: Node, names: RobotNames) -> None:
         self._node = node
         self._names = names
-        self._scans: list[tuple[LaserScan, float]] = []
+        self._scans: dict[str, list[tuple[LaserScan, float]]] = {}
         self._odometry: list[tuple[Odometry, float]] = []
         self._clock: list[Clock] = []
         self._transforms: dict[tuple[str, str], bool] = {}
-        self._listen(LaserScan, names.scan_topic, self._scans)
+        for topic in names.scan_topics:
+            self._listen(LaserScan, topic, self._scans.setdefault(topic, []))
         self._listen(Odometry, names.odom_topic, self._odometry)
         node.create_subscription(Clock, '/clock', self._clock.append, qos.SENSOR)
         node.create_subscription(TFMessage, 'tf', self._on_moving, _LISTENING)
@@ -94,15 +95,20 @@ class RobotCheck:
     def findings(self) -> Iterator[Finding]:
         """All lines, the sensors first."""
         names = self._names
-        yield from self._stream(names.scan_topic, 'sensor_msgs/msg/LaserScan', self._scans)
-        if self._scans:
-            yield self._laser(self._scans[-1][0])
+        for topic, scans in self._scans.items():
+            yield from self._stream(topic, 'sensor_msgs/msg/LaserScan', scans)
+            if scans:
+                yield self._laser(scans[-1][0])
         yield from self._stream(names.odom_topic, 'nav_msgs/msg/Odometry', self._odometry)
         yield self._frame(names.odom_frame, names.base_frame, 'odometry', 'odom_frame, base_frame')
-        if self._scans:
-            laser = self._scans[-1][0].header.frame_id
-            advice = 'publish it on /tf_static (robot_state_publisher), or set laser_pose'
-            yield self._frame(names.base_frame, laser, 'mount of the laser', advice)
+        frames = [scans[-1][0].header.frame_id for scans in self._scans.values() if scans]
+        advice = 'publish it on /tf_static (robot_state_publisher)'
+        advice += '' if len(names.scan_topics) > 1 else ', or set laser_pose'
+        for frame in dict.fromkeys(frames):
+            yield self._frame(names.base_frame, frame, 'mount of the laser', advice)
+        if len(set(frames)) < len(frames):
+            seen = f'{len(frames)} lasers in {", ".join(map(quoted, sorted(set(frames))))}'
+            yield Finding('frames of the lasers', False, seen, 'expected one of its own for each')
         yield self._commands()
         yield self._one_map()
         yield self._time()
@@ -226,7 +232,7 @@ class RobotCheck:
         )
 
     def _time(self) -> Finding:
-        heard = self._scans or self._odometry
+        heard = next(filter(None, self._scans.values()), self._odometry)
         if self._clock:
             return Finding('clock', True, '/clock is published: use_sim_time:=true for all nodes')
         if not heard:

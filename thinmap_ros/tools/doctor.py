@@ -26,7 +26,7 @@ def _work(arguments: argparse.Namespace) -> None:
     from thinmap_ros.ros.robot_check import RobotNames, check_robot, try_watchdog
 
     names = RobotNames(
-        arguments.scan_topic,
+        tuple(arguments.scan_topic),
         arguments.odom_topic,
         arguments.base_frame,
         arguments.odom_frame,
@@ -72,8 +72,10 @@ def main() -> None:
         'stands within 2 s; asks first',
     )
     parser.add_argument('--yes', action='store_true', help='do not ask')
+    parser.add_argument(
+        '--scan-topic', nargs='+', default=['scan'], help='of each laser (default scan)'
+    )
     for name, default in (
-        ('scan-topic', 'scan'),
         ('odom-topic', 'odom'),
         ('base-frame', 'base_link'),
         ('odom-frame', 'odom'),
