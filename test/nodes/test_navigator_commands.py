@@ -69,7 +69,7 @@ class Driven:
         if 'laser' not in self.silent:
             noise = 0.01 * np.random.default_rng(self.now_ns).standard_normal(61)
             scan = Scan.create(self.now_ns, 6.0 + noise, -1.5, 0.05, 0.05, 8.0)
-            self.node._on_scan(messages.scan_msg(scan, 'laser', CONTROL_PERIOD_S))
+            self.node._on_scan('scan', messages.scan_msg(scan, 'laser', CONTROL_PERIOD_S))
         if 'localizer' not in self.silent:
             message = messages.pose_with_covariance_msg(T, np.eye(3), 'map', self.now_ns)
             for _ in range(self.poses):

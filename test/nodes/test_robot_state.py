@@ -1,5 +1,7 @@
 """Each reason to stop: the first cause, with its value and what is needed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rclpy.clock import ROSClock
@@ -78,7 +80,7 @@ class Robot:
 def test_a_robot_that_knows_everything_has_no_reason_to_stop():
     robot = Robot()
     assert robot.run(60) == ['']
-    assert robot.state.scan is not None
+    assert len(robot.state.scans) == 1 and not robot.state.awaited
     assert robot.state.pose() is not None
 
 
@@ -87,6 +89,7 @@ def test_without_any_input_there_is_no_pose_and_no_fault():
     robot.silent = {'odometry', 'laser', 'localizer'}
     assert robot.run(10) == ['']
     assert robot.state.pose() is None
+    assert robot.state.awaited == ['laser', 'pose or odometry']
 
 
 @pytest.mark.parametrize(
@@ -180,7 +183,66 @@ def test_a_blind_laser_comes_before_all_other_reasons():
     robot.state.pose_fault = 'laser misaligned (turned on the robot)'
     robot.silent = {'odometry'}
     assert robot.run(4)[-1] == 'laser blind (no hits)'
-    assert robot.state.scan.blind_reason == ''
+    assert robot.state.scans[0].blind_reason == ''
+
+
+class TwoLasers(Robot):
+    """The same robot with a second laser, whose scans come right after those of the first.
+
+    missing: topics without scans; blind: those whose lasers see nothing.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.state = RobotState(ElapsedTime(self.clock), True, ('front/scan', 'rear/scan'))
+        self.missing = set()
+        self.blind = set()
+        self.ahead_ns = 0
+        add = self.state.add_scan
+        lasers = ('front', 'rear')
+        self.state.add_scan = lambda scan: [self._add(add, scan, each) for each in lasers]
+
+    def _add(self, add, scan, laser):
+        topic = f'{laser}/scan'
+        scan = replace(scan, frame=laser)
+        if laser == 'rear':
+            scan = replace(scan, stamp_ns=scan.stamp_ns + self.ahead_ns)
+        if topic not in self.missing:
+            add(scan.blinded('no hits') if topic in self.blind else scan, topic)
+
+
+def test_one_of_two_lasers_that_is_silent_stops_the_robot_with_its_topic():
+    robot = TwoLasers()
+    assert robot.run(4) == ['']
+    assert [scan.frame for scan in robot.state.scans] == ['front', 'rear']
+    robot.missing = {'front/scan'}
+    reasons = robot.run(4)
+    assert reasons[0] == '' and 'front/scan silent for 0.5 s' in reasons[1:3]
+    assert [scan.frame for scan in robot.state.scans] == ['rear']
+    robot.missing = set()
+    assert robot.run(4)[-1] == ''
+
+
+def test_one_of_two_lasers_that_is_blind_stays_so_while_the_other_sees():
+    robot = TwoLasers()
+    robot.run(4)
+    robot.blind = {'front/scan'}
+    assert robot.run(4)[1:] == ['front/scan blind (no hits)']
+    robot.blind = set()
+    assert robot.run(4)[-1] == ''
+
+
+def test_a_laser_that_never_came_is_awaited_by_its_topic():
+    robot = TwoLasers()
+    robot.missing = {'rear/scan'}
+    assert robot.run(4) == ['']
+    assert robot.state.awaited == ['rear/scan']
+
+
+def test_the_stamps_of_one_of_two_lasers_are_named_by_its_topic():
+    robot = TwoLasers()
+    robot.ahead_ns = 5 * S
+    assert robot.run(4)[-1].startswith('rear/scan stamps are 5.0 s ahead of')
 
 
 def test_the_word_of_the_localizer_counts_while_sensors_are_sound():

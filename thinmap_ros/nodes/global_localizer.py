@@ -24,7 +24,7 @@ from thinmap_ros.core.planning.navigator import (
 )
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import Scan, with_newest
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.synchronizer import InputStream, ScanOdometrySynchronizer
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
@@ -43,6 +43,7 @@ from thinmap_ros.ros.time_jumps import ElapsedTime
 from thinmap_ros.ros.velocity import VelocityPublisher, declare_stamped
 
 _SAMPLES_PERIOD_NS = 1_000_000_000
+_ODOMETRY = 'odometry'
 # Margins added to the radius of the robot: for paths, and for stops in front of obstacles.
 _PATH_MARGIN_M = 0.05
 _STOP_MARGIN_M = 0.04
@@ -146,9 +147,12 @@ class _SearchDriver:
     search: None while there is nothing to search.
     """
 
-    def __init__(self, time: ElapsedTime, velocity: VelocityPublisher | None) -> None:
+    def __init__(
+        self, time: ElapsedTime, scan_topics: tuple[str, ...], velocity: VelocityPublisher | None
+    ) -> None:
         """velocity: None for a node that does not drive."""
         self.search: ActiveSearch | None = None
+        self._scan_topics = scan_topics
         self._time = time
         self._velocity = velocity
         self._is_driving = False
@@ -158,27 +162,27 @@ class _SearchDriver:
     def reset(self) -> None:
         """Forget scan, odometry and search."""
         self.search = None
-        self._scan: Scan | None = None
+        self._scans: tuple[Scan, ...] = ()
         self._T_odom_base: Array | None = None
         self._odometry_ns = 0
         self._streams = {
             name: InputStream(name, SENSOR_TIMEOUT_NS, SENSOR_DELAY_NS)
-            for name in ('laser', 'odometry')
+            for name in (*self._scan_topics, _ODOMETRY)
         }
 
     def record(self, source: str, stamp_ns: int) -> None:
-        """A measurement of a source, 'laser' or 'odometry', was received."""
+        """A measurement of a source, a topic of scans or the odometry, was received."""
         time = self._time
         self._streams[source].add(stamp_ns, time.now_ns(), time.age_ns(stamp_ns))
 
     def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         self._T_odom_base = T_odom_base
         self._odometry_ns = stamp_ns
-        self.record('odometry', stamp_ns)
+        self.record(_ODOMETRY, stamp_ns)
 
     def add_scan(self, scan: Scan) -> None:
-        """Add a scan; while the laser is blind, the robot does not drive."""
-        self._scan = None if scan.is_blind else scan
+        """Add a scan; while a laser is blind, the robot does not drive."""
+        self._scans = with_newest(self._scans, scan)
 
     def add_result(self, result: Result, T_odom_base: Array) -> None:
         """Add the result of a step of the localization at an odometry pose (3,)."""
@@ -194,13 +198,13 @@ class _SearchDriver:
 
     def step(self) -> None:
         """Publish the next command, or stop while inputs are missing or too old."""
-        if self._is_held or self.search is None or self._scan is None or self._T_odom_base is None:
+        if self._is_held or self.search is None or self._T_odom_base is None:
             self.stop()
             return
-        if not self._is_recent(self._scan.stamp_ns):
+        if not self._sees_now():
             self.stop()
             return
-        command = self.search.step(self._T_odom_base, self._scan, CONTROL_PERIOD_S)
+        command = self.search.step(self._T_odom_base, self._scans, CONTROL_PERIOD_S)
         if command.state == 'idle':
             self.stop()
             return
@@ -219,11 +223,16 @@ class _SearchDriver:
         if self._is_driving and self._velocity is not None:
             self._velocity.stop()
 
-    def _is_recent(self, scan_ns: int) -> bool:
+    def _sees_now(self) -> bool:
+        """Whether no laser is blind, and all inputs are those of now."""
         now_ns = self._time.now_ns()
+        if len(self._scans) < len(self._scan_topics) or any(each.is_blind for each in self._scans):
+            return False
         if any(stream.fault(now_ns) for stream in self._streams.values()):
             return False
-        return abs(self._odometry_ns - scan_ns) <= SENSOR_TIMEOUT_NS
+        return all(
+            abs(self._odometry_ns - scan.stamp_ns) <= SENSOR_TIMEOUT_NS for scan in self._scans
+        )
 
 
 class _LocalizationPublishers:
@@ -309,18 +318,18 @@ class GlobalLocalizerNode(ThinmapNode):
             subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._odometry.subscribe()
-        scan_topic = self._laser_transform.scan_topic
-        subscribe_guarded(self, LaserScan, scan_topic, self._on_scan, qos.SENSOR)
+        self._laser_transform.subscribe(self, self._on_scan)
         offer(self.create_active_service, LocalizeGlobally, 'localize_globally', self._on_request)
         self.create_active_timer(1.0, self._report_missing_inputs)
 
     def _create_driver(self) -> _SearchDriver:
+        topics = self._laser_transform.scan_topics
         if not self._settings.node.drive:
-            return _SearchDriver(self.elapsed_time, None)
+            return _SearchDriver(self.elapsed_time, topics, None)
         base_frame = self._laser_transform.base_frame
         velocity = VelocityPublisher(self, base_frame, self._settings.stamped_commands)
         self.create_active_timer(CONTROL_PERIOD_S, lambda: self._driver.step())
-        driver = _SearchDriver(self.elapsed_time, velocity)
+        driver = _SearchDriver(self.elapsed_time, topics, velocity)
         StopTopic(self, driver.hold)
         return driver
 
@@ -378,10 +387,10 @@ class GlobalLocalizerNode(ThinmapNode):
         tilt_rad = self._odometry.tilt_rad
         self._process(self._pairing.add_odometry(stamp_ns, T_odom_base, tilt_rad))
 
-    def _on_scan(self, message: LaserScan) -> None:
-        scan = self._laser_transform.to_scan(message)
-        self._received.add('scan')
-        self._driver.record('laser', scan.stamp_ns)
+    def _on_scan(self, topic: str, message: LaserScan) -> None:
+        scan = self._laser_transform.to_scan(topic, message)
+        self._received.add(topic)
+        self._driver.record(topic, scan.stamp_ns)
         self._odometry.add_scan_stamp(scan.stamp_ns)
         self._process(self._pairing.add_scan(scan))
 
@@ -428,7 +437,8 @@ class GlobalLocalizerNode(ThinmapNode):
         """Names of the missing inputs; '' for none."""
         maps = {'map': self._patch, 'topology': self._topology}
         missing = [name for name, value in maps.items() if value is None]
-        missing += [name for name in ('odom', 'scan') if name not in self._received]
+        topics = ('odom', *self._laser_transform.scan_topics)
+        missing += [name for name in topics if name not in self._received]
         return ', '.join(missing)
 
     def _report_missing_inputs(self) -> None:

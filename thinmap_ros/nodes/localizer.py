@@ -216,8 +216,7 @@ class LocalizerNode(ThinmapNode):
         # last scan first.
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         self._odometry.subscribe()
-        scan_topic = self._laser_transform.scan_topic
-        subscribe_guarded(self, LaserScan, scan_topic, self._on_scan, qos.SENSOR)
+        self._laser_transform.subscribe(self, self._on_scan)
         poses = InitialPoses(
             self, self._output.map_frame, self._on_initial_pose, self._broadcaster.received
         )
@@ -278,8 +277,8 @@ class LocalizerNode(ThinmapNode):
         tilt_rad = self._odometry.tilt_rad
         self._process(self._input.pairing.add_odometry(stamp_ns, T_odom_base, tilt_rad))
 
-    def _on_scan(self, message: LaserScan) -> None:
-        scan = self._laser_transform.to_scan(message)
+    def _on_scan(self, topic: str, message: LaserScan) -> None:
+        scan = self._laser_transform.to_scan(topic, message)
         self._odometry.add_scan_stamp(scan.stamp_ns)
         self._process(self._input.pairing.add_scan(scan))
 

@@ -137,8 +137,7 @@ class NavigatorNode(ThinmapNode):
         self.reset_state()
         self._odometry.subscribe()
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
-        scan_topic = self._laser_transform.scan_topic
-        subscribe_guarded(self, LaserScan, scan_topic, self._on_scan, qos.SENSOR)
+        self._laser_transform.subscribe(self, self._on_scan)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._map.subscribe(self)
         subscribe_guarded(self, KeepOut, 'keep_out', self._on_keep_out, qos.LATCHED)
@@ -179,7 +178,9 @@ class NavigatorNode(ThinmapNode):
         self._navigator = Navigator(self._config)
         self._map.reset()
         self._output.base.release()
-        self._robot = RobotState(self.elapsed_time, self._odometry.source != NONE)
+        self._robot = RobotState(
+            self.elapsed_time, self._odometry.source != NONE, self._laser_transform.scan_topics
+        )
         self._task = NavigationTask(NavigateToPose, (), 0)
 
     def _on_config(self, config: NavigatorConfig) -> None:
@@ -211,10 +212,10 @@ class NavigatorNode(ThinmapNode):
         T_map_base = messages.pose_from_msg(message.pose.pose)
         self._robot.add_pose(messages.stamp_ns(message.header.stamp), T_map_base)
 
-    def _on_scan(self, message: LaserScan) -> None:
-        scan = self._laser_transform.to_scan(message)
+    def _on_scan(self, topic: str, message: LaserScan) -> None:
+        scan = self._laser_transform.to_scan(topic, message)
         self._odometry.add_scan_stamp(scan.stamp_ns)
-        self._robot.add_scan(scan)
+        self._robot.add_scan(scan, topic)
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         self._robot.pose_fault = _POSE_FAULTS.get(message.state, '')
@@ -303,18 +304,19 @@ class NavigatorNode(ThinmapNode):
         if fault := self._robot.stop_reason() or self._map.fault or self.diagnostics.error:
             return self._stand(fault)
         patch = self._map.patch
-        scan = self._robot.scan
         T_map_base = self._robot.pose()
-        if patch is None or scan is None or T_map_base is None:
+        awaited = self._robot.awaited
+        if patch is None or T_map_base is None or awaited:
+            missing = [*awaited, *([] if patch else ['map'])]
             self.get_logger().warning(
-                'goal waits: no map, scan, pose or odometry yet',
+                f'goal waits: no {", ".join(missing)} yet',
                 throttle_duration_sec=WARN_PERIOD_S,
             )
             return None
         self.diagnostics.set_state(OK, 'driving')
         with self.diagnostics.time_step('navigator'):
             patch = self._map.keep_out.laid_on(self._team.completed(patch), T_map_base)
-            command = self._navigator.step(T_map_base, patch, scan, CONTROL_PERIOD_S)
+            command = self._navigator.step(T_map_base, patch, self._robot.scans, CONTROL_PERIOD_S)
             return self._team.allowed(self._navigator, T_map_base, command, CONTROL_PERIOD_S)
 
     def _stand(self, fault: str) -> Command:

@@ -75,11 +75,11 @@ class RerunViewerNode(Node):
         names = {
             'diagnostics': '/diagnostics',  # all robots share it
             'map_updates': updates_topic(self, 'map'),
-            'scan': mount.scan_topic,
         }
         for topic, (kind, profile) in _TOPICS.items():
-            name = names.get(topic, topic)
-            self.create_subscription(kind, name, self._callback(topic), profile)
+            of_kind = mount.scan_topics if topic == 'scan' else (names.get(topic, topic),)
+            for name in of_kind:
+                self.create_subscription(kind, name, self._callback(topic), profile)
 
     def close(self) -> None:
         """Finish the recording."""

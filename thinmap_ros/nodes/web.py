@@ -116,7 +116,7 @@ class WebNode(ThinmapNode):
         picture = self._picture
         subscribe_to_map(self, 'map', picture.grid)
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
-        subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        self._laser.subscribe(self, self._on_scan)
         subscribe_guarded(self, PathMsg, 'trajectory', self._on_trajectory, qos.LATCHED)
         subscribe_guarded(self, PathMsg, 'plan', picture.plan, qos.LATCHED)
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
@@ -135,9 +135,9 @@ class WebNode(ThinmapNode):
         covariance = messages.covariance_from_msg(message)
         self._picture.pose(messages.stamp_ns(message.header.stamp), T_map_base, covariance)
 
-    def _on_scan(self, message: LaserScan) -> None:
+    def _on_scan(self, topic: str, message: LaserScan) -> None:
         if self._pages.open:
-            self._picture.scan(self._laser.to_scan(message))
+            self._picture.scan(self._laser.to_scan(topic, message))
 
     def _on_trajectory(self, message: PathMsg) -> None:
         self._picture.path.correct(*messages.trajectory_from_msg(message))

@@ -1,19 +1,22 @@
 """The pose of the laser on the robot, from /tf_static or from a parameter."""
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from thinmap_ros.core.errors import InputError, quoted
+from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs.transforms import Mount, StaticTransforms, parse_pose
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.diagnostics import WARN
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.tf import TransformReader
 
 
@@ -49,7 +52,8 @@ class LaserTransform:
     It is looked up in the static transforms, as for bags. For a robot that does not publish them,
     the parameter `laser_pose` [x m, y m, yaw rad] is used for every frame. There is no default.
     The first pose of a frame is kept: the map was made with it. Another one is reported on
-    /diagnostics. base_frame, scan_topic: values of the parameters of these names.
+    /diagnostics. base_frame, scan_topics: values of the parameters base_frame and scan_topic. Of
+    several topics, each is that of other lasers.
     """
 
     def __init__(self, node: Node) -> None:
@@ -64,18 +68,26 @@ class LaserTransform:
             '',
             'Pose of the laser on the robot as "x,y,yaw" (m, m, rad). Empty: from /tf_static.',
         )
-        self.scan_topic = str(
-            parameters.declare_parameter(
-                node, 'scan_topic', 'scan', 'Topic of the scans, as for slam_toolbox and AMCL.'
-            )
+        self.scan_topics = parameters.declare_texts(
+            node,
+            'scan_topic',
+            'scan',
+            'Topic of the scans, as for slam_toolbox and AMCL; of several lasers a list: '
+            '[front/scan, rear/scan].',
         )
+        if given and len(self.scan_topics) > 1:
+            raise ConfigError(
+                f'laser_pose {quoted(str(given))} with {len(self.scan_topics)} topics in scan_topic'
+                ': expected no pose: that of each laser is from /tf_static'
+            )
         self._laser = parameters.declare_config(node, LaserConfig)
         self._fixed = Mount(parse_pose(str(given)), upside_down=False) if given else None
         self._transforms = StaticTransforms()
         self._reader = TransformReader(lambda frame: frame in self._mounts)
         self._mounts: dict[str, Mount] = {}
         self._changes: dict[str, str] = {}
-        self._first = _FirstScans(node, self.scan_topic)
+        self._topics: dict[str, str] = {}  # of each laser frame
+        self._first = {topic: _FirstScans(node, topic) for topic in self.scan_topics}
         if isinstance(node, ThinmapNode):
             node.diagnostics.add_check(WARN, lambda: '; '.join(self._changes.values()))
         if self._fixed is None:
@@ -83,10 +95,16 @@ class LaserTransform:
                 TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS, raw=True
             )
 
-    def to_scan(self, message: LaserScan) -> Scan:
-        """Scan of a message, with the pose of its laser.
+    def subscribe(self, node: ThinmapNode, process: Callable[[str, LaserScan], None]) -> None:
+        """Call `process` with topic and message of each scan, as `subscribe_guarded`."""
+        for topic in self.scan_topics:
+            subscribe_guarded(node, LaserScan, topic, partial(process, topic), qos.SENSOR)
 
-        Raises InputError where the pose is unknown or the message is no scan.
+    def to_scan(self, topic: str, message: LaserScan) -> Scan:
+        """Scan of a message on a topic, with the pose of its laser.
+
+        Raises InputError where the pose is unknown, the message is no scan, or another topic has
+        scans in its frame.
         """
         mount = self._mount(message.header.frame_id)
         if mount is None:
@@ -96,13 +114,25 @@ class LaserTransform:
                 'laser_pose'
             )
         scan = messages.scan_from_msg(message, mount.T_base_laser, self._laser)
-        self._first.report(scan)
+        self._require_own_frame(topic, scan.frame)
+        self._first[topic].report(scan)
         return mount.apply(scan)
 
     def pose(self, frame_id: str) -> Array | None:
         """T_base_laser (3,) of a laser frame; None until it is known."""
         mount = self._mount(frame_id)
         return None if mount is None else mount.T_base_laser
+
+    def _require_own_frame(self, topic: str, frame: str) -> None:
+        """Raise InputError where the frame of a scan is that of another topic."""
+        if len(self.scan_topics) == 1:
+            return
+        known = self._topics.setdefault(frame, topic)
+        if known != topic:
+            raise InputError(
+                f'scan in frame {quoted(frame)}, as those on {known}: expected a frame of its own '
+                'for each laser'
+            )
 
     def _mount(self, frame_id: str) -> Mount | None:
         if self._fixed is not None:

@@ -26,7 +26,7 @@ from thinmap_ros.core.config import (
     suggestion,
     with_values,
 )
-from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.core.errors import ConfigError, quoted
 from thinmap_ros.ros.foreign import (
     foreign_values,
     given_files,
@@ -153,6 +153,23 @@ def declare_parameter(
         raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
     require_number(name, value, low, high)
     return value
+
+
+def declare_texts(node: Node, name: str, default: str, description: str) -> tuple[str, ...]:
+    """Declare a read-only parameter that is a text or a list of texts, and return them all.
+
+    Raises ConfigError where it is neither, where a text is empty, or given twice.
+    """
+    descriptor = ParameterDescriptor(description=description, read_only=True, dynamic_typing=True)
+    value = node.declare_parameter(name, default, descriptor).value
+    texts = value if isinstance(value, list | tuple) else [value]
+    are_texts = all(isinstance(each, str) and each for each in texts)
+    if not texts or not are_texts or len(set(texts)) < len(texts):
+        raise ConfigError(
+            f'parameter {name} of node {node.get_name()}: {quoted(value)}: expected a text, or a '
+            'list of different ones'
+        )
+    return tuple(texts)
 
 
 def _accept_integer(node: Node, name: str, default: Any) -> None:

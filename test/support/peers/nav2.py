@@ -158,7 +158,7 @@ class BtNavigator(LifecycleNode):
             return
         try:
             T_map_base = self._transforms.lookup('map', 'base_link', stamp_ns)
-            scan = self._laser.to_scan(message)
+            scan = self._laser.to_scan('scan', message)
         except InputError:
             if not self._is_paced:
                 return

@@ -1,7 +1,7 @@
 """Parts of the navigator: map and robot in, goals, the team, and the watch on the base."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
@@ -26,7 +26,7 @@ from thinmap_ros.core.planning.navigator import (
 )
 from thinmap_ros.core.planning.path_follower import Motion, as_heard, must_stop
 from thinmap_ros.core.planning.supervision import BaseSupervisor
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import Scan, with_newest
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.sensing.beams import LaserMonitor
 from thinmap_ros.core.sensing.synchronizer import InputStream
@@ -214,28 +214,59 @@ _POSE_TIMEOUT_NS = 3_000_000_000
 _POSE_ONLY_TIMEOUT_NS = SECOND_NS
 
 
+_LASER = 'laser'  # name of the only one
+_MAX_LASERS = 8
+
+
+@dataclass(eq=False)
+class _Laser:
+    """What is known of a laser; blind_reason: of its last scan."""
+
+    topic: str
+    monitor: LaserMonitor = field(default_factory=LaserMonitor)
+    blind_reason: str = ''
+
+
+@dataclass(eq=False)
+class _ScanTopic:
+    """Scans of a topic that are not blind: name in faults, when they come, stamp of the last.
+
+    offset_ns: of that stamp from the odometry, when the scan was received.
+    """
+
+    name: str
+    stream: InputStream
+    stamp_ns: int | None = None
+    offset_ns: int = 0
+
+
 class RobotState:
     """Pose and view of the robot now, and whether they are recent.
 
-    scan: the last one that is not blind; pose_fault: why the localizer does not trust its pose, ''
-    where it does.
+    scans: the last one of each laser that is not blind; pose_fault: why the localizer does not
+    trust its pose, '' where it does.
     """
 
-    def __init__(self, time: ElapsedTime, has_odometry: bool) -> None:
+    def __init__(
+        self, time: ElapsedTime, has_odometry: bool, scan_topics: Iterable[str] = (_LASER,)
+    ) -> None:
         """has_odometry: False where the odometry says that the robot never moves."""
-        self.scan: Scan | None = None
+        self.scans: tuple[Scan, ...] = ()
         self.pose_fault = ''
         self._time = time
         pose_timeout_ns = _POSE_TIMEOUT_NS if has_odometry else _POSE_ONLY_TIMEOUT_NS
         self._streams = {
-            'laser': InputStream('laser', SENSOR_TIMEOUT_NS, SENSOR_DELAY_NS),
             'odometry': InputStream('odometry', SENSOR_TIMEOUT_NS, SENSOR_DELAY_NS),
             # A late pose corrects the odometry as well as a new one: they are as late as silent.
             'localizer': InputStream('localizer', pose_timeout_ns, pose_timeout_ns),
         }
-        self._laser = LaserMonitor()
-        self._blind_reason = ''
-        self._scan_offset_ns = 0  # from the odometry, when the last scan was received
+        topics = tuple(scan_topics)
+        names = topics if len(topics) > 1 else (_LASER,)
+        self._topics = {
+            topic: _ScanTopic(name, InputStream(name, SENSOR_TIMEOUT_NS, SENSOR_DELAY_NS))
+            for topic, name in zip(topics, names, strict=True)
+        }
+        self._lasers: dict[str, _Laser] = {}  # by frame
         self._pose_fault = ''  # why the last pose was not used
         self._odometry = OdometryBuffer(max_gap_ns=MAX_ODOMETRY_GAP_NS)
         self._T_map_odom: Array | None = None
@@ -244,7 +275,7 @@ class RobotState:
     def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         """Add the odometry, T_odom_base (3,), at a stamp."""
         self._T_odom_base = T_odom_base
-        self._record('odometry', stamp_ns)
+        self._record(self._streams['odometry'], stamp_ns)
         self._odometry.add(stamp_ns, T_odom_base)
 
     def add_pose(self, stamp_ns: int, T_map_base: Array) -> None:
@@ -254,18 +285,29 @@ class RobotState:
             self._pose_fault = _offset_fault('pose', self._offset_ns(stamp_ns))
             return
         self._pose_fault = ''
-        self._record('localizer', stamp_ns)
+        self._record(self._streams['localizer'], stamp_ns)
         self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
 
-    def add_scan(self, scan: Scan) -> None:
+    def add_scan(self, scan: Scan, topic: str = _LASER) -> None:
         """Add a scan; a blind one is not kept, and is a reason to stop."""
+        if scan.frame not in self._lasers and len(self._lasers) >= _MAX_LASERS:
+            self._lasers.clear()
+        laser = self._lasers.setdefault(scan.frame, _Laser(topic))
         if self._T_odom_base is not None:
-            scan = self._laser.checked(scan, self._T_odom_base)
-        self._blind_reason = scan.blind_reason
+            scan = laser.monitor.checked(scan, self._T_odom_base)
+        laser.blind_reason = scan.blind_reason
         if not scan.is_blind:
-            self.scan = scan
-            self._scan_offset_ns = self._offset_ns(scan.stamp_ns)
-            self._record('laser', scan.stamp_ns)
+            self.scans = with_newest(self.scans, scan)
+            of_topic = self._topics[topic]
+            of_topic.stamp_ns = scan.stamp_ns
+            of_topic.offset_ns = self._offset_ns(scan.stamp_ns)
+            self._record(of_topic.stream, scan.stamp_ns)
+
+    @property
+    def awaited(self) -> list[str]:
+        """What is not received yet, and is needed to drive."""
+        found = [each.name for each in self._topics.values() if each.stamp_ns is None]
+        return found if self.pose() is not None else [*found, 'pose or odometry']
 
     @property
     def odometry_fault(self) -> str:
@@ -284,20 +326,29 @@ class RobotState:
 
     def stop_reason(self) -> str:
         """Why the robot must not drive on, the cause before its consequences; '' for no reason."""
-        if self._blind_reason:
-            return f'laser blind ({self._blind_reason})'
+        for laser in self._lasers.values():
+            if laser.blind_reason:
+                return f'{self._topics[laser.topic].name} blind ({laser.blind_reason})'
         return self._sensor_fault() or self.pose_fault or self._localizer_fault()
 
     def _sensor_fault(self) -> str:
         now_ns = self._time.now_ns()
-        for source in ('laser', 'odometry'):
-            if fault := self._streams[source].fault(now_ns):
+        topics = self._topics.values()
+        for stream in (*(each.stream for each in topics), self._streams['odometry']):
+            if fault := stream.fault(now_ns):
                 return fault
-        if fault := _offset_fault('scan', self._scan_offset_ns):
+        return next(filter(None, map(self._stamp_fault, topics)), '')
+
+    def _stamp_fault(self, topic: _ScanTopic) -> str:
+        if topic.stamp_ns is None:
+            return ''
+        source = 'scan' if topic.name == _LASER else topic.name
+        if fault := _offset_fault(source, topic.offset_ns):
             return fault
         # Also where the clock stands.
-        silent_ns = 0 if self.scan is None else -self._offset_ns(self.scan.stamp_ns)
-        return f'laser silent for {silent_ns / 1e9:.1f} s' if silent_ns > SENSOR_TIMEOUT_NS else ''
+        silent_ns = -self._offset_ns(topic.stamp_ns)
+        silent = f'{topic.name} silent for {silent_ns / 1e9:.1f} s'
+        return silent if silent_ns > SENSOR_TIMEOUT_NS else ''
 
     def _localizer_fault(self) -> str:
         fault = self._streams['localizer'].fault(self._time.now_ns())
@@ -309,9 +360,9 @@ class RobotState:
         latest_ns = self._odometry.latest_stamp_ns
         return 0 if latest_ns is None else stamp_ns - latest_ns
 
-    def _record(self, source: str, stamp_ns: int) -> None:
+    def _record(self, stream: InputStream, stamp_ns: int) -> None:
         time = self._time
-        self._streams[source].add(stamp_ns, time.now_ns(), time.age_ns(stamp_ns))
+        stream.add(stamp_ns, time.now_ns(), time.age_ns(stamp_ns))
 
 
 def _offset_fault(source: str, offset_ns: int) -> str:

@@ -116,7 +116,8 @@ _MAX_SCAN_AGE_NS = 2 * SECOND_NS
 class RobotView:
     """Newest scan whose pose in the map TF knows, and that pose.
 
-    Without scans, what the map shows around the robot stands for one.
+    Without scans, what the map shows around the robot stands for one. Of several lasers it is that
+    of another one than the last time, if there is one.
     """
 
     def __init__(
@@ -130,21 +131,25 @@ class RobotView:
         self._map_frame = map_frame
         self._laser_transform = laser_transform
         self._node = node
-        self._scans: deque[LaserScan] = deque(maxlen=_MAX_SCANS)
+        self._scans: deque[tuple[str, LaserScan]] = deque(maxlen=_MAX_SCANS)
+        self._looked_in = ''  # frame of the last scan
 
     def reset(self) -> None:
         """Discard the scans."""
         self._scans.clear()
 
-    def add_scan(self, message: LaserScan) -> None:
-        """Keep a scan until its pose is known."""
-        self._scans.append(message)
+    def add_scan(self, topic: str, message: LaserScan) -> None:
+        """Keep a scan of a topic until its pose is known."""
+        self._scans.append((topic, message))
 
     def look(self, patch: GridPatch, now_ns: int) -> tuple[Scan, Array]:
         """Scan and pose (3,) in a map. Raises InputError where TF does not know the pose."""
-        for message in reversed(self._scans):
-            found = self._scan_at(message, now_ns)
+        newest = reversed(self._scans)
+        in_turn = sorted(newest, key=lambda each: each[1].header.frame_id == self._looked_in)
+        for topic, message in in_turn:
+            found = self._scan_at(topic, message, now_ns)
             if found is not None:
+                self._looked_in = message.header.frame_id
                 return found
         T_map_base = self.newest_pose(now_ns)
         return scan_in_map(patch, T_map_base, self._settings.view_range_m, now_ns), T_map_base
@@ -154,14 +159,14 @@ class RobotView:
         """From the first look on: each transform costs time, and most explorations need none."""
         return TransformListener(self._node)
 
-    def _scan_at(self, message: LaserScan, now_ns: int) -> tuple[Scan, Array] | None:
+    def _scan_at(self, topic: str, message: LaserScan, now_ns: int) -> tuple[Scan, Array] | None:
         try:
             stamp_ns = messages.stamp_ns(message.header.stamp)
             if abs(now_ns - stamp_ns) > _MAX_SCAN_AGE_NS:
                 return None
             base_frame = self._laser_transform.base_frame
             T_map_base = self._transforms.lookup(self._map_frame, base_frame, stamp_ns)
-            scan = self._laser_transform.to_scan(message)
+            scan = self._laser_transform.to_scan(topic, message)
         except InputError:
             return None
         return None if scan.is_blind else (scan, T_map_base)
@@ -314,8 +319,7 @@ class ObservationSource:
         subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(node, KeepOutMsg, 'keep_out', self._on_keep_out, qos.LATCHED)
         subscribe_guarded(node, LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
-        scan_topic = frames.laser_transform.scan_topic
-        subscribe_guarded(node, LaserScan, scan_topic, self._on_scan, qos.SENSOR)
+        frames.laser_transform.subscribe(node, self._on_scan)
         node.create_active_timer(_LOOK_PERIOD_S, self._look)
 
     def reset(self) -> None:
@@ -395,9 +399,9 @@ class ObservationSource:
     def _on_keep_out(self, message: KeepOutMsg) -> None:
         self._keep_out = decode.keep_out(message)
 
-    def _on_scan(self, message: LaserScan) -> None:
+    def _on_scan(self, topic: str, message: LaserScan) -> None:
         if self._uses_foreign_map():
-            self._view.add_scan(message)
+            self._view.add_scan(topic, message)
 
     # Outputs.
 
