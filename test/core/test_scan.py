@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.scan import LaserConfig, Scan
 
 
@@ -105,3 +105,36 @@ def test_fewer_than_a_tenth_of_the_beams_is_blind(valid, blind):
     ranges = np.full(100, np.nan)
     ranges[:valid] = np.inf
     assert Scan.create(0, ranges, -1.0, 0.01, 0.1, 8.0).is_blind == blind
+
+
+@pytest.mark.parametrize(
+    ('text', 'left_out'),
+    [
+        ('', []),
+        ('-180 -135, 135 180', [-180, -135, 135]),
+        ('135 -135', [-180, -135, 135]),
+        ('135 225', [-180, -135, 135]),
+        ('-180 180', [-180, -135, -90, -45, 0, 45, 90, 135]),
+        (' 10 20 ,, -46 -44 ', [-45]),
+    ],
+)
+def test_beams_into_the_sectors_of_the_body_are_invalid(text, left_out):
+    scan = Scan.create(
+        0, np.ones(8), -math.pi, math.pi / 4, 0.1, 8.0, laser=LaserConfig(body_sectors=text)
+    )
+    degrees = np.rint(np.degrees(scan.angles_rad))
+    np.testing.assert_array_equal(np.isnan(scan.ranges_m), np.isin(degrees, left_out))
+
+
+@pytest.mark.parametrize('text', ['12', '1 2 3', 'a b', 'nan 3', '10 400', '10, 20'])
+def test_what_is_no_sector_is_named(text):
+    with pytest.raises(ConfigError, match=f"body_sectors = '{text}': expected pairs of bearings"):
+        LaserConfig(body_sectors=text)
+
+
+def test_ranges_below_the_least_one_are_invalid():
+    ranges = [-np.inf, 0.0, 0.2, 0.31, np.inf]
+    laser = LaserConfig(min_range_m=0.3, zero_is_no_return=True)
+    scan = Scan.create(0, ranges, 0.0, 0.1, 0.1, 8.0, laser=laser)
+    assert scan.below_range_min[0] and scan.hit[3] and scan.no_return[4]
+    np.testing.assert_array_equal(scan.valid, [True, True, False, True, True])

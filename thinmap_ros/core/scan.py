@@ -1,15 +1,16 @@
 """One revolution of a planar laser scanner."""
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, config_or_default, parameter
-from thinmap_ros.core.errors import InputError, one_line_reason, quoted_name
+from thinmap_ros.core.errors import ConfigError, InputError, one_line_reason, quoted, quoted_name
 from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 
 # With a smaller share of valid beams, the space in front of the laser is unobserved.
@@ -27,6 +28,28 @@ TILTED = 'robot tilted by more than max_tilt_rad'
 # What the stamp of a scan is the time of.
 AT_START = 'start'
 AT_END = 'end'
+
+# How far from the body that was found another range of it may be: noise, and a cable that hangs.
+BODY_TOLERANCE_M = 0.1
+# Pairs of bearings in the frame of a laser, deg: from the first one counter-clockwise to the other.
+Sectors = tuple[tuple[float, float], ...]
+
+
+def parse_sectors(text: str) -> Sectors:
+    """Sectors of a text as "-180 -126, 126 180". Raises ConfigError where it is no such text."""
+    sectors: list[tuple[float, float]] = []
+    for part in filter(str.strip, text.split(',')):
+        try:
+            low, high = (float(word) for word in part.split())
+        except ValueError:
+            low = high = math.nan
+        if not (abs(low) <= 360.0 and abs(high) <= 360.0):
+            raise ConfigError(
+                f'body_sectors = {quoted(text)}: expected pairs of bearings from -360 to 360 deg, '
+                'as "-180 -126, 126 180"'
+            )
+        sectors.append((low, high))
+    return tuple(sectors)
 
 
 @dataclass(frozen=True)
@@ -55,13 +78,31 @@ class LaserConfig(Config):
     )
     max_tilt_rad: float = parameter(
         0.08,
-        'Tilt of the robot, by the orientation of its odometry or IMU, above which scans are left '
+        'Tilt of the robot, by the orientation of its odometry, above which scans are left '
         'out (rad): on a ramp they show the floor. 0.08 is above the noise of the odometry of a '
         'level robot and below a ramp of 1:12. Raise it where the orientation is noisier, lower it '
         'for a laser near the floor.',
         low=0.01,
         high=1.5,
     )
+    body_sectors: str = parameter(
+        '',
+        "Sectors in which the laser sees the robot's own body, pairs of bearings in the frame of "
+        'the laser (deg), as "-180 -126, 126 180": their beams are left out. Without them, a body '
+        'is found after some turns, up to 0.7 m from the laser.',
+    )
+    min_range_m: float = parameter(
+        0.0,
+        'Nearer ranges are left out (m). For dust and parts of the robot around the laser; '
+        'obstacles that near are not seen.',
+        low=0.0,
+        high=10.0,
+    )
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError where a parameter is invalid."""
+        super().__post_init__()
+        parse_sectors(self.body_sectors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +120,9 @@ class Scan:
     fault: why the ranges of the laser were replaced by invalid ones; warning: how the angles of its
     message contradict its beams; odometry_silence_s: by how much the odometry was silent for longer
     than usual since the previous scan; None: unknown; frame: that of the laser, by which the lasers
-    of a robot differ. Use `Scan.create` to make one.
+    of a robot differ; is_mirrored: it hangs upside down, so that its bearings have the other sign
+    in its own frame; body_m (360,): range at which the robot's own body was found at each degree
+    from -180, NaN where there is none. Use `Scan.create` to make one.
 
     Each range is one of `hit`, a hit beyond the usable range, `no_return`, `below_range_min`, or
     invalid (`valid` is False).
@@ -104,6 +147,8 @@ class Scan:
     warning: str = ''
     odometry_silence_s: float | None = None
     frame: str = ''
+    is_mirrored: bool = False
+    body_m: Array | None = None
 
     @staticmethod
     def create(
@@ -144,7 +189,8 @@ class Scan:
         if not np.isfinite([time_increment_s, scan_time_s]).all():
             time_increment_s = scan_time_s = 0.0
         is_at_end = laser.scan_stamp == AT_END
-        return Scan(
+        ranges[(ranges > 0.0) & (ranges < laser.min_range_m)] = np.nan
+        scan = Scan(
             int(stamp_ns),
             ranges,
             first,
@@ -159,6 +205,7 @@ class Scan:
             beam_period_s=time_increment_s,
             scan_time_s=scan_time_s,
         )
+        return scan.without_sectors(parse_sectors(laser.body_sectors))
 
     @cached_property
     def angles_rad(self) -> Array:
@@ -230,6 +277,30 @@ class Scan:
     def blinded(self, fault: str) -> 'Scan':
         """The scan with invalid ranges only: the laser did not measure the given ones."""
         return replace(self, ranges_m=np.full_like(self.ranges_m, np.nan), fault=fault)
+
+    @property
+    def degrees(self) -> NDArray[np.int64]:
+        """Bearing of each beam in whole degrees since -180, 0 to 359, (N,)."""
+        return (np.rint(np.degrees(self.angles_rad)).astype(np.int64) + 180) % 360
+
+    def without_sectors(self, sectors: Sectors) -> 'Scan':
+        """The scan with the beams invalid that point into some sectors."""
+        if not sectors:
+            return self
+        bearings = np.degrees(self.angles_rad)
+        widths = [high - low + 360.0 * (high < low) for low, high in sectors]
+        left_out = [
+            (bearings - low) % 360.0 <= width
+            for (low, _), width in zip(sectors, widths, strict=True)
+        ]
+        return replace(self, ranges_m=np.where(np.any(left_out, axis=0), np.nan, self.ranges_m))
+
+    def without_body(self, body_m: Array | None) -> 'Scan':
+        """The scan with the beams invalid that end at the robot's body (360,), as `body_m`."""
+        if body_m is None:
+            return self
+        at_body = np.abs(self.ranges_m - body_m[self.degrees]) < BODY_TOLERANCE_M
+        return replace(self, ranges_m=np.where(at_body, np.nan, self.ranges_m), body_m=body_m)
 
     def points_laser(self) -> Array:
         """End points of the hits, laser frame, (M, 2)."""

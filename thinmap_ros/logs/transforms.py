@@ -83,6 +83,7 @@ class Mount:
             T_base_laser=self.T_base_laser,
             first_beam_s=scan.first_beam_s + scan.beam_period_s * (scan.ranges_m.size - 1),
             beam_period_s=-scan.beam_period_s,
+            is_mirrored=True,
         )
 
 

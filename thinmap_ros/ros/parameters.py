@@ -46,6 +46,8 @@ ROBOT = (
     'laser_range_noise_m',
     'scan_stamp',
     'max_tilt_rad',
+    'body_sectors',
+    'min_range_m',
     'map_frame',
     'odom_frame',
     'odom_source',

@@ -512,3 +512,22 @@ def test_saved_scans_of_a_laser_that_dropped_out_clear_nothing_once_they_are_ren
     for scan, T in saved:
         moved.add_scan(scan, T + [0.0, 0.5, 0.0])
     assert (shown.cells == moved.known_area().cells).mean() > 0.999
+
+
+def test_once_the_body_of_the_robot_is_known_it_is_no_wall():
+    def with_body(scan):
+        ranges = np.where(np.abs(scan.angles_rad - 1.0) < 0.2, 0.4, scan.ranges_m)
+        return replace(scan, ranges_m=ranges)
+
+    body_m = np.full(360, np.nan)
+    body_m[180 + 45 : 180 + 70] = 0.4
+    grid = CorrectableGrid(OccupancyGrid(PAPER_GRID))
+    clean = OccupancyGrid(PAPER_GRID)
+    for k in range(30):
+        scan = with_body(SCANS[k])
+        clean.add_scan(scan.without_body(body_m), TRUE[k])
+        grid.update(scan if k < 20 else scan.without_body(body_m), TRUE[k])
+    grid.finish()
+    shown = grid.shown.known_area()
+    assert shown.frame == clean.known_area().frame
+    assert (shown.cells == clean.known_area().cells).mean() > 0.999

@@ -3,7 +3,7 @@
 import math
 from array import array
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Generic, NamedTuple, TypeVar
@@ -382,14 +382,17 @@ class Rerendering:
         T_map_base: Array,
         dropping: frozenset[str] = frozenset(),
         erased: Sequence[Array] = (),
+        bodies: Mapping[str, Array | None] | None = None,
     ) -> None:
         """Start with the stored scans at their poses (N, 3).
 
         like: a grid with the same cells and configuration; T_map_base (3,): pose of the robot;
         dropping: frames of the lasers that drop out, as is known now, for all their scans, and for
         those of an unknown laser; those that have it, keep it;
-        erased: polygons (M, 2), m, of which only scans since show anything.
+        erased: polygons (M, 2), m, of which only scans since show anything; bodies: what each
+        laser, by its frame, is known to see of the robot.
         """
+        self._bodies = bodies or {}
         self._dropping = dropping
         self._erased = erased
         self.grid = OccupancyGrid(like.config, like.frame)
@@ -429,6 +432,7 @@ class Rerendering:
             task = self._queue.pop()
             try:
                 scan = task.stored.scan
+                scan = scan.without_body(self._bodies.get(scan.frame))
                 drops_out = scan.frame in self._dropping or bool(self._dropping and not scan.frame)
                 scan = replace(scan, drops_out=drops_out or scan.drops_out)
                 erased = self._erased[task.stored.erasures :]
@@ -474,7 +478,8 @@ def _tile_boxes(extents: Sequence[Array], poses: Array, frame: GridFrame) -> Cel
 class CorrectableGrid:
     """A grid that is re-rendered from stored scans after a loop closure, one slice per scan.
 
-    So it is when the beams without return of a laser turn out to show no free space (`drops_out`).
+    So it is when the beams without return of a laser turn out to show no free space (`drops_out`),
+    or some of its beams to end at the robot (`body_m`).
     `shown` is the published map. It is always complete: each tile shows the old rendering until its
     new one is complete. `corrected_ns` is the stamp of the newest correction that has been
     applied to the whole map.
@@ -503,6 +508,7 @@ class CorrectableGrid:
         self.corrected_ns = corrected_ns
         self.erasures = erasures or Erasures()
         self._dropping: frozenset[str] = frozenset()  # frames of the lasers that drop out
+        self._bodies: dict[str, Array | None] = {}  # by the frame of the laser
         self._refusals: list[str] = []
         history: PoseHistory[StoredScan] = PoseHistory()
         for scan, T_scan in scans:
@@ -567,6 +573,7 @@ class CorrectableGrid:
     def _place(self, scan: Scan, T_map_base: Array, destination: Destination) -> None:
         if destination is Destination.MAP:
             self._set_drops_out(scan)
+            self._set_body(scan)
             for earlier, T_earlier in self._open:
                 self._add_scan(earlier, T_earlier)
             self._open.clear()
@@ -623,6 +630,14 @@ class CorrectableGrid:
         if self._history is not None:
             self._render_again()
 
+    def _set_body(self, scan: Scan) -> None:
+        """Render the stored scans again if more of their beams are known to end at the robot."""
+        if scan.body_m is self._bodies.get(scan.frame):
+            return
+        self._bodies[scan.frame] = scan.body_m
+        if self._history is not None:
+            self._render_again()
+
     def _render_again(self) -> None:
         """Begin to render all stored scans."""
         self._rerendering = None
@@ -667,6 +682,7 @@ class CorrectableGrid:
                 self._T_map_base,
                 self._dropping,
                 [item.corners for item in self.erasures.items],
+                self._bodies,
             )
             # The step that closes a loop is already long: rendering starts with the next one.
             return None

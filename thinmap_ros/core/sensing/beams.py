@@ -1,4 +1,4 @@
-"""What beams mean: scans that no laser measured, beams without return, beams at other robots."""
+"""What beams mean: without return, at the robot itself, at other robots, of no laser."""
 
 import math
 from collections import deque
@@ -7,7 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.scan import MIN_HITS, NO_RETURN_CLEAR_RANGE_M, Scan, is_most_missed
+from thinmap_ros.core.scan import (
+    BODY_TOLERANCE_M,
+    MIN_HITS,
+    NO_RETURN_CLEAR_RANGE_M,
+    Scan,
+    is_most_missed,
+)
 from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 from thinmap_ros.jit import kernel
 
@@ -52,6 +58,19 @@ _MIN_GAPS = 0.1
 _MIN_SHARE = 0.2
 # Real ranges may lie between that value and range_max.
 _MAX_BEYOND = 0.05
+
+# Of the robot's own body.
+_BODY_REACH_M = 0.7  # a person follows farther behind
+_BODY_MOVES_M = 0.5 * BODY_TOLERANCE_M
+_BODY_STRIKES = 2  # views in turn: a single range may be false
+# A robot can follow a wall at one distance, and round the end of it. It does not turn on the spot
+# meanwhile.
+_BODY_PATH_M = 2.0
+_BODY_HEADINGS_RAD = 2.8
+_BODY_TURN_RAD = 0.8
+_ON_THE_SPOT_M = 0.2  # radius of a turn: nearer to its centre there is only the robot
+_JUMP_M = 1.0
+_JUMP_RAD = 1.5
 
 # Of scans that no laser measured.
 FROZEN = 'the same ranges while the robot moves'
@@ -207,7 +226,7 @@ def _gaps(scan: Scan) -> Mask:
     for k in inside[np.diff(hits)[inside] > 1]:
         gaps[hits[k] + 1 : hits[k + 1]] = True
     gaps &= scan.without_return
-    return gaps & (gaps.sum() >= _MIN_GAPS * gaps.size)
+    return gaps if gaps.sum() >= _MIN_GAPS * gaps.size else np.zeros_like(gaps)
 
 
 def _reach_m(scan: Scan) -> float:
@@ -361,6 +380,105 @@ class _Surfaces:
         return is_most_missed(scan, int(np.count_nonzero(scan.without_return[beams])))
 
 
+class BodyDetector:
+    """Finds the beams of a laser that end at the robot's own body.
+
+    Their ranges stay while the robot drives, turns by nearly 180 degrees, and turns on the spot.
+    Ranges of surfaces change then: of a wall that the robot follows, of a person who follows the
+    robot. Views are scans 0.1 m or 0.1 rad apart, of one range for each degree.
+    """
+
+    def __init__(self) -> None:
+        self._last: Array | None = None
+        self._motion = np.zeros(2)  # path, m, and heading, rad
+        self._range_m = np.full(360, np.nan)  # of what may be the body
+        self._strikes = np.zeros(360, dtype=np.int64)
+        # Since the range is that: path before, headings, and the turn on the spot now, at most.
+        self._begun_m = np.zeros(360)
+        self._headings = np.zeros((2, 360))
+        self._turns = np.zeros((2, 360))
+        self._body_m: Array | None = None
+        self._is_mirrored = False
+
+    @property
+    def warning(self) -> str:
+        """Description of the body that the laser sees; '' where it sees none."""
+        if self._body_m is None:
+            return ''
+        text = _sectors_text(~np.isnan(self._body_m), self._is_mirrored)
+        return (
+            f"the laser sees the robot's own body at bearings of {text} deg: left out; set "
+            f'body_sectors to "{text}"'
+        )
+
+    def applied(self, scan: Scan, T_odom_base: Array) -> Scan:
+        """The scan, made at an odometry pose (3,), without the beams at the body."""
+        if self._last is None or se2.are_apart(self._last, T_odom_base, _APART_M, _APART_RAD):
+            self._move(T_odom_base)
+            self._add_view(_by_degree(scan))
+            self._is_mirrored = scan.is_mirrored
+        return scan.without_body(self._body_m)
+
+    def _move(self, T_odom_base: Array) -> None:
+        moved = se2.between(T_odom_base if self._last is None else self._last, T_odom_base)
+        self._last = T_odom_base
+        path_m = math.hypot(moved[0], moved[1])
+        turn_rad = float(moved[2])
+        if path_m > _JUMP_M or abs(turn_rad) > _JUMP_RAD:
+            self._range_m[:] = np.nan
+        is_on_the_spot = path_m < _ON_THE_SPOT_M * abs(turn_rad)
+        self._motion = self._motion + [path_m, turn_rad]
+        self._turns[0] = self._turns[0] + turn_rad if is_on_the_spot else 0.0
+
+    def _add_view(self, ranges: Array) -> None:
+        agrees = np.abs(ranges - self._range_m) < _BODY_MOVES_M
+        self._strikes = np.where(agrees, 0, self._strikes + ~np.isnan(ranges))
+        is_new = np.isnan(self._range_m) | (self._strikes >= _BODY_STRIKES)
+        self._range_m[is_new] = np.where(ranges < _BODY_REACH_M, ranges, np.nan)[is_new]
+        self._strikes[is_new] = 0
+        path_m, heading = self._motion
+        self._begun_m[is_new] = path_m
+        self._headings[:, is_new] = heading
+        self._turns[:, is_new] = 0.0
+        self._headings[0] = np.minimum(self._headings[0], heading)
+        self._headings[1] = np.maximum(self._headings[1], heading)
+        self._turns[1] = np.maximum(self._turns[1], np.abs(self._turns[0]))
+        is_body = ~np.isnan(self._range_m) & (path_m - self._begun_m >= _BODY_PATH_M)
+        is_body &= self._headings[1] - self._headings[0] >= _BODY_HEADINGS_RAD
+        self._set_body(is_body & (self._turns[1] >= _BODY_TURN_RAD))
+
+    def _set_body(self, is_body: Mask) -> None:
+        """Set the degrees (360,) of the body, with one more beside each: their beams are mixed."""
+        core = np.where(is_body, self._range_m, np.nan)
+        body_m = np.fmin.reduce([core, np.roll(core, 1), np.roll(core, -1)])
+        before = np.full(360, np.nan) if self._body_m is None else self._body_m
+        if not np.array_equal(body_m, before, equal_nan=True):
+            self._body_m = None if np.isnan(body_m).all() else body_m
+
+
+def _by_degree(scan: Scan) -> Array:
+    """Nearest range of each degree from -180, (360,): inf without return, NaN where unknown."""
+    ranges = np.full(360, np.nan)
+    known = scan.returned | scan.no_return
+    ends = np.where(scan.returned, scan.ranges_m, np.inf)[known]
+    np.fmin.at(ranges, scan.degrees[known], ends)
+    return ranges
+
+
+def _sectors_text(is_body: Mask, is_mirrored: bool) -> str:
+    """Sectors of degrees (360,) from -180, as the parameter `body_sectors`."""
+    if is_mirrored:
+        is_body = np.roll(is_body[::-1], 1)
+    if is_body.all():
+        return '-180 180'
+    begin = np.flatnonzero(is_body & ~np.roll(is_body, 1))
+    end = np.flatnonzero(is_body & ~np.roll(is_body, -1))
+    if end[0] < begin[0]:
+        end = np.roll(end, -1)
+    pairs = zip((begin - 180.5).tolist(), (end - 179.5).tolist(), strict=True)
+    return ', '.join(f'{low:g} {high:g}' for low, high in pairs)
+
+
 class LaserMonitor:
     """Replaces scans that the laser did not measure by blind ones, and recognizes dropouts.
 
@@ -368,12 +486,14 @@ class LaserMonitor:
     for its beams: walls do not vanish from one scan to the next. Such a scan is blind, until walls
     are measured again, or scans agree with each other for some time (the robot was carried away).
     The scans of a laser that often has no return from surfaces in range are marked (`drops_out`).
+    Beams that end at the robot's own body are invalid.
     """
 
     def __init__(self) -> None:
         self._freeze = _FreezeDetector()
         self._no_return = NoReturnRange()
         self._dropouts = DropoutDetector()
+        self._body = BodyDetector()
         self._trusted = _Surfaces()
         self._previous = _Surfaces()
         self._doubted_ns: int | None = None  # first scan of a series that agrees with itself only
@@ -381,7 +501,11 @@ class LaserMonitor:
     @property
     def warnings(self) -> dict[str, str]:
         """What the laser or its driver do otherwise than REP 117, by kind."""
-        texts = {'no return': self._no_return.warning, 'dropouts': self._dropouts.warning}
+        texts = {
+            'no return': self._no_return.warning,
+            'dropouts': self._dropouts.warning,
+            'body': self._body.warning,
+        }
         return {kind: text for kind, text in texts.items() if text}
 
     def checked(self, scan: Scan, T_odom_base: Array) -> Scan:
@@ -394,8 +518,9 @@ class LaserMonitor:
         # Of a laser that drops out, a scan without returns is blind anyway.
         if not self._dropouts.drops_out and self._has_failed(scan, T_odom_base):
             return scan.blinded(NO_RETURNS)
-        drops_out = self._dropouts.update(scan, T_odom_base)
-        return replace(scan, drops_out=True) if drops_out else scan
+        if self._dropouts.update(scan, T_odom_base):
+            scan = replace(scan, drops_out=True)
+        return self._body.applied(scan, T_odom_base)
 
     def _has_failed(self, scan: Scan, T_odom_base: Array) -> bool:
         surfaces = _Surfaces.of(scan, T_odom_base)
