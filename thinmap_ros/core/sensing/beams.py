@@ -45,7 +45,7 @@ _REST_APART_NS = SECOND_NS // 8  # with which a person who walks by has left aft
 # at most 0.0004 in recordings of others, 0.002 with people before a laser of 3.5 m in a hall.
 _MAX_BLINKS = 0.005
 _TRUSTED_SCANS = 10
-_MIN_AGREEING = 0.5  # of the beams: a robot that moves without odometry sees other ranges
+_MIN_AGREEING = 0.8  # of the beams: a robot that moves without odometry sees other ranges
 _MIN_KNOWN = 0.15  # of the beams: in a hall, only the edges of people and pillars would count
 # Beams without return between hits of one surface: 0.24 of all beams of merged scans; at most
 # 0.028 in other recordings, 0.06 before a fence.
