@@ -283,8 +283,8 @@ def team_image(loop: TeamLoop, canvas: Canvas, seconds: float) -> Image.Image:
     patch = loop.maps.known_area()
     paste_map(canvas, patch)
     for member in loop.members:
-        if member.moment.scan is not None and not loop.is_finished:
-            draw_laser(canvas, member.moment.scan, member.pose)
+        if member.moment.scans and not loop.is_finished:
+            draw_laser(canvas, member.moment.scans[0], member.pose)
     draw_graph(canvas, loop.maps.view(0)[0])
     driven_m = 0.0
     for member, colour in zip(loop.members, palette.ROBOTS, strict=False):

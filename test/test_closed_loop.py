@@ -4,14 +4,17 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from thinmap_ros.closed_loop import Options, make_loop
 from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
 from thinmap_ros.core.grid.edits import KeepOut, inside
+from thinmap_ros.core.planning.navigator import NavigatorConfig
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.laser import LaserScannerConfig
+from thinmap_ros.sim.robot import LASERS, PRESETS
 from thinmap_ros.sim.world import World
 
 NODE = EndNode(1, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True, np.zeros(3))
@@ -69,6 +72,43 @@ def test_between_a_few_beams_the_robot_looks_by_turning():
     assert path_m > 0.5
 
 
+def test_a_large_robot_with_a_laser_at_two_corners_explores():
+    """It starts amid cells that its lasers do not see: those below its body."""
+    world = World.from_patch(*read_world(package_data.world_path('office')))
+    start = np.asarray(world.start)
+    options = Options(robot='mir100', laser=LASERS['mir100'], localization='slam', speed_m_s=0.5)
+    loop = make_loop(world, start, options)
+    frames = []
+    step = loop.pipeline.step
+
+    def steps(scan, T_odom_base):
+        frames.append(scan.frame)
+        return step(scan, T_odom_base)
+
+    loop.pipeline.step = steps
+    outcome = loop.run(observable_cells(world, start, 0.6, 8.0), 15.0, lambda *shown: None)
+    errors = np.array(loop.log.poses) - np.array(loop.log.true_poses)
+    assert outcome.collisions == 0
+    assert frames[:4] == 2 * ['front_laser', 'rear_laser']
+    assert frames.count('front_laser') == pytest.approx(frames.count('rear_laser'), abs=1)
+    assert loop.log.coverage[-1][1] > 0.7
+    assert math.dist(loop.log.true_poses[-1][:2], start[:2]) > 1.0
+    assert np.hypot(*errors[:, :2].T).max() < 0.02
+
+
+def test_a_wide_robot_keeps_away_as_far_as_its_radius():
+    """The 3-AT is wider than what paths are planned with by default."""
+    world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
+    navigators = [
+        make_loop(world, world.start, Options(robot=name)).navigator.config
+        for name in ('2dx', '3at')
+    ]
+    assert navigators[0].planner == NavigatorConfig().planner
+    assert navigators[0].stop_radius_m == NavigatorConfig().stop_radius_m
+    assert PRESETS['3at'].radius_m < navigators[1].stop_radius_m
+    assert navigators[1].stop_radius_m < navigators[1].planner.robot_radius_m
+
+
 def test_an_exploration_that_reaches_nothing_is_not_finished():
     world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
     start = np.asarray(world.start)
@@ -92,11 +132,12 @@ def test_a_robot_stands_still_once_its_laser_has_slipped():
 
     def read():
         if simulation.stamp_ns >= slip_s * 1e9:
-            simulation.laser.T_base_laser = np.array([0.0, 0.0, math.radians(45.0)])
+            turned = np.array([0.0, 0.0, math.radians(45.0)])
+            simulation.lasers[0].mount = replace(simulation.lasers[0].mount, T_base_laser=turned)
             path_m.append(path_m[-1] + 0.05 * abs(simulation.robot.v))
         moment = read_sensors()
-        as_given = moment.scan and replace(moment.scan, T_base_laser=np.zeros(3))
-        return replace(moment, scan=as_given)
+        as_given = (replace(scan, T_base_laser=np.zeros(3)) for scan in moment.scans)
+        return replace(moment, scans=tuple(as_given))
 
     simulation.read_sensors = read
     goal = observable_cells(world, start, 0.25, 8.0)

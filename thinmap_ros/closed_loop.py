@@ -10,19 +10,22 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter, part
 from thinmap_ros.core.errors import ConfigError, quoted
+from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.mission import Drives, Odometer
 from thinmap_ros.core.exploration.strategy import Decision, Observation, Strategy
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
+from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import Estimate
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import ObservableCells
 from thinmap_ros.sim.laser import LaserScannerConfig
-from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.robot import PRESETS, RobotConfig
 from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, make_strategy
@@ -30,6 +33,9 @@ from thinmap_ros.strategies import DEFAULT, make_strategy
 CONTROL_STEPS = 2
 # The period of the candidate search; thinning costs more than all other stages.
 SCANS_PER_GRAPH = 5
+# Beyond, and within, the radius with which paths are planned.
+_INFLATION_M = 0.35
+_STOP_MARGIN_M = 0.01
 # Receives each decision, and the estimated pose (3,) at which it was made.
 Watch = Callable[[Decision, Array], None]
 # Command of a robot at a pose (3,) for the next seconds, as others allow it to drive.
@@ -128,12 +134,12 @@ class ClosedLoop:
         moment = self.simulation.read_sensors()
         steps = 0
         while moment.stamp_ns < limit_s * 1e9:
-            if moment.scan is not None:
-                self._process_scan(moment.scan, moment.T_odom_base)
+            for scan in moment.scans:
+                self._process_scan(scan, moment.T_odom_base)
                 if len(self.log.poses) % scans_per_show == 1:
                     show(*self._measure(goal))
-                if self.is_finished:
-                    break
+            if self.is_finished:
+                break
             if steps % CONTROL_STEPS == 0:
                 self.control(moment)
             moment = self.simulation.step(*self.command)
@@ -308,20 +314,27 @@ def make_loop(
     watch: Watch | None = None,
 ) -> ClosedLoop:
     """Make all parts by the options. Raises ConfigError where there is no such strategy."""
-    simulation = Simulation(world, start, PRESETS[options.robot], options.laser, options.seed)
+    robot = PRESETS[options.robot]
+    radius_m = robot.planned_radius_m
+    simulation = Simulation(world, start, robot, options.laser, options.seed)
     x, y, theta = (float(number) for number in start)
     localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=theta)
     source = ground_truth_poses(simulation) if options.localization == 'truth' else None
     # A beam without return has observed free space up to the laser's range.
     grid = replace(PAPER_GRID, no_return_clear_range_m=options.laser.range_max_m)
-    pipeline = Pipeline(
-        PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source
-    )
-    navigator = Navigator(
-        NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=options.speed_m_s))
-    )
-    strategy = make_strategy(options.strategy)
+    topology = TopologyConfig(robot_radius_m=radius_m)
+    pipeline = Pipeline(PipelineConfig(localizer, grid, topology, SCANS_PER_GRAPH), source)
+    strategy = make_strategy(options.strategy, ExplorerConfig(robot_radius_m=radius_m))
+    navigator = Navigator(_navigator_config(robot, options.speed_m_s))
     return ClosedLoop(simulation, pipeline, strategy, navigator, mishap, watch)
+
+
+def _navigator_config(robot: RobotConfig, speed_m_s: float) -> NavigatorConfig:
+    """The default, for a body of another size, too."""
+    radius_m = robot.planned_radius_m
+    planner = WavefrontConfig(robot_radius_m=radius_m, inflation_radius_m=radius_m + _INFLATION_M)
+    controller = PathFollowerConfig(max_speed_m_s=speed_m_s)
+    return NavigatorConfig(planner, controller, stop_radius_m=radius_m - _STOP_MARGIN_M)
 
 
 def no_progress(seconds: float, coverage: float) -> None:

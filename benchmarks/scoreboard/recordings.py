@@ -78,8 +78,8 @@ class RecordedSimulation(Simulation):
     def read_sensors(self) -> SensorReadings:
         """Return what the sensors measure now, and keep a scan with its true pose."""
         moment = super().read_sensors()
-        if moment.scan is not None:
-            self._scans.append(moment.scan)
+        for scan in moment.scans:
+            self._scans.append(scan)
             self._poses.append(self.robot.T_world_base)
         return moment
 

@@ -39,8 +39,9 @@ def driven(simulation):
     for command in COMMANDS:
         moments.append(simulation.step(*command))
         poses.append(simulation.robot.T_world_base)
-    kept = [(m, T) for m, T in zip(moments, poses, strict=True) if m.scan is not None]
-    return [(m.scan, m.T_odom_base, T) for m, T in kept]
+    return [
+        (scan, m.T_odom_base, T) for m, T in zip(moments, poses, strict=True) for scan in m.scans
+    ]
 
 
 @pytest.mark.parametrize('robot', ['2dx', '3at'])

@@ -259,7 +259,7 @@ def test_preset_of_a_laser_that_publishes_zero_holds_for_every_node_with_a_laser
 
 
 def test_presets_fit_together():
-    assert len(PRESETS) == 7
+    assert len(PRESETS) == 8
     for preset in PRESETS:
         content = yaml.safe_load(preset.read_text())
         sim, grid, localizer = (

@@ -1,5 +1,6 @@
 """Each node as a process on a live graph: its topics, start and end."""
 
+import math
 import signal
 
 import numpy as np
@@ -57,6 +58,28 @@ def test_the_simulated_robot_follows_commands_and_stops_without_them(graph):
         ('odom', 'base_link')
     }
     assert graph.stop('sim') == 0
+
+
+def test_each_of_two_lasers_has_its_topic_frame_and_pose(graph):
+    scans = {name: graph.heard(f'{name}/scan', LaserScan, qos.SENSOR) for name in ('front', 'rear')}
+    static = graph.heard('/tf_static', TFMessage, qos.STATIC_TRANSFORMS)
+    graph.start('sim', robot='mir100', start=START, real_time_factor=4.0, wait_for_subscribers=1)
+    graph.until(
+        lambda: static and all(len(heard) > 3 for heard in scans.values()), 'scans of both lasers'
+    )
+    assert graph.node.count_publishers('scan') == 0
+    for name, heard in scans.items():
+        assert {scan.header.frame_id for scan in heard} == {f'{name}_laser'}
+        assert len(heard[0].ranges) == 541
+        assert heard[0].scan_time == pytest.approx(0.1)
+    assert not set(stamps(scans['front'])) & set(stamps(scans['rear']))
+    mounts = {'front_laser': (0.4288, 0.2358, 0.7854), 'rear_laser': (-0.3548, -0.2352, -2.3562)}
+    for each in static[0].transforms:
+        x, y, yaw = mounts.pop(each.child_frame_id)
+        assert each.header.frame_id == 'base_link'
+        assert (each.transform.translation.x, each.transform.translation.y) == (x, y)
+        assert math.sin(yaw / 2.0) == pytest.approx(each.transform.rotation.z)
+    assert not mounts
 
 
 def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):

@@ -79,8 +79,8 @@ class SimulatedLog:
         moment = simulation.read_sensors()
         for _ in range(400):
             yield OdometryEvent(moment.stamp_ns, moment.T_odom_base)
-            if moment.scan is not None:
-                yield ScanEvent(moment.scan)
+            for scan in moment.scans:
+                yield ScanEvent(scan)
             moment = simulation.step(0.2, 0.25)
 
 

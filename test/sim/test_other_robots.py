@@ -31,7 +31,7 @@ def two(place):
 
 def test_a_laser_sees_the_other_robot_and_the_wall_beside_it():
     one, _ = two(se2.pose(5.0, 4.0, math.pi))
-    scan = one.read_sensors().scan
+    (scan,) = one.read_sensors().scans
     ahead = scan.ranges_m.size // 2
     assert scan.ranges_m[ahead] == pytest.approx(3.0 - RADIUS_M, abs=0.002)
     off = math.asin(RADIUS_M / 3.0)

@@ -34,7 +34,7 @@ from thinmap_ros.core.planning.grid_search import (
 )
 from thinmap_ros.core.planning.obstacles import RecentPath
 from thinmap_ros.core.planning.paths import path_lengths_to_nodes
-from thinmap_ros.core.planning.wavefront import START_ESCAPE_M
+from thinmap_ros.core.planning.wavefront import start_escape_m
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array, Cells, Mask
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
@@ -44,6 +44,7 @@ _COARSE = 2
 _PART_M = 1.0
 # The same robot and the same frontiers as for the exploration of the paper.
 _EXPLORER = ExplorerConfig()
+_ESCAPE_M = start_escape_m(_EXPLORER.robot_radius_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +140,11 @@ class FrontierFinder:
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
             return np.zeros_like(standing)
         if self._recent_path is None:
-            ways = escape_cells(standing, free, frame, xy, START_ESCAPE_M)
+            ways = escape_cells(standing, free, frame, xy, _ESCAPE_M)
             return reachable_cells(ways, (row, col)) & standing
         trail = self._recent_path.cells(frame, free.shape)
         return reachable_cells(
-            escape_cells(standing, free, frame, xy, START_ESCAPE_M, trail),
+            escape_cells(standing, free, frame, xy, _ESCAPE_M, trail),
             (row, col),
         )
 

@@ -260,7 +260,7 @@ class BagObjects:
         """sensor_msgs/LaserScan."""
         return self._make(
             'sensor_msgs/msg/LaserScan',
-            header=self.header('laser', scan.stamp_ns),
+            header=self.header(scan.frame or 'laser', scan.stamp_ns),
             angle_min=scan.angle_min_rad,
             angle_max=scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1),
             angle_increment=scan.angle_increment_rad,

@@ -1,5 +1,6 @@
 """Simulated robots: /cmd_vel in; /scan, /odom, /tf, /clock and the true pose out.
 
+Several lasers (`lasers`) have each its topic: /front/scan, /rear/scan.
 Commands are Twist or TwistStamped, as their publishers choose. ~/set_pose teleports the robot.
 With `robots` of 2 or more each has its namespace, from robot1 on: /robot1/scan, /robot1/tf, ...,
 ~/robot1/set_pose; there is one /clock. The robots see each other with their lasers, and touch.
@@ -22,7 +23,7 @@ from thinmap_ros.ros.localized_scan import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S,
 from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.other_robots import MAX_ROBOTS, simulations_in
-from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.robot import LASERS, PRESETS
 from thinmap_ros.sim.simulation import STEP_NS, Simulation
 from thinmap_ros.sim.world import World
 
@@ -64,11 +65,13 @@ class SimConfig(Config):
     lockstep_timeout_s: float = parameter(TIMEOUT_S, TIMEOUT_DESCRIPTION, low=0.1, high=3600.0)
     wait_for_subscribers: int = parameter(
         0,
-        'Time stands still until scan, of each robot, has this many subscribers.',
+        'Time stands still until the scans of each laser have this many subscribers.',
         low=0,
         high=100,
     )
-    publish_tf: bool = parameter(True, 'Publish odom -> base_link and base_link -> laser.')
+    publish_tf: bool = parameter(
+        True, 'Publish odom -> base_link and base_link -> the frame of each laser.'
+    )
 
 
 class SimNode(Node):
@@ -77,7 +80,9 @@ class SimNode(Node):
     def __init__(self) -> None:
         super().__init__('sim')
         self._config = parameters.declare_config(self, SimConfig)
-        laser = parameters.declare_config(self, LaserScannerConfig)
+        laser = parameters.declare_config(
+            self, LaserScannerConfig, base=LASERS.get(self._config.robot)
+        )
         parameters.reject_unknown(self)
         self._diagnostics = NodeDiagnostics(self)
         self._simulations = _simulations(self._config, laser)

@@ -16,7 +16,6 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
-from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.jit import kernel
 from thinmap_ros.sim.robot import RobotConfig
@@ -25,7 +24,6 @@ from thinmap_ros.sim.world import World
 CELL_M = 0.1
 _RAY_SPACING_M = 0.05
 _ALIGNED = 1e-3
-_PLANNED_RADIUS_M = WavefrontConfig().robot_radius_m
 _PER_CELL = 10  # points of a leaf, so that no ray passes between two of its cells
 
 
@@ -100,7 +98,7 @@ def robot_observable_cells(
     """
     row, col = world.frame.cells_of(start[None, :2])[0]
     rows, cols = world.occupied.shape
-    planned_m = max(robot.radius_m, _PLANNED_RADIUS_M)
+    planned_m = robot.planned_radius_m
     inside = 0 <= row < rows and 0 <= col < cols
     has_room = inside and world.distance_to_wall_m[row, col] > planned_m
     return observable_cells(world, start, planned_m if has_room else robot.radius_m, range_m)

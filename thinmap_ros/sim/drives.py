@@ -14,7 +14,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, Mask, path_length, pose
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import RobotConfig
-from thinmap_ros.sim.simulation import STEP_NS, Simulation
+from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 
 MARGIN_M = 0.1  # minimum distance of planned paths from obstacles
@@ -49,9 +49,7 @@ def drive(
     A path that takes much too long is aborted.
     """
     follower = PathFollower(PathFollowerConfig(max_speed_m_s=config.speed_m_s))
-    moment = simulation.read_sensors()
-    if moment.scan is not None:
-        yield DriveSample(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
+    yield from _samples(simulation, simulation.read_sensors())
     for path in paths:
         duration_s = config.timeout_factor * path_length(path) / config.speed_m_s
         for _ in range(round(1e9 / STEP_NS * (config.min_timeout_s + duration_s))):
@@ -59,8 +57,12 @@ def drive(
             if np.hypot(*(path[-1] - T[:2])) < config.goal_tolerance_m:
                 break
             moment = simulation.step(*follower.command(T, path, STEP_NS / 1e9))
-            if moment.scan is not None:
-                yield DriveSample(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
+            yield from _samples(simulation, moment)
+
+
+def _samples(simulation: Simulation, moment: SensorReadings) -> Iterator[DriveSample]:
+    for scan in moment.scans:
+        yield DriveSample(scan, moment.T_odom_base, simulation.robot.T_world_base)
 
 
 def world_to_grid(world: World) -> GridPatch:

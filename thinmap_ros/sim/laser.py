@@ -1,21 +1,34 @@
 """Simulated planar laser scanner, with range noise and mixed pixels."""
 
 import math
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.errors import ConfigError, quoted
 from thinmap_ros.core.grid.raytrace import cast_rays
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import MAX_MOUNT_OFFSET_M, Scan
 from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.jit import kernel
 from thinmap_ros.sim.world import World
 
 _INTO_CELL = 1e-6
 _DEPTH_EDGE_M = 0.3  # between neighbouring beams: less is one surface seen at a slant
+_NAME = re.compile(r'[a-z][a-z0-9_]*')  # a part of a topic and of a frame
+_EXPECTED = 'expected "NAME x,y,yaw; NAME x,y,yaw" (m, m, rad), each name once, as front and rear'
+
+
+@dataclass(frozen=True, eq=False)
+class LaserMount:
+    """A laser on its robot: topic and frame of its scans, and its pose (3,)."""
+
+    topic: str
+    frame: str
+    T_base_laser: Array
 
 
 @dataclass(frozen=True)
@@ -48,15 +61,51 @@ class LaserScannerConfig(Config):
     laser_x_m: float = parameter(
         0.0, 'Position of the laser ahead of the robot centre (m).', low=-2.0, high=2.0
     )
+    lasers: str = parameter(
+        '',
+        'Name and pose of each of several lasers on the robot, as "front x,y,yaw; rear x,y,yaw" '
+        '(m, m, rad). Their topics are front/scan and rear/scan, their frames front_laser and '
+        'rear_laser. Empty: one laser, at laser_x_m.',
+    )
     min_incidence_deg: float = 10.0  # beams side by side on a wall at this angle are no depth edge
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.mounts()
+
+    def mounts(self) -> list[LaserMount]:
+        """Each laser on the robot. Raises ConfigError where `lasers` names none, or one twice."""
+        if not self.lasers:
+            return [LaserMount('scan', 'laser', np.array([self.laser_x_m, 0.0, 0.0]))]
+        mounts = [_mount(text) for text in self.lasers.split(';')]
+        found = {mount.frame: mount for mount in mounts if mount is not None}
+        if len(found) < len(mounts):
+            raise ConfigError(f'lasers = {quoted(self.lasers)}: {_EXPECTED}')
+        return list(found.values())
+
+
+def _mount(text: str) -> LaserMount | None:
+    """A laser as "NAME x,y,yaw"; None where the text is none."""
+    name, _, pose = text.strip().partition(' ')
+    try:
+        x, y, yaw = (float(number) for number in pose.split(','))
+    except ValueError:
+        return None
+    is_pose = math.hypot(x, y) <= MAX_MOUNT_OFFSET_M and math.isfinite(yaw)
+    if not (_NAME.fullmatch(name) and is_pose):
+        return None
+    return LaserMount(f'{name}/scan', f'{name}_laser', se2.pose(x, y, yaw))
 
 
 class LaserScanner:
     """Simulates scans of a world; a beam without a hit in range is +inf (REP 117)."""
 
-    def __init__(self, config: LaserScannerConfig, seed: int) -> None:
+    def __init__(
+        self, config: LaserScannerConfig, seed: int, mount: LaserMount | None = None
+    ) -> None:
+        """mount: of one of several lasers; None: of the first."""
         self.config = config
-        self.T_base_laser = np.array([config.laser_x_m, 0.0, 0.0])
+        self.mount = mount or config.mounts()[0]
         full_circle = config.field_of_view_deg >= 360.0
         intervals = config.beams if full_circle else config.beams - 1
         self._increment = math.radians(config.field_of_view_deg) / intervals
@@ -66,22 +115,23 @@ class LaserScanner:
 
     def scan(self, world: World, T_world_base: Array, stamp_ns: int) -> Scan:
         """Scan from a robot pose (3,) in the world."""
-        exact = self._exact(world, se2.compose(T_world_base, self.T_base_laser), stamp_ns)
+        exact = self._exact(world, se2.compose(T_world_base, self.mount.T_base_laser), stamp_ns)
         ranges = self._mix(exact) + self._rng.normal(0.0, self.config.range_noise_m, exact.size)
         if self.config.range_resolution_m > 0.0:
             ranges = (
                 np.round(ranges / self.config.range_resolution_m) * self.config.range_resolution_m
             )
         ranges[~(ranges < self.config.range_max_m)] = np.inf
-        return Scan.create(
+        scan = Scan.create(
             stamp_ns,
             ranges,
             self._angle_min,
             self._increment,
             self.config.range_min_m,
             self.config.range_max_m,
-            self.T_base_laser,
+            self.mount.T_base_laser,
         )
+        return replace(scan, frame=self.mount.frame)
 
     def _exact(self, world: World, T_world_laser: Array, stamp_ns: int) -> Array:
         frame = world.frame

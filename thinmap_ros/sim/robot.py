@@ -7,8 +7,13 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.world import World
+
+_PATH_MARGIN_M = 0.03  # between a body and the obstacles beside its path
+_PLANNED_RADIUS_M = WavefrontConfig().robot_radius_m
 
 
 @dataclass(frozen=True)
@@ -44,8 +49,14 @@ class RobotConfig(Config):
     )
     contact_margin_m: float = 0.05  # a contact ends where the body is so far from the wall
 
+    @property
+    def planned_radius_m(self) -> float:
+        """Radius with which paths are planned, m: at least that of the nodes by default."""
+        return max(self.radius_m + _PATH_MARGIN_M, _PLANNED_RADIUS_M)
 
-# The 3-AT is larger and skid-steered: its wheels slip whenever it turns.
+
+# The 3-AT is larger and skid-steered: its wheels slip whenever it turns. The footprint of the
+# MiR100 is 0.89 x 0.58 m, 0.04 m ahead of its axle.
 PRESETS = {
     '2dx': RobotConfig(),
     '3at': RobotConfig(
@@ -56,6 +67,25 @@ PRESETS = {
         turn_noise=0.06,
         drift_sigma_rad_m=0.02,
     ),
+    'mir100': RobotConfig(
+        radius_m=0.57,
+        max_speed_m_s=1.5,
+        max_angular_speed_rad_s=1.5,
+        max_angular_acceleration_rad_s2=2.5,
+    ),
+}
+# Lasers of those that have others than an LMS200. The two S300 scan at 12.5 Hz; at 10 Hz they
+# alternate in steps of 50 ms.
+# Source: mir_description of DFKI, mir_100_v1.urdf.xacro and sick_s300.urdf.xacro.
+LASERS = {
+    'mir100': LaserScannerConfig(
+        beams=541,
+        field_of_view_deg=270.0,
+        range_max_m=29.0,
+        scan_rate_hz=10.0,
+        range_resolution_m=0.01,
+        lasers='front 0.4288,0.2358,0.7854; rear -0.3548,-0.2352,-2.3562',
+    )
 }
 
 

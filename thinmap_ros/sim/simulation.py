@@ -1,4 +1,4 @@
-"""Simulation of a robot with a laser in a world, in fixed time steps."""
+"""Simulation of a robot with its lasers in a world, in fixed time steps."""
 
 from dataclasses import dataclass
 
@@ -16,17 +16,18 @@ STEP_NS = 50_000_000
 
 @dataclass(frozen=True, eq=False)
 class SensorReadings:
-    """Sensor readings after a step: odometry at stamp_ns, and a scan if one is due."""
+    """Sensor readings after a step: odometry at stamp_ns, and a scan of each laser that is due."""
 
     stamp_ns: int
     T_odom_base: Array
-    scan: Scan | None
+    scans: tuple[Scan, ...]
 
 
 class Simulation:
-    """Steps of 50 ms: odometry at 20 Hz, and scans at the rate of the laser.
+    """Steps of 50 ms: odometry at 20 Hz, and scans at the rate of the lasers.
 
-    The seed determines all noise.
+    Several lasers begin one after the other within a period, as they are not synchronized. The seed
+    determines all noise.
 
     start (3,): initial pose of the robot in the world; its odometry is zero there. Raises
     InputError if it does not fit.
@@ -37,10 +38,15 @@ class Simulation:
     ) -> None:
         _check_fits(world, start, robot)
         self.world = world
-        self.robot = DifferentialDriveRobot(robot, world, start, odometry_seed(seed))
-        self.laser = LaserScanner(laser, _seeds(seed)[1])
+        mounts = laser.mounts()
+        seeds = _seeds(seed, len(mounts))
+        self.robot = DifferentialDriveRobot(robot, world, start, seeds[0])
+        self.lasers = [
+            LaserScanner(laser, own_seed, mount)
+            for own_seed, mount in zip(seeds[1:], mounts, strict=True)
+        ]
         self._scan_period_ns = round(1e9 / laser.scan_rate_hz)
-        self._next_scan_ns = 0
+        self._next_scan_ns = [self._scan_period_ns * k // len(mounts) for k in range(len(mounts))]
         self.stamp_ns = 0
 
     def teleport(self, T_world_base: Array) -> None:
@@ -55,11 +61,12 @@ class Simulation:
 
     def read_sensors(self) -> SensorReadings:
         """Return the present sensor readings; each scan is returned once."""
-        scan = None
-        if self.stamp_ns >= self._next_scan_ns:
-            scan = self.laser.scan(self.world, self.robot.T_world_base, self.stamp_ns)
-            self._next_scan_ns += self._scan_period_ns
-        return SensorReadings(self.stamp_ns, self.robot.T_odom_base, scan)
+        scans = []
+        for k, laser in enumerate(self.lasers):
+            if self.stamp_ns >= self._next_scan_ns[k]:
+                scans.append(laser.scan(self.world, self.robot.T_world_base, self.stamp_ns))
+                self._next_scan_ns[k] += self._scan_period_ns
+        return SensorReadings(self.stamp_ns, self.robot.T_odom_base, tuple(scans))
 
     def step(self, v: float, w: float) -> SensorReadings:
         """Drive for one step, as `move`; returns the sensor readings after it."""
@@ -74,12 +81,12 @@ class Simulation:
 
 def odometry_seed(seed: int) -> int:
     """Seed of the wheel odometry in a simulation with a seed."""
-    return _seeds(seed)[0]
+    return _seeds(seed, 0)[0]
 
 
-def _seeds(seed: int) -> list[int]:
-    """Independent seeds of the wheel odometry and of the laser."""
-    return [int(word) for word in np.random.SeedSequence(seed).generate_state(2)]
+def _seeds(seed: int, lasers: int) -> list[int]:
+    """Independent seeds of the wheel odometry and of each laser."""
+    return [int(word) for word in np.random.SeedSequence(seed).generate_state(1 + lasers)]
 
 
 def _check_fits(world: World, T_world_base: Array, robot: RobotConfig) -> None:

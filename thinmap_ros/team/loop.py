@@ -12,6 +12,7 @@ from thinmap_ros.core.exploration.strategy import Observation
 from thinmap_ros.core.exploration.team import Claim
 from thinmap_ros.core.planning.navigator import Command
 from thinmap_ros.core.planning.path_follower import NEAR_ROBOT_M, Motion, must_stop
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.sensing.beams import without_robots
 from thinmap_ros.sim.coverage import ObservableCells
@@ -108,12 +109,12 @@ class TeamLoop:
         while self.now_s < limit_s:
             if steps % CONTROL_STEPS == 0:
                 self._exchange_motions()
-            if self.members[0].moment.scan is not None:
-                self._process_scans()
+            for scans in zip(*(member.moment.scans for member in self.members), strict=True):
+                self._process_scans(scans)
                 if self._scans % scans_per_show == 1:
                     show(*self._measure(goal))
-                if self.is_finished:
-                    break
+            if self.members[0].moment.scans and self.is_finished:
+                break
             if steps % CONTROL_STEPS == 0:
                 for _, member in self._working():
                     member.loop.control(member.moment, self._right_of_way(member))
@@ -141,16 +142,14 @@ class TeamLoop:
             if not self.trouble.is_dead(number, now_s):
                 yield number, member
 
-    def _process_scans(self) -> None:
+    def _process_scans(self, scans: tuple[Scan, ...]) -> None:
         """Process one scan of each robot through the maps to decisions."""
         now_s = self.now_s
         estimates = {}
         for number, member in self._working():
-            scan = member.moment.scan
-            assert scan is not None
             places = np.array([m.pose[:2] for m in self._recent_motions(member)]).reshape(-1, 2)
             cut_m = member.radius_m + _CUT_MARGIN_M
-            seen = without_robots(scan, member.pose, places, cut_m)
+            seen = without_robots(scans[number], member.pose, places, cut_m)
             estimates[number] = self.maps.add_scan(number, seen, member.moment.T_odom_base)
         self.maps.update({i: estimate.T_map_base for i, estimate in estimates.items()}, now_s)
         self._scans += 1
@@ -159,10 +158,9 @@ class TeamLoop:
             estimate = estimates[number]
             for box in self.maps.take_changes(number):
                 member.explorer.team.add_changes(box)
-            scan = member.moment.scan
-            if scan is not None and not estimate.blind_reason:
+            if not estimate.blind_reason:
                 topology, patch = self.maps.view(number)
-                observation = Observation(topology, patch, scan, estimate.T_map_base)
+                observation = Observation(topology, patch, scans[number], estimate.T_map_base)
                 member.loop.decide_on(observation, estimate.T_map_odom)
 
     def _exchange_claims(self, now_s: float) -> None:

@@ -18,7 +18,7 @@ from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.other_robots import starts_side_by_side
-from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.robot import LASERS, PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, NAMES, check_strategy
 from thinmap_ros.team.loop import TeamLoop
@@ -94,7 +94,7 @@ def options_from(arguments: argparse.Namespace, strategy: str) -> Options:
         speed_m_s=arguments.speed_m_s,
         localization=arguments.localization,
         robot=arguments.robot,
-        laser=cli.config_from(arguments, LaserScannerConfig),
+        laser=cli.config_from(arguments, LaserScannerConfig, LASERS.get(arguments.robot)),
         time_limit_s=arguments.time_limit_s,
         kidnap_at_s=arguments.kidnap_at_s,
     )
@@ -107,7 +107,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         '--speed-m-s', type=float, default=0.2, help='speed limit, m/s (default 0.2)'
     )
     parser.add_argument('--localization', default='truth', choices=('truth', 'slam'))
-    parser.add_argument('--robot', default='2dx', choices=sorted(PRESETS))
+    parser.add_argument(
+        '--robot',
+        default='2dx',
+        choices=sorted(PRESETS),
+        help='simulated robot: a Pioneer (default 2dx), or a MiR100 with its two lasers',
+    )
     parser.add_argument(
         '--time-limit-s', type=float, default=20_000.0, help='limit of simulated time, s'
     )
@@ -115,7 +120,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         '--kidnap-at-s', type=float, help='kidnap the robot at this simulated time, s (with slam)'
     )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
-    cli.add_config(parser, LaserScannerConfig, ['beams', 'field_of_view_deg', 'range_max_m'])
+    cli.add_config(
+        parser, LaserScannerConfig, ['beams', 'field_of_view_deg', 'range_max_m', 'lasers']
+    )
 
 
 def _check_team(arguments: argparse.Namespace) -> None:

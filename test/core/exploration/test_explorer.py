@@ -85,7 +85,7 @@ class Run:
     def go(self, seconds=300.0):
         moment = self.simulation.read_sensors()
         while moment.stamp_ns < seconds * 1e9:
-            if moment.scan is not None and self.look(moment.scan).finished:
+            if moment.scans and self.look(*moment.scans).finished:
                 break
             command = self.navigator.step(
                 self.simulation.robot.T_world_base, self.grid.known_area(), self.scan, 0.05
@@ -370,9 +370,9 @@ def test_the_first_target_of_the_paper_is_the_one_that_the_robot_faces():
 
 def test_a_graph_that_is_there_before_the_map_does_not_end_the_exploration():
     run = Run(two_rooms())
-    run.look(run.simulation.read_sensors().scan)
+    run.look(*run.simulation.read_sensors().scans)
     for _ in range(5):
-        run.look(run.simulation.step(0.0, 0.0).scan or run.scan)
+        run.look(*run.simulation.step(0.0, 0.0).scans or [run.scan])
     assert run.topology.map.nodes
     unknown = GridPatch(
         run.grid.known_area().frame, np.full(run.grid.known_area().shape, -1, dtype=np.int8)

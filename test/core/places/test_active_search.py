@@ -64,8 +64,7 @@ def seconds_driven_by_itself(finder, start, seed):
     moment = simulation.read_sensors()
     scan = None
     for k in itertools.count():
-        if moment.scan is not None:
-            scan = moment.scan
+        for scan in moment.scans:
             result = finder.step(scan, moment.T_odom_base)
             search.take(result, moment.T_odom_base)
             if result.pose is not None:

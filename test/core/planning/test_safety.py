@@ -55,7 +55,7 @@ def rove(seed, speed, knows_pillars, seconds=40.0):
     until = 0.0
     way_m = 0.0
     while moment.stamp_ns < seconds * 1e9:
-        scan = moment.scan or scan
+        (scan,) = moment.scans or (scan,)
         if moment.stamp_ns >= until * 1e9:
             until += rng.uniform(0.5, 6.0)
             navigator.set_goal(*start_in(world, rng).tolist())
@@ -64,7 +64,7 @@ def rove(seed, speed, knows_pillars, seconds=40.0):
         command = navigator.step(robot.robot.T_world_base, patch, scan, 0.1)
         for _ in range(2):
             moment = robot.step(command.v, command.w)
-            scan = moment.scan or scan
+            (scan,) = moment.scans or (scan,)
         way_m += robot.robot.v * 0.1
     return robot.robot.collisions, way_m
 

@@ -18,6 +18,7 @@ from thinmap_ros.core.planning.grid_search import (
     update_traversable_cells,
 )
 from thinmap_ros.core.planning.obstacles import RecentPath
+from thinmap_ros.core.planning.wavefront import start_escape_m
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, Cell, Cells, Mask, Place
 from thinmap_ros.core.topology.graph import TopologyConfig
@@ -55,7 +56,6 @@ _STRIDE = 4
 _SLACK_CELLS = 5
 
 # Of what can be reached.
-_ESCAPE_M = 0.6
 _DETOUR = 3.0  # of the straight line, where no path is known
 
 
@@ -588,6 +588,7 @@ class ReachableSpace:
 
     def __init__(self, robot_radius_m: float) -> None:
         self._radius_m = robot_radius_m
+        self._escape_m = start_escape_m(robot_radius_m)
         self._recent_path = RecentPath()
         self._standing: Mask = np.zeros((0, 0), dtype=np.bool_)
         self._passable = self._standing
@@ -616,7 +617,7 @@ class ReachableSpace:
     def _reach(self, T_map_base: Array, frame: GridFrame, recent: Cells | None = None) -> Reachable:
         """What can be reached from a pose (3,); recent (N, 2): cells where the robot was."""
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        allowed = escape_cells(self._standing, self._passable, frame, xy, _ESCAPE_M, recent)
+        allowed = escape_cells(self._standing, self._passable, frame, xy, self._escape_m, recent)
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
         # Cells say whether there is a way, as the navigator does; squares, which join what a narrow
         # gap separates, say how long it is.

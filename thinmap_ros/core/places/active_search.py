@@ -21,7 +21,7 @@ from thinmap_ros.core.places.place_database import (
 from thinmap_ros.core.places.wall_field import FREE, UNKNOWN, WALL
 from thinmap_ros.core.planning.grid_search import escape_cells, traversable_cells
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
-from thinmap_ros.core.planning.wavefront import START_ESCAPE_M, WavefrontConfig, navigation_function
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, navigation_function, start_escape_m
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import kernel
@@ -262,7 +262,9 @@ def _in_reach(
     resolution = patch.frame.resolution
     xy = (float(T_odom_base[0]), float(T_odom_base[1]))
     standing = traversable_cells(patch.free, driving.robot_radius_m, resolution)
-    ways = escape_cells(standing, patch.free, patch.frame, xy, START_ESCAPE_M)
+    ways = escape_cells(
+        standing, patch.free, patch.frame, xy, start_escape_m(driving.robot_radius_m)
+    )
     middle = patch.shape[0] // 2, patch.shape[1] // 2
     metres = navigation_function(np.where(ways, 1.0, np.inf), middle) * resolution
     near_by = np.argwhere(standing & (metres >= _NEAREST_M) & np.isfinite(metres))

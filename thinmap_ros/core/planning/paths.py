@@ -12,11 +12,11 @@ from thinmap_ros.core.grid.fields import nearest_true
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import distance_field_from, path_collides
 from thinmap_ros.core.planning.wavefront import (
-    START_ESCAPE_M,
     Obstacles,
     WavefrontConfig,
     cost_of_cells,
     find_path,
+    start_escape_m,
 )
 from thinmap_ros.core.se2 import Array, Cells, Mask, Place, lengths_along, path_length
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
@@ -123,7 +123,7 @@ def _least_detour(
 
 def _rim_cells(resolution: float, config: WavefrontConfig, obstacles: Obstacles | None) -> int:
     """Cells at the rim whose cost may differ from that in the map."""
-    reach_m = max(config.inflation_radius_m, config.robot_radius_m, START_ESCAPE_M)
+    reach_m = max(config.inflation_radius_m, start_escape_m(config.robot_radius_m))
     if obstacles is not None:
         reach_m = max(reach_m, obstacles.radius_m)
     return math.ceil((reach_m + _GAP_M) / resolution) + 1
@@ -384,7 +384,7 @@ def route_band(
     checked = _Checked(topology, patch, config, obstacles)
     ends = []
     for xy, reach_m in (
-        (start_xy, START_ESCAPE_M),
+        (start_xy, start_escape_m(config.robot_radius_m)),
         (goal_xy, config.goal_search_radius_m),
     ):
         entrance = _entrance(checked, xy, reach_m)

@@ -25,8 +25,8 @@ from thinmap_ros.jit import inlined, kernel
 
 _STEP_CELLS = 0.5
 _TOPOLOGY = TopologyConfig()
-# A start in collision may leave inflated cells within this distance, that of the usual inflation.
-START_ESCAPE_M = 0.6
+_INFLATION_RADIUS_M = 0.6
+_BESIDE_BODY_M = 0.35  # so much wider than the usual radius is the usual inflation
 # Distances are whole cells times the resolution:
 # rounding must not close a passage as wide as the robot.
 _HAIR_M = 1e-6
@@ -38,7 +38,7 @@ class WavefrontConfig(Config):
 
     robot_radius_m: float = robot_radius()
     inflation_radius_m: float = parameter(
-        0.6,
+        _INFLATION_RADIUS_M,
         'Distance from obstacles below which cells cost more (m). Raise it to keep to the middle '
         'of rooms, lower it to cut corners.',
         low=0.0,
@@ -68,6 +68,15 @@ class WavefrontConfig(Config):
         high=5.0,
     )
     escape_cost: float = 10.0  # of these cells, and of those of the recent path
+
+
+def start_escape_m(robot_radius_m: float) -> float:
+    """Distance, m, within which a start in collision may leave inflated cells.
+
+    That of the usual inflation, which is farther from the centre of a larger body: lasers at its
+    corners do not see the floor below it, so that it starts amid unknown cells.
+    """
+    return max(_INFLATION_RADIUS_M, robot_radius_m + _BESIDE_BODY_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +219,7 @@ def _open_escape_cells(
     Occupied cells stay forbidden, except the cell of the robot itself. So do cells
     from which a step over a corner leads through a wall.
     """
-    where, within = disc(cost, start, START_ESCAPE_M / resolution)
+    where, within = disc(cost, start, start_escape_m(config.robot_radius_m) / resolution)
     opened = np.argwhere(within & ~np.isfinite(cost[where]) & ~occupied[where])
     opened += (where[0].start, where[1].start)
     rows, cols = opened[~_beside_thin_wall(occupied, opened)].T

@@ -36,6 +36,7 @@ from thinmap_ros.ros.services import action_servers
 from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.ros.velocity import TOPIC as COMMANDS
 from thinmap_ros.ros.velocity import VelocitySubscription
+from thinmap_ros.sim.laser import LaserScanner
 from thinmap_ros.sim.other_robots import starts_in, starts_side_by_side
 from thinmap_ros.sim.simulation import SensorReadings, Simulation
 from thinmap_ros.sim.world import World
@@ -198,13 +199,17 @@ _COMMAND_TIMEOUT_NS = 500_000_000
 class _Publishers:
     """Publishes what a simulated robot senses, and the ground truth."""
 
-    def __init__(self, node: Node, prefix: str, scan_time_s: float, publish_tf: bool) -> None:
+    def __init__(self, node: Node, prefix: str, lasers: list[LaserScanner], tf: bool) -> None:
         """prefix: of the topics of one of several robots, with a slash; ''.
 
-        scan_time_s: time between two scans. publish_tf: also publish the transforms.
+        tf: also publish the transforms.
         """
-        self._scan_time_s = scan_time_s
-        self._scan = node.create_publisher(LaserScan, f'{prefix}scan', qos.STREAM)
+        self._scan_time_s = 1.0 / lasers[0].config.scan_rate_hz
+        self._mounts = [laser.mount for laser in lasers]
+        self._scans = {
+            mount.frame: node.create_publisher(LaserScan, f'{prefix}{mount.topic}', qos.STREAM)
+            for mount in self._mounts
+        }
         self._odom = node.create_publisher(Odometry, f'{prefix}odom', qos.STREAM)
         self._truth = node.create_publisher(PoseStamped, f'{prefix}ground_truth', qos.STREAM)
         self._collisions = node.create_publisher(UInt32, f'{prefix}collisions', qos.LATCHED)
@@ -214,18 +219,25 @@ class _Publishers:
         self._tf_static = node.create_publisher(
             TFMessage, f'{below}tf_static', qos.STATIC_TRANSFORMS
         )
-        self._publish_tf = publish_tf
+        self._publish_tf = tf
         self._last_collisions = -1
-        self._last_scan: LaserScan | None = None
+        self._last_scans: list[LaserScan] = []
 
-    def publish_laser_pose(self, simulation: Simulation) -> None:
+    @property
+    def fewest_subscribers(self) -> int:
+        """Number of subscribers of the scans of the laser that has the fewest."""
+        return min(int(scans.get_subscription_count()) for scans in self._scans.values())
+
+    def publish_laser_poses(self) -> None:
         if self._publish_tf:
-            T_base_laser = simulation.laser.T_base_laser
-            transform = messages.transform_msg(T_base_laser, 'base_link', 'laser', 0)
-            self._tf_static.publish(TFMessage(transforms=[transform]))
+            transforms = [
+                messages.transform_msg(mount.T_base_laser, 'base_link', mount.frame, 0)
+                for mount in self._mounts
+            ]
+            self._tf_static.publish(TFMessage(transforms=transforms))
 
     def publish(self, moment: SensorReadings, simulation: Simulation) -> None:
-        """Publish a moment; the scan, if there is one, comes last."""
+        """Publish a moment; the scans, if there are any, come last."""
         robot = simulation.robot
         self._publish_odometry(moment, simulation)
         truth = messages.pose_stamped_msg(robot.T_world_base, 'world', moment.stamp_ns)
@@ -233,15 +245,21 @@ class _Publishers:
         if robot.collisions != self._last_collisions:
             self._last_collisions = robot.collisions
             self._collisions.publish(UInt32(data=robot.collisions))
-        if moment.scan is not None:
-            self._last_scan = messages.scan_msg(moment.scan, 'laser', self._scan_time_s)
-            self._scan.publish(self._last_scan)
+        if moment.scans:
+            self._last_scans = [
+                messages.scan_msg(scan, scan.frame, self._scan_time_s) for scan in moment.scans
+            ]
+            self._publish_scans()
 
     def repeat_scan(self, simulation: Simulation) -> None:
         """Publish the last scan again, with the present odometry."""
-        if self._last_scan is not None:
-            self._scan.publish(self._last_scan)
+        if self._last_scans:
+            self._publish_scans()
             self._publish_odometry(simulation.read_sensors(), simulation)
+
+    def _publish_scans(self) -> None:
+        for message in self._last_scans:
+            self._scans[message.header.frame_id].publish(message)
 
     def _publish_odometry(self, moment: SensorReadings, simulation: Simulation) -> None:
         velocity = (simulation.robot.v, simulation.robot.w)
@@ -280,22 +298,20 @@ class RobotInterface:
         publish_tf: bool,
     ) -> None:
         """publish_tf: whether odom -> base_link and base_link -> laser are published."""
-        scan_time_s = 1.0 / simulation.laser.config.scan_rate_hz
-        self._node = node
         self._prefix = prefix
         self._simulation = simulation
         self._diagnostics = diagnostics
-        self._output = _Publishers(node, prefix, scan_time_s, publish_tf)
+        self._output = _Publishers(node, prefix, simulation.lasers, publish_tf)
         self._command = _VelocityCommand()
         VelocitySubscription(node, diagnostics, self._on_command, f'{prefix}{COMMANDS}')
         self._teleports = f'~/{prefix}set_pose'
         node.create_subscription(PoseStamped, self._teleports, self._on_teleport, qos.STREAM)
-        self._output.publish_laser_pose(simulation)
+        self._output.publish_laser_poses()
 
     @property
     def scan_subscribers(self) -> int:
-        """Number of subscribers of the scans."""
-        return int(self._node.count_subscribers(f'{self._prefix}scan'))
+        """Number of subscribers of the scans; of several lasers, of the one that has the fewest."""
+        return self._output.fewest_subscribers
 
     def move(self) -> None:
         """Drive for one step as commanded."""
@@ -305,7 +321,7 @@ class RobotInterface:
         """Publish the present sensor readings; returns whether there was a scan."""
         moment = self._simulation.read_sensors()
         self._output.publish(moment, self._simulation)
-        return moment.scan is not None
+        return bool(moment.scans)
 
     def repeat_scan(self) -> None:
         """Publish the last scan again."""
