@@ -111,7 +111,8 @@ def add_config(parser: Options, config: type[Config], names: list[str] | None = 
     for field in filter(is_parameter, fields(config)):
         if names is None or field.name in names:
             option = '--' + field.name.replace('_', '-')
-            help_text = f'{field.metadata["description"]} (default {field.default})'
+            default = '' if field.default == '' else f' (default {field.default})'
+            help_text = field.metadata['description'] + default
             kind = type(field.default)
             choices = field.metadata.get('choices')
             if kind is bool:

@@ -27,7 +27,7 @@ from thinmap_ros.evaluation.ros_domains import use_free_domain
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_starts, read_world
 from thinmap_ros.sim.other_robots import MAX_ROBOTS, starts_in
-from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.robot import LASERS, PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser, add_out, out_folder, require_ros
@@ -293,8 +293,9 @@ def main() -> None:
     parser.add_argument(
         '--world', default='room_10x10', help='world or map YAML file, or a world of the package'
     )
+    pioneers = [name for name in PRESETS if name not in LASERS]
     parser.add_argument(
-        '--robot', default='2dx', choices=tuple(PRESETS), help='which Pioneer (default 2dx)'
+        '--robot', default='2dx', choices=pioneers, help='which Pioneer (default 2dx)'
     )
     parser.add_argument(
         '--robots',
