@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from support.driven_pieces import driven_piece, true_transform
+from support.rooms import KITCHEN, room, turned
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
@@ -14,7 +15,13 @@ from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files import sessions
-from thinmap_ros.files.merging import NotTheSamePlaceError, merge_maps, read_piece, write_ids
+from thinmap_ros.files.merging import (
+    CannotTellError,
+    NotTheSamePlaceError,
+    merge_maps,
+    read_piece,
+    write_ids,
+)
 from thinmap_ros.files.occupancy_maps import write_map
 from thinmap_ros.files.sessions import GRID, LOCALIZER, REGIONS, TOPOLOGY
 
@@ -252,3 +259,55 @@ def test_a_piece_of_a_session_continues_its_ids(folder):
     assert piece.next_id == TOPOLOGY.load(str(folder / 'first')).next_id
     assert piece.is_rigid
     assert len(piece.frames) > 50
+
+
+T_ROOM = np.array([1.3, -0.7, 0.65])
+
+
+def save_rooms(folder, boxes):
+    """A room, and the same in a frame that lies at T_ROOM in its own."""
+    known = room(boxes)
+    return [
+        str(write_map(folder / 'today', known)),
+        str(write_map(folder / 'yesterday', turned(known, se2.invert(T_ROOM)))),
+    ]
+
+
+def test_a_room_too_small_for_views_is_joined_as_a_whole(tmp_path):
+    (join,) = merge_maps(save_rooms(tmp_path, KITCHEN)).joins
+    np.testing.assert_allclose(join.T_merged_map, T_ROOM, atol=0.05)
+    assert math.log(1e5) < join.log_odds < math.inf
+    assert join.found > 0.9
+
+
+def test_a_given_pose_joins_a_symmetric_room_and_is_refined(tmp_path):
+    paths = save_rooms(tmp_path, [])
+    with pytest.raises(NotTheSamePlaceError):
+        merge_maps(paths)
+    (join,) = merge_maps(paths, at=[T_ROOM + (0.3, -0.2, 0.08)]).joins
+    np.testing.assert_allclose(join.T_merged_map, T_ROOM, atol=0.05)
+    assert math.isinf(join.log_odds)
+
+
+def test_odds_for_a_join_that_are_too_small_name_the_places(tmp_path):
+    paths = save_rooms(tmp_path, KITCHEN)
+    with pytest.raises(
+        CannotTellError, match=r'cannot tell \(odds [\d,]+, asked 1e50\): '
+    ) as error:
+        merge_maps(paths, join_odds=1e50)
+    np.testing.assert_allclose(error.value.places[0], T_ROOM, atol=0.05)
+    assert '--at X,Y,YAW; it fits best at 1.3' in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ('at', 'match'),
+    [
+        ([T_ROOM + (0.3, 1.5, 0.8)], r'contradict the given pose .* % of the walls agree near it'),
+        ([T_ROOM, T_ROOM], '2 given poses: expected one for each map after the first: 1'),
+        ([np.array([0.0, np.nan, 0.0])], 'expected x, y and yaw'),
+    ],
+)
+def test_a_wrong_given_pose_is_one_line(tmp_path, at, match):
+    with pytest.raises(InputError, match=match) as error:
+        merge_maps(save_rooms(tmp_path, KITCHEN), at=at)
+    assert '\n' not in str(error.value)

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 from PIL import Image
-from support.driven_pieces import driven_piece
+from support.driven_pieces import driven_piece, true_transform
 
 from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import write_map
@@ -82,6 +82,7 @@ def test_another_place_ends_with_1_and_one_line(folder, tmp_path, monkeypatch, c
         (('a.yaml', 'missing.yaml', '-o', 'out'), 'missing.yaml: No such file or directory'),
         (('a.yaml', '-o', 'out'), 'expected two different maps or more'),
         (('a.yaml', 'b.yaml', '-o', 'out', '--picture', 'x.jpg'), 'x.jpg: expected a name that'),
+        (('a.yaml', 'b.yaml', '-o', 'out', '--at', '1,2'), '"1,2": expected "X,Y,YAW"'),
         (('a.yaml', 'b.yaml', '-o', 'out', '--join-odds', '0'), 'join odds 0: expected more'),
     ],
 )
@@ -93,3 +94,15 @@ def test_wrong_arguments_are_one_line(folder, monkeypatch, capsys, words, expect
     assert line.startswith('merge_sessions: error: ')
     assert expected in line
     assert sorted(folder.iterdir()) == before
+
+
+def test_odds_that_are_too_small_end_with_3_and_a_pose_joins(folder, tmp_path, monkeypatch, capsys):
+    words = (folder / 'a.yaml', folder / 'b.yaml', '-o', tmp_path / 'out', '--quiet')
+    assert run(monkeypatch, *words, '--join-odds', '1e200') == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(r'/b\.yaml: cannot tell \(odds .*, asked 1e200\): lower --join-odds, ', line)
+    assert list(tmp_path.iterdir()) == []
+    T = true_transform(driven_piece(2, 1), driven_piece(2, 2))
+    pose = ','.join(f'{value:.1f}' for value in T)
+    assert run(monkeypatch, *words, f'--at={pose}') == 0
+    assert re.search(r'pose given, \d+ % of the walls agree, \d+ matches', capsys.readouterr().out)

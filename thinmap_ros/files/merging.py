@@ -1,16 +1,20 @@
 """Merges saved maps: sessions and map_server maps of one place into one session."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from thinmap_ros.core.errors import InputError, ThinmapError, quoted
 from thinmap_ros.core.grid.edits import KeepOut, MapEdits, require_count
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.places.recognition import JOIN_ODDS, recognize
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.joining.join import JoinedMap, join
+from thinmap_ros.core.places.alignment import LEAST_FOUND, align, fitted
+from thinmap_ros.core.places.recognition import JOIN_ODDS, Placement, recognize
+from thinmap_ros.core.se2 import Array, is_bounded_pose
+from thinmap_ros.core.slam.joining.join import join
 from thinmap_ros.core.slam.joining.pieces import SlamPiece
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.segmentation import RegionTracker
@@ -26,23 +30,54 @@ MIN_MAPS = 2
 class NotTheSamePlaceError(ThinmapError):
     """Maps do not show the same place; log_odds: that one lies in the others."""
 
-    def __init__(self, path: str, log_odds: float) -> None:
-        super().__init__(f'{path}: not the same place (log odds {log_odds:.1f})')
+    def __init__(self, path: str, log_odds: float, what: str = '') -> None:
+        super().__init__(f'{path}: {what or f"not the same place (log odds {log_odds:.1f})"}')
         self.log_odds = log_odds
+
+
+class CannotTellError(NotTheSamePlaceError):
+    """A map probably lies in the others, but its odds are less than those that are asked for.
+
+    places: poses (3,) at which it fits best, the best one first.
+    """
+
+    def __init__(
+        self, path: str, log_odds: float, join_odds: float, places: Sequence[Array]
+    ) -> None:
+        fits = ', then at '.join(','.join(f'{value:.2f}' for value in T) for T in places)
+        super().__init__(
+            path,
+            log_odds,
+            f'cannot tell (odds {_odds(log_odds)}, asked {_odds(math.log(join_odds))}): lower '
+            '--join-odds, or give the pose with --at X,Y,YAW'
+            + (f'; it fits best at {fits}' if fits else ''),
+        )
+        self.places = places
+
+
+def _odds(log_odds: float) -> str:
+    """Odds in words."""
+    return f'{math.exp(log_odds):,.0f}' if log_odds < _LONG else f'1e{log_odds / math.log(10):.0f}'
+
+
+_LONG = math.log(1e9)
 
 
 @dataclass(frozen=True, eq=False)
 class MapJoin:
     """How a map was joined: pose T_merged_map (3,) with covariance (3, 3), and log odds.
 
-    ids: of its nodes in the merged map, by their own; nodes: number of its nodes; links: matches of
-    its scans with those of the other maps.
+    Infinite log odds: the pose was given. found: share of the walls of which both maps tell that
+    both have, where the pose was given or found by whole maps; else NaN. ids: of its nodes in the
+    merged map, by their own; nodes: number of its nodes; links: matches of its scans with those of
+    the other maps.
     """
 
     path: str
     T_merged_map: Array
     covariance: Array
     log_odds: float
+    found: float
     ids: dict[int, int]
     nodes: int
     links: int
@@ -76,13 +111,16 @@ def merge_maps(
     join_odds: float = JOIN_ODDS,
     report: Report = warn,
     progress: Callable[[float, str], None] = lambda _share, _text: None,
+    at: Sequence[Array] = (),
 ) -> MergedMap:
     """Merge sessions and map_server maps (YAML files) of one place, in the frame of the first.
 
     join_odds: from which a map is joined, at most one false join in so many. report: receives lines
-    on maps that are read; progress: the share of the work that is done, and what is done next.
-    Raises InputError where a map cannot be read, NotTheSamePlaceError where one has no place in the
-    others: each must show some 20 m of path through what another one shows.
+    on maps that are read; progress: the share of the work that is done, and what is done next. at:
+    the pose (3,), m, m, rad, of each map after the first in the frame of the first; none: they are
+    found. Raises InputError where a map cannot be read or contradicts its pose,
+    NotTheSamePlaceError where one has no place in the others, CannotTellError, which is one, where
+    the odds are for it but too small.
     """
     if isinstance(paths, str | Path) or not isinstance(paths, Sequence):
         raise InputError(f'paths = {quoted(paths)}: expected a list of paths')
@@ -91,8 +129,9 @@ def merge_maps(
         raise InputError(f'{" ".join(names)}: expected two different maps or more')
     if not join_odds > 1.0:
         raise InputError(f'join odds {join_odds:g}: expected more than 1')
+    given = _given_poses(names[1:], at)
     maps = {name: read_piece(name, report) for name in names}
-    merging = _Merging(maps, join_odds, progress)
+    merging = _Merging(maps, join_odds, progress, given)
     while merging.waiting:
         merging.join_next()
     regions = merging.drawn.regions
@@ -100,6 +139,28 @@ def merge_maps(
     return MergedMap(
         merging.grid, merging.topology, regions, merging.drawn.keep_out, maps, merging.joins
     )
+
+
+def _given_poses(names: Sequence[str], at: Sequence[Array]) -> dict[str, Array]:
+    """The poses (3,) that are given, by the names of their maps. Raises InputError."""
+    if len(at) not in (0, len(names)):
+        raise InputError(
+            f'{len(at)} given poses: expected one for each map after the first: {len(names)}'
+        )
+    for T in at:
+        if np.shape(T) != (3,) or not is_bounded_pose(T):
+            raise InputError(f'given pose {quoted(T)}: expected x, y and yaw (m, m, rad)')
+    return dict(zip(names, at, strict=False))
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """The most likely place of a map in the others; None: none that may be joined."""
+
+    path: str
+    log_odds: float
+    placement: Placement | None
+    found: float = math.nan
 
 
 @dataclass(eq=False)
@@ -134,11 +195,14 @@ class _Merging:
         maps: dict[str, SlamPiece],
         join_odds: float,
         progress: Callable[[float, str], None],
+        given: dict[str, Array],
     ) -> None:
         first, *self.waiting = maps
         self._maps = maps
         self._join_odds = join_odds
         self._progress = progress
+        self._given = given
+        self._fits: dict[str, list[Array]] = {}  # poses (3,) at which a whole map fits best
         self._drawn = {path: _Drawn.of(path) for path in maps}
         require_count(sum(len(drawn.keep_out.areas) for drawn in self._drawn.values()))
         self.drawn = self._drawn[first]
@@ -149,28 +213,71 @@ class _Merging:
 
     def join_next(self) -> None:
         """Join a map that waits. Raises NotTheSamePlaceError if none has a place."""
-        best = ('', -float('inf'))
-        for path in self.waiting:
-            share = len(self.joins) / (len(self._maps) - 1)
-            self._progress(share, f'{path}: looking for its place')
-            query = self._maps[path]
-            decision = recognize(query.places, self.known.places, self._join_odds)
-            if decision.is_joined and decision.placement is not None:
-                self._progress(share, f'{path}: joining')
-                joined = join(self.known, query, decision.placement)
-                self._add(path, joined, decision.placement.covariance, decision.log_odds)
-                return
-            best = max(best, (path, decision.log_odds), key=lambda each: each[1])
-        raise NotTheSamePlaceError(best[0] or self.waiting[0], best[1])
+        finders = [self._by_pose] if self._given else [self._by_views, self._by_whole_map]
+        share = len(self.joins) / (len(self._maps) - 1)
+        best = _Candidate(self.waiting[0], -math.inf, None)
+        for find in finders:
+            for path in self.waiting:
+                self._progress(share, f'{path}: looking for its place')
+                found = find(path)
+                if found.placement is not None and found.log_odds > math.log(self._join_odds):
+                    self._progress(share, f'{path}: joining')
+                    self._join(found, found.placement)
+                    return
+                best = max(best, found, key=lambda each: each.log_odds)
+        raise self._refusal(best)
 
-    def _add(self, path: str, joined: JoinedMap, covariance: Array, log_odds: float) -> None:
+    def _refusal(self, best: _Candidate) -> NotTheSamePlaceError:
+        if best.log_odds <= 0.0:
+            return NotTheSamePlaceError(best.path, best.log_odds)
+        places = self._fits.get(best.path, [])
+        return CannotTellError(best.path, best.log_odds, self._join_odds, places)
+
+    def _by_views(self, path: str) -> _Candidate:
+        decision = recognize(self._maps[path].places, self.known.places, self._join_odds)
+        placement = decision.placement if decision.is_joined else None
+        return _Candidate(path, decision.log_odds, placement)
+
+    def _by_whole_map(self, path: str) -> _Candidate:
+        """For maps too small for their views to decide."""
+        query, known = self._maps[path].places, self.known.places
+        alignment = align(query, known)
+        if alignment is None:
+            return _Candidate(path, -math.inf, None)
+        fits = [fitted(query, known, T) for T in (alignment.T_known_query, alignment.second)]
+        self._fits[path] = [fit.T_known_query for fit in fits]
+        placement = fits[0].placement(query, alignment.log_odds)
+        return _Candidate(
+            path,
+            alignment.log_odds,
+            None if fits[0].is_contrary else placement,
+            fits[0].found,
+        )
+
+    def _by_pose(self, path: str) -> _Candidate:
+        """Where a person says that it lies."""
+        query = self._maps[path].places
+        given = self._given[path]
+        fit = fitted(query, self.known.places, given)
+        if fit.is_contrary:
+            raise InputError(
+                f'{path}: the maps contradict the given pose '
+                f'{",".join(f"{value:g}" for value in given)}: {100 * fit.found:.0f} % of the '
+                f'walls agree near it: expected at least {100 * LEAST_FOUND:.0f} %'
+            )
+        return _Candidate(path, math.inf, fit.placement(query, math.inf), fit.found)
+
+    def _join(self, candidate: _Candidate, placement: Placement) -> None:
+        path = candidate.path
+        joined = join(self.known, self._maps[path], placement)
         nodes = len(self._maps[path].graph.nodes)
         self.joins.append(
             MapJoin(
                 path,
                 joined.T_first_second,
-                covariance,
-                log_odds,
+                placement.covariance,
+                candidate.log_odds,
+                candidate.found,
                 joined.ids,
                 nodes,
                 joined.links,

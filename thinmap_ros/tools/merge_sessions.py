@@ -11,6 +11,7 @@ import numpy as np
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.places.recognition import JOIN_ODDS
 from thinmap_ros.files.merging import (
+    CannotTellError,
     MapJoin,
     MergedMap,
     NotTheSamePlaceError,
@@ -18,21 +19,27 @@ from thinmap_ros.files.merging import (
     write_ids,
 )
 from thinmap_ros.files.sessions import GRID, maps_in, require_own_files, stem_of
+from thinmap_ros.logs.transforms import parse_pose
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser, check_place
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import merged_figure
 
 _NOT_THE_SAME_PLACE = 1
+_CANNOT_TELL = 3
 
 
 def _describe(joined: MapJoin) -> str:
     x, y, theta = joined.T_merged_map.tolist()
     sigmas = np.sqrt(np.diag(joined.covariance)).tolist()
+    is_given = math.isinf(joined.log_odds)
+    said = 'pose given' if is_given else f'log odds {joined.log_odds:.1f}'
+    if not math.isnan(joined.found):
+        said += f', {100.0 * joined.found:.0f} % of the walls agree'
     return (
         f'{joined.path}: at {x:.3f}, {y:.3f} m, {math.degrees(theta):.2f} deg '
         f'(sigma {sigmas[0]:.3f}, {sigmas[1]:.3f} m, {math.degrees(sigmas[2]):.2f} deg), '
-        f'log odds {joined.log_odds:.1f}, {joined.links} matches; '
+        f'{said}, {joined.links} matches; '
         f'{len(joined.ids)} of {joined.nodes} nodes in the map'
     )
 
@@ -57,16 +64,20 @@ def _maps_of(given: str, out: str) -> list[str]:
 def _merge(arguments: argparse.Namespace) -> MergedMap:
     with ProgressBar('merge_sessions', arguments.quiet) as bar:
         try:
-            return merge_maps(arguments.maps, arguments.join_odds, progress=bar.show)
+            return merge_maps(
+                arguments.maps, arguments.join_odds, progress=bar.show, at=arguments.at
+            )
         except NotTheSamePlaceError as error:
             bar.close()
             print(error, file=sys.stderr)
-            sys.exit(_NOT_THE_SAME_PLACE)
+            is_unsure = isinstance(error, CannotTellError)
+            sys.exit(_CANNOT_TELL if is_unsure else _NOT_THE_SAME_PLACE)
 
 
 def _work(arguments: argparse.Namespace) -> None:
     for path in filter(None, (arguments.out, arguments.picture, arguments.ids)):
         check_place(Path(path))
+    arguments.at = [parse_pose(given, '--at', 'X,Y,YAW') for given in arguments.at]
     require_own_files(arguments.out, GRID)  # report a wrong name before the work
     arguments.maps = [each for given in arguments.maps for each in _maps_of(given, arguments.out)]
     if arguments.picture is not None and arguments.picture.suffix != '.png':
@@ -90,7 +101,8 @@ def main() -> None:
     parser = Parser(
         'merge_sessions',
         __doc__,
-        epilog='Ends with 1, and writes nothing, if a map does not show the same place.',
+        epilog='Ends with 1, and writes nothing, if a map does not show the same place, with 3 if '
+        'that it does is not sure enough.',
     )
     parser.add_argument(
         'maps',
@@ -104,6 +116,14 @@ def main() -> None:
         f'buildings with similar floors, lower it if maps overlap little (default {JOIN_ODDS:g})'
     )
     parser.add_argument('--join-odds', type=float, default=JOIN_ODDS, help=odds_help)
+    parser.add_argument(
+        '--at',
+        action='append',
+        default=[],
+        metavar='X,Y,YAW',
+        help='pose of the second map in the first one (m, m, rad), to some 0.5 m and 0.1 rad, '
+        'instead of looking for it; again for each further map',
+    )
     parser.add_argument('--picture', type=Path, help='FILE.png: the maps, and the merged one')
     parser.add_argument('--ids', type=Path, help='FILE.csv: ids of nodes in the merged map')
     parser.add_argument('--quiet', action='store_true', help='no progress bar')

@@ -138,7 +138,7 @@ _MAX_HYPOTHESES = 12
 
 _MAX_VIEWS = 20  # by which a new hypothesis is judged: bounds the time of a view
 
-_NOISE = np.diag([0.05**2, 0.05**2, 0.01**2])  # of a match, besides that of its points
+MATCH_NOISE = np.diag([0.05**2, 0.05**2, 0.01**2])  # of a match, besides that of its points
 
 
 @dataclass(eq=False)
@@ -275,7 +275,7 @@ class Recognition:
         best = max(hypothesis.poses, key=lambda k: hypothesis.evidence_of[k].log_ratio)
         view = self.views[best]
         T, information, _ = self.known.field.refined(view, hypothesis.poses[best])
-        covariance = inverse(information + np.eye(3)) + _NOISE
+        covariance = inverse(information + np.eye(3)) + MATCH_NOISE
         return se2.compose(T, se2.invert(view.T_piece_view)), covariance
 
 
