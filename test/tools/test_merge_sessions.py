@@ -82,7 +82,7 @@ def test_another_place_ends_with_1_and_one_line(folder, tmp_path, monkeypatch, c
         (('a.yaml', 'missing.yaml', '-o', 'out'), 'missing.yaml: No such file or directory'),
         (('a.yaml', '-o', 'out'), 'expected two different maps or more'),
         (('a.yaml', 'b.yaml', '-o', 'out', '--picture', 'x.jpg'), 'x.jpg: expected a name that'),
-        (('a.yaml', 'b.yaml', '-o', 'out', '--at', '1,2'), '"1,2": expected "X,Y,YAW"'),
+        (('a.yaml', 'b.yaml', '-o', 'out', '--at', '1,2'), '--at = \'1,2\': expected "X,Y,YAW"'),
         (('a.yaml', 'b.yaml', '-o', 'out', '--join-odds', '0'), 'join odds 0: expected more'),
     ],
 )
