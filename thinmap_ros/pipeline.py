@@ -14,6 +14,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import LaserConfig, Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
+from thinmap_ros.core.sensing.odometry_scale import OdometryScale
 from thinmap_ros.core.slam.localizer import Localizer, localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import (
@@ -112,7 +113,13 @@ class Pipeline:
     @property
     def warnings(self) -> list[str]:
         """What the scans so far contradict: their own angles, the odometry, or their mount."""
-        return list(self._consistency.reported.values())
+        scale = self.odometry_scale.warning
+        return [*self._consistency.reported.values(), *([scale] if scale else [])]
+
+    @property
+    def odometry_scale(self) -> OdometryScale:
+        """Turns and distances of the odometry, compared with those of the scans."""
+        return self._consistency.odometry_scale
 
     def step(self, scan: Scan, T_odom_base: Array) -> PipelineResult:
         """Localize and map one scan with the odometry pose (3,) at its stamp.

@@ -2,7 +2,7 @@
 
 import resource
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from thinmap_ros.core.errors import InputError, one_line_reason
-from thinmap_ros.core.scan import Scan, laser_names
+from thinmap_ros.core.scan import Scan, delayed_ns, laser_names
 from thinmap_ros.core.se2 import Array, path_length_m
 from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.stage import Estimate
@@ -88,6 +88,7 @@ class ScanCounts:
 class Replay:
     """Result of a replay: the pipeline at the end, and the pose (3,) of every scan.
 
+    frames: of the laser of every scan; delays_s: of the scans of each of them, s.
     counts: of scans that did not change the map. notes: what was assumed of the log, a line each.
     warnings: contradictions within the log, a line each. odometry_jumps: discontinuities of the
     odometry, a line each.
@@ -98,6 +99,8 @@ class Replay:
 
     pipeline: Pipeline
     stamps_ns: list[int] = field(default_factory=list)
+    frames: list[str] = field(default_factory=list)
+    delays_s: dict[str, float] = field(default_factory=dict)
     poses: list[Array] = field(default_factory=list)
     local_features: list[int] = field(default_factory=list)
     skipped: int = 0
@@ -109,6 +112,15 @@ class Replay:
     ended_by: Exception | KeyboardInterrupt | None = None
     session: str = ''
     continued: str = ''
+
+    def measured_ns(self) -> list[int]:
+        """Time of the measurement of every scan, ns.
+
+        None is stamped before it: where the odometry is late, the stamp of the scan is right.
+        """
+        delays_s = {frame: max(delay_s, 0.0) for frame, delay_s in self.delays_s.items()}
+        pairs = zip(self.stamps_ns, self.frames, strict=True)
+        return [delayed_ns(stamp_ns, delays_s[frame]) for stamp_ns, frame in pairs]
 
 
 class Watcher(Protocol):
@@ -139,20 +151,23 @@ def replay(
         result.pipeline.load_session(continued)
     pairing = ScanOdometrySynchronizer(WAITING_SCANS)
     lasers = SilentLasers()
+    # The records of a sorted log state which odometry belongs to a scan: its stamps have no delay.
+    learn = None if log.is_sorted else pairing.add_estimate
     tidy_up = compiler_memory_releaser()
     with _errors_kept(result, keep_partial), ProgressBar('replay', not show_progress) as bar:
         expected = None
         for number, event in enumerate(recording_events(log)):
             lasers.add(event)
-            _process(result, complete_scans(pairing, event), watcher)
+            _process(result, complete_scans(pairing, event), watcher, learn)
             tidy_up()
             if show_progress:
                 # Of a bag it is known once the bag has been opened.
                 expected = log.expected_scans if number == 0 else expected
                 _show(bar, len(result.poses), expected)
     with _errors_kept(result, keep_partial):
-        _process(result, pairing.finish(), watcher)
+        _process(result, pairing.finish(), watcher, learn)
         result.pipeline.finish()
+    result.delays_s = pairing.delays_s
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
     result.counts.without_odometry = pairing.reasons()
@@ -198,11 +213,22 @@ def _errors_kept(result: Replay, keep_partial: bool) -> Iterator[None]:
         result.ended_by = result.ended_by or error
 
 
-def _process(result: Replay, ready: list[tuple[Scan, Array]], watcher: Watcher | None) -> None:
-    """Process scans with their odometry poses (3,)."""
+def _process(
+    result: Replay,
+    ready: list[tuple[Scan, Array]],
+    watcher: Watcher | None,
+    learn: Callable[[Scan, Estimate], None] | None,
+) -> None:
+    """Process scans with their odometry poses (3,).
+
+    learn: receives each scan with its estimate.
+    """
     for scan, T_odom_base in ready:
         step = result.pipeline.step(scan, T_odom_base)
         result.stamps_ns.append(scan.stamp_ns)
+        result.frames.append(scan.frame)
+        if learn is not None:
+            learn(scan, step.estimate)
         result.poses.append(step.estimate.T_map_base)
         result.local_features.append(step.estimate.n_local_features)
         result.counts.add(step.estimate, scan.frame)
@@ -219,14 +245,15 @@ def write_outputs(
     pipeline = result.pipeline
     poses = np.array(result.poses)
     final = np.array(list(pipeline.localizer.optimized_trajectory())[: len(poses)])
+    measured_ns = result.measured_ns()
     release_compiler_pages()  # before matplotlib is loaded
     run = RunResult(
         pipeline.grid.known_area(),
         pipeline.topology.map,
         title,
         {
-            'trajectory': _in_order(result.stamps_ns, poses),
-            'trajectory_final': _in_order(result.stamps_ns, final),
+            'trajectory': _in_order(measured_ns, poses),
+            'trajectory_final': _in_order(measured_ns, final),
         },
         poses,
         {'apart': pipeline.localizer.apart_points()},
@@ -281,6 +308,11 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'warnings': result.warnings,
         'continued': result.continued,
         'session': result.session,
+        'scan_delays_s': {frame: round(s, 3) for frame, s in result.delays_s.items()},
+        'odometry_ratios': {
+            kind: {'value': round(ratio.value, 4), 'sigma': round(ratio.sigma, 4)}
+            for kind, ratio in result.pipeline.odometry_scale.values.items()
+        },
         'ended_by': '' if result.ended_by is None else one_line_reason(result.ended_by),
         'wall_s': round(seconds[0], 3),
         'cpu_s': round(seconds[1], 3),

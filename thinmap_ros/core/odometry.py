@@ -221,6 +221,27 @@ class OdometryBuffer:
             return None
         return np.array(inner, dtype=np.int64), np.array(known)
 
+    def headings(self, stamps_ns: NDArray[np.int64]) -> Array | None:
+        """Headings (K,), without jumps of a turn, at stamps (K,).
+
+        None where a stamp is outside the buffer, and where a long gap or a discontinuity is between
+        the first and the last one.
+        """
+        first = bisect_right(self._stamps, int(stamps_ns.min())) - 1
+        end = bisect_left(self._stamps, int(stamps_ns.max())) + 1
+        if first < 0 or end > len(self._stamps):
+            return None
+        known_ns = np.array(self._stamps[first:end], dtype=np.int64)
+        headings = np.unwrap([float(pose[2]) for pose in self._poses[first:end]])
+        steps_ns = np.diff(known_ns)
+        if self._max_gap_ns is not None and steps_ns.max(initial=0) > self._max_gap_ns:
+            return None
+        limits = _LIMITS.jump_rad + _LIMITS.max_speed_rad_s * steps_ns / SECOND_NS
+        if (np.abs(np.diff(headings)) > limits).any():
+            return None
+        since_s = (stamps_ns - known_ns[0]) / SECOND_NS
+        return np.asarray(np.interp(since_s, (known_ns - known_ns[0]) / SECOND_NS, headings))
+
     def _drop_old(self) -> None:
         first = bisect_left(self._stamps, self._stamps[-1] - self._span_ns)
         # In blocks, so that a long buffer is not shifted at every sample.
@@ -350,6 +371,8 @@ class OdometryIncrements:
             self.rejected += 1
             return OdometryIncrement(np.zeros(3), seconds)
         before = self.T_odom_base if self._is_begun else T_odom_base
+        if scan.T_odom_before is not None:
+            before = scan.T_odom_before
         self._is_begun = True
         self.T_odom_base = np.array(T_odom_base, dtype=np.float64)
         # Rounded, so that text logs, bags and messages give identical results.

@@ -76,6 +76,14 @@ class LaserConfig(Config):
         'matters where the driver publishes time_increment.',
         choices=(AT_START, AT_END),
     )
+    scan_delay_s: float = parameter(
+        0.0,
+        'Time by which the stamp of a scan is later than its measurement, by the clock of the '
+        'odometry (s), as of drivers that stamp a scan when it is received. Negative: the '
+        'odometry is late. What turns show beyond it is estimated and corrected, too.',
+        low=-10.0,
+        high=10.0,
+    )
     max_tilt_rad: float = parameter(
         0.08,
         'Tilt of the robot, by the orientation of its odometry, above which scans are left '
@@ -122,7 +130,9 @@ class Scan:
     than usual since the previous scan; None: unknown; frame: that of the laser, by which the lasers
     of a robot differ; is_mirrored: it hangs upside down, so that its bearings have the other sign
     in its own frame; body_m (360,): range at which the robot's own body was found at each degree
-    from -180, NaN where there is none. Use `Scan.create` to make one.
+    from -180, NaN where there is none; delay_s: by how much the stamp is later than the
+    measurement, by the clock of the odometry; T_odom_before (3,): odometry of the previous scan,
+    where its delay has turned out to be another one. Use `Scan.create` to make one.
 
     Each range is one of `hit`, a hit beyond the usable range, `no_return`, `below_range_min`, or
     invalid (`valid` is False).
@@ -149,6 +159,8 @@ class Scan:
     frame: str = ''
     is_mirrored: bool = False
     body_m: Array | None = None
+    delay_s: float = 0.0
+    T_odom_before: Array | None = None
 
     @staticmethod
     def create(
@@ -204,6 +216,7 @@ class Scan:
             first_beam_s=-time_increment_s * (ranges.size - 1) if is_at_end else 0.0,
             beam_period_s=time_increment_s,
             scan_time_s=scan_time_s,
+            delay_s=laser.scan_delay_s,
         )
         return scan.without_sectors(parse_sectors(laser.body_sectors))
 
@@ -214,16 +227,21 @@ class Scan:
         return self.angle_min_rad + self.angle_increment_rad * beams
 
     @property
+    def odometry_ns(self) -> int:
+        """Time of the scan by the clock of the odometry: its stamp less its delay, ns."""
+        return delayed_ns(self.stamp_ns, self.delay_s)
+
+    @property
     def end_ns(self) -> int:
-        """Time of the last beam, or the stamp if that is later, ns."""
+        """Time of the last beam, or of the scan if that is later, as `odometry_ns`."""
         last_s = self.first_beam_s + self.beam_period_s * (self.ranges_m.size - 1)
-        return self.stamp_ns + round(max(self.first_beam_s, last_s, 0.0) * SECOND_NS)
+        return self.odometry_ns + round(max(self.first_beam_s, last_s, 0.0) * SECOND_NS)
 
     @property
     def begin_ns(self) -> int:
-        """Time of the first beam, or the stamp if that is earlier, ns."""
+        """Time of the first beam, or of the scan if that is earlier, as `odometry_ns`."""
         last_s = self.first_beam_s + self.beam_period_s * (self.ranges_m.size - 1)
-        return self.stamp_ns + round(min(self.first_beam_s, last_s, 0.0) * SECOND_NS)
+        return self.odometry_ns + round(min(self.first_beam_s, last_s, 0.0) * SECOND_NS)
 
     @cached_property
     def returned(self) -> Mask:
@@ -311,6 +329,11 @@ class Scan:
     def points_base(self) -> Array:
         """End points of the hits, robot frame, (M, 2)."""
         return se2.transform_points(self.T_base_laser, self.points_laser())
+
+
+def delayed_ns(stamp_ns: int, delay_s: float) -> int:
+    """Time of what was stamped with a delay, ns."""
+    return stamp_ns - round(delay_s * SECOND_NS)
 
 
 def _require_geometry(ranges: Array, first: float, step: float, low: float, high: float) -> None:

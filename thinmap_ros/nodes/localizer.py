@@ -54,7 +54,7 @@ from thinmap_ros.nodes.parts.localization import (
     saved_pose,
 )
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
+from thinmap_ros.ros.diagnostics import ERROR, OK, SCALE_KEY, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_msg
@@ -94,7 +94,8 @@ class _PosePublishers:
         """Publish an estimate; status: with its state and step time, the rest is filled in."""
         stamp_ns = scan.stamp_ns
         frame = self.map_frame
-        self._pose.publish(messages.estimate_msg(estimate, frame, stamp_ns))
+        # At its stamp by the clock of the odometry, with which others take it on.
+        self._pose.publish(messages.estimate_msg(estimate, frame, scan.odometry_ns))
         header = messages.header(frame, stamp_ns)
         features = [_feature_msg(feature) for feature in localizer.features]
         self._features.publish(LineFeatureArray(header=header, features=features))
@@ -324,6 +325,7 @@ class LocalizerNode(ThinmapNode):
         started = perf_counter()
         estimate = self._localizer.step(scan, T_odom_base)
         estimate = self._input.consistency.checked(scan, T_odom_base, estimate)
+        self._input.pairing.add_estimate(scan, estimate)
         step_ms = 1000.0 * (perf_counter() - started)
         self._publish(scan, estimate, step_ms)
         if estimate.odometry_discontinuity:
@@ -343,6 +345,11 @@ class LocalizerNode(ThinmapNode):
             if kind not in self._input.reported:
                 self.get_logger().warning(f'scan: {text}')
                 self._input.reported.add(kind)
+        scale = self._input.consistency.odometry_scale.warning
+        self.diagnostics.set_value(SCALE_KEY, scale)
+        if scale and SCALE_KEY not in self._input.reported:
+            self.get_logger().warning(scale)
+            self._input.reported.add(SCALE_KEY)
 
     def _on_living_map(self, map_id: int, patch: GridPatch) -> None:
         """Continue in a map that was there before this node, rather than begin a second one."""
@@ -416,7 +423,7 @@ class LocalizerNode(ThinmapNode):
             self.get_logger().info(_correction_line(estimate.correction, len(poses)))
         if state != SlamStatus.NO_MAP:
             self._broadcaster.update(estimate.T_map_odom)
-        self._given.publish(scan.stamp_ns, estimate, state)
+        self._given.publish(scan.odometry_ns, estimate, state)
         status = SlamStatus(
             state=state,
             step_time_ms=step_ms,

@@ -22,11 +22,13 @@ from thinmap_ros.ros import qos
 from thinmap_ros.ros.time_jumps import STEADY
 
 _PERIOD_S = 1.0
+NAME_END = ': thinmap'  # of the name of a status, after that of its node
 # For which a failed step is reported, unless another fails: five times what is published.
 _FAILED_S = 5.0
 _MAX_TRACEBACKS = 20  # in the log of a node, each of another place in the code
 _TOPICS_OF_EVERY_NODE = ('/parameter_events', '/rosout', '/diagnostics', '/clock')
 _NUMBER = re.compile(r'-?\b(\d+\.?\d*(e[+-]?\d+)?|inf|nan)\b')
+SCALE_KEY = 'odometry scale'  # of a value of the localizer: what is wrong, '' for nothing
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
@@ -345,7 +347,7 @@ class NodeDiagnostics(MessageStatistics):
         name = self._node.get_fully_qualified_name()
         return DiagnosticStatus(
             level=level,
-            name=f'{name.lstrip("/")}: thinmap',
+            name=f'{name.lstrip("/")}{NAME_END}',
             message=message,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )

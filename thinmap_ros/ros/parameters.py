@@ -48,6 +48,7 @@ ROBOT = (
     'max_tilt_rad',
     'body_sectors',
     'min_range_m',
+    'scan_delay_s',
     'map_frame',
     'odom_frame',
     'odom_source',

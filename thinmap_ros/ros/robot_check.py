@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -23,7 +24,14 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import messages, qos, stop_topic, velocity
-from thinmap_ros.ros.diagnostics import full_name, publisher_names, subscriber_names
+from thinmap_ros.ros.diagnostics import (
+    NAME_END,
+    SCALE_KEY,
+    WARN,
+    full_name,
+    publisher_names,
+    subscriber_names,
+)
 
 _MAX_DELAY_S = 1.0  # of a stamp against the clock, beyond which clocks differ
 _MIN_RATE_HZ = 2.0
@@ -89,6 +97,8 @@ class RobotCheck:
             self._listen(LaserScan, topic, self._scans.setdefault(topic, []))
         self._listen(Odometry, names.odom_topic, self._odometry)
         node.create_subscription(Clock, '/clock', self._clock.append, qos.SENSOR)
+        self._localizer: DiagnosticStatus | None = None
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         node.create_subscription(TFMessage, 'tf', self._on_moving, _LISTENING)
         node.create_subscription(TFMessage, 'tf_static', self._on_static, qos.STATIC_TRANSFORMS)
 
@@ -111,6 +121,8 @@ class RobotCheck:
             yield Finding('frames of the lasers', False, seen, 'expected one of its own for each')
         yield self._commands()
         yield self._one_map()
+        if self._localizer is not None:
+            yield _of_localizer(self._localizer)
         yield self._time()
 
     def _listen(self, kind: type, topic: str, heard: list[tuple[Any, float]]) -> None:
@@ -119,6 +131,11 @@ class RobotCheck:
                 heard.append((message, time.time()))
 
         self._node.create_subscription(kind, topic, hear, qos.SENSOR)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.removesuffix(NAME_END).rpartition('/')[2] == 'localizer':
+                self._localizer = status
 
     def _on_moving(self, message: TFMessage) -> None:
         for each in message.transforms:
@@ -242,6 +259,14 @@ class RobotCheck:
         advice = 'synchronize the clocks of the machines (chrony), or play a bag with --clock'
         seen = f'stamps are {delay_s:.3f} s old'
         return Finding('clock', abs(delay_s) <= _MAX_DELAY_S, seen, advice)
+
+
+def _of_localizer(status: DiagnosticStatus) -> Finding:
+    """What the localizer finds wrong with laser and odometry while the robot drives."""
+    scale = next((pair.value for pair in status.values if pair.key == SCALE_KEY), '')
+    if scale:
+        return Finding('localizer', False, *scale.split(': ', 1))
+    return Finding('localizer', status.level < WARN, status.message, 'see the log of the localizer')
 
 
 TURN_RAD_S = 0.3

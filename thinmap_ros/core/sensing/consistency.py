@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import MIN_HITS, Scan, laser_names, of_lasers
 from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, rotation
+from thinmap_ros.core.sensing.odometry_scale import OdometryScale
 from thinmap_ros.core.stage import Estimate
 
 _ITERATIONS = 3
@@ -420,9 +421,11 @@ class ConsistencyMonitor:
     """Checks each scan with its estimate; warns of contradictions between laser and odometry.
 
     Each laser is checked on its own, by the frame of its scans.
+    odometry_scale: turns and distances of the odometry, compared with those of the scans.
     """
 
     def __init__(self) -> None:
+        self.odometry_scale = OdometryScale()
         self._lasers: dict[str, _LaserConsistency] = {}
 
     @property
@@ -441,13 +444,26 @@ class ConsistencyMonitor:
         A pose that no match has set, or that a loop closure has moved, says nothing of the mount,
         and neither does an odometry that has jumped.
         """
-        if estimate.correction is not None or estimate.odometry_discontinuity:
-            for laser in self._lasers.values():
-                laser.reset_span()
+        self._compare(scan, T_odom_base, estimate)
         own = self._lasers.setdefault(scan.frame, _LaserConsistency())
         fault = own.check(scan, T_odom_base, estimate)
         name = laser_names(self._lasers.keys())[scan.frame]
         return replace(estimate, mount_fault=fault and name + fault)
+
+    def _compare(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> None:
+        """Compare the motion by odometry and by matching; where poses jump, begin again."""
+        is_other_time = scan.T_odom_before is not None
+        if is_other_time:
+            self.odometry_scale.forget()
+        if is_other_time or estimate.correction is not None or estimate.odometry_discontinuity:
+            for laser in self._lasers.values():
+                laser.reset_span()
+            self.odometry_scale.reset_span()
+            return
+        if estimate.scan_information is None:
+            self.odometry_scale.reset_span()
+        elif se2.is_finite(T_odom_base):
+            self.odometry_scale.add(estimate.T_map_base, estimate.scan_information, T_odom_base)
 
 
 class _LaserConsistency:
@@ -476,7 +492,7 @@ class _LaserConsistency:
     def _add_to_mount(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> None:
         information = estimate.scan_information
         is_moved = estimate.correction is not None or estimate.odometry_discontinuity
-        if information is None or is_moved:
+        if information is None or is_moved or scan.T_odom_before is not None:
             self._mount_errors.reset_span()
             return
         T_base_laser = scan.T_base_laser

@@ -1,7 +1,7 @@
 """Scans with the odometry at their stamps, without the motion during them; late measurements."""
 
 import math
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Collection
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -16,6 +16,8 @@ from thinmap_ros.core.odometry import MAX_ODOMETRY_GAP_NS, Missing, OdometryBuff
 from thinmap_ros.core.scan import TILTED, Scan, laser_names, of_lasers
 from thinmap_ros.core.se2 import SECOND_NS, Array, Mask
 from thinmap_ros.core.sensing.beams import LaserMonitor
+from thinmap_ros.core.sensing.delay import DelayEstimator
+from thinmap_ros.core.stage import Estimate
 from thinmap_ros.jit import inlined, kernel
 
 _MAX_OVERDUE = 10_000  # stamps of scans whose odometry may still come
@@ -84,7 +86,7 @@ def deskewed(scan: Scan, stamps_ns: NDArray[np.int64], poses: Array) -> Scan:
     bearing that no beam covers any more is invalid (NaN). Rounded to float32 as `Scan.create` does.
     """
     headings = np.unwrap(poses[:, 2])
-    since_s = (stamps_ns - scan.stamp_ns) / SECOND_NS
+    since_s = (stamps_ns - scan.odometry_ns) / SECOND_NS
     beams_s = scan.first_beam_s + scan.beam_period_s * np.arange(scan.ranges_m.size)
     at_s = np.append(beams_s, 0.0)
     values = (poses[:, 0], poses[:, 1], headings)
@@ -257,9 +259,9 @@ class _UnpairedScans:
         self.total = 0
         self._found: dict[str, dict[str, tuple[int, Missing]]] = {}
 
-    def add(self, scan: Scan, missing: Missing) -> None:
+    def add(self, frame: str, missing: Missing) -> None:
         self.total += 1
-        own = self._found.setdefault(scan.frame, {})
+        own = self._found.setdefault(frame, {})
         count, worst = own.get(missing.reason, (0, missing))
         own[missing.reason] = (count + 1, max(worst, missing, key=lambda m: m.amount))
 
@@ -278,7 +280,8 @@ class ScanOdometrySynchronizer:
 
     A scan waits until newer odometry has arrived; those of several lasers do so in the order of
     their stamps. One that the laser did not measure is blind (see `LaserMonitor`), and so is one of
-    a tilted robot. Live nodes and replay use it alike, so that both process the same pairs.
+    a tilted robot. Live nodes and replay use it alike, so that both process the same pairs. The
+    delay of each laser is estimated from the estimates of its scans, and corrected.
     """
 
     def __init__(self, capacity: int = 20) -> None:
@@ -287,6 +290,8 @@ class ScanOdometrySynchronizer:
         self._lasers = Lasers()
         self._silence_s = 0.0  # since the last scan
         self._waiting: list[Scan] = []
+        self._delays: defaultdict[str, DelayEstimator] = defaultdict(DelayEstimator)  # by frame
+        self._last: Scan | None = None  # that was paired
         self._capacity = capacity
         self._since_scan_ns: int | None = None  # stamp of the odometry since the last scan
         self._packets: dict[str, PacketStamps] = {}  # by frame of the laser
@@ -294,7 +299,7 @@ class ScanOdometrySynchronizer:
         self._least_tilt_rad = math.inf
         self._askew_rad = 0.0  # the least tilt, while that is above its limit
         self._unpaired = _UnpairedScans()
-        self._overdue: deque[Scan] = deque()  # which have waited for too long
+        self._overdue: deque[tuple[int, str]] = deque()  # time and frame of late scans
 
     @property
     def dropped(self) -> int:
@@ -309,7 +314,8 @@ class ScanOdometrySynchronizer:
     @property
     def warnings(self) -> dict[str, str]:
         """What the laser, its driver or the odometry do otherwise than expected, by kind."""
-        found = self._lasers.warnings
+        late = {frame: {'delay': delay.warning} for frame, delay in self._delays.items()}
+        found = self._lasers.warnings | of_lasers(late)
         moved = {packets.period_ns: packets.moved for packets in self._packets.values()}
         count = sum(moved.values())
         if count:
@@ -326,6 +332,11 @@ class ScanOdometrySynchronizer:
         return found
 
     @property
+    def delays_s(self) -> dict[str, float]:
+        """Delay of the scans of each laser frame, s."""
+        return {frame: delay.total_s for frame, delay in self._delays.items()}
+
+    @property
     def waiting(self) -> int:
         """Scans that wait for odometry."""
         return len(self._waiting)
@@ -333,8 +344,9 @@ class ScanOdometrySynchronizer:
     def reasons(self) -> dict[str, int]:
         """Number of scans that were not paired, or wait, by reason."""
         found = deepcopy(self._unpaired)
-        for scan in [*self._overdue, *self._waiting]:
-            found.add(scan, self._buffer.missing(scan.stamp_ns))
+        waiting = ((scan.odometry_ns, scan.frame) for scan in self._waiting)
+        for odometry_ns, frame in (*self._overdue, *waiting):
+            found.add(frame, self._buffer.missing(odometry_ns))
         return found.reasons(self._packets.keys())
 
     def add_odometry(
@@ -347,7 +359,7 @@ class ScanOdometrySynchronizer:
         self._silence_s += self._buffer.add(stamp_ns, T_odom_base)
         self._tilts.add(stamp_ns, tilt_rad)
         self._since_scan_ns = stamp_ns
-        while self._overdue and self._overdue[0].stamp_ns <= stamp_ns:
+        while self._overdue and self._overdue[0][0] <= stamp_ns:
             self._end_overdue()
         return self._ready()
 
@@ -358,7 +370,7 @@ class ScanOdometrySynchronizer:
         self._since_scan_ns = None
         stamped = self._packets.setdefault(scan.frame, PacketStamps()).moved_on(scan, has_own_pose)
         if stamped is None:
-            self._unpaired.add(scan, Missing('with the stamp of the scan before'))
+            self._unpaired.add(scan.frame, Missing('with the stamp of the scan before'))
             return []
         scan = stamped
         own = [waiting for waiting in self._waiting if waiting.frame == scan.frame]
@@ -369,7 +381,7 @@ class ScanOdometrySynchronizer:
             self._drop(own.pop(), Missing.by_time(reason, ahead_ns))
         if len(own) >= self._capacity:
             self._waiting.remove(own[0])
-            self._overdue.append(own[0])
+            self._overdue.append((own[0].odometry_ns, own[0].frame))
         if len(self._overdue) > _MAX_OVERDUE:
             self._end_overdue()
         self._lasers.of(scan).timing.add(scan)
@@ -378,24 +390,29 @@ class ScanOdometrySynchronizer:
 
     def _end_overdue(self) -> None:
         """Count the scan that has waited longest; it waits no more."""
-        scan = self._overdue.popleft()
+        odometry_ns, frame = self._overdue.popleft()
         missing = Missing('with too many others between two samples of the odometry')
-        if self._buffer.interpolate(scan.stamp_ns) is None:
-            missing = self._buffer.missing(scan.stamp_ns)
-        self._unpaired.add(scan, missing)
+        if self._buffer.interpolate(odometry_ns) is None:
+            missing = self._buffer.missing(odometry_ns)
+        self._unpaired.add(frame, missing)
 
     def finish(self) -> list[tuple[Scan, Array]]:
         """Scans at the end of a log, for whose last beams the odometry has ended."""
         ready = []
-        waiting = []
-        for scan in self._waiting:
-            T_odom_base = self._buffer.interpolate(scan.stamp_ns)
+        unpaired = []
+        for waiting in self._waiting:
+            scan = self._delays[waiting.frame].with_delay(waiting)
+            T_odom_base = self._buffer.interpolate(scan.odometry_ns)
             if T_odom_base is None:
-                waiting.append(scan)
+                unpaired.append(waiting)
             else:
                 ready.append(self._complete(scan, T_odom_base))
-        self._waiting = waiting
+        self._waiting = unpaired
         return ready
+
+    def add_estimate(self, scan: Scan, estimate: Estimate) -> None:
+        """Add the estimate of a scan that was ready, from which the delay is estimated."""
+        self._delays[scan.frame].add(scan, estimate, self._buffer)
 
     def _place(self, scan: Scan) -> int:
         """Where a scan belongs among those that wait: before later ones of other lasers."""
@@ -408,27 +425,30 @@ class ScanOdometrySynchronizer:
 
     def _drop(self, scan: Scan, missing: Missing) -> None:
         self._waiting.remove(scan)
-        self._unpaired.add(scan, missing)
+        self._unpaired.add(scan.frame, missing)
 
     def _ready(self) -> list[tuple[Scan, Array]]:
         ready = []
         latest = self._buffer.latest_stamp_ns
         while self._waiting and latest is not None:
-            scan = self._waiting[0]
-            T_odom_base = self._buffer.interpolate(scan.stamp_ns)
+            waiting = self._waiting[0]
+            scan = self._delays[waiting.frame].with_delay(waiting)
+            T_odom_base = self._buffer.interpolate(scan.odometry_ns)
             if latest < self._needed_until(scan) or (
-                T_odom_base is None and scan.stamp_ns > latest
+                T_odom_base is None and scan.odometry_ns > latest
             ):
                 break
             if T_odom_base is None:
-                self._drop(scan, self._buffer.missing(scan.stamp_ns))
+                self._drop(waiting, self._buffer.missing(scan.odometry_ns))
                 continue
             self._waiting.pop(0)
             ready.append(self._complete(scan, T_odom_base))
         return ready
 
     def _complete(self, scan: Scan, T_odom_base: Array) -> tuple[Scan, Array]:
-        scan = replace(scan, odometry_silence_s=self._silence_s)
+        T_before = self._odometry_before()
+        self._last = scan
+        scan = replace(scan, odometry_silence_s=self._silence_s, T_odom_before=T_before)
         self._silence_s = 0.0
         if self._is_tilted(scan):
             return scan.blinded(TILTED), T_odom_base
@@ -440,16 +460,28 @@ class ScanOdometrySynchronizer:
 
         It may also have started on a ramp.
         """
-        tilt_rad = self._tilts.at(scan.stamp_ns)
+        tilt_rad = self._tilts.at(scan.odometry_ns)
         least_rad = min(self._least_tilt_rad, tilt_rad)
         self._least_tilt_rad = least_rad
         self._askew_rad = least_rad if least_rad > scan.max_tilt_rad else 0.0
         return least_rad <= scan.max_tilt_rad < tilt_rad
 
+    def _odometry_before(self) -> Array | None:
+        """Odometry pose (3,) of the previous scan if its delay has changed since; else None.
+
+        The motion between two scans is that of the odometry with one delay.
+        """
+        last = self._last
+        if last is None or self._delays[last.frame].total_s == last.delay_s:
+            return None
+        return self._buffer.interpolate(
+            replace(last, delay_s=self._delays[last.frame].total_s).odometry_ns
+        )
+
     def _needed_until(self, scan: Scan) -> int:
         """Time until which a scan needs odometry, ns."""
         is_plausible = self._lasers.of(scan).timing.is_plausible(scan)
-        return scan.end_ns if is_plausible else scan.stamp_ns
+        return scan.end_ns if is_plausible else scan.odometry_ns
 
     def _deskewed(self, scan: Scan) -> Scan:
         """The scan with all beams at its stamp, if their times and the motion are known."""
