@@ -52,9 +52,9 @@ class Log:
     def events(self):
         for moment, _ in self.drive:
             yield OdometryEvent(moment.stamp_ns, moment.T_odom_base)
-            if moment.scan is not None:
-                stamp_ns = moment.scan.stamp_ns + self.delay_ns
-                yield ScanEvent(replace(moment.scan, stamp_ns=stamp_ns, frame='laser'))
+            for scan in moment.scans:
+                stamp_ns = scan.stamp_ns + self.delay_ns
+                yield ScanEvent(replace(scan, stamp_ns=stamp_ns, frame='laser'))
 
 
 def errors(result, drive):
@@ -88,7 +88,7 @@ def test_stamps_without_delay_give_the_poses_of_the_pipeline_alone(drive):
     result = replay(Log(drive, 0.0), PipelineConfig())
     assert result.warnings == [] and result.delays_s == {'laser': 0.0}
     alone = Pipeline(PipelineConfig())
-    pairs = [(m.scan, m.T_odom_base) for m, _ in drive if m.scan is not None]
+    pairs = [(scan, moment.T_odom_base) for moment, _ in drive for scan in moment.scans]
     poses = [alone.step(scan, T_odom_base).estimate.T_map_base for scan, T_odom_base in pairs]
     assert np.array_equal(result.poses, poses[: len(result.poses)])
 
@@ -102,8 +102,8 @@ def scaled(drive, distance, turn):
         moved = se2.between(before, moment.T_odom_base)
         before = moment.T_odom_base
         T_odom = se2.compose(T_odom, moved * [distance, distance, turn])
-        if moment.scan is not None:
-            pipeline.step(moment.scan, T_odom)
+        for scan in moment.scans:
+            pipeline.step(scan, T_odom)
     return pipeline.warnings
 
 

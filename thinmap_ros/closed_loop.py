@@ -17,7 +17,7 @@ from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import Scan, with_newest
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import Estimate
@@ -115,6 +115,7 @@ class ClosedLoop:
         self.log = RunLog()
         self.decision: Decision | None = None
         self._observation: Observation | None = None
+        self._scans: tuple[Scan, ...] = ()  # the newest of each laser
         self._drive = _Drive()
         # The odometry is zero at the start.
         self._T_map_odom = simulation.robot.T_world_base
@@ -204,6 +205,7 @@ class ClosedLoop:
         """Choose a target by an observation; T_map_odom (3,): of its scan."""
         self._T_map_odom = T_map_odom
         self._observation = observation
+        self._scans = with_newest(self._scans, observation.scan)
         self.navigator.topology = observation.topology
         # Processor time of this thread: other processes do not count.
         began = time.thread_time()
@@ -252,7 +254,7 @@ class ClosedLoop:
             return
         T_map_base = self.pose_at(moment.T_odom_base)
         period_s = CONTROL_STEPS * STEP_NS / 1e9
-        command = self.navigator.step(T_map_base, observation.patch, observation.scan, period_s)
+        command = self.navigator.step(T_map_base, observation.patch, self._scans, period_s)
         command = right_of_way(T_map_base, command, period_s)
         self._drive.command = (command.v, command.w)
         if command.state == 'failed':

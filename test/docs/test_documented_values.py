@@ -16,7 +16,9 @@ from thinmap_ros.ros.foreign import is_known
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 SOURCES = [*sorted((ROOT / 'thinmap_ros').rglob('*.py')), *sorted((ROOT / 'config').rglob('*.*'))]
 # A value may be in quotes for the shell, or a variable of it.
-_GIVEN = re.compile(r"""(?<![\w/.:])(?:\w+:)?([A-Za-z_/][\w./]*):=["']?([^\s`'"|)\]]+)""")
+_GIVEN = re.compile(
+    r"""(?<![\w/.:])(?:\w+:)?([A-Za-z_/][\w./]*):=(?:"([^"`\n]+)"|["']?([^\s`'"|)\]]+))"""
+)
 _REMAPPING = re.compile(r'(-r|--remap) \S+:=\S+')
 _COMMAND = re.compile(r'ros2 run thinmap_ros ([a-z_]+)((?:[^`\n]|\\\n)*)')
 TOPICS = {'scan', 'odom', 'tf', 'tf_static', 'cmd_vel', 'map', 'robot', 'stop'}
@@ -49,8 +51,8 @@ def is_remapping(name):
 def wrong_values(text, node='thinmap'):
     """What is no parameter of a node, or of another type, in a text."""
     wrong = []
-    for name, given in _GIVEN.findall(_REMAPPING.sub('', text)):
-        given = given.rstrip(':.,')
+    for name, quoted, plain in _GIVEN.findall(_REMAPPING.sub('', text)):
+        given = quoted or plain.rstrip(':.,')
         rule = f'{name}:={given}'
         if name in OTHERS or rule in ARGUMENTS or is_remapping(name) or is_known(name):
             continue

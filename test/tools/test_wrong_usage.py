@@ -36,7 +36,10 @@ WRONG = [
     ('replay LOG -o FILE/x', 'FILE is a file: expected a folder'),
     ('replay LOG --recording FILE/x.rrd', 'FILE is a file: expected a folder'),
     ('replay LOG LOG', 'expected files of different names, or given once'),
-    ('replay LOG nowhere.bag --view', '--view, --recording: expected one log'),
+    (
+        'replay LOG nowhere.bag --view',
+        '--view, --recording, --session, --continue: expected one log',
+    ),
     ('replay LOG --jobs many', "argument --jobs: invalid int value: 'many'"),
     ('replay LOG --odom-source gps', "invalid choice: 'gps'"),
     ('explore_world', 'the following arguments are required: world'),

@@ -382,6 +382,7 @@ def localized(state, x):
     """LocalizedScan of three beams, 2 m long, at a pose."""
     upright = plain(x=0.0, y=0.0, z=0.0, w=1.0)
     beams = plain(
+        header=plain(frame_id=''),
         ranges=[2.0, 2.0, 2.0],
         angle_min=-0.5,
         angle_max=0.5,

@@ -240,7 +240,8 @@ class _Merging:
 
     def _by_whole_map(self, path: str) -> _Candidate:
         """For maps too small for their views to decide."""
-        query, known = self._maps[path].places, self.known.places
+        query = self._maps[path].places
+        known = self.known.places
         alignment = align(query, known)
         if alignment is None:
             return _Candidate(path, -math.inf, None)

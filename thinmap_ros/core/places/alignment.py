@@ -84,7 +84,8 @@ def align(query: MapPiece, known: MapPiece) -> Alignment | None:
     back = np.append(-small.middle, 0.0)
     first, second = (se2.compose(T, back) for T in peaks[:2, 1:])
     if is_query_larger:
-        first, second = se2.invert(first), se2.invert(second)
+        first = se2.invert(first)
+        second = se2.invert(second)
     return Alignment(first, second, surprise - _LOG_RANGE)
 
 

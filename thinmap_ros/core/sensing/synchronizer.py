@@ -314,8 +314,11 @@ class ScanOdometrySynchronizer:
     @property
     def warnings(self) -> dict[str, str]:
         """What the laser, its driver or the odometry do otherwise than expected, by kind."""
-        late = {frame: {'delay': delay.warning} for frame, delay in self._delays.items()}
-        found = self._lasers.warnings | of_lasers(late)
+        found = self._lasers.warnings
+        names = laser_names(self._packets.keys())
+        for frame, delay in self._delays.items():
+            if delay.warning:
+                found[f'delay {frame}'] = names[frame] + delay.warning
         moved = {packets.period_ns: packets.moved for packets in self._packets.values()}
         count = sum(moved.values())
         if count:

@@ -105,7 +105,8 @@ def test_a_sector_of_invalid_beams_that_another_laser_sees_is_not_blind():
 def test_a_laser_with_dead_sectors_is_seen_through_in_either_order():
     dead = seen_by('front', blind=(70, 135))
     sound = seen_by('rear')
-    one, other = blind_points(dead, sound), blind_points(sound, dead)
+    one = blind_points(dead, sound)
+    other = blind_points(sound, dead)
     assert sorted(map(tuple, one)) == sorted(map(tuple, other))
 
 
