@@ -227,11 +227,11 @@ def _process(
         step = result.pipeline.step(scan, T_odom_base)
         result.stamps_ns.append(scan.stamp_ns)
         result.frames.append(scan.frame)
-        if learn is not None:
-            learn(scan, step.estimate)
         result.poses.append(step.estimate.T_map_base)
         result.local_features.append(step.estimate.n_local_features)
         result.counts.add(step.estimate, scan.frame)
+        if learn is not None:
+            learn(scan, step.estimate)
         if step.estimate.odometry_discontinuity:
             result.odometry_jumps.append(step.estimate.odometry_discontinuity)
         if watcher is not None:

@@ -355,6 +355,7 @@ class OdometryIncrements:
         self.T_odom_base: Array = np.zeros(3)  # of the last scan
         self._is_begun = False
         self.stamp_ns: int | None = None  # of the last scan
+        self._last: Scan | None = None
 
     def add(self, scan: Scan, T_odom_base: Array) -> OdometryIncrement:
         """Increment up to the odometry pose (3,) of a scan; zero for the first one.
@@ -362,11 +363,12 @@ class OdometryIncrements:
         An odometry that is reset while it is silent looks as if the robot had driven meanwhile. So
         the limits of a motion grow only with the time in which odometry came at its usual rate.
         """
-        silence_s = self._silence.add(scan.stamp_ns)
+        silence_s = self._silence.add(scan.odometry_ns)
         if scan.odometry_silence_s is not None:
             silence_s = scan.odometry_silence_s
-        seconds = 0.0 if self.stamp_ns is None else (scan.stamp_ns - self.stamp_ns) / SECOND_NS
+        seconds = 0.0 if self._last is None else _seconds(self._last, scan)
         self.stamp_ns = scan.stamp_ns
+        self._last = scan
         if not se2.is_finite(T_odom_base):
             self.rejected += 1
             return OdometryIncrement(np.zeros(3), seconds)
@@ -385,3 +387,10 @@ class OdometryIncrements:
             f'{math.degrees(float(moved[2])):.0f} deg within {max(seconds, 0.0):.2f} s'
         )
         return OdometryIncrement(np.zeros(3), seconds, _LIMITS.distance_m(max(seconds, 1.0)), jump)
+
+
+def _seconds(before: Scan, after: Scan) -> float:
+    """Time between two scans by the clock of the odometry, s; as if none had found its delay."""
+    if after.T_odom_before is not None and before.frame == after.frame:
+        return (after.stamp_ns - before.stamp_ns) / SECOND_NS
+    return (after.odometry_ns - before.odometry_ns) / SECOND_NS

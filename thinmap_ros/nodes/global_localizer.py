@@ -231,7 +231,7 @@ class _SearchDriver:
         if any(stream.fault(now_ns) for stream in self._streams.values()):
             return False
         return all(
-            abs(self._odometry_ns - scan.stamp_ns) <= SENSOR_TIMEOUT_NS for scan in self._scans
+            abs(self._odometry_ns - scan.odometry_ns) <= SENSOR_TIMEOUT_NS for scan in self._scans
         )
 
 
@@ -391,7 +391,7 @@ class GlobalLocalizerNode(ThinmapNode):
         scan = self._laser_transform.to_scan(topic, message)
         self._received.add(topic)
         self._driver.record(topic, scan.stamp_ns)
-        self._odometry.add_scan_stamp(scan.stamp_ns)
+        self._odometry.add_scan_stamp(scan.odometry_ns)
         self._process(self._pairing.add_scan(scan))
 
     def _process(self, ready: list[tuple[Scan, Array]]) -> None:

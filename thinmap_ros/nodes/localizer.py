@@ -280,7 +280,7 @@ class LocalizerNode(ThinmapNode):
 
     def _on_scan(self, topic: str, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(topic, message)
-        self._odometry.add_scan_stamp(scan.stamp_ns)
+        self._odometry.add_scan_stamp(scan.odometry_ns)
         self._process(self._input.pairing.add_scan(scan))
 
     def _on_initial_pose(self, T_map_base: Array, covariance: Array) -> None:

@@ -214,7 +214,7 @@ class NavigatorNode(ThinmapNode):
 
     def _on_scan(self, topic: str, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(topic, message)
-        self._odometry.add_scan_stamp(scan.stamp_ns)
+        self._odometry.add_scan_stamp(scan.odometry_ns)
         self._robot.add_scan(scan, topic)
 
     def _on_slam_status(self, message: SlamStatus) -> None:

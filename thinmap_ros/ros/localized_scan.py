@@ -116,8 +116,9 @@ def _laser(message: LocalizedScanMsg) -> LaserConfig:
 
 
 NONE = 'none'
+_POSE = 'pose'
 _TYPES: dict[str, Any] = {
-    'pose': PoseWithCovarianceStamped,
+    _POSE: PoseWithCovarianceStamped,
     'local_grid': LocalGrid,
     'local_topology': TopologicalMap,
     'localization_status': LocalizationStatus,
@@ -143,6 +144,10 @@ class Lockstep:
         self._since = 0.0
         if topic != NONE:
             node.create_subscription(_TYPES[topic], self._name, self._on_message, qos.STREAM)
+        if topic == _POSE:
+            # Of a scan with a delay, the pose is stamped earlier.
+            status = f'{prefix}slam_status'
+            node.create_subscription(SlamStatus, status, self._on_message, qos.STREAM)
 
     def scan_published(self, stamp_ns: int) -> None:
         """Wait for the result of a scan that was published, and of those before it."""

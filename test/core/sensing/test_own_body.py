@@ -149,3 +149,11 @@ def test_a_jump_of_the_odometry_is_no_drive():
         odom = se2.pose(3.0 * (k % 2), 0.0, 3.0 * (k % 2))
         monitor.checked(scan_in(wall, np.zeros(3), rng, k * PERIOD_NS), odom)
     assert 'body' not in monitor.warnings
+
+
+def test_a_body_that_was_found_stays_over_a_gap_in_the_scans():
+    monitor, scan, _ = driven(lambda scan, rng: with_part(scan, rng, 60.1, 89.9, 0.22))
+    known = monitor.warnings['body']
+    far = monitor.checked(replace(scan, stamp_ns=scan.stamp_ns + 1), se2.pose(30.0, 0.0, 0.0))
+    assert np.isnan(far.ranges_m).any()
+    assert monitor.warnings['body'] == known

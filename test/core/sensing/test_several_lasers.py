@@ -9,11 +9,12 @@ import pytest
 from support.slam_room import ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.odometry import OdometryIncrements
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.sensing.beams import FROZEN, NO_RETURNS
 from thinmap_ros.core.sensing.consistency import ConsistencyMonitor
-from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
+from thinmap_ros.core.sensing.synchronizer import Lasers, ScanOdometrySynchronizer
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
@@ -202,3 +203,42 @@ def test_the_mount_of_one_laser_is_checked_with_its_own_scans():
     assert not any(faults['front'])
     assert all(text.startswith('rear: laser') for text in monitor.warnings.values())
     assert monitor.warnings and monitor.reported.keys() >= monitor.warnings.keys()
+
+
+def test_lasers_with_two_delays_are_one_sequence_of_motions():
+    """The stamps of one laser are later by 0.3 s; the robot turns at 1 rad/s."""
+    pairing = ScanOdometrySynchronizer()
+    increments = OdometryIncrements()
+    turned = 0.0
+    for k in range(80):
+        ns = k * SECOND_NS // 20
+        ready = pairing.add_odometry(ns, se2.pose(0.0, 0.0, ns / SECOND_NS))
+        if k % 2:
+            late = replace(at('front', 0.0), stamp_ns=ns, delay_s=0.3)
+            ready += pairing.add_scan(late) + pairing.add_scan(replace(at('rear', 0.0), stamp_ns=ns))
+        for scan, T_odom_base in ready:
+            increment = increments.add(scan, T_odom_base)
+            assert not increment.discontinuity
+            turned += float(increment.T_before_base[2])
+    assert not increments.rejected and turned > 3.0
+
+
+def test_two_lasers_of_one_kind_above_each_other_are_no_echoes():
+    lasers = Lasers()
+    front = at('front', 1.0)
+    above = replace(front, frame='above', stamp_ns=front.stamp_ns + PERIOD_NS // 3)
+    assert lasers.of(front) is lasers.of(replace(front, frame='echo'))
+    assert lasers.of(front) is not lasers.of(above)
+
+
+def test_the_scale_of_the_odometry_is_found_beside_a_laser_that_matches_nothing():
+    monitor = ConsistencyMonitor()
+    sure = np.diag([1e6, 1e6, 1e6])
+    for k in range(60):
+        x = 0.1 * k
+        estimate = Estimate(se2.pose(x, 0.0, 0.0), np.zeros((3, 3)), np.zeros(3))
+        matched = replace(estimate, scan_information=sure)
+        T_odom_base = se2.pose(0.7 * x, 0.0, 0.0)
+        monitor.checked(at('front', 0.1 * k), T_odom_base, matched)
+        monitor.checked(at('rear', 0.1 * k + 0.05), T_odom_base, estimate)
+    assert 'moves 30 % too little' in monitor.odometry_scale.warning

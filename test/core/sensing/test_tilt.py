@@ -71,3 +71,8 @@ def test_old_tilts_are_forgotten_also_when_the_time_is_set_back() -> None:
     assert tilts.at(150 * SECOND_NS) == 0.0
     tilts.add(SECOND_NS, 0.2)
     assert tilts.at(2 * SECOND_NS) == 0.2
+
+
+def test_an_askew_imu_that_is_level_on_a_bump_is_still_askew() -> None:
+    blind, warnings = left_out([*[0.1] * 60, *[0.075] * 4, *[0.1] * 60])
+    assert blind == [] and 'askew' in warnings['tilt']

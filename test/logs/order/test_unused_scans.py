@@ -154,6 +154,25 @@ def test_moved_stamps_are_told_with_their_number() -> None:
     assert text.startswith('2 scans with the stamp of the scan before') and '0.100 s' in text
 
 
+def test_moved_stamps_of_one_of_two_lasers_are_told() -> None:
+    pairing = ScanOdometrySynchronizer(100)
+    for k in range(20):
+        pairing.add_scan(scan(0.2 * (k // 2), 1.0 + k, 'packets'))
+        pairing.add_scan(scan(0.1 * k, 1.0 + k, 'honest'))
+    (text,) = pairing.warnings.values()
+    assert text.startswith('9 scans with the stamp of the scan before')
+
+
+def test_a_coarse_clock_of_two_lasers_with_their_own_poses_is_kept() -> None:
+    pairing = ScanOdometrySynchronizer()
+    for k in range(6):
+        ns = k // 2 * 10**9
+        pairing.add_odometry(ns, np.array([0.1 * k, 0.0, 0.0]))
+        for frame in ('front', 'rear'):
+            pairing.add_scan(scan(ns / 1e9, 1.0 + k, frame))
+    assert not pairing.warnings and not pairing.dropped
+
+
 def test_a_coarse_clock_of_scans_with_their_own_poses_is_kept() -> None:
     pairing = ScanOdometrySynchronizer()
     pairs = []

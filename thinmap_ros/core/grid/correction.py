@@ -631,7 +631,7 @@ class CorrectableGrid:
             self._render_again()
 
     def _set_body(self, scan: Scan) -> None:
-        """Render the stored scans again if more of their beams are known to end at the robot."""
+        """Render the stored scans again if other beams than before end at the robot."""
         if scan.body_m is self._bodies.get(scan.frame):
             return
         self._bodies[scan.frame] = scan.body_m

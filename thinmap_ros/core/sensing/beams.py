@@ -397,6 +397,7 @@ class BodyDetector:
         self._begun_m = np.zeros(360)
         self._headings = np.zeros((2, 360))
         self._turns = np.zeros((2, 360))
+        self._is_body = np.zeros(360, dtype=np.bool_)
         self._body_m: Array | None = None
         self._is_mirrored = False
 
@@ -425,7 +426,8 @@ class BodyDetector:
         path_m = math.hypot(moved[0], moved[1])
         turn_rad = float(moved[2])
         if path_m > _JUMP_M or abs(turn_rad) > _JUMP_RAD:
-            self._range_m[:] = np.nan
+            self._range_m[~self._is_body] = np.nan
+            return
         is_on_the_spot = path_m < _ON_THE_SPOT_M * abs(turn_rad)
         self._motion = self._motion + [path_m, turn_rad]
         self._turns[0] = self._turns[0] + turn_rad if is_on_the_spot else 0.0
@@ -445,11 +447,12 @@ class BodyDetector:
         self._turns[1] = np.maximum(self._turns[1], np.abs(self._turns[0]))
         is_body = ~np.isnan(self._range_m) & (path_m - self._begun_m >= _BODY_PATH_M)
         is_body &= self._headings[1] - self._headings[0] >= _BODY_HEADINGS_RAD
-        self._set_body(is_body & (self._turns[1] >= _BODY_TURN_RAD))
+        self._is_body = is_body & (self._turns[1] >= _BODY_TURN_RAD)
+        self._set_body()
 
-    def _set_body(self, is_body: Mask) -> None:
+    def _set_body(self) -> None:
         """Set the degrees (360,) of the body, with one more beside each: their beams are mixed."""
-        core = np.where(is_body, self._range_m, np.nan)
+        core = np.where(self._is_body, self._range_m, np.nan)
         body_m = np.fmin.reduce([core, np.roll(core, 1), np.roll(core, -1)])
         before = np.full(360, np.nan) if self._body_m is None else self._body_m
         if not np.array_equal(body_m, before, equal_nan=True):

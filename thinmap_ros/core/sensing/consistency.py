@@ -426,6 +426,7 @@ class ConsistencyMonitor:
 
     def __init__(self) -> None:
         self.odometry_scale = OdometryScale()
+        self._matched: str | None = None  # frame of the scan that was matched last
         self._lasers: dict[str, _LaserConsistency] = {}
 
     @property
@@ -444,26 +445,32 @@ class ConsistencyMonitor:
         A pose that no match has set, or that a loop closure has moved, says nothing of the mount,
         and neither does an odometry that has jumped.
         """
-        self._compare(scan, T_odom_base, estimate)
         own = self._lasers.setdefault(scan.frame, _LaserConsistency())
-        fault = own.check(scan, T_odom_base, estimate)
+        is_other_time = scan.T_odom_before is not None
+        if is_other_time or estimate.correction is not None or estimate.odometry_discontinuity:
+            self._begin_again(is_other_time)
+        elif se2.is_finite(T_odom_base):
+            self._compare(scan, T_odom_base, estimate)
+            own.add_motion(scan, T_odom_base, estimate)
+        fault = own.check(scan, T_odom_base)
         name = laser_names(self._lasers.keys())[scan.frame]
         return replace(estimate, mount_fault=fault and name + fault)
 
-    def _compare(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> None:
-        """Compare the motion by odometry and by matching; where poses jump, begin again."""
-        is_other_time = scan.T_odom_before is not None
+    def _begin_again(self, is_other_time: bool) -> None:
+        """Begin new spans; is_other_time: the odometry so far was that of another time."""
+        for laser in self._lasers.values():
+            laser.reset_span()
+        self.odometry_scale.reset_span()
         if is_other_time:
             self.odometry_scale.forget()
-        if is_other_time or estimate.correction is not None or estimate.odometry_discontinuity:
-            for laser in self._lasers.values():
-                laser.reset_span()
-            self.odometry_scale.reset_span()
-            return
-        if estimate.scan_information is None:
-            self.odometry_scale.reset_span()
-        elif se2.is_finite(T_odom_base):
+
+    def _compare(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> None:
+        """Compare the motion by odometry and by matching; a laser beside may match nothing."""
+        if estimate.scan_information is not None:
+            self._matched = scan.frame
             self.odometry_scale.add(estimate.T_map_base, estimate.scan_information, T_odom_base)
+        elif scan.frame == self._matched:
+            self.odometry_scale.reset_span()
 
 
 class _LaserConsistency:
@@ -480,20 +487,19 @@ class _LaserConsistency:
         """Discard the current span of motion."""
         self._mount_errors.reset_span()
 
-    def check(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> str:
+    def check(self, scan: Scan, T_odom_base: Array) -> str:
         """Check a scan; returns why the robot must not drive with this laser, '' for no reason."""
         if se2.is_finite(T_odom_base):
             self._turns.add(scan, T_odom_base)
-            self._add_to_mount(scan, T_odom_base, estimate)
         self.warnings = dict(self._found(scan))
         self.reported |= self.warnings
         return self._fault
 
-    def _add_to_mount(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> None:
+    def add_motion(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> None:
+        """Add a pose that neither a loop closure nor a jump of the odometry has moved."""
         information = estimate.scan_information
-        is_moved = estimate.correction is not None or estimate.odometry_discontinuity
-        if information is None or is_moved or scan.T_odom_before is not None:
-            self._mount_errors.reset_span()
+        if information is None:
+            self.reset_span()
             return
         T_base_laser = scan.T_base_laser
         if self._mount_errors.add(estimate.T_map_base, information, T_odom_base, T_base_laser):

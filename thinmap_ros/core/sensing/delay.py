@@ -108,6 +108,10 @@ class DelayEstimator:
         is_matched = estimate.scan_information is not None and not is_moved
         heading = float(estimate.T_map_base[2]) if is_matched else None
         self._waiting.append((delayed_ns(scan.stamp_ns, self._given_s), heading))
+        latest_ns = odometry.latest_stamp_ns
+        ahead_ns = 2.0 * self._config.max_s * SECOND_NS
+        if latest_ns is not None and self._waiting[0][0] > latest_ns + ahead_ns:
+            self._waiting.clear()  # of a clock that was set back since
         while self._waiting and self._is_covered(self._waiting[0][0], odometry):
             self._compare(*self._waiting.popleft(), odometry)
 

@@ -1,7 +1,7 @@
 """Scans with the odometry at their stamps, without the motion during them; late measurements."""
 
 import math
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Collection
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -20,6 +20,8 @@ from thinmap_ros.core.sensing.delay import DelayEstimator
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.jit import inlined, kernel
 
+# Of its scans, a robot whose IMU is not askew makes at least so many on level ground.
+_LEVEL_SHARE = 0.1
 _MAX_OVERDUE = 10_000  # stamps of scans whose odometry may still come
 # Largest relative difference between the stated and the measured time of a revolution.
 _TOLERANCE = 0.2
@@ -164,21 +166,23 @@ def _moved_beams(ranges: Array, hit: Mask, moved: Array, fan: tuple[float, float
     return found
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Laser:
-    """What is known of a laser; first: its first scan."""
+    """What is known of a laser; frame, last: of its first scan, and its last one."""
 
-    first: Scan
+    frame: str
+    last: Scan
     monitor: LaserMonitor = field(default_factory=LaserMonitor)
     timing: SweepTiming = field(default_factory=SweepTiming)
 
     def has_made(self, scan: Scan) -> bool:
-        """Whether a scan of another frame has the same beams, from the same place."""
-        first = self.first
+        """Whether a scan of another frame has the same beams, from the same place and time."""
+        last = self.last
         return (
-            np.array_equal(first.T_base_laser, scan.T_base_laser)
-            and first.angle_min_rad == scan.angle_min_rad
-            and first.angle_increment_rad == scan.angle_increment_rad
+            last.stamp_ns == scan.stamp_ns
+            and np.array_equal(last.T_base_laser, scan.T_base_laser)
+            and last.angle_min_rad == scan.angle_min_rad
+            and last.angle_increment_rad == scan.angle_increment_rad
         )
 
 
@@ -197,15 +201,16 @@ class Lasers:
         known = self._by_frame.get(scan.frame)
         if known is None:
             same = (laser for laser in self._by_frame.values() if laser.has_made(scan))
-            known = next(same, None) or _Laser(scan)
+            known = next(same, None) or _Laser(scan.frame, scan)
             self._by_frame[scan.frame] = known
+        known.last = scan
         return known
 
     @property
     def warnings(self) -> dict[str, str]:
         """What the lasers or their drivers do otherwise than REP 117, by kind."""
         lasers = self._by_frame.values()
-        return of_lasers({laser.first.frame: laser.monitor.warnings for laser in lasers})
+        return of_lasers({laser.frame: laser.monitor.warnings for laser in lasers})
 
 
 class PacketStamps:
@@ -293,11 +298,12 @@ class ScanOdometrySynchronizer:
         self._delays: defaultdict[str, DelayEstimator] = defaultdict(DelayEstimator)  # by frame
         self._last: Scan | None = None  # that was paired
         self._capacity = capacity
-        self._since_scan_ns: int | None = None  # stamp of the odometry since the last scan
+        self._odometry_ns: int | None = None  # stamp of the last sample
+        self._since: set[str] = set()  # frames of the scans since then
         self._packets: dict[str, PacketStamps] = {}  # by frame of the laser
         self._tilts = TiltBuffer()
+        self._tilted: Counter[bool] = Counter()  # scans above the limit, and others
         self._least_tilt_rad = math.inf
-        self._askew_rad = 0.0  # the least tilt, while that is above its limit
         self._unpaired = _UnpairedScans()
         self._overdue: deque[tuple[int, str]] = deque()  # time and frame of late scans
 
@@ -319,17 +325,18 @@ class ScanOdometrySynchronizer:
         for frame, delay in self._delays.items():
             if delay.warning:
                 found[f'delay {frame}'] = names[frame] + delay.warning
-        moved = {packets.period_ns: packets.moved for packets in self._packets.values()}
-        count = sum(moved.values())
-        if count:
-            periods = ', '.join(f'{ns / SECOND_NS:.3f} s' for ns, n in moved.items() if n)
+        moved = [packets for packets in self._packets.values() if packets.moved]
+        if moved:
+            count = sum(packets.moved for packets in moved)
+            periods = ', '.join(f'{packets.period_ns / SECOND_NS:.3f} s' for packets in moved)
             found['stamps'] = (
                 f'{counted(count, "scan")} with the stamp of the scan before and other ranges: '
                 f'taken as made a period later ({periods})'
             )
-        if self._askew_rad:
+        if self._is_askew:
+            least_deg = math.degrees(self._least_tilt_rad)
             found['tilt'] = (
-                f'robot tilted by {math.degrees(self._askew_rad):.0f} deg or more since the start: '
+                f'robot tilted by {least_deg:.0f} deg or more since the start: '
                 'is its IMU askew? No scan is left out for it'
             )
         return found
@@ -361,7 +368,8 @@ class ScanOdometrySynchronizer:
         """
         self._silence_s += self._buffer.add(stamp_ns, T_odom_base)
         self._tilts.add(stamp_ns, tilt_rad)
-        self._since_scan_ns = stamp_ns
+        self._odometry_ns = stamp_ns
+        self._since.clear()
         while self._overdue and self._overdue[0][0] <= stamp_ns:
             self._end_overdue()
         return self._ready()
@@ -369,8 +377,8 @@ class ScanOdometrySynchronizer:
     def add_scan(self, scan: Scan) -> list[tuple[Scan, Array]]:
         """Add a scan; returns the scans that are ready now, each with its T_odom_base (3,)."""
         # Odometry with that stamp came in between: by a coarse clock each scan has its own pose.
-        has_own_pose = self._since_scan_ns == scan.stamp_ns
-        self._since_scan_ns = None
+        has_own_pose = self._odometry_ns == scan.stamp_ns and scan.frame not in self._since
+        self._since.add(scan.frame)
         stamped = self._packets.setdefault(scan.frame, PacketStamps()).moved_on(scan, has_own_pose)
         if stamped is None:
             self._unpaired.add(scan.frame, Missing('with the stamp of the scan before'))
@@ -417,11 +425,15 @@ class ScanOdometrySynchronizer:
         """Add the estimate of a scan that was ready, from which the delay is estimated."""
         self._delays[scan.frame].add(scan, estimate, self._buffer)
 
+    def _time_ns(self, scan: Scan) -> int:
+        """Time of a scan by the clock of the odometry, ns."""
+        return self._delays[scan.frame].with_delay(scan).odometry_ns
+
     def _place(self, scan: Scan) -> int:
         """Where a scan belongs among those that wait: before later ones of other lasers."""
         place = len(self._waiting)
         for waiting in reversed(self._waiting):
-            if waiting.frame == scan.frame or waiting.stamp_ns <= scan.stamp_ns:
+            if waiting.frame == scan.frame or self._time_ns(waiting) <= self._time_ns(scan):
                 break
             place -= 1
         return place
@@ -459,15 +471,20 @@ class ScanOdometrySynchronizer:
         return self._deskewed(checked), T_odom_base
 
     def _is_tilted(self, scan: Scan) -> bool:
-        """Whether the scan shows the floor; not of a robot that was never level: its IMU is askew.
+        """Whether the scan shows the floor; not of a robot that is never level: its IMU is askew.
 
         It may also have started on a ramp.
         """
         tilt_rad = self._tilts.at(scan.odometry_ns)
-        least_rad = min(self._least_tilt_rad, tilt_rad)
-        self._least_tilt_rad = least_rad
-        self._askew_rad = least_rad if least_rad > scan.max_tilt_rad else 0.0
-        return least_rad <= scan.max_tilt_rad < tilt_rad
+        self._least_tilt_rad = min(self._least_tilt_rad, tilt_rad)
+        is_above = tilt_rad > scan.max_tilt_rad
+        self._tilted[is_above] += 1
+        return is_above and not self._is_askew
+
+    @property
+    def _is_askew(self) -> bool:
+        """Whether the robot was hardly ever level; an IMU that is askew is level on some bump."""
+        return self._tilted[False] < _LEVEL_SHARE * self._tilted.total()
 
     def _odometry_before(self) -> Array | None:
         """Odometry pose (3,) of the previous scan if its delay has changed since; else None.

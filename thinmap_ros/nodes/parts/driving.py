@@ -299,9 +299,9 @@ class RobotState:
         if not scan.is_blind:
             self.scans = with_newest(self.scans, scan)
             of_topic = self._topics[topic]
-            of_topic.stamp_ns = scan.stamp_ns
-            of_topic.offset_ns = self._offset_ns(scan.stamp_ns)
-            self._record(of_topic.stream, scan.stamp_ns)
+            of_topic.stamp_ns = scan.odometry_ns
+            of_topic.offset_ns = self._offset_ns(scan.odometry_ns)
+            self._record(of_topic.stream, scan.odometry_ns)
 
     @property
     def awaited(self) -> list[str]:

@@ -161,12 +161,11 @@ class RobotView:
 
     def _scan_at(self, topic: str, message: LaserScan, now_ns: int) -> tuple[Scan, Array] | None:
         try:
-            stamp_ns = messages.stamp_ns(message.header.stamp)
-            if abs(now_ns - stamp_ns) > _MAX_SCAN_AGE_NS:
+            scan = self._laser_transform.to_scan(topic, message)
+            if abs(now_ns - scan.odometry_ns) > _MAX_SCAN_AGE_NS:
                 return None
             base_frame = self._laser_transform.base_frame
-            T_map_base = self._transforms.lookup(self._map_frame, base_frame, stamp_ns)
-            scan = self._laser_transform.to_scan(topic, message)
+            T_map_base = self._transforms.lookup(self._map_frame, base_frame, scan.odometry_ns)
         except InputError:
             return None
         return None if scan.is_blind else (scan, T_map_base)
