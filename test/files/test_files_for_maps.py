@@ -13,6 +13,7 @@ from support.ros1_bag import ros1_bag
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.merging import read_piece
 from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.files.sessions import load_grid
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.bag_writer import BagWriter
 
@@ -85,3 +86,15 @@ def test_a_text_that_only_mentions_another_kind_is_a_map(tmp_path: Path) -> None
         'image: map.pgm # P5, of serialization::archive\nresolution: 0.05\norigin: [0, 0, 0]\n'
     )
     assert read_map(tmp_path / 'map.yaml').shape == (4, 4)
+
+
+def test_a_map_whose_image_is_called_like_a_format_is_a_map(tmp_path: Path) -> None:
+    (tmp_path / 'P2_floor.pgm').write_bytes(image('PPM'))
+    (tmp_path / 'map.yaml').write_text('image: P2_floor.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n')
+    assert read_map(tmp_path / 'map.yaml').shape == (4, 4)
+
+
+def test_a_session_of_another_kind_is_named(tmp_path: Path) -> None:
+    (tmp_path / 'map.mcap').write_bytes(mcap(tmp_path))
+    with pytest.raises(InputError, match='a bag, of which `replay` makes a map'):
+        load_grid(str(tmp_path / 'map.mcap'))

@@ -11,6 +11,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.edits import Erasures, KeepOut, KeepOutArea, MapEdits
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import TopologyBuilder
@@ -311,3 +312,14 @@ def test_a_wrong_given_pose_is_one_line(tmp_path, at, match):
     with pytest.raises(InputError, match=match) as error:
         merge_maps(save_rooms(tmp_path, KITCHEN), at=at)
     assert '\n' not in str(error.value)
+
+
+def test_given_poses_join_maps_of_a_chain_in_any_order(tmp_path):
+    whole = room(KITCHEN)
+    paths = []
+    for name, begin, end in (('left', 0, 50), ('right', 60, 112), ('middle', 20, 90)):
+        cells = np.full_like(whole.cells, -1)
+        cells[:, begin:end] = whole.cells[:, begin:end]
+        paths.append(str(write_map(tmp_path / name, GridPatch(whole.frame, cells))))
+    joins = merge_maps(paths, at=[np.zeros(3), np.zeros(3)]).joins
+    assert [join.path for join in joins] == [paths[2], paths[1]]

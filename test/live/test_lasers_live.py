@@ -139,6 +139,7 @@ def test_a_search_waits_for_all_lasers(graph):
         ),
         ({'scan_topic': ['scan', 'scan']}, "['scan', 'scan']: expected a text, or a list of diff"),
         ({'scan_topic': [1, 2]}, '[1, 2]'),
+        ({'scan_topic': ['scan', '/scan']}, 'expected different topics'),
         ({'scan_topic': TOPICS, 'laser_pose': '0,0,0'}, 'expected no pose'),
     ],
 )

@@ -260,3 +260,14 @@ def test_a_paused_simulation_is_no_fault_of_the_sensors():
     robot.set_clock()
     assert robot.state.stop_reason() == ''
     assert robot.run(4) == ['']
+
+
+def test_one_of_two_lasers_on_one_topic_that_is_silent_is_named():
+    robot = Robot()
+    robot.run(1)
+    for frame in ('front', 'rear'):
+        ranges = np.full(61, 3.0)
+        scan = Scan.create(robot.stamp('laser'), ranges, -1.5, 0.05, 0.05, 8.0)
+        robot.state.add_scan(replace(scan, frame=frame))
+    robot.state.stop_reason()
+    assert any(text.startswith("laser 'front' silent for") for text in robot.run(2))

@@ -98,6 +98,39 @@ def test_the_newest_scans_of_two_lasers_are_drawn_together():
     assert see(2 * 10**9, 'front', 0.5) == [100, 0], 'the other one is silent'
 
 
+def test_a_scan_with_a_delay_is_drawn_at_its_pose_which_has_another_stamp():
+    board = Board()
+    picture = Picture(board)
+    scan = Scan.create(5 * 10**8, np.array([1.0]), 0.0, 1.0, 0.05, 8.0)
+    picture.pose(3 * 10**8, np.array([2.0, 0.0, 0.0]), np.eye(3))
+    picture.scan(scan)
+    assert 'laser' not in items_of(board)
+    upright = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    place = SimpleNamespace(position=SimpleNamespace(x=2.0, y=0.0, z=0.0), orientation=upright)
+    origin = SimpleNamespace(position=SimpleNamespace(x=0.0, y=0.0, z=0.0), orientation=upright)
+    beams = SimpleNamespace(
+        header=SimpleNamespace(frame_id='laser'),
+        ranges=[1.0],
+        angle_min=0.0,
+        angle_max=0.0,
+        angle_increment=1.0,
+        range_min=0.05,
+        range_max=8.0,
+        time_increment=0.0,
+        scan_time=0.0,
+    )
+    picture.localized_scan(
+        SimpleNamespace(
+            header=SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=5 * 10**8)),
+            scan=beams,
+            laser_pose=origin,
+            pose=SimpleNamespace(pose=place),
+            status=SimpleNamespace(state=0, MAPPING_APART=5),
+        )
+    )
+    assert items_of(board)['laser'] == {'pose': [2.0, 0.0, 0.0], 'points_cm': [100, 0]}
+
+
 def region(number, **fields):
     place = SimpleNamespace(x=1.0, y=2.0)
     outline = SimpleNamespace(points=[SimpleNamespace(x=float(x), y=0.0) for x in range(3)])
@@ -143,6 +176,9 @@ def test_keep_out_areas_have_names_and_corners():
     assert items_of(board)['keep_out'] == []
 
 
+TENTH_NS = 10**8
+
+
 def shown_path(board):
     items = items_of(board)
     pieces = [items[f'path/{i}'] for i in range(items['path'])]
@@ -155,16 +191,18 @@ def test_a_path_in_pieces_is_the_path_and_a_correction_keeps_what_is_newer():
     board = Board()
     path = DrivenPath(board)
     for i in range(250):
-        path.add(i, 0.25 * i, 0.0)
-        path.add(i, 0.25 * i + 0.01, 0.0)  # hardly moved
+        path.add(i * TENTH_NS, 0.25 * i, 0.0)
+        path.add(i * TENTH_NS, 0.25 * i + 0.01, 0.0)  # hardly moved
     np.testing.assert_allclose(shown_path(board), [(0.25 * i, 0.0) for i in range(250)], atol=0.006)
     assert path.start == (0.0, 0.0)
     stamps = np.arange(0, 240, 20)
     poses = np.column_stack([stamps * 0.25, np.ones(len(stamps)), np.zeros(len(stamps))])
-    path.correct(stamps, poses)
+    path.correct(stamps * TENTH_NS, poses)
     shown = shown_path(board)
     assert len(shown) == 12 + 29 and shown[0].tolist() == [0.0, 1.0]
     assert shown[12].tolist() == [pytest.approx(55.25, abs=0.006), 0.0]
+    path.add(247 * TENTH_NS, 80.0, 0.0)  # of a scan with a delay
+    assert len(shown_path(board)) == len(shown) + 1
     path.add(0, 500.0, 0.0)  # time was set back
     assert shown_path(board).tolist() == [[500.0, 0.0]]
 

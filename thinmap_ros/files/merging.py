@@ -227,7 +227,17 @@ class _Merging:
                 best = max(best, found, key=lambda each: each.log_odds)
         raise self._refusal(best)
 
-    def _refusal(self, best: _Candidate) -> NotTheSamePlaceError:
+    def _refusal(self, best: _Candidate) -> ThinmapError:
+        least = f'expected at least {100 * LEAST_FOUND:.0f} %'
+        agree = f'{100 * best.found:.0f} % of the walls agree'
+        if self._given:
+            given = ','.join(f'{value:g}' for value in self._given[best.path])
+            return InputError(
+                f'{best.path}: the maps contradict the given pose {given}: {agree} near it: {least}'
+            )
+        if best.log_odds > 0.0 and best.found < LEAST_FOUND:
+            reason = f'not the same place: {agree}: {least}'
+            return NotTheSamePlaceError(best.path, best.log_odds, reason)
         if best.log_odds <= 0.0:
             return NotTheSamePlaceError(best.path, best.log_odds)
         places = self._fits.get(best.path, [])
@@ -258,15 +268,9 @@ class _Merging:
     def _by_pose(self, path: str) -> _Candidate:
         """Where a person says that it lies."""
         query = self._maps[path].places
-        given = self._given[path]
-        fit = fitted(query, self.known.places, given)
-        if fit.is_contrary:
-            raise InputError(
-                f'{path}: the maps contradict the given pose '
-                f'{",".join(f"{value:g}" for value in given)}: {100 * fit.found:.0f} % of the '
-                f'walls agree near it: expected at least {100 * LEAST_FOUND:.0f} %'
-            )
-        return _Candidate(path, math.inf, fit.placement(query, math.inf), fit.found)
+        fit = fitted(query, self.known.places, self._given[path])
+        placement = None if fit.is_contrary else fit.placement(query, math.inf)
+        return _Candidate(path, math.inf, placement, fit.found)
 
     def _join(self, candidate: _Candidate, placement: Placement) -> None:
         path = candidate.path
@@ -303,11 +307,7 @@ def read_piece(path: str, report: Report = warn) -> SlamPiece:
     if GRID.exists(path):
         patch = GRID.load(path).known_area()
     else:
-        stem = sessions.stem_of(path)
-        description = stem.with_name(f'{stem.name}.yaml')
-        if Path(path).is_file() and not description.exists():
-            description = Path(path)  # the error names what it is
-        patch = read_map(description, report=report, keeps_unknown=True)
+        patch = read_map(sessions.description_of(path), report=report, keeps_unknown=True)
     if TOPOLOGY.exists(path):
         builder = sessions.load_topology(path)
         saved = KEYFRAMES.load_optional(path) if GRID.exists(path) else None

@@ -305,6 +305,7 @@ def _parse(text: str, loader: type['_BoundedLoader']) -> object:
 
 # Bytes near the begin of files that are given for a YAML file, and what they are.
 _BEGIN_BYTES = 64
+_IMAGE = 'an image, which a YAML file beside it names'
 _FOREIGN = (
     (
         b'serialization::archive',
@@ -318,10 +319,8 @@ _FOREIGN = (
     (b'MCAP0\r\n', 'a bag, of which `replay` makes a map'),
     (b'SQLite format 3\0', 'a bag, of which `replay` makes a map'),
     (b'PK\x03\x04', 'a NumPy archive, as of a session'),
-    (b'PNG\r\n', 'an image, which a YAML file beside it names'),
-    (b'\xff\xd8\xff', 'an image, which a YAML file beside it names'),
-    (b'P5', 'an image, which a YAML file beside it names'),
-    (b'P2', 'an image, which a YAML file beside it names'),
+    (b'PNG\r\n', _IMAGE),
+    (b'\xff\xd8\xff', _IMAGE),
 )
 
 
@@ -332,6 +331,8 @@ def _foreign_kind(path: Path) -> str:
             begin = stream.read(_BEGIN_BYTES)
     except (OSError, ValueError):
         return ''
+    if begin[:2] in (b'P2', b'P5') and begin[2:3].isspace():
+        return _IMAGE
     # A magic number is at the begin, or after a byte or a size.
     return next((kind for magic, kind in _FOREIGN if magic in begin[: 8 + len(magic)]), '')
 

@@ -299,12 +299,18 @@ def load_grid(
     Raises InputError where both are missing, or one is broken.
     """
     stem = stem_of(path)
-    description = _with_ending(stem, _MAP_ENDING)
+    description = description_of(path)
     if GRID.exists(path) or path.endswith(GRID.ending):
         return GRID.load(path, config)
     if not _exists(description):
         raise InputError(f'{stem}: neither {GRID.file(path).name} nor {description.name} exists')
     return OccupancyGrid.from_patch(read_map(description, folder, report), config)
+
+
+def description_of(path: str) -> Path:
+    """STEM.yaml of a map; where it is missing, a file of another kind, which the reader names."""
+    description = _with_ending(stem_of(path), _MAP_ENDING)
+    return Path(path) if Path(path).is_file() and not _exists(description) else description
 
 
 def load_edits(path: str) -> MapEdits:

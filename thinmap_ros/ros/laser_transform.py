@@ -75,6 +75,9 @@ class LaserTransform:
             'Topic of the scans, as for slam_toolbox and AMCL; of several lasers a list: '
             '[front/scan, rear/scan].',
         )
+        names = [node.resolve_topic_name(topic) for topic in self.scan_topics]
+        if len(set(names)) < len(names):
+            raise ConfigError(f'scan_topic: {", ".join(names)}: expected different topics')
         if given and len(self.scan_topics) > 1:
             raise ConfigError(
                 f'laser_pose {quoted(str(given))} with {len(self.scan_topics)} topics in scan_topic'

@@ -35,7 +35,8 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
 
     0, 2 after one line on what is wrong, or 130 on Ctrl-C.
     """
-    arguments = parser.parse_args(_files_first(sys.argv[1:]))
+    words = sys.argv[1:]
+    arguments = parser.parse_args(_files_first(words) if _takes_files(parser) else words)
     _print_warnings(parser.prog)
     compilation = report_compilation()
     try:
@@ -51,13 +52,18 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
         compilation.end()
 
 
+def _takes_files(parser: argparse.ArgumentParser) -> bool:
+    return any(not action.option_strings for action in parser._actions)
+
+
 def _files_first(words: list[str]) -> list[str]:
     """The words of a command line, where files behind a scan topic come before the options."""
     if _TOPICS not in words:
         return words
     begin = words.index(_TOPICS) + 2
     end = next((k for k in range(begin, len(words)) if words[k].startswith('-')), len(words))
-    files = [word for word in words[begin:end] if Path(word).exists()]
+    # No topic has a dot in its name.
+    files = [word for word in words[begin:end] if '.' in word or Path(word).exists()]
     topics = [word for word in words[begin:end] if word not in files]
     return [*files, *words[:begin], *topics, *words[end:]]
 

@@ -36,8 +36,8 @@ from thinmap_ros.view.rerun_view import View
 
 # Whose parameters replay takes from a file.
 _NODES = ('localizer', 'grid_mapper', 'topology_builder')
-# Arguments that do not decide about the result.
 _OF_ONE = ('view', 'recording', 'session', 'continued', 'start')  # expect one log
+# Arguments that do not decide about the result.
 _ASIDE = ('logs', 'out', 'jobs', 'dask', 'quiet', *_OF_ONE, 'command')
 _COLUMNS = ('scans', 'distance_m', 'ms_per_scan', 'loops', 'lost', 'apart')
 Opened = Callable[[Log], AbstractContextManager[Any]]

@@ -16,7 +16,7 @@ from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.core.scan import Scan, with_newest
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs import decode
@@ -82,7 +82,8 @@ class DrivenPath:
             last_ns, last_x, last_y = self._points[-1]
             if math.hypot(x - last_x, y - last_y) < _STEP_M:
                 return
-            if stamp_ns < last_ns:
+            # A pose of a scan with a delay is stamped earlier than the trajectory that follows.
+            if stamp_ns < last_ns - SECOND_NS:
                 self._points = []  # time was set back
         self._points.append((stamp_ns, x, y))
         # The piece before ends with the first point of the next one.
@@ -292,6 +293,7 @@ class Picture:
         self._tiles = MapTiles(board)
         self._table = DiagnosticsTable()
         self._apart = ApartScans()
+        self._is_localized = False
         self._pairs: dict[str, StampMatcher[Array, Scan]] = {}  # by the frame of the laser
         self._scans: tuple[Scan, ...] = ()
         self._poses: dict[str, Array] = {}  # of the robot, when they were made
@@ -317,7 +319,12 @@ class Picture:
             self._laser(pairs.add_left(ns, T_map_base))
 
     def scan(self, scan: Scan) -> None:
-        """Show the points of a scan, once the pose at its stamp is known."""
+        """Show the points of a scan, once the pose at its stamp is known.
+
+        Unless its localizer publishes both at once: the stamp of its pose may be another one.
+        """
+        if self._is_localized:
+            return
         pairs = self._pairs.setdefault(scan.frame, StampMatcher())
         self._laser(pairs.add_right(scan.stamp_ns, scan))
 
@@ -415,7 +422,12 @@ class Picture:
         self.board.put('slam', {**shown, 'inliers': round(inliers, 3), 'step_ms': round(step_ms)})
 
     def localized_scan(self, message: Any) -> None:
-        """Show the scan of a thinmap_msgs/LocalizedScan that is mapped apart, if it is."""
+        """Show the scan of a thinmap_msgs/LocalizedScan, also with those that are mapped apart."""
+        self._is_localized = True
+        T_map_base = decode.checked_pose(message.pose.pose)
+        T_base_laser = decode.pose(message.laser_pose)
+        scan = decode.scan(message.scan, decode.stamp_ns(message), T_base_laser)
+        self._laser((T_map_base, scan))
         if self._apart.update(message):
             points = self._apart.points[-_MAX_APART_POINTS:]
             self.board.put('apart', np.round(points, 2).ravel().tolist())

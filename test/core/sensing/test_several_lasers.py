@@ -215,7 +215,8 @@ def test_lasers_with_two_delays_are_one_sequence_of_motions():
         ready = pairing.add_odometry(ns, se2.pose(0.0, 0.0, ns / SECOND_NS))
         if k % 2:
             late = replace(at('front', 0.0), stamp_ns=ns, delay_s=0.3)
-            ready += pairing.add_scan(late) + pairing.add_scan(replace(at('rear', 0.0), stamp_ns=ns))
+            ready += pairing.add_scan(late)
+            ready += pairing.add_scan(replace(at('rear', 0.0), stamp_ns=ns))
         for scan, T_odom_base in ready:
             increment = increments.add(scan, T_odom_base)
             assert not increment.discontinuity

@@ -225,6 +225,7 @@ class _Laser:
     topic: str
     monitor: LaserMonitor = field(default_factory=LaserMonitor)
     blind_reason: str = ''
+    stamp_ns: int = 0
 
 
 @dataclass(eq=False)
@@ -296,6 +297,7 @@ class RobotState:
         if self._T_odom_base is not None:
             scan = laser.monitor.checked(scan, self._T_odom_base)
         laser.blind_reason = scan.blind_reason
+        laser.stamp_ns = scan.odometry_ns
         if not scan.is_blind:
             self.scans = with_newest(self.scans, scan)
             of_topic = self._topics[topic]
@@ -329,7 +331,8 @@ class RobotState:
         for laser in self._lasers.values():
             if laser.blind_reason:
                 return f'{self._topics[laser.topic].name} blind ({laser.blind_reason})'
-        return self._sensor_fault() or self.pose_fault or self._localizer_fault()
+        fault = self._sensor_fault() or self._laser_fault()
+        return fault or self.pose_fault or self._localizer_fault()
 
     def _sensor_fault(self) -> str:
         now_ns = self._time.now_ns()
@@ -338,6 +341,15 @@ class RobotState:
             if fault := stream.fault(now_ns):
                 return fault
         return next(filter(None, map(self._stamp_fault, topics)), '')
+
+    def _laser_fault(self) -> str:
+        """Which of several lasers on one topic is silent; '' for none."""
+        if len(self._lasers) > len(self._topics):
+            for frame, laser in self._lasers.items():
+                silent_ns = -self._offset_ns(laser.stamp_ns)
+                if silent_ns > SENSOR_TIMEOUT_NS:
+                    return f'laser {quoted(frame)} silent for {silent_ns / SECOND_NS:.1f} s'
+        return ''
 
     def _stamp_fault(self, topic: _ScanTopic) -> str:
         if topic.stamp_ns is None:
