@@ -80,7 +80,7 @@ def test_bearings_of_a_laser_that_hangs_are_those_of_its_own_frame():
 
 
 def along(way):
-    """Poses of a robot that drives along some points (N, 2), and turns on the spot at them."""
+    """Poses of a robot that drives along some points (N, 2), and turns in place at them."""
     T = se2.pose(*way[0], 0.0)
     for goal in way[1:]:
         bearing = np.arctan2(goal[1] - T[1], goal[0] - T[0])
@@ -157,3 +157,12 @@ def test_a_body_that_was_found_stays_over_a_gap_in_the_scans():
     far = monitor.checked(replace(scan, stamp_ns=scan.stamp_ns + 1), se2.pose(30.0, 0.0, 0.0))
     assert np.isnan(far.ranges_m).any()
     assert monitor.warnings['body'] == known
+
+
+def test_a_surface_that_is_measured_once_in_a_dead_sector_is_no_body():
+    def dead(scan, rng):
+        range_m = 0.65 if 50 <= scan.stamp_ns // PERIOD_NS < 56 else np.nan
+        return with_part(scan, rng, 60.1, 89.9, range_m)
+
+    monitor, _, _ = driven(dead)
+    assert 'body' not in monitor.warnings

@@ -234,7 +234,7 @@ _AROUND = np.array(
 
 
 def _whole_view(piece: MapPiece) -> View:
-    """All walls of a map, and its free places some way off them, as one view from its middle."""
+    """All walls of a map, and its free places away from them, as one view from its middle."""
     patch = piece.patch
     has_room = patch.free & (distance_cells(patch.occupied) * patch.frame.resolution > _CLEAR_M)
     walls, free = (

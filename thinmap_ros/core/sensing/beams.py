@@ -62,13 +62,15 @@ _MAX_BEYOND = 0.05
 # Of the robot's own body.
 _BODY_REACH_M = 0.7  # a person follows farther behind
 _BODY_MOVES_M = 0.5 * BODY_TOLERANCE_M
+# Of the views: a laser that drops returns may measure a surface once, and never another one.
+_BODY_SHARE = 0.5
 _BODY_STRIKES = 2  # views in turn: a single range may be false
-# A robot can follow a wall at one distance, and round the end of it. It does not turn on the spot
+# A robot can follow a wall at one distance, and round the end of it. It does not turn in place
 # meanwhile.
 _BODY_PATH_M = 2.0
 _BODY_HEADINGS_RAD = 2.8
 _BODY_TURN_RAD = 0.8
-_ON_THE_SPOT_M = 0.2  # radius of a turn: nearer to its centre there is only the robot
+_IN_PLACE_M = 0.2  # radius of a turn: nearer to its centre there is only the robot
 _JUMP_M = 1.0
 _JUMP_RAD = 1.5
 
@@ -383,7 +385,7 @@ class _Surfaces:
 class BodyDetector:
     """Finds the beams of a laser that end at the robot's own body.
 
-    Their ranges stay while the robot drives, turns by nearly 180 degrees, and turns on the spot.
+    Their ranges stay while the robot drives, turns by nearly 180 degrees, and turns in place.
     Ranges of surfaces change then: of a wall that the robot follows, of a person who follows the
     robot. Views are scans 0.1 m or 0.1 rad apart, of one range for each degree.
     """
@@ -393,7 +395,8 @@ class BodyDetector:
         self._motion = np.zeros(2)  # path, m, and heading, rad
         self._range_m = np.full(360, np.nan)  # of what may be the body
         self._strikes = np.zeros(360, dtype=np.int64)
-        # Since the range is that: path before, headings, and the turn on the spot now, at most.
+        # Since the range is that: views, and those with it; path before, headings, turn in place.
+        self._views = np.zeros((2, 360), dtype=np.int64)
         self._begun_m = np.zeros(360)
         self._headings = np.zeros((2, 360))
         self._turns = np.zeros((2, 360))
@@ -428,9 +431,9 @@ class BodyDetector:
         if path_m > _JUMP_M or abs(turn_rad) > _JUMP_RAD:
             self._range_m[~self._is_body] = np.nan
             return
-        is_on_the_spot = path_m < _ON_THE_SPOT_M * abs(turn_rad)
+        is_in_place = path_m < _IN_PLACE_M * abs(turn_rad)
         self._motion = self._motion + [path_m, turn_rad]
-        self._turns[0] = self._turns[0] + turn_rad if is_on_the_spot else 0.0
+        self._turns[0] = self._turns[0] + turn_rad if is_in_place else 0.0
 
     def _add_view(self, ranges: Array) -> None:
         agrees = np.abs(ranges - self._range_m) < _BODY_MOVES_M
@@ -438,6 +441,8 @@ class BodyDetector:
         is_new = np.isnan(self._range_m) | (self._strikes >= _BODY_STRIKES)
         self._range_m[is_new] = np.where(ranges < _BODY_REACH_M, ranges, np.nan)[is_new]
         self._strikes[is_new] = 0
+        self._views[:, is_new] = 0
+        self._views += [np.ones_like(agrees), agrees]
         path_m, heading = self._motion
         self._begun_m[is_new] = path_m
         self._headings[:, is_new] = heading
@@ -447,6 +452,7 @@ class BodyDetector:
         self._turns[1] = np.maximum(self._turns[1], np.abs(self._turns[0]))
         is_body = ~np.isnan(self._range_m) & (path_m - self._begun_m >= _BODY_PATH_M)
         is_body &= self._headings[1] - self._headings[0] >= _BODY_HEADINGS_RAD
+        is_body &= self._views[1] > _BODY_SHARE * self._views[0]
         self._is_body = is_body & (self._turns[1] >= _BODY_TURN_RAD)
         self._set_body()
 
