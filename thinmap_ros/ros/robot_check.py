@@ -13,6 +13,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -73,11 +74,13 @@ def check_robot(names: RobotNames, seconds: float) -> list[Finding]:
 
 @contextmanager
 def _own_node() -> Iterator[Node]:
-    """The node of this program, while it looks."""
+    """The node of this program, while it looks. Raises InputError for a name that is no topic's."""
     rclpy.init()
     node = rclpy.create_node('doctor')
     try:
         yield node
+    except InvalidTopicNameException as error:
+        raise InputError(f'{error}: expected the name of a topic') from error
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
