@@ -24,7 +24,7 @@ DELAY_S = 0.2
 
 @pytest.fixture(scope='module')
 def drive():
-    """Readings, and true poses (3,) of a robot that turns, and drives to and fro."""
+    """Readings, and true poses (3,) of a robot that turns, and drives back and forth."""
     name, patch, start = read_world(WORLD)
     world = World.from_patch(name, patch, start)
     simulation = Simulation(world, start, RobotConfig(radius_m=0.17), LaserScannerConfig(), 1)

@@ -35,7 +35,7 @@ def first_day() -> list[DriveSample]:
 
 @pytest.fixture(scope='module')
 def second_day() -> list[DriveSample]:
-    """Starts elsewhere, and goes on to where the first day did not come."""
+    """Starts elsewhere, and continues to where the first day did not come."""
     return drive_of(7, 150, 1400)
 
 

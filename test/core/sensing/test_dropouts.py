@@ -116,7 +116,7 @@ def test_empty_beams_between_those_of_a_surface_show_no_free_space():
 
 
 class Person:
-    """A person who walks to and fro, or stands and sways, as two legs."""
+    """A person who walks back and forth, or stands and sways, as two legs."""
 
     def __init__(self, rng, walks):
         self._start = rng.uniform(-3.0, 3.0, 2)

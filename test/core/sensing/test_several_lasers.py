@@ -157,7 +157,7 @@ def test_capacity_counts_for_each_laser():
 
 
 def test_a_clock_that_is_ahead_stops_its_laser_alone():
-    """The other one goes on, and so does the laser itself once its clock is right."""
+    """The other one continues, and so does the laser itself once its clock is right."""
     arrivals = [('rear', 5.0), ('front', 1.0), ('rear', 5.1), ('front', 1.1), ('rear', 1.2)]
     found, dropped = paired(arrivals)
     assert found == [('front', 1.0), ('front', 1.1), ('rear', 1.2)] and dropped == 2

@@ -305,7 +305,7 @@ class ScanOdometrySynchronizer:
         self._tilted: Counter[bool] = Counter()  # scans above the limit, and others
         self._least_tilt_rad = math.inf
         self._unpaired = _UnpairedScans()
-        self._overdue: deque[tuple[int, str]] = deque()  # time and frame of late scans
+        self._overdue: deque[tuple[int, str]] = deque()  # time and frame of scans that were late
 
     @property
     def dropped(self) -> int:
