@@ -307,7 +307,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return whole_bags(tmp_path_factory.mktemp('whole'))
 
 
-@pytest.mark.cpu_budget(20, 'hundreds of damaged bags')
 def test_no_damage_ends_in_a_traceback(whole: dict[str, bytes], tmp_path: Path) -> None:
     ends = run_cases(whole, tmp_path, seed=0, count=CASES)
     assert ends['repaired'] > ends.total() / 2

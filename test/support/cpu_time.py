@@ -16,8 +16,6 @@ from numba.core import event
 
 # Of a test. One that needs more says why: @pytest.mark.cpu_budget(seconds, 'the reason').
 TEST_S = 10.0
-# A test fails above so many budgets: on machines whose cores are shared, each takes twice as long.
-_SLOWEST = 2.0
 # Variable with the budget of all tests of a run that are not slow, s; without it there is none.
 STAGE = 'THINMAP_STAGE_CPU_S'
 _SHOWN = 10
@@ -91,7 +89,7 @@ def pytest_runtest_makereport(
         return report
     spent_s = report.cpu_s = _cpu_s() - item.stash[_BEGAN]
     mark = item.get_closest_marker('cpu_budget')
-    budget_s = _SLOWEST * (_budget_s(*mark.args) if mark else TEST_S)
+    budget_s = _budget_s(*mark.args) if mark else TEST_S
     if not item.stash[_FAILED] and spent_s > budget_s:
         report.outcome = 'failed'
         report.longrepr = f'{item.nodeid}: {_above(spent_s, budget_s)}'
@@ -107,7 +105,7 @@ class _Stage:
 
     def __init__(self, shown: int) -> None:
         self._shown = shown
-        self._budget_s = _SLOWEST * float(os.environ.get(STAGE) or 'inf')
+        self._budget_s = float(os.environ.get(STAGE) or 'inf')
         self._spent_s: dict[str, float] = {}
 
     @property

@@ -21,7 +21,6 @@ STEPS = {
 }
 
 
-@pytest.mark.cpu_budget(20, 'five nodes and an explorer')
 def test_each_node_goes_on_after_steps_that_failed(graph):
     doctor = Doctor(graph)
     commands = graph.heard('cmd_vel', Twist)
