@@ -121,3 +121,13 @@ def test_a_robot_that_does_not_change_its_heading_shows_nothing():
     drive.buffer = OdometryBuffer()
     drive.run(0.2, lambda heading: heading)
     assert drive.estimator.warning == ''
+
+
+def test_a_clock_that_was_set_back_does_not_end_the_estimate():
+    drive = Drive(0.0, seconds=1.0)
+    drive.buffer.add(1000 * SECOND_NS, np.zeros(3))
+    drive.add_scan(1000.0, 1000.0)
+    drive.times, drive.headings = turning(drive.rng, 90.0)
+    drive.buffer = OdometryBuffer()
+    drive.run(0.2, lambda heading: heading)
+    assert drive.estimator.applied.seconds == pytest.approx(0.2, abs=0.02)
