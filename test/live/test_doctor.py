@@ -53,7 +53,7 @@ def test_each_of_several_lasers_has_its_rows(graph):
     thread = threading.Thread(target=graph.executor.spin)
     thread.start()
     try:
-        code, said = lines('--seconds', '3', '--scan-topic', 'a', 'b', 'c')
+        code, said = lines('--seconds', '8', '--scan-topic', 'a', 'b', 'c')
         table = '\n'.join(said)
         assert code == 1
         for name in 'ab':
@@ -62,7 +62,7 @@ def test_each_of_several_lasers_has_its_rows(graph):
         assert '✗ topic /c' in table and 'no publisher; of its type: /a, /b' in table
         assert '✗ frames of the lasers' in table and "2 lasers in 'laser'" in table
         frames['b'] = 'other'
-        _, said = lines('--seconds', '3', '--scan-topic', 'a', 'b')
+        _, said = lines('--seconds', '8', '--scan-topic', 'a', 'b')
         table = '\n'.join(said)
         assert 'frames of the lasers' not in table
         for frame in ('laser', 'other'):

@@ -9,7 +9,7 @@ from geometry_msgs.msg import Twist
 from nav2_msgs.action import NavigateToPose
 from rclpy.action import ActionClient
 from std_msgs.msg import String
-from support.peers.room_robot import RoomRobot
+from support.peers.room_robot import SPEAK_S, RoomRobot
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
@@ -22,9 +22,9 @@ UNREACHABLE = (GoalStatus.STATUS_ABORTED, ExplorationStatus.UNREACHABLE)
 class Scene:
     """A robot in a room, a substitute for Nav2 with a mode, and an exploration."""
 
-    def __init__(self, graph, mode='drive', **values):
+    def __init__(self, graph, mode='drive', speak_s=SPEAK_S, **values):
         self.graph = graph
-        self.robot = RoomRobot(graph)
+        self.robot = RoomRobot(graph, speak_s=speak_s)
         self.mode = graph.node.create_publisher(String, 'nav2_mode', qos.LATCHED)
         self.tell(mode)
         self.words = graph.heard('explore/status', String, qos.LATCHED)
@@ -121,7 +121,8 @@ def test_a_nav2_that_takes_the_place_of_another_gets_the_goal_again(graph):
 
 
 def test_somebody_elses_goal_pauses_the_exploration_until_it_has_ended(graph):
-    scene = Scene(graph)
+    # Slower: at ten times, two seconds of a busy machine are the 20 s after which a goal fails.
+    scene = Scene(graph, speak_s=3.0 * SPEAK_S)
     result = scene.explore()
     scene.until_it_drives()
     assert scene.words[-1].data == 'exploration_in_progress'

@@ -58,7 +58,7 @@ class Robot:
             self.commands.publish(ahead)
             return condition()
 
-        self.graph.until(met, what, 120.0)
+        self.graph.until(met, what)
 
     def travelled_m(self):
         xy = np.array([[m.pose.position.x, m.pose.position.y] for m in self.truth])
