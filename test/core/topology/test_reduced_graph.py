@@ -166,3 +166,42 @@ def test_a_straight_line_may_pass_a_corner_of_cells() -> None:
     assert not is_drivable(standing, 0, 0, 4, 3)
     standing[2, 2] = False
     assert not is_drivable(standing, 0, 0, 4, 4)
+
+
+def pillars() -> np.ndarray:
+    """A hall of 20 m x 15 m with pillars of 0.5 m, and a wall in it."""
+    cells = room(150, 200)
+    for row in (30, 75, 120):
+        for col in range(30, 200, 45):
+            cells[row : row + 5, col : col + 5] = 100
+    cells[50:54, 60:110] = 100
+    return cells
+
+
+def test_length_and_clearance_of_an_edge_are_those_of_its_line() -> None:
+    for cells in (rough_corridor(), chairs(), pillars()):
+        _, reduced = graphs_of(cells)
+        obstacles = patch_of(cells).frame.centres_of(np.argwhere(cells != 0))
+        for edge in reduced.edges.values():
+            a, b = (reduced.nodes[i].position for i in (edge.a, edge.b))
+            line = np.linspace(a, b, 200)
+            away = np.hypot(*np.moveaxis(line[:, None] - obstacles, 2, 0)).min()
+            assert edge.length_m == pytest.approx(math.dist(a, b))
+            assert edge.clearance_m == pytest.approx(away, abs=0.1)
+
+
+@pytest.mark.parametrize(('bend', 'edges'), [(2.0, 2), (0.8, 0)])
+def test_an_edge_whose_line_is_blocked_leads_over_its_bend_or_goes(bend: float, edges: int) -> None:
+    cells = room(60, 100)
+    cells[25:37, 48:54] = 100
+    patch = patch_of(cells)
+    standing = select_free_space(patch, None, CONFIG)
+    nodes = [Node(i, NodeKind.END, x, 3.05, 1.0) for i, x in ((1, 2.05), (2, 8.05))]
+    height = 3.05 + bend * np.sin(np.linspace(0, math.pi, 61))
+    path = np.column_stack([np.linspace(2.05, 8.05, 61), height])
+    graph = EditedGraph(
+        TopologicalMap(nodes, [Edge(3, 1, 2, path, 7.5, 0.9)]), patch.frame, standing, patch.free
+    )
+    routes.split_parallels(graph)
+    assert len(graph.map.edges) == edges
+    assert drivable_share(patch, graph.map, CONFIG.robot_radius_m) == float(edges > 0)

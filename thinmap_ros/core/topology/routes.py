@@ -121,17 +121,20 @@ def is_drivable(standing: Mask, row: int, col: int, to_row: int, to_col: int) ->
 
 
 def split_parallels(graph: EditedGraph) -> None:
-    """Lead the longer one of two edges between the same nodes over a corner node.
+    """Make all edges straight, as they are driven; two between the same nodes get a corner node.
 
-    It stands where the edge is farthest from the line. An edge that no such corner clears goes:
-    both would be driven along the same line.
+    Length and clearance become those of the line. The longer one of two, and one whose line is
+    blocked, leads over a corner where it is farthest from the line; where no such corner clears it,
+    it goes.
     """
     known: set[tuple[int, int]] = set()
     edges = sorted(graph.map.edges.values(), key=lambda edge: (edge.length_m, edge.id))
     for edge in edges:
         ends = (min(edge.a, edge.b), max(edge.a, edge.b))
-        if ends in known or edge.a == edge.b:
+        if ends in known or edge.a == edge.b or not graph.is_clear(*map(graph.cell, ends)):
             _lead_over_corner(graph, edge)
+        else:
+            graph.put_straight(edge.id, edge.a, edge.b)
         known.add(ends)
 
 
@@ -588,8 +591,8 @@ def route_graph(
       straight line;
     - no two edges along one straight line, and no node without an edge.
 
-    standing (H, W): cells of the patch that a robot can traverse. Each edge that is changed is a
-    straight line over such cells. detail_m: smaller obstacles are passed on one side only.
+    standing (H, W): cells of the patch that a robot can traverse. Each edge is a straight line over
+    such cells. detail_m: smaller obstacles are passed on one side only.
     node_spacing_m: nodes nearer to each other than this, or than the clearance of one of them, are
     one where places see it as well; None: detail_m.
     """
