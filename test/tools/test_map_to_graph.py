@@ -100,6 +100,25 @@ def test_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert nodes('--start=-50,0') == 0
 
 
+@pytest.mark.parametrize(('resolution', 'gap'), [(0.05, 9), (0.125, 3)])
+def test_a_gap_that_nav2_calls_inscribed_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resolution: float, gap: int
+) -> None:
+    """The middle of the gap is 0.25 m from both walls, centre to centre of the cells."""
+    grey = np.zeros((80, 100), dtype=np.uint8)
+    grey[5:75, 5:48] = grey[5:75, 52:95] = grey[40 : 40 + gap, 48:52] = 254
+    path = written(tmp_path, grey, resolution=resolution)
+    out = tmp_path / 'g.graphml'
+
+    def parts(*words: object) -> int:
+        assert run(monkeypatch, path, '-o', out, *words) == 0
+        return networkx.number_connected_components(networkx.read_graphml(out))
+
+    assert parts() == 2
+    assert parts('--allow-touching') == 1
+    assert parts('--robot-radius-m', 0.2) == 1
+
+
 def test_nodes_are_fewer_the_larger_the_node_spacing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.regions import membership_of
 from thinmap_ros.core.topology.routes import DETAIL_M, MIN_NODE_SPACING_M, route_graph
 from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions
-from thinmap_ros.core.topology.thinning import select_free_space
+from thinmap_ros.core.topology.thinning import beyond_radius, select_free_space
 from thinmap_ros.core.topology.topology import build_along
 from thinmap_ros.evaluation.batch import (
     REASON,
@@ -43,6 +43,7 @@ _FORMATS = ('geojson', 'graphml', 'tmap2.yaml')
 _OPTIONS = (
     'robot_radius_m',
     'min_clearance_m',
+    'allow_touching',
     'prune_m',
     'max_unknown_gap_m',
     'detail_m',
@@ -124,6 +125,8 @@ def _graph_of(
     patch: GridPatch, config: TopologyConfig, arguments: argparse.Namespace
 ) -> TopologicalMap:
     """The route graph of a map; --detail-m 0: its whole skeleton."""
+    if not arguments.allow_touching:
+        config = beyond_radius(config, patch.frame.resolution)
     start = _start(arguments.start)
     detail_m = arguments.detail_m
     standing = select_free_space(patch, start, config)
@@ -276,6 +279,11 @@ def main() -> None:
     )
     clearance_help = 'how far nodes and edges stay from obstacles, m (default: the robot radius)'
     parser.add_argument('--min-clearance-m', type=float, help=clearance_help)
+    touching_help = (
+        'nodes and edges may be exactly as far from obstacles (default: farther, as Nav2 refuses '
+        'cells that are a radius away)'
+    )
+    parser.add_argument('--allow-touching', action='store_true', help=touching_help)
     default = _DEFAULTS.min_branch_length_m
     prune_help = f'shorter branches of the skeleton are pruned, m (default {default})'
     parser.add_argument(

@@ -1,6 +1,7 @@
 """Free space of a map, and its skeleton by Zhang-Suen thinning, both at once."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,17 @@ def select_free_space(
     reach = math.ceil(config.seed_search_radius_m / patch.frame.resolution)
     seed = nearest_true(standing, (row, col), reach)
     return np.zeros_like(standing) if seed is None else reachable(standing, np.array([seed]))
+
+
+def beyond_radius(config: TopologyConfig, resolution: float) -> TopologyConfig:
+    """Configuration of a robot that stays farther from obstacles than its radius, as Nav2 demands.
+
+    Nav2's inflation layer calls a cell inscribed, and refuses it, whose centre is up to the radius,
+    included, from that of an obstacle. Squared distances between centres, in cells, are whole
+    numbers: the next one above the radius is the radius to be at least away.
+    """
+    squared = math.floor((config.robot_radius_m / resolution) ** 2 + 1e-6) + 1
+    return replace(config, robot_radius_m=resolution * math.sqrt(squared))
 
 
 def known_free(patch: GridPatch, config: TopologyConfig) -> Mask:
