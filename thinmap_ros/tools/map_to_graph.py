@@ -298,8 +298,9 @@ def main() -> None:
     )
     parser.add_argument('--detail-m', type=float, default=DETAIL_M, help=detail_help)
     spacing_help = (
-        'nodes nearer to each other than this are one, m: more for fewer nodes, less for a node at '
-        'each junction (default: as --detail-m)'
+        'nodes nearer to each other than this are one, and no place in sight is farther than three '
+        'times this from a node, m: more for fewer nodes, less for a node at each junction '
+        '(default: as --detail-m)'
     )
     parser.add_argument('--node-spacing-m', type=float, help=spacing_help)
     speed_help = (

@@ -1,11 +1,13 @@
 """Graphs of saved maps: few nodes, straight edges, nothing that is not there."""
 
+import itertools
 import math
 
+import networkx
 import numpy as np
 import pytest
 
-from benchmarks.graphs.graph_metrics import drivable_share
+from benchmarks.graphs.graph_metrics import completeness, drivable_share
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology import routes
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
@@ -26,13 +28,15 @@ def room(rows: int, cols: int) -> np.ndarray:
     return cells
 
 
-def graphs_of(cells: np.ndarray) -> tuple[TopologicalMap, TopologicalMap]:
+def graphs_of(
+    cells: np.ndarray, node_spacing_m: float | None = None
+) -> tuple[TopologicalMap, TopologicalMap]:
     """The whole skeleton of a map, and the reduced graph."""
     patch = patch_of(cells)
     standing = select_free_space(patch, None, CONFIG)
     whole = build_along(patch, standing, None, CONFIG)
     before = (dict(whole.nodes), dict(whole.edges))
-    reduced = route_graph(whole, patch, standing, CONFIG)
+    reduced = route_graph(whole, patch, standing, CONFIG, node_spacing_m=node_spacing_m)
     assert before == (whole.nodes, whole.edges)
     assert drivable_share(patch, reduced, CONFIG.robot_radius_m) == 1.0
     return whole, reduced
@@ -60,7 +64,7 @@ def chairs() -> np.ndarray:
 
 
 def test_a_corridor_with_rough_walls_is_a_line() -> None:
-    whole, reduced = graphs_of(rough_corridor())
+    whole, reduced = graphs_of(rough_corridor(), 3.0)
     assert len(whole.nodes) > 2
     assert len(reduced.nodes) <= 4
     assert len(reduced.components()) == 1
@@ -82,7 +86,7 @@ def test_both_paths_round_an_obstacle_smaller_than_a_table_are_one(side: int, pa
     cells[5:35, 5:35] = cells[5:35, 85:115] = cells[85:115, 5:35] = cells[85:115, 85:115] = 100
     low = 60 - side // 2
     cells[low : low + side, low : low + side] = 100
-    _, reduced = graphs_of(cells)
+    _, reduced = graphs_of(cells, 2.0)
     loops = len(reduced.edges) - len(reduced.nodes) + len(reduced.components())
     assert loops == paths - 1
 
@@ -168,6 +172,13 @@ def test_a_straight_line_may_pass_a_corner_of_cells() -> None:
     assert not is_drivable(standing, 0, 0, 4, 4)
 
 
+def seen_from(patch: GridPatch, standing: np.ndarray, graph: TopologicalMap) -> np.ndarray:
+    """Distance of each traversable cell to the nearest node, m."""
+    nodes = np.array([node.position for node in graph.nodes.values()])
+    places = patch.frame.centres_of(np.argwhere(standing))
+    return np.asarray(np.hypot(*np.moveaxis(places[:, None] - nodes, 2, 0)).min(axis=1))
+
+
 def pillars() -> np.ndarray:
     """A hall of 20 m x 15 m with pillars of 0.5 m, and a wall in it."""
     cells = room(150, 200)
@@ -205,3 +216,41 @@ def test_an_edge_whose_line_is_blocked_leads_over_its_bend_or_goes(bend: float, 
     routes.split_parallels(graph)
     assert len(graph.map.edges) == edges
     assert drivable_share(patch, graph.map, CONFIG.robot_radius_m) == float(edges > 0)
+
+
+def test_places_are_near_a_node_and_routes_are_short() -> None:
+    cells = pillars()
+    patch = patch_of(cells)
+    standing = select_free_space(patch, None, CONFIG)
+    _, reduced = graphs_of(cells)
+    assert (
+        seen_from(patch, standing, reduced).max() < 3.0 * 1.2 + 0.4
+    )  # half of a lattice of places
+    assert len(reduced.nodes) < 0.12 * 300.0
+    joined, longer = completeness(patch, reduced, CONFIG.robot_radius_m, 30, 0)
+    assert (joined, len(reduced.components())) == (1.0, 1)
+    assert longer < 1.1
+    between = dict(networkx.all_pairs_dijkstra_path_length(as_networkx(reduced), weight='length'))
+    for a, b in itertools.combinations(reduced.nodes.values(), 2):
+        away_m = math.dist(a.position, b.position)
+        ends = patch.frame.cells_of(np.array([a.position, b.position]))
+        if away_m <= 7.2 and is_drivable(standing, *ends.ravel()):
+            assert between[a.id][b.id] <= 1.2 * away_m + 1e-9
+
+
+def as_networkx(graph: TopologicalMap) -> networkx.Graph:
+    edges = [(edge.a, edge.b, edge.length_m) for edge in graph.edges.values()]
+    made = networkx.Graph()
+    made.add_weighted_edges_from(edges, weight='length')
+    return made
+
+
+def test_a_corridor_has_nodes_within_three_spacings() -> None:
+    cells = np.full((30, 300), 100)
+    cells[5:25, 5:295] = 0
+    patch = patch_of(cells)
+    standing = select_free_space(patch, None, CONFIG)
+    for spacing_m, most in ((1.2, 6), (3.0, 3)):
+        _, reduced = graphs_of(cells, spacing_m)
+        assert seen_from(patch, standing, reduced).max() < 3.0 * spacing_m + 0.4
+        assert len(reduced.nodes) <= most

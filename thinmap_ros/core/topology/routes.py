@@ -30,6 +30,8 @@ _SIGHT_REACH_M = 10.0  # a node that is farther off is out of sight
 _MIN_GAIN = 3  # places that a node must show
 _NODE_REACH_M = 6.0  # of a place from an edge on which a node may show it
 _SPLIT_STEP_M = 0.25  # between the points on edges where nodes may be put
+_REACH = 3.0  # of places from a node, in node spacings
+_DETOUR = 1.2  # of a route between nodes that see each other, relative to the line
 
 Box = tuple[float, float, float, float]  # smallest x and y, largest x and y, m
 
@@ -66,12 +68,12 @@ class EditedGraph:
         end = self.map.nodes[b].position
         steps = math.ceil(math.dist(start, end) / self.frame.resolution) + 1
         path = np.linspace(start, end, max(steps, 2))
-        clearance = float(self._clearances(path).min())
+        clearance = float(self.clearances(path).min())
         self.map.put_edge(Edge(edge_id or self._new_id(), a, b, path, path_length(path), clearance))
 
     def put_node(self, xy: Array) -> int:
         """Put a node at a point (2,), m; returns its id."""
-        clearance = float(self._clearances(xy[None])[0])
+        clearance = float(self.clearances(xy[None])[0])
         node = Node(self._new_id(), NodeKind.CORNER, float(xy[0]), float(xy[1]), clearance)
         self.map.put_node(node)
         return node.id
@@ -89,7 +91,8 @@ class EditedGraph:
             self.map.put_node(replace(node, kind=self.map.kind_at(node.id)))
         return self.map
 
-    def _clearances(self, points: Array) -> Array:
+    def clearances(self, points: Array) -> Array:
+        """Distance of points (N, 2) to the nearest cell that is not free, m."""
         squared = squared_clearance(self._distance, self.frame.cells_of(points))
         return np.asarray(np.sqrt(squared) * self.frame.resolution)
 
@@ -376,14 +379,14 @@ class Sight:
         del self._places[node.id]
         return True
 
-    def add(self, node: Node) -> bool:
+    def add(self, node: Node, least_gain: int = _MIN_GAIN) -> bool:
         """Add a node, if so some more places see the node nearest to them."""
         near = np.array(self._tree.query_ball_point(node.position, _SIGHT_REACH_M), dtype=np.int64)
         away = np.hypot(*(self._xy[near] - node.position).T)
         closer = away < self._away[near]
         places = near[closer]
         seen = self._sees(node, places)
-        if seen.sum() < self._seen[places].sum() + _MIN_GAIN:
+        if seen.sum() < self._seen[places].sum() + least_gain:
             return False
         for owner in np.unique(self._owner[places]).tolist():
             self._places[owner] = np.setdiff1d(self._places[owner], places)
@@ -395,6 +398,27 @@ class Sight:
     def unseen(self) -> Cells:
         """Indices of the places that do not see the node nearest to them."""
         return np.flatnonzero(~self._seen)
+
+    def farthest(self, gone: list[Node]) -> Cells:
+        """Indices of the places, those farthest from a node first, none nearer to one that is gone.
+
+        gone: nodes that were dropped with the places around them.
+        """
+        order = np.argsort(-self._away, kind='stable')
+        if not gone:
+            return order
+        away = cKDTree([node.position for node in gone]).query(self._xy[order])[0]
+        return order[away > self._away[order]]
+
+    def away_m(self, place: int) -> float:
+        """Distance of a place from the node nearest to it."""
+        return float(self._away[place])
+
+    def around(self, place: int, reach_m: float) -> Cells:
+        """Places (N, 2), as cells, that see one, within a reach of it."""
+        near = self._cells[self._tree.query_ball_point(self._xy[place], reach_m)]
+        row, col = self._cells[place].tolist()
+        return np.asarray(near[_lines_clear(self._known, row, col, near)])
 
     def is_seen(self, place: int) -> bool:
         """Whether a place sees the node nearest to it."""
@@ -537,9 +561,9 @@ class _EdgePoints:
         self.edges = np.concatenate(owners)
         self._tree = cKDTree(graph.frame.centres_of(self.cells))
 
-    def near(self, xy: Array) -> Cells:
+    def near(self, xy: Array, reach_m: float) -> Cells:
         """Indices of the points within reach of a place (2,), m, the nearest first."""
-        found = np.array(self._tree.query_ball_point(xy, _NODE_REACH_M), dtype=np.int64)
+        found = np.array(self._tree.query_ball_point(xy, reach_m), dtype=np.int64)
         away = np.hypot(*(self._tree.data[found] - xy).T)
         return found[np.argsort(away, kind='stable')]
 
@@ -554,17 +578,97 @@ def show_places(graph: EditedGraph, sight: Sight) -> None:
     """Put nodes on edges from which places are in sight that do not see their nearest node."""
     points = _EdgePoints(graph)
     for place in sight.unseen().tolist():
-        if sight.is_seen(place) or not len(points.cells):
-            continue
-        near = points.near(sight.position(place))
-        first = sight.first_seeing(place, points.cells[near])
-        edge_id = int(points.edges[near[first]]) if first >= 0 else 0
-        if edge_id and _can_split(graph, graph.map.edges[edge_id], points.cells[near[first]]):
-            node_id = graph.put_node(graph.frame.centres_of(points.cells[near[first]][None])[0])
-            if sight.add(graph.map.nodes[node_id]):
-                points.split(int(near[first]), graph.split(graph.map.edges[edge_id], node_id))
-            else:
-                graph.map.drop_node(node_id)
+        if not sight.is_seen(place):
+            _put_on_edge(graph, sight, points, place, _NODE_REACH_M, _MIN_GAIN)
+
+
+def _put_on_edge(
+    graph: EditedGraph,
+    sight: Sight,
+    points: _EdgePoints,
+    place: int,
+    reach_m: float,
+    least_gain: int,
+) -> bool:
+    """Put a node on the nearest edge in sight of a place, if so some more places see a node."""
+    near = points.near(sight.position(place), reach_m)
+    first = sight.first_seeing(place, points.cells[near])
+    edge_id = int(points.edges[near[first]]) if first >= 0 else 0
+    if not edge_id or not _can_split(graph, graph.map.edges[edge_id], points.cells[near[first]]):
+        return False
+    node_id = graph.put_node(graph.frame.centres_of(points.cells[near[first]][None])[0])
+    if not sight.add(graph.map.nodes[node_id], least_gain):
+        graph.map.drop_node(node_id)
+        return False
+    points.split(int(near[first]), graph.split(graph.map.edges[edge_id], node_id))
+    return True
+
+
+def spread_nodes(graph: EditedGraph, sight: Sight, reach_m: float, gone: list[Node]) -> None:
+    """Put nodes where places are farther than a reach from each, those farthest off first.
+
+    On an edge within reach, else in open space that is in sight of a node: `cross_edges` joins it.
+    gone: nodes of space that shall have none.
+    """
+    for node in graph.map.nodes.values():
+        sight.add(node, 0)
+    points = _EdgePoints(graph)
+    places = sight.farthest(gone).tolist()
+    count = 0
+    while count < len(graph.map.nodes):
+        count = len(graph.map.nodes)
+        for place in places:
+            if reach_m < sight.away_m(place) < 2.0 * reach_m and not _put_on_edge(
+                graph, sight, points, place, reach_m, 0
+            ):
+                _put_in_space(graph, sight, place, reach_m)
+
+
+def _put_in_space(graph: EditedGraph, sight: Sight, place: int, reach_m: float) -> None:
+    """Put a node where there is most clearance in sight of a place, unless no node is in sight."""
+    centres = graph.frame.centres_of(sight.around(place, 0.5 * reach_m))
+    xy = centres[int(graph.clearances(centres).argmax())]
+    node_id = graph.put_node(xy)
+    cell = graph.cell(node_id)
+    clear = any(
+        0.0 < math.dist(node.position, xy) <= 2.0 * reach_m
+        and graph.is_clear(cell, graph.cell(node.id))
+        for node in graph.map.nodes_near(float(xy[0]), float(xy[1]), 2.0 * reach_m)
+    )
+    if not clear or not sight.add(graph.map.nodes[node_id], 0):
+        graph.map.drop_node(node_id)
+
+
+def cross_edges(graph: EditedGraph, reach_m: float) -> None:
+    """Join nodes by straight edges where the route between them is a detour, the nearest first.
+
+    Source: Althöfer et al., "On sparse spanners of weighted graphs", 1993.
+    """
+    ids = list(graph.map.nodes)
+    places = np.array([node.position for node in graph.map.nodes.values()]).reshape(-1, 2)
+    pairs = cKDTree(places).query_pairs(reach_m, output_type='ndarray')
+    away_m = np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]]).T)
+    for k in np.argsort(away_m, kind='stable').tolist():
+        a, b = (ids[i] for i in pairs[k].tolist())
+        clear = graph.is_clear(graph.cell(a), graph.cell(b))
+        if clear and not _is_reached(graph.map, a, b, _DETOUR * float(away_m[k])):
+            graph.put_straight(0, a, b)
+
+
+def _is_reached(topology: TopologicalMap, start: int, goal: int, most_m: float) -> bool:
+    """Whether a route between two nodes is shorter than a length."""
+    costs = {start: 0.0}
+    open_nodes = [(0.0, start)]
+    while open_nodes:
+        cost, node_id = heapq.heappop(open_nodes)
+        if node_id == goal:
+            return True
+        for edge in topology.edges_at(node_id):
+            to = edge.other(node_id)
+            if cost + edge.length_m < costs.get(to, most_m):
+                costs[to] = cost + edge.length_m
+                heapq.heappush(open_nodes, (costs[to], to))
+    return False
 
 
 def _can_split(graph: EditedGraph, edge: Edge, cell: Cells) -> bool:
@@ -589,20 +693,28 @@ def route_graph(
     - one path, the wider one, round an obstacle smaller than `detail_m`;
     - one node for several that are nearer to each other than `node_spacing_m`, and none on a
       straight line;
-    - no two edges along one straight line, and no node without an edge.
+    - no two edges along one straight line, and no node without an edge;
+    - a node within three spacings of each place, and, where a straight line is free, no route that
+      is longer than it by more than a fifth.
 
     standing (H, W): cells of the patch that a robot can traverse. Each edge is a straight line over
     such cells. detail_m: smaller obstacles are passed on one side only.
     node_spacing_m: nodes nearer to each other than this, or than the clearance of one of them, are
-    one where places see it as well; None: detail_m.
+    one where places see it as well; reaches of places and edges are multiples of it; None:
+    detail_m.
     """
     known = known_free(patch, config)
     graph = EditedGraph(topology.copy(), patch.frame, standing, known)
     drop_rays(graph, patch)
+    gone = [node for node in topology.nodes.values() if node.id not in graph.map.nodes]
     open_rings(graph, known, detail_m)
     sight = Sight(patch.frame, standing, known, graph.map.nodes.values())
-    merge_nodes(graph, sight, detail_m if node_spacing_m is None else node_spacing_m, detail_m)
+    spacing_m = detail_m if node_spacing_m is None else node_spacing_m
+    merge_nodes(graph, sight, spacing_m, detail_m)
     show_places(graph, sight)
     split_parallels(graph)
     give_edges(graph)
+    reach_m = _REACH * max(spacing_m, _LATTICE_M)
+    spread_nodes(graph, sight, reach_m, gone)
+    cross_edges(graph, 2.0 * reach_m)
     return graph.with_kinds()
