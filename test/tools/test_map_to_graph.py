@@ -363,3 +363,113 @@ def test_no_edge_leads_through_a_keep_out_area_of_the_session(
     printed = capsys.readouterr().out
     assert 'connected parts: 1' in printed
     assert 'keep-out' not in printed
+
+
+def told(
+    path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    *words: object,
+) -> tuple[str, list[str]]:
+    """What a run prints, and its warnings on the graph."""
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, path, *words) == 0
+    printed = capsys.readouterr()
+    lines = printed.err.splitlines()
+    return printed.out, [line for line in lines if line.startswith('map_to_graph: warning: ')]
+
+
+def test_small_parts_are_left_out_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grey = np.zeros((120, 120), dtype=np.uint8)
+    grey[5:105, 5:105] = 254
+    grey[40:60, 40:60] = 0
+    grey[44:56, 44:56] = 254  # the inside of a cupboard
+    path = written(tmp_path, grey)
+    out, warnings = told(path, tmp_path, monkeypatch, capsys)
+    assert 'connected parts: 1, ' in out
+    assert out.endswith(', small parts left out: 1 (0.6 m2)\n')
+    assert not warnings
+
+
+def test_parts_without_a_route_between_them_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grey = np.zeros((60, 120), dtype=np.uint8)
+    grey[5:55, 5:55] = grey[5:55, 65:115] = 254
+    path = written(tmp_path, grey)
+    out, (warning,) = told(path, tmp_path, monkeypatch, capsys)
+    assert 'connected parts: 2, ' in out and 'left out' not in out
+    assert f'{path}: 2 parts without a route between them (21.2, 21.2 m2): --start X,Y' in warning
+    out, warnings = told(path, tmp_path, monkeypatch, capsys, '--start=2,5')
+    assert 'connected parts: 1, ' in out
+    assert not warnings
+
+
+def room_of_walls(grey_of_walls: int) -> np.ndarray:
+    """A corridor and two rooms in the unknown."""
+    grey = np.full((130, 160), 205, dtype=np.uint8)
+    grey[35:95, 35:125] = grey_of_walls
+    grey[37:60, 37:78] = grey[37:60, 80:123] = grey[62:93, 37:123] = 254
+    grey[60:62, 52:62] = grey[60:62, 95:105] = 254
+    return grey
+
+
+@pytest.mark.parametrize(
+    ('walls', 'speck_share', 'words', 'said'),
+    [
+        (0, 0.0, (), None),
+        (205, 0.0, (), 'as rays through glass do; --detail-m 0 keeps them'),
+        (205, 0.0, ('--detail-m', 0), None),
+        (0, 0.05, (), 'nearer than that to unknown cells; --max-unknown-gap-m closes gaps'),
+        (0, 0.05, ('--max-unknown-gap-m', 0.2), None),
+    ],
+)
+def test_a_graph_that_covers_little_of_the_floor_says_why(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    walls: int,
+    speck_share: float,
+    words: tuple[object, ...],
+    said: str | None,
+) -> None:
+    grey = room_of_walls(walls)
+    grey[(np.random.default_rng(3).random(grey.shape) < speck_share) & (grey == 254)] = 205
+    path = written(tmp_path, grey)
+    _, warnings = told(path, tmp_path, monkeypatch, capsys, *words)
+    found = [line for line in warnings if 'the graph covers' in line]
+    assert len(found) == (said is not None)
+    assert all(said in line and str(path) in line for line in found if said)
+
+
+@pytest.mark.parametrize(
+    ('name', 'nodes', 'parts'),
+    [
+        ('marrtino_r3d/maps/garage', 14, 1),
+        ('marrtino_r3d/maps/casa', 10, 3),
+        ('ecn_house', 18, 6),
+        ('kobuki_lab', 10, 2),
+        ('elsabot_4wd/maps/upstairs', 10, 1),
+    ],
+)
+def test_graphs_of_homes(
+    shared_data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    nodes: int,
+    parts: int,
+) -> None:
+    """Walls that a cheap laser drew, and furniture in whose insides a robot would fit."""
+    path = shared_data / 'maps' / 'homes' / f'{name}.yaml'
+    _, told_of_all = told(path, tmp_path, monkeypatch, capsys, '-o', tmp_path / 'g.graphml')
+    warnings = [line for line in told_of_all if 'cells of grey' not in line]
+    graph = networkx.read_graphml(tmp_path / 'g.graphml')
+    assert len(graph) >= nodes
+    assert networkx.number_connected_components(graph) == parts
+    assert [line for line in warnings if 'parts without' not in line] == []
+    assert len(warnings) == (parts > 1)

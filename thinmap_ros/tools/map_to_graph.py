@@ -4,21 +4,32 @@ import argparse
 import math
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.edits import with_walls
+from thinmap_ros.core.grid.fields import label
 from thinmap_ros.core.grid.moved import resampled
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Mask
-from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.regions import membership_of
-from thinmap_ros.core.topology.routes import DETAIL_M, MIN_NODE_SPACING_M, route_graph
+from thinmap_ros.core.topology.routes import (
+    DETAIL_M,
+    MIN_NODE_SPACING_M,
+    Coverage,
+    coverage,
+    route_graph,
+)
 from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions
-from thinmap_ros.core.topology.thinning import beyond_radius, select_free_space
+from thinmap_ros.core.topology.thinning import (
+    beyond_radius,
+    select_free_space,
+    without_islands,
+)
 from thinmap_ros.core.topology.topology import build_along
 from thinmap_ros.evaluation.batch import (
     REASON,
@@ -38,6 +49,7 @@ from thinmap_ros.view.summary import summary_figure
 
 _DEFAULTS = TopologyConfig()
 _DESCRIPTIONS = ('.yaml', '.yml')
+_MIN_COVERED = 0.8  # of the reachable floor; a graph of less is told
 _FORMATS = ('geojson', 'graphml', 'tmap2.yaml')
 # Arguments that decide about a graph.
 _OPTIONS = (
@@ -106,8 +118,9 @@ def _check_node_spacing(arguments: argparse.Namespace) -> None:
 
 @dataclass(frozen=True)
 class _Graph:
-    """What was found in a map: counts, and why there is nothing, if so.
+    """What was found in a map: counts, and what is to be said of it, a line each.
 
+    islands: number of the small parts that were left out, and island_m2: their traversable area.
     keep_out: number of the keep-out areas of its session, and masked_m2: what the mask forbids in
     the map; both are walls for the graph.
     """
@@ -116,24 +129,44 @@ class _Graph:
     edges: int
     parts: int
     regions: int
+    islands: int
+    island_m2: float
     keep_out: int
     masked_m2: float
-    empty: str
+    warnings: list[str]
 
 
-def _graph_of(
-    patch: GridPatch, config: TopologyConfig, arguments: argparse.Namespace
-) -> TopologicalMap:
-    """The route graph of a map; --detail-m 0: its whole skeleton."""
-    if not arguments.allow_touching:
-        config = beyond_radius(config, patch.frame.resolution)
-    start = _start(arguments.start)
-    detail_m = arguments.detail_m
-    standing = select_free_space(patch, start, config)
-    whole = build_along(patch, standing, None, config)
-    if detail_m == 0.0:
-        return whole
-    return route_graph(whole, patch, standing, config, detail_m, arguments.node_spacing_m)
+def _areas(cells: Mask, resolution: float) -> list[float]:
+    """Areas of the parts of cells (H, W), m2, the largest first."""
+    _, sizes = label(cells)
+    return sorted((sizes[1:] * resolution**2).tolist(), reverse=True)
+
+
+def _told_of_parts(areas: list[float]) -> list[str]:
+    """A line on parts of the traversable floor, m2, where there are several."""
+    if len(areas) < 2:
+        return []
+    listed = ', '.join(f'{area:.1f}' for area in areas)
+    return [
+        f'{len(areas)} parts without a route between them ({listed} m2): --start X,Y keeps the one '
+        'in which the robot is'
+    ]
+
+
+def _told_of_coverage(found: Coverage, radius_m: float) -> list[str]:
+    """A line on a graph that leads to little of the floor, with the reason."""
+    if found.covered >= _MIN_COVERED:
+        return []
+    reason = (
+        'most of the rest is nearer than that to unknown cells; --max-unknown-gap-m closes gaps'
+        if found.unknown > found.rays
+        else 'paths in most of the rest end at more unknown than walls, as rays through glass do; '
+        '--detail-m 0 keeps them'
+    )
+    return [
+        f'the graph covers {found.covered:.0%} of the floor that is {radius_m} m or more from all '
+        f'walls: {reason}'
+    ]
 
 
 def _masked(path: Path | None, patch: GridPatch) -> Mask:
@@ -147,11 +180,23 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
     """Write the graph of a map, and a picture of it."""
     start = _start(arguments.start)
     config = _config(arguments)
+    radius_m = config.robot_radius_m
     patch = occupancy_maps.read_map(path, keeps_unknown=True)
     keep_out = load_edits(str(path)).keep_out
     forbidden = _masked(arguments.keep_out, patch)
     drivable = with_walls(keep_out.as_walls(patch), forbidden)
-    topology = _graph_of(drivable, config, arguments)
+    resolution = drivable.frame.resolution
+    if not arguments.allow_touching:
+        config = beyond_radius(config, resolution)
+    selected = select_free_space(drivable, start, config)
+    standing = without_islands(selected, resolution)
+    whole = build_along(drivable, standing, None, config)
+    detail_m = arguments.detail_m
+    topology = (
+        route_graph(whole, drivable, standing, config, detail_m, arguments.node_spacing_m)
+        if detail_m
+        else whole
+    )
     found = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius_m))
     session = REGIONS.load_optional(str(path))
     regions = found if session is None else session.names.named(found)
@@ -166,16 +211,24 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
             title=path.stem,
             regions=regions,
         )
+    islands = _areas(selected & ~standing, resolution)
     place = 'no free place' if start is None else f'no free place round {start}'
-    empty = f'{place} for a robot of {config.robot_radius_m} m radius: the graph is empty'
+    warnings = [f'{place} for a robot of {radius_m} m radius: the graph is empty']
+    if topology.nodes:
+        lost = coverage(whole, drivable, standing, config)
+        lost = lost if detail_m else replace(lost, rays=0.0)  # the whole skeleton has its rays
+        warnings = _told_of_parts(_areas(standing, resolution))
+        warnings += _told_of_coverage(lost, radius_m)
     return _Graph(
         len(topology.nodes),
         len(topology.edges),
         len(topology.components()),
         len(regions.regions),
+        len(islands),
+        sum(islands),
         len(keep_out.areas),
         np.count_nonzero(forbidden) * patch.frame.resolution**2,
-        '' if topology.nodes else empty,
+        warnings,
     )
 
 
@@ -196,7 +249,7 @@ def run_job(job: FileJob) -> Report:
         'parts': found.parts,
         'regions': found.regions,
         'cpu_s': round(time.process_time() - began, 2),
-        REASON: found.empty,
+        REASON: '; '.join(found.warnings),
     }
     return reported(job, row)
 
@@ -244,14 +297,19 @@ def _convert_one(path: Path, arguments: argparse.Namespace) -> None:
     if arguments.picture is not None and arguments.picture.suffix != '.png':
         raise InputError(f'{arguments.picture}: expected a name that ends in .png')
     found = _convert(path, arguments.out, arguments.picture, arguments)
-    if found.empty:
-        print(f'map_to_graph: warning: {path}: {found.empty}', file=sys.stderr)
+    for warning in found.warnings:
+        print(f'map_to_graph: warning: {path}: {warning}', file=sys.stderr)
+    left_out = (
+        f', small parts left out: {found.islands} ({found.island_m2:.1f} m2)'
+        if found.islands
+        else ''
+    )
     kept_out = f', keep-out areas: {found.keep_out}' if found.keep_out else ''
     if arguments.keep_out is not None:
         kept_out += f', keep-out mask: {found.masked_m2:.1f} m2'
     print(
         f'{arguments.out}: {found.nodes} nodes, {found.edges} edges, '
-        f'connected parts: {found.parts}, regions: {found.regions}{kept_out}'
+        f'connected parts: {found.parts}, regions: {found.regions}{left_out}{kept_out}'
     )
 
 
@@ -308,7 +366,8 @@ def main() -> None:
     )
     parser.add_argument('--speed-limit', help=speed_help)
     parser.add_argument(
-        '--start', help='X,Y in m: only what a robot can reach from there (default: all parts)'
+        '--start',
+        help='X,Y in m: only what a robot can reach from there (default: all but small parts)',
     )
     parser.add_argument(
         '--keep-out',

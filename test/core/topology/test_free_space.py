@@ -17,6 +17,7 @@ from thinmap_ros.core.topology.thinning import (
     select_free_space,
     squared_clearance,
     standing_room,
+    without_islands,
 )
 
 
@@ -119,3 +120,22 @@ def test_parts_smaller_than_the_robot_are_noise():
     cells[20:38, 20:38] = 0
     free = select_free_space(patch_of(cells), None, TopologyConfig(robot_radius_m=0.3))
     assert label(free)[1].size == 2 and free[28, 28] and not free[8, 8]
+
+
+@pytest.mark.parametrize(
+    ('largest_m2', 'small_m2', 'stays'),
+    [(100.0, 1.8, False), (100.0, 2.2, True), (20.0, 0.8, False), (20.0, 1.2, True)],
+)
+def test_a_part_below_2_m2_and_5_percent_of_the_largest_is_an_island(
+    largest_m2: float, small_m2: float, stays: bool
+) -> None:
+    standing = np.zeros((60, 300), dtype=np.bool_)
+    standing[2:52, 2 : 2 + round(largest_m2 * 2)] = True
+    standing[54:58, 2 : 2 + round(small_m2 * 25)] = True
+    kept = without_islands(standing, 0.1)
+    assert kept[:53].sum() == standing[:53].sum()
+    assert kept[53:].any() == stays
+
+
+def test_no_cells_are_no_island() -> None:
+    assert not without_islands(np.zeros((4, 5), dtype=np.bool_), 0.1).any()

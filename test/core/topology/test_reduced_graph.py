@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from pathlib import Path
 
 import networkx
 import numpy as np
@@ -14,6 +15,7 @@ from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.routes import EditedGraph, is_drivable, route_graph
 from thinmap_ros.core.topology.thinning import select_free_space
 from thinmap_ros.core.topology.topology import build_along
+from thinmap_ros.files.occupancy_maps import read_map
 
 CONFIG = TopologyConfig(max_unknown_gap_m=0.0)
 
@@ -117,6 +119,75 @@ def test_there_is_no_branch_into_rays_through_glass() -> None:
     whole, reduced = graphs_of(cells)
     assert max(node.y for node in whole.nodes.values()) > 5.0
     assert max(node.y for node in reduced.nodes.values()) < 4.2
+
+
+def rooms_of(share: float) -> np.ndarray:
+    """Three rooms at a corridor, in the unknown; of the walls a share is unknown, too."""
+    cells = np.full((110, 140), -1)
+    walls = cells[25:85, 20:120]
+    walls[:] = 100
+    walls[2:24, 2:32] = walls[2:24, 34:65] = walls[2:24, 67:98] = walls[26:58, 2:98] = 0
+    for col in (14, 46, 80):
+        walls[24:26, col : col + 9] = 0
+    is_hole = np.random.default_rng(1).random(walls.shape) < share
+    walls[is_hole & (walls == 100)] = -1
+    return cells
+
+
+@pytest.mark.parametrize('share', [0.5, 0.7, 0.8])
+def test_a_graph_between_walls_with_holes_is_that_between_whole_walls(share: float) -> None:
+    _, right = graphs_of(rooms_of(0.0))
+    _, reduced = graphs_of(rooms_of(share))
+    ends, expected = ({n.position.tobytes() for n in g.nodes.values()} for g in (reduced, right))
+    assert ends == expected
+    assert len(reduced.edges) == len(right.edges)
+
+
+@pytest.mark.parametrize('depth', [1, 2])
+def test_specks_and_fringes_of_unknown_cells_end_no_branch(depth: int) -> None:
+    cells = room(60, 100)
+    cells[1 : 1 + depth] = cells[-1 - depth : -1] = -1
+    cells[:, 1 : 1 + depth] = cells[:, -1 - depth : -1] = -1
+    cells[[0, -1]] = cells[:, [0, -1]] = 100
+    whole, _ = graphs_of(cells)
+    kept = whole.copy()
+    routes.drop_rays(kept, patch_of(cells))
+    assert kept.nodes.keys() == whole.nodes.keys()
+
+
+def coverage_of(cells: np.ndarray) -> routes.Coverage:
+    patch = patch_of(cells)
+    standing = select_free_space(patch, None, CONFIG)
+    return routes.coverage(build_along(patch, standing, None, CONFIG), patch, standing, CONFIG)
+
+
+def test_a_graph_between_walls_covers_all() -> None:
+    found = coverage_of(rooms_of(0.0))
+    assert (found.unknown, found.rays) == (0.0, 0.0)
+
+
+def test_floor_without_walls_is_not_covered() -> None:
+    found = coverage_of(rooms_of(1.0))
+    assert found.rays > 0.8
+    assert found.unknown < 0.2
+    assert found.covered == pytest.approx(1.0 - found.rays - found.unknown)
+
+
+def test_floor_between_unknown_specks_is_not_covered() -> None:
+    cells = rooms_of(0.0)
+    is_speck = np.random.default_rng(2).random(cells.shape) < 0.15
+    cells[27:49, 22:52][is_speck[27:49, 22:52]] = -1  # one of three rooms
+    found = coverage_of(cells)
+    assert 0.05 < found.unknown < 0.2
+    assert found.rays == 0.0
+
+
+def test_a_floor_with_glass_keeps_its_pruning(shared_data: Path) -> None:
+    """Branches into fans of rays are dropped, and little else."""
+    patch = read_map(shared_data / 'maps' / 'carmines_floor.yaml', keeps_unknown=True)
+    standing = select_free_space(patch, None, CONFIG)
+    whole = build_along(patch, standing, None, CONFIG)
+    assert 0.005 < routes.coverage(whole, patch, standing, CONFIG).rays < 0.02
 
 
 def test_places_see_the_node_that_is_nearest() -> None:

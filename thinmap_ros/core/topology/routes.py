@@ -3,17 +3,24 @@
 import heapq
 import math
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from thinmap_ros.core.grid.fields import reachable
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.se2 import Array, Cells, Mask, distances_from_line, path_length
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
-from thinmap_ros.core.topology.thinning import column_distance, known_free, squared_clearance
+from thinmap_ros.core.topology.thinning import (
+    column_distance,
+    known_free,
+    squared_clearance,
+    standing_room,
+    true_cells,
+)
 from thinmap_ros.jit import inlined, kernel
 
 DETAIL_M = 1.2  # a small table; nodes are as far apart, unless another spacing is given
@@ -21,6 +28,8 @@ MIN_NODE_SPACING_M = 0.05  # a cell of most maps
 
 _DIRECTIONS = 72  # of straight lines from a cell
 _RAY_REACH_M = 3.0  # beyond, whatever ends a view is no part of the place
+_DEPTH_M = 0.25  # less of the unknown is specks between beams, and the fringe before walls
+_BESIDE_M = 0.15  # of a wall: a hole between beams of 2 degrees at 8 m is twice as wide
 # States of cells, besides 0, free.
 _UNKNOWN = 1
 _WALL = 2
@@ -192,24 +201,39 @@ def _is_true(mask: Mask, row: int, col: int) -> bool:
     return bool(0 <= row < mask.shape[0] and 0 <= col < mask.shape[1] and mask[row, col])
 
 
-def drop_rays(graph: EditedGraph, patch: GridPatch) -> None:
+def drop_rays(topology: TopologicalMap, patch: GridPatch) -> None:
     """Drop ends that see more of the unknown than of walls, back to the first node that does not.
 
     Such a branch is a ray: space that a laser saw through glass, without walls around.
-    A node without edges counts as an end, unless nothing else is left.
+    A node without edges counts as an end, unless nothing else is left. Walls that a cheap laser
+    draws have holes: unknown cells beside a wall count as wall, others only where they are deep.
     """
-    states = _UNKNOWN * patch.unknown.astype(np.uint8) + _WALL * patch.occupied.astype(np.uint8)
+    states = _states(patch)
     reach = _RAY_REACH_M / patch.frame.resolution
-    open_ids = [number for number in graph.map.nodes if len(graph.map.edges_at(number)) < 2]
-    while open_ids and len(graph.map.nodes) > 1:
+    open_ids = [number for number in topology.nodes if len(topology.edges_at(number)) < 2]
+    while open_ids and len(topology.nodes) > 1:
         number = open_ids.pop()
-        edges = graph.map.edges_at(number) if number in graph.map.nodes else []
-        if number not in graph.map.nodes or len(edges) > 1:
+        edges = topology.edges_at(number) if number in topology.nodes else []
+        if number not in topology.nodes or len(edges) > 1:
             continue
-        walls, unknown = _view(states, *graph.cell(number), reach, _DIRECTIONS)
+        row, col = patch.frame.cells_of(topology.nodes[number].position)[0].tolist()
+        walls, unknown = _view(states, row, col, reach, _DIRECTIONS)
         if unknown > walls:
             open_ids += [edge.other(number) for edge in edges if edge.a != edge.b]
-            graph.map.drop_node(number)
+            topology.drop_node(number)
+
+
+def _states(patch: GridPatch) -> NDArray[np.uint8]:
+    """What ends a view in each cell (H, W): a wall, the unknown, or, 0, nothing."""
+    depth = _DEPTH_M / 2.0 / patch.frame.resolution
+    core = standing_room(column_distance(patch.unknown), depth)
+    deep = patch.unknown & ~standing_room(column_distance(~core), depth)
+    beside = _BESIDE_M / patch.frame.resolution
+    margin = math.ceil(beside)  # cells outside are no walls
+    no_wall = np.pad(~patch.occupied, margin, constant_values=True)
+    apart = standing_room(column_distance(no_wall), beside)[margin:-margin, margin:-margin]
+    walls = patch.occupied | (patch.unknown & ~apart)
+    return np.where(walls, np.uint8(_WALL), _UNKNOWN * deep.astype(np.uint8))
 
 
 @kernel
@@ -218,7 +242,8 @@ def _view(
 ) -> tuple[int, int]:
     """Directions in which a view from a cell ends at a wall, and in the unknown, within a reach.
 
-    states (H, W): see the constants, 0 for free; cells outside are unknown; reach in cells.
+    states (H, W): see the constants, 0 for what ends no view; reach in cells. The end of the map is
+    neither: it may be cut out of a larger one.
     """
     walls = 0
     unknown = 0
@@ -228,14 +253,56 @@ def _view(
         while away < reach:
             r = int(math.floor(row + 0.5 + away * math.sin(angle)))
             c = int(math.floor(col + 0.5 + away * math.cos(angle)))
-            inside = 0 <= r < states.shape[0] and 0 <= c < states.shape[1]
-            state = states[r, c] if inside else _UNKNOWN
+            if not (0 <= r < states.shape[0] and 0 <= c < states.shape[1]):
+                break
+            state = states[r, c]
             if state != 0:
                 walls += state == _WALL
                 unknown += state == _UNKNOWN
                 break
             away += 0.5
     return walls, unknown
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Shares of the reachable floor that a reduced graph does not cover.
+
+    Reachable are the free cells at least a robot's radius from all walls, in one part with
+    traversable cells. unknown: those that a robot on a traversable cell does not touch, as unknown
+    cells are too near. rays: of the others, those nearest to a path that `drop_rays` drops.
+    """
+
+    unknown: float
+    rays: float
+
+    @property
+    def covered(self) -> float:
+        """Share of the reachable floor that the graph covers."""
+        return 1.0 - self.unknown - self.rays
+
+
+def coverage(
+    whole: TopologicalMap, patch: GridPatch, standing: Mask, config: TopologyConfig
+) -> Coverage:
+    """What the reduced graph of a skeleton covers; standing (H, W): as of `route_graph`.
+
+    whole: with at least one node.
+    """
+    radius = config.robot_radius_m / patch.frame.resolution
+    room = known_free(patch, config) & standing_room(column_distance(~patch.occupied), radius)
+    floor = reachable(room, true_cells(standing))
+    step = max(round(_SPLIT_STEP_M / patch.frame.resolution), 1)
+    cells = np.argwhere(floor[::step, ::step]) * step
+    beyond = standing_room(column_distance(~standing), radius)[cells[:, 0], cells[:, 1]]
+    kept = whole.copy()
+    drop_rays(kept, patch)
+    parts = [(edge.path, edge.id in kept.edges) for edge in whole.edges.values()]
+    parts += [(node.position[None], node.id in kept.nodes) for node in whole.nodes.values()]
+    is_kept = np.concatenate([np.full(len(points), is_kept) for points, is_kept in parts])
+    tree = cKDTree(np.concatenate([points for points, _ in parts]))
+    nearest = tree.query(patch.frame.centres_of(cells))[1]
+    return Coverage(float(beyond.mean()), float((~is_kept[nearest] & ~beyond).mean()))
 
 
 def open_rings(graph: EditedGraph, known: Mask, detail_m: float) -> None:
@@ -705,7 +772,7 @@ def route_graph(
     """
     known = known_free(patch, config)
     graph = EditedGraph(topology.copy(), patch.frame, standing, known)
-    drop_rays(graph, patch)
+    drop_rays(graph.map, patch)
     gone = [node for node in topology.nodes.values() if node.id not in graph.map.nodes]
     open_rings(graph, known, detail_m)
     sight = Sight(patch.frame, standing, known, graph.map.nodes.values())

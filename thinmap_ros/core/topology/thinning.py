@@ -14,6 +14,8 @@ from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.jit import inlined, kernel
 
 FAR = 1 << 14  # rows; "nothing in this column"
+_ISLAND_M2 = 2.0
+_ISLAND_SHARE = 0.05  # of the largest part
 
 
 def select_free_space(
@@ -83,6 +85,16 @@ def without_specks(cells: Mask, smallest: float) -> Mask:
     keep = sizes >= smallest
     keep[0] = False
     return keep[labels]
+
+
+def without_islands(standing: Mask, resolution: float) -> Mask:
+    """Traversable cells (H, W) without small parts: insides of furniture, slivers beyond walls.
+
+    Small is below 2 m2 and below 5 % of the largest part; resolution: edge of a cell, m.
+    """
+    _, sizes = label(standing)
+    largest = float(sizes[1:].max(initial=0))
+    return without_specks(standing, min(_ISLAND_M2 / resolution**2, _ISLAND_SHARE * largest))
 
 
 @kernel
