@@ -326,6 +326,16 @@ def topology_builder() -> None:
 
 
 @cache
+def route_graph() -> None:
+    """Warm up the reduction of a graph for a route server."""
+    from thinmap_ros.core.topology.graph import TopologyConfig
+    from thinmap_ros.core.topology.topology import build_routes
+
+    for patch in (_room(), _closet(), _corridors()):
+        build_routes(patch, None, TopologyConfig())
+
+
+@cache
 def explorer() -> None:
     """Warm up the choice of an end node, in a partly unknown room, and what other maps need."""
     from thinmap_ros.core.exploration.explorer import Explorer
@@ -420,6 +430,7 @@ ALL = (
     ekf_localizer,
     grid_mapper,
     topology_builder,
+    route_graph,
     explorer,
     navigator,
     global_localizer,
@@ -434,8 +445,7 @@ def _graph(patch: GridPatch) -> 'TopologicalMap':
     from thinmap_ros.core.topology.graph import TopologyConfig
     from thinmap_ros.core.topology.topology import build
 
-    closet = GridPatch(GridFrame(0.0, 0.0, _REHEARSAL.cell_m), _walls(_REHEARSAL.closet_cells))
-    build(closet, None, TopologyConfig())
+    build(_closet(), None, TopologyConfig())
     return build(patch, (2.0, 2.0), TopologyConfig())
 
 
@@ -445,6 +455,17 @@ def _room() -> GridPatch:
     cells[40:46, 40:46] = 100
     cells[_REHEARSAL.passage, -1] = 0
     cells[:, -20:-1] = UNKNOWN
+    return GridPatch(GridFrame(0.0, 0.0, _REHEARSAL.cell_m), cells)
+
+
+def _closet() -> GridPatch:
+    return GridPatch(GridFrame(0.0, 0.0, _REHEARSAL.cell_m), _walls(_REHEARSAL.closet_cells))
+
+
+def _corridors() -> GridPatch:
+    """Two corridors joined at one end; a branch of one is near places of the other, unseen."""
+    cells = np.full((80, 80), 100, dtype=np.int8)
+    cells[5:75, 40:52] = cells[5:75, 54:66] = cells[5:17, 40:66] = cells[35:47, 5:40] = 0
     return GridPatch(GridFrame(0.0, 0.0, _REHEARSAL.cell_m), cells)
 
 

@@ -78,7 +78,8 @@ class TopologyBuilderNode(ThinmapNode):
     Services save_topology, load_topology and check_topology, which reads a saved graph without
     replacing the present one; name_region, which gives a region a name. A graph is published when
     it has changed, /local_topology for each scan while somebody subscribes to it. Where Nav2's
-    route server runs, it is given the graph when it has changed, and when it is saved: client of
+    route server runs, it is given the route graph of `map_to_graph`, with areas of /keep_out as
+    walls, when that has changed, and when the graph is saved: client of
     route_server/set_route_graph.
     Cells outside of the windows are those of /grid. After a correction the graph is rebuilt from
     the /grid that has undergone it, in a thread; until then the graph stays as it is. Nodes keep
@@ -93,7 +94,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._save_directory = SaveDirectory(self)
         save_on_exit(self, self._save_directory, TOPOLOGY, self._save_at_end)
         self._route_graph = RouteGraphUpdates(
-            self, self._output.frame_id, lambda: self._topology.map
+            self, self._output.frame_id, self._config, lambda: self._topology.builder
         )
         self._regions = RegionUpdates(
             self, self._output.frame_id, self._config.robot_radius_m, lambda: self._topology.map
@@ -101,6 +102,7 @@ class TopologyBuilderNode(ThinmapNode):
         RegionNaming(self, self._regions)
         parameters.reject_unknown(self)
         kernels.topology_builder()
+        kernels.route_graph()
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(self, LocalGrid, 'local_grid', self._on_local_grid, qos.STREAM)
         offer_saving(self, self._save_directory, TOPOLOGY, self._save_and_route)
@@ -127,6 +129,7 @@ class TopologyBuilderNode(ThinmapNode):
         for restored in (self._topology.builder, tracker):
             restored.skip_ids(_ID_RESERVE)
         self._regions.reset(tracker)
+        self._route_graph.reset()
         self._stamp.restore(latest_ns)
         self._publish(latest_ns)
 
@@ -135,6 +138,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._output.followed = FollowedMap()
         self._newest_saved_id = 0
         self._topology.reset()
+        self._route_graph.reset()
         if self._session:
             self._topology.replace(load_topology(self._session, self._config))
             self._regions.reset(REGIONS.load_optional(self._session, self._regions.config))
@@ -179,6 +183,7 @@ class TopologyBuilderNode(ThinmapNode):
         whole = messages.whole_map_from_msg(message)
         self._regions.tracker.follow(whole)
         self._regions.add_grid(stamp_ns, whole.patch)
+        self._route_graph.map_changed()
         with self.diagnostics.time_step('whole map'):
             changed = self._topology.add_map(whole)
         if changed is not None:
@@ -188,7 +193,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._checkpoint_new_ids()
         map_id = self._output.followed.id
         if self._output.map.publish(self._topology.map, stamp_ns, map_id, again):
-            self._route_graph.graph_changed()
+            self._route_graph.map_changed()
             self._regions.graph_changed()
 
     def _checkpoint_new_ids(self) -> None:
@@ -227,6 +232,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._topology.replace(loaded)
         self._output.followed.leave()
         self._regions.reset(regions)
+        self._route_graph.reset()
         self._publish(self.now_ns)
         return f'graph of {len(loaded.map.nodes)} nodes' if path else 'graph reset'
 

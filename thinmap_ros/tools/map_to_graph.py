@@ -17,20 +17,9 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.regions import membership_of
-from thinmap_ros.core.topology.routes import (
-    DETAIL_M,
-    MIN_NODE_SPACING_M,
-    Coverage,
-    coverage,
-    route_graph,
-)
+from thinmap_ros.core.topology.routes import DETAIL_M, MIN_NODE_SPACING_M, Coverage, coverage
 from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions
-from thinmap_ros.core.topology.thinning import (
-    beyond_radius,
-    select_free_space,
-    without_islands,
-)
-from thinmap_ros.core.topology.topology import build_along
+from thinmap_ros.core.topology.topology import build_routes
 from thinmap_ros.evaluation.batch import (
     REASON,
     Batch,
@@ -186,17 +175,11 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
     forbidden = _masked(arguments.keep_out, patch)
     drivable = with_walls(keep_out.as_walls(patch), forbidden)
     resolution = drivable.frame.resolution
-    if not arguments.allow_touching:
-        config = beyond_radius(config, resolution)
-    selected = select_free_space(drivable, start, config)
-    standing = without_islands(selected, resolution)
-    whole = build_along(drivable, standing, None, config)
     detail_m = arguments.detail_m
-    topology = (
-        route_graph(whole, drivable, standing, config, detail_m, arguments.node_spacing_m)
-        if detail_m
-        else whole
+    routes = build_routes(
+        drivable, start, config, detail_m, arguments.node_spacing_m, arguments.allow_touching
     )
+    topology = routes.map
     found = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius_m))
     session = REGIONS.load_optional(str(path))
     regions = found if session is None else session.names.named(found)
@@ -211,13 +194,13 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
             title=path.stem,
             regions=regions,
         )
-    islands = _areas(selected & ~standing, resolution)
+    islands = _areas(routes.selected & ~routes.standing, resolution)
     place = 'no free place' if start is None else f'no free place round {start}'
     warnings = [f'{place} for a robot of {radius_m} m radius: the graph is empty']
     if topology.nodes:
-        lost = coverage(whole, drivable, standing, config)
+        lost = coverage(routes.whole, drivable, routes.standing, routes.config)
         lost = lost if detail_m else replace(lost, rays=0.0)  # the whole skeleton has its rays
-        warnings = _told_of_parts(_areas(standing, resolution))
+        warnings = _told_of_parts(_areas(routes.standing, resolution))
         warnings += _told_of_coverage(lost, radius_m)
     return _Graph(
         len(topology.nodes),

@@ -114,6 +114,16 @@ def test_seed_beside_the_free_space_finds_it_within_reach():
         select_free_space(patch, (float('nan'), 0.0), config)
 
 
+def test_parts_of_several_seeds_of_which_some_are_nowhere():
+    patch = drawn('##########', '#..#..#..#', '#..#..#..#', '##########')
+    all_parts = select_free_space(patch, None, TopologyConfig())
+    places = np.array([[1.5, 1.5], [7.5, 1.5], [-50.0, 2.0]])
+    found = select_free_space(patch, places, TopologyConfig())
+    assert found[:, :30].any() and found[:, 65:].any() and not found[:, 35:65].any()
+    assert np.array_equal(found[:, :30], all_parts[:, :30])
+    assert not select_free_space(patch, places[2:], TopologyConfig()).any()
+
+
 def test_parts_smaller_than_the_robot_are_noise():
     cells = np.full((40, 40), 100)
     cells[5:12, 5:12] = 0

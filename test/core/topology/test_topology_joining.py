@@ -5,7 +5,7 @@ import numpy as np
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.registry import MATCH_RADIUS_M
-from thinmap_ros.core.topology.topology import TopologyBuilder, build, join_topologies
+from thinmap_ros.core.topology.topology import TopologyBuilder, build, join_topologies, with_ids_of
 
 FRAME = GridFrame(0.0, 0.0, 0.1)
 
@@ -72,3 +72,27 @@ def test_a_continued_builder_never_assigns_an_id_again():
     new = (set(builder.map.nodes) | set(builder.map.edges)) - before
     assert new
     assert min(new) >= 7000
+
+
+def test_a_map_takes_the_ids_of_a_known_one():
+    known = graph_of(corridors(0, 250))
+    other = graph_of(corridors(150, 400))
+    found = with_ids_of(known, other, 9000)
+    for mine, own in zip(found.nodes.values(), other.nodes.values(), strict=True):
+        assert mine.position.tolist() == own.position.tolist()
+    shared = found.nodes.keys() & known.nodes.keys()
+    assert shared and min(found.nodes.keys() - shared) >= 9000
+    for number in shared:
+        away = found.nodes[number].position - known.nodes[number].position
+        assert np.hypot(*away) <= MATCH_RADIUS_M
+    same = found.edges.keys() & known.edges.keys()
+    assert same
+    for number in same:
+        ends = ({edge.a, edge.b} for edge in (found.edges[number], known.edges[number]))
+        assert next(ends) == next(ends)
+
+
+def test_a_map_has_its_own_ids_again():
+    known = graph_of(corridors(0, 400))
+    again = with_ids_of(known, with_ids_of(TopologicalMap(), known, 9000), 20000)
+    assert again.nodes == known.nodes and again.edges.keys() == known.edges.keys()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.fields import label, nearest_true, reachable
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import Cells, Mask
+from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.jit import inlined, kernel
 
@@ -19,7 +19,7 @@ _ISLAND_SHARE = 0.05  # of the largest part
 
 
 def select_free_space(
-    patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig
+    patch: GridPatch, seed_xy: tuple[float, float] | Array | None, config: TopologyConfig
 ) -> Mask:
     """Cells on which the robot can stand and that it can reach from the seed, (H, W) bool.
 
@@ -29,8 +29,9 @@ def select_free_space(
     unknown cells up to gap_m long between two free cells of a row or column are taken for free:
     specks between beams. Occupied cells count however few they are: a lone one is a pillar until
     the grid takes it back. Cells are joined over edges and corners. seed_xy: x, y in m in the map
-    frame; where it is not on such a cell, the nearest one within seed_search_radius_m; none: empty
-    selection. Without seed: every part that is larger than the robot itself.
+    frame, or several such places (N, 2); where one is not on such a cell, the nearest one within
+    seed_search_radius_m; none: empty selection. Without seed: every part that is larger than the
+    robot itself.
     Source: exploration paper section 2.1, "selection of free space"; rules beyond the papers are
     stated above. Raises InputError where the seed is not finite.
     """
@@ -38,12 +39,14 @@ def select_free_space(
     standing = standing_room(column_distance(known_free(patch, config)), radius)
     if seed_xy is None:
         return without_specks(standing, math.pi * radius**2)
-    if not (math.isfinite(seed_xy[0]) and math.isfinite(seed_xy[1])):
+    places = np.atleast_2d(seed_xy)
+    if not np.isfinite(places).all():
         raise InputError(f'seed {seed_xy}: expected finite coordinates')
-    row, col = patch.frame.cells_of(np.array([seed_xy]))[0].tolist()
     reach = math.ceil(config.seed_search_radius_m / patch.frame.resolution)
-    seed = nearest_true(standing, (row, col), reach)
-    return np.zeros_like(standing) if seed is None else reachable(standing, np.array([seed]))
+    cells = patch.frame.cells_of(places).tolist()
+    nearest = [nearest_true(standing, (row, col), reach) for row, col in cells]
+    seeds = [seed for seed in nearest if seed is not None]
+    return reachable(standing, np.array(seeds, dtype=np.int64).reshape(-1, 2))
 
 
 def beyond_radius(config: TopologyConfig, resolution: float) -> TopologyConfig:

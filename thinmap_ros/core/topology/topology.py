@@ -31,7 +31,7 @@ from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.layers.lattice import Lattice
 from thinmap_ros.core.topology.layers.stack import Layers, Span
 from thinmap_ros.core.topology.registry import MATCH_RADIUS_M, Changes, Registry
-from thinmap_ros.core.topology.thinning import select_free_space
+from thinmap_ros.core.topology.thinning import beyond_radius, select_free_space, without_islands
 
 _OFF_LATTICE = 1e-3  # of a cell: windows farther off do not belong to the same grid
 _STALE_NS = -1  # before every correction: the graph is rebuilt from the next whole map
@@ -184,6 +184,51 @@ def build_along(
     registry = Registry(patch.frame, config)
     registry.update(*_all_edges(patch, free, lines, config))
     return registry.map
+
+
+class Routes(NamedTuple):
+    """A route graph, and what it was made of.
+
+    map: the route graph; whole: the skeleton that it reduces; selected, standing (H, W): the cells
+    that a robot can reach, and those of them that are no island; config: with the radius beyond
+    which obstacles have to be.
+    """
+
+    map: TopologicalMap
+    whole: TopologicalMap
+    selected: Mask
+    standing: Mask
+    config: TopologyConfig
+
+
+def build_routes(
+    patch: GridPatch,
+    start_xy: tuple[float, float] | Array | None,
+    config: TopologyConfig,
+    detail_m: float | None = None,
+    node_spacing_m: float | None = None,
+    touching: bool = False,
+) -> Routes:
+    """The route graph of a map in which all that is forbidden is a wall.
+
+    start_xy: one place or several (N, 2), m, from which it is reached; None: all of the map but its
+    islands. detail_m, node_spacing_m: as of `route_graph`; detail_m 0: the whole skeleton.
+    touching: whether gaps that are exactly as wide as the robot count, which Nav2 refuses.
+    Raises InputError where a place is not finite.
+    """
+    # Imported here: a robot that maps needs neither it nor the search tree of scipy.
+    from thinmap_ros.core.topology.routes import DETAIL_M, route_graph
+
+    resolution = patch.frame.resolution
+    config = config if touching else beyond_radius(config, resolution)
+    selected = select_free_space(patch, start_xy, config)
+    standing = without_islands(selected, resolution) if start_xy is None else selected
+    whole = build_along(patch, standing, None, config)
+    detail_m = DETAIL_M if detail_m is None else detail_m
+    reduced = (
+        route_graph(whole, patch, standing, config, detail_m, node_spacing_m) if detail_m else whole
+    )
+    return Routes(reduced, whole, selected, standing, config)
 
 
 def build_again(
@@ -680,6 +725,26 @@ def join_topologies(
     builder = TopologyBuilder.continued(patch, predecessor, after, config)
     there = builder.map.nodes
     return builder, {own: ids[own] for own in second.nodes if ids[own] in there}
+
+
+def with_ids_of(known: TopologicalMap, other: TopologicalMap, next_id: int) -> TopologicalMap:
+    """Another map of the same place with the ids of a known one.
+
+    A node within MATCH_RADIUS_M of a known one takes its id, nearest pairs first, and an edge that
+    of the known one between the same nodes. All others get ids from next_id on.
+    """
+    ids = _new_ids(known, other, next_id)
+    between = {frozenset((edge.a, edge.b)): edge.id for edge in known.edges.values()}
+    edges = [
+        replace(
+            edge,
+            id=between.pop(frozenset((ids[edge.a], ids[edge.b])), ids[edge.id]),
+            a=ids[edge.a],
+            b=ids[edge.b],
+        )
+        for edge in other.edges.values()
+    ]
+    return TopologicalMap([replace(n, id=ids[n.id]) for n in other.nodes.values()], edges)
 
 
 def _new_ids(first: TopologicalMap, second: TopologicalMap, next_id: int) -> Ids:

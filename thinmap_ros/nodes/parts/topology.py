@@ -6,6 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
+from typing import Any, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import Point
@@ -14,15 +15,18 @@ from rclpy.client import Client
 from rclpy.task import Future as AnswerFuture
 
 from thinmap_msgs.msg import Door as DoorMsg
+from thinmap_msgs.msg import KeepOut as KeepOutMsg
 from thinmap_msgs.msg import Region as RegionMsg
 from thinmap_msgs.msg import RegionArray
 from thinmap_msgs.srv import NameRegion
 from thinmap_ros.core import errors
 from thinmap_ros.core.config import Config, parameter, part
 from thinmap_ros.core.errors import InputError, one_line_reason
+from thinmap_ros.core.grid.edits import KeepOut
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.snapshot import State
+from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.regions import (
     Door,
     Membership,
@@ -32,13 +36,21 @@ from thinmap_ros.core.topology.regions import (
     membership_of,
 )
 from thinmap_ros.core.topology.segmentation import RegionConfig, RegionTracker
+from thinmap_ros.core.topology.topology import (
+    SavedTopology,
+    TopologyBuilder,
+    build_routes,
+    unpack,
+    with_ids_of,
+)
 from thinmap_ros.files.graphs import write_geojson
 from thinmap_ros.jit.cache import private_folder, temporary_folder
 from thinmap_ros.kernels import release_free_pages
+from thinmap_ros.logs import decode
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.services import offer
-from thinmap_ros.ros.subscription import WARN_PERIOD_S
+from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.time_jumps import STEADY
 
 
@@ -88,8 +100,10 @@ def _door_msg(door: Door, edge_ids: list[int]) -> DoorMsg:
     )
 
 
+Found = TypeVar('Found')
+
 _POLL_S = 0.1
-# Of a core, that is used for regions at most: on a map of 100 x 100 m they take more than a second.
+# Of a core, that a worker uses at most: on a map of 100 x 100 m regions take more than a second.
 _MAX_CPU_SHARE = 0.1
 
 
@@ -108,23 +122,43 @@ class RegionUpdatesConfig(Config):
     regions: RegionConfig = part(RegionConfig)
 
 
-class _RegionJob:
-    """Computes regions in a thread of its own, where the map has changed since the last time."""
+class _Worker:
+    """A thread of its own for work on a map, so that no scan waits for it."""
 
-    def __init__(self, tracker: RegionTracker) -> None:
-        self.tracker = tracker
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix='regions')
-        self._last: GridPatch | None = None
+    def __init__(self, name: str) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix=name)
         self._rests_until_s = 0.0
 
     @property
     def is_resting(self) -> bool:
-        """Whether the last regions took so long that the next ones have to wait."""
+        """Whether the last work took so long that the next has to wait."""
         return monotonic() < self._rests_until_s
+
+    def submit(self, work: Callable[..., Found], *arguments: Any) -> Future[Found]:
+        """Begin to work, after all that was begun before."""
+        return self._thread.submit(self._work, work, *arguments)
+
+    def _work(self, work: Callable[..., Found], *arguments: Any) -> Found:
+        began_s = monotonic()
+        result = work(*arguments)
+        # On a large map this takes, and frees, a hundred bytes a cell.
+        release_free_pages()
+        ended_s = monotonic()
+        self._rests_until_s = ended_s + (ended_s - began_s) / _MAX_CPU_SHARE
+        return result
+
+
+class _RegionJob:
+    """Computes regions in a thread, where the map has changed since the last time."""
+
+    def __init__(self, tracker: RegionTracker) -> None:
+        self.tracker = tracker
+        self.worker = _Worker('regions')
+        self._last: GridPatch | None = None
 
     def submit(self, patch: GridPatch) -> Future[RegionMap]:
         """Begin to compute the regions of a grid; those of before, if no cell shows another."""
-        return self._worker.submit(self._regions_of, patch)
+        return self.worker.submit(self._regions_of, patch)
 
     def _regions_of(self, patch: GridPatch) -> RegionMap:
         before = self._last
@@ -132,13 +166,7 @@ class _RegionJob:
         known = self.tracker.regions
         if known is not None and before is not None and _shows_the_same(patch, before):
             return known
-        began_s = monotonic()
-        regions = self.tracker.update(patch)
-        # On a large map this takes, and frees, a hundred bytes a cell.
-        release_free_pages()
-        ended_s = monotonic()
-        self._rests_until_s = ended_s + (ended_s - began_s) / _MAX_CPU_SHARE
-        return regions
+        return self.tracker.update(patch)
 
 
 def _shows_the_same(patch: GridPatch, before: GridPatch) -> bool:
@@ -210,7 +238,7 @@ class RegionUpdates:
         """Begin to compute the regions of the newest grid; of the same grid with a new graph."""
         if self._pending is not None:
             return
-        if self._newest is not None and not self._job.is_resting:
+        if self._newest is not None and not self._job.worker.is_resting:
             self._pending_ns, patch = self._newest
             self._newest = None
             self._pending = self._job.submit(patch)
@@ -278,6 +306,8 @@ def _anchor(regions: RegionMap, request: NameRegion.Request) -> tuple[int, Array
 
 
 _SERVICE = 'route_server/set_route_graph'
+# Above all ids of the topological map, which counts from 1, and small enough for two in 32 bits.
+_FIRST_ID = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -301,59 +331,175 @@ class RouteGraphConfig(Config):
     )
 
 
-class RouteGraphUpdates:
-    """Writes the graph after changes, and has Nav2's route server load it.
+class RouteGraph:
+    """The route graph of the newest map, by the rules of `map_to_graph`, with ids that stay.
 
-    A graph without edges is never sent, as the route server refuses it. A route server that starts
-    later, or has refused a graph, receives the one of that time.
+    Nodes and edges have the ids of those of the topological map that they continue; all others,
+    which the map that grows does not have, ids from _FIRST_ID on.
+    """
+
+    def __init__(self, config: TopologyConfig, write: Callable[[TopologicalMap], None]) -> None:
+        self._config = replace(config, max_unknown_gap_m=0.0)
+        self._write = write
+        self._next_id = _FIRST_ID
+        self._graph = TopologicalMap()
+        self._source: tuple[GridPatch, set[int]] | None = None
+
+    def update(self, state: State, keep_out: KeepOut, is_forced: bool) -> TopologicalMap:
+        """Write the graph of the `state` of a builder; the one of before, if it is the same.
+
+        keep_out: areas that are walls. is_forced: write it again even if it is the same. Raises
+        InputError or OSError where it cannot be written.
+        """
+        saved = unpack(state)
+        patch = keep_out.as_walls(saved.patch)
+        nodes = set(saved.map.nodes)
+        before = self._source
+        if before is None or nodes != before[1] or not _shows_the_same(patch, before[0]):
+            graph = self._continued(saved, patch)
+            is_forced |= not _is_same(graph, self._graph)
+        else:
+            graph = self._graph
+        if is_forced and graph.edges:
+            self._write(graph)
+        self._source = (patch, nodes)
+        self._graph = graph if is_forced else self._graph
+        return self._graph
+
+    def _continued(self, saved: SavedTopology, patch: GridPatch) -> TopologicalMap:
+        """The graph of what is reached from where the robot has been, with known ids."""
+        starts = saved.frame.centres_of(saved.robot_places)
+        found = build_routes(patch, starts, self._config).map
+        known = TopologicalMap(
+            (self._graph.nodes | saved.map.nodes).values(),
+            (self._graph.edges | saved.map.edges).values(),
+        )
+        graph = with_ids_of(known, found, self._next_id)
+        self._next_id = max([self._next_id - 1, *graph.nodes, *graph.edges]) + 1
+        return graph
+
+
+def _is_same(graph: TopologicalMap, other: TopologicalMap) -> bool:
+    """Whether two route graphs, whose edges are straight, are the same."""
+    return graph.nodes == other.nodes and _ends(graph) == _ends(other)
+
+
+def _ends(graph: TopologicalMap) -> dict[int, tuple[int, int]]:
+    return {edge.id: (edge.a, edge.b) for edge in graph.edges.values()}
+
+
+class RouteGraphUpdates:
+    """Writes the route graph after changes, and has Nav2's route server load it.
+
+    Areas of /keep_out are walls. A graph without edges is never sent, as the route server refuses
+    it. A route server that starts later, or has refused a graph, receives the one of that time.
     """
 
     def __init__(
-        self, node: ThinmapNode, frame_id: str, topology: Callable[[], TopologicalMap]
+        self,
+        node: ThinmapNode,
+        frame_id: str,
+        topology_config: TopologyConfig,
+        builder: Callable[[], TopologyBuilder],
     ) -> None:
-        """Declare the parameters; topology: returns the present graph, in the frame frame_id."""
+        """Declare the parameters; builder: returns that of the present graph, in frame_id."""
         self._node = node
         self._frame_id = frame_id
-        self._topology = topology
+        self._topology_config = topology_config
+        self._builder = builder
         self._config = parameters.declare_config(node, RouteGraphConfig)
-        self._is_changed = False
+        self._keep_out = KeepOut()
+        self._worker = _Worker('route graph')
         self._client: Client | None = None
         self._was_ready = False
         self._pending: AnswerFuture | None = None
+        self.reset()
         if self._config.route_graph_period_s > 0.0:
             self._client = node.create_client(SetRouteGraph, _SERVICE)
+            subscribe_guarded(node, KeepOutMsg, 'keep_out', self._on_keep_out, qos.LATCHED)
             node.create_active_timer(self._config.route_graph_period_s, self._update, clock=STEADY)
+            # Only while a graph is found.
+            self._poll = node.create_active_timer(_POLL_S, self._send_found, clock=STEADY)
+            self._poll.cancel()
 
-    def graph_changed(self) -> None:
+    def reset(self) -> None:
+        """Forget the map with its ids: the next one is another."""
+        self._routes = RouteGraph(self._topology_config, self._write)
+        self._job: Future[TopologicalMap] | None = None
+        self._sent: TopologicalMap | None = None
+        self._is_changed = False
+        self._is_urgent = False
+
+    def map_changed(self) -> None:
         """Update the route server at the end of the period."""
         self._is_changed = True
 
     def graph_saved(self) -> None:
         """Update the route server at once."""
+        self._sent = None
+        self._update_at_once()
+
+    def _on_keep_out(self, message: KeepOutMsg) -> None:
+        """Update the route server at once if areas come or go; a correction only moves them."""
+        before = {area.id for area in self._keep_out.areas}
+        self._keep_out = decode.keep_out(message)
         self._is_changed = True
+        if before != {area.id for area in self._keep_out.areas}:
+            self._update_at_once()
+
+    def _update_at_once(self) -> None:
+        self._is_changed = True
+        self._is_urgent = True
         self._update()
 
     def _update(self) -> None:
+        """Begin to find the route graph, if the route server may need another one."""
         if self._client is None:
             return
         is_ready = self._client.service_is_ready()
-        self._is_changed |= is_ready and not self._was_ready
+        if is_ready and not self._was_ready:
+            self._sent = None
+            self._is_changed = True
         self._was_ready = is_ready
         if not self._is_changed or not (is_ready or self._config.route_graph_path):
             return
-        topology = self._topology()
-        if not topology.edges:
-            return
-        try:
-            with self._node.diagnostics.time_step('route graph'):
-                path = self._path()
-                write_geojson(path, topology, frame_id=self._frame_id, with_paths=False)
-        except (InputError, OSError) as error:
-            self._warn(f'route graph not written: {one_line_reason(error)}')
+        must_wait = self._worker.is_resting and not self._is_urgent
+        if self._job is not None or must_wait or not self._builder().map.nodes:
             return
         self._is_changed = False
-        if is_ready:
-            self._send(self._client, path)
+        self._is_urgent = False
+        with self._node.diagnostics.time_step('route graph'):
+            state = self._builder().state()
+        is_forced = self._sent is None
+        self._job = self._worker.submit(self._routes.update, state, self._keep_out, is_forced)
+        self._poll.reset()
+
+    def _send_found(self) -> None:
+        """Have the route server load the graph that was found, unless it has it."""
+        if self._job is not None and not self._job.done():
+            return
+        self._poll.cancel()
+        if self._job is None:
+            return
+        job = self._job
+        self._job = None
+        try:
+            graph = job.result()
+        except (InputError, OSError) as error:
+            self._is_changed = True
+            self._warn(f'route graph not written: {one_line_reason(error)}')
+            return
+        if not graph.edges and self._keep_out.areas:
+            self._warn('no edges outside of keep-out areas: the route server keeps its last graph')
+        if graph.edges and graph is not self._sent:
+            self._sent = graph
+            if self._client is not None and self._was_ready:
+                self._send(self._client, self._path())
+        if self._is_urgent:
+            self._update()
+
+    def _write(self, graph: TopologicalMap) -> None:
+        write_geojson(self._path(), graph, frame_id=self._frame_id, with_paths=False)
 
     def _path(self) -> Path:
         if self._config.route_graph_path:
@@ -372,6 +518,7 @@ class RouteGraphUpdates:
         self._pending = None
         if done.cancelled() or done.result().success:
             return
+        self._sent = None
         self._is_changed = True
         self._warn(f'{_SERVICE}: {path} not loaded: the log of the route server has the reason')
 
