@@ -380,12 +380,12 @@ class RouteGraph:
 
 
 def _is_same(graph: TopologicalMap, other: TopologicalMap) -> bool:
-    """Whether two route graphs, whose edges are straight, are the same."""
-    return graph.nodes == other.nodes and _ends(graph) == _ends(other)
+    """Whether two route graphs are written as the same."""
+    return graph.nodes == other.nodes and _values(graph) == _values(other)
 
 
-def _ends(graph: TopologicalMap) -> dict[int, tuple[int, int]]:
-    return {edge.id: (edge.a, edge.b) for edge in graph.edges.values()}
+def _values(graph: TopologicalMap) -> set[tuple[float, ...]]:
+    return {(e.id, e.a, e.b, e.length_m, e.clearance_m) for e in graph.edges.values()}
 
 
 class RouteGraphUpdates:
