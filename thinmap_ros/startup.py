@@ -3,6 +3,8 @@
 import os
 import signal
 import sys
+import warnings
+from typing import TextIO
 
 _PACKAGE = __name__.partition('.')[0]
 
@@ -32,9 +34,30 @@ def _end_on_interrupt(program: str) -> None:
         signal.signal(signal.SIGINT, end)
 
 
+def print_warnings(program: str) -> None:
+    """Have warnings for the user printed as one line each, without the place in the code."""
+    show = warnings.showwarning
+
+    def show_line(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if category is UserWarning:
+            print(f'{program}: warning: {message}', file=sys.stderr)
+        else:
+            show(message, category, filename, lineno, file, line)
+
+    warnings.showwarning = show_line
+
+
 # Matrices here are small: sharing one among threads costs more than it saves, ten times in the
 # filter, and sums in another order on every number of cores, so that the same log gives other last
 # digits. It counts if NumPy comes later.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 if _program():
     _end_on_interrupt(_program())
+    print_warnings(_program())

@@ -259,7 +259,7 @@ def test_kernels_are_not_kept_where_others_may_write(install: Install) -> None:
     variables = {'XDG_CACHE_HOME': '/dev/null/home', 'TMPDIR': str(install.folder)}
     (value, folder), said = install.run(**variables)
     assert (value, folder) == ('6.0', 'None')
-    assert said.count('RuntimeWarning: kernels are compiled at each start') == 1
+    assert said.count('UserWarning: kernels are compiled at each start') == 1
     assert 'NUMBA_CACHE_DIR' in said
     assert 'closed to other users' in said
     assert not list(private.iterdir())

@@ -91,3 +91,14 @@ def test_each_node_is_closed_once_whatever_becomes_of_the_others():
     assert sorted(done.stdout.split()) == ['first', 'second']
     assert done.returncode == 1
     assert 'ValueError: planted' in done.stderr
+
+
+@pytest.mark.usefixtures('ros_domain')
+def test_a_warning_is_one_line_of_the_node(tmp_path):
+    (tmp_path / 'hall.pgm').write_bytes(b'P5\n8 8\n255\n' + bytes([205] * 24 + [254] * 40))
+    world = tmp_path / 'hall.yaml'
+    world.write_text('image: hall.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nfree_thresh: 0.25\n')
+    command = [sys.executable, '-m', 'thinmap_ros.nodes.sim', '--ros-args', '-p', f'world:={world}']
+    said = subprocess.run(command, capture_output=True, text=True).stderr.splitlines()
+    assert [line.partition(str(world))[0] for line in said[:-1]] == ['sim: warning: ']
+    assert said[-1].startswith('error: start: world hall has none')

@@ -136,6 +136,22 @@ def test_a_real_map_among_others(maps: Path, tmp_path: Path, shared_data: Path) 
     assert (tmp_path / 'out' / 'carmines_floor' / 'topology.graphml').exists()
 
 
+@pytest.mark.programs
+def test_a_warning_of_a_map_among_others_is_one_line_with_its_name(
+    maps: Path, tmp_path: Path
+) -> None:
+    for path in maps.glob('*.pgm'):
+        grey = np.array(Image.open(path))
+        grey[:8] = 205
+        Image.fromarray(grey).save(path)
+    result = called('map_to_graph', *maps.glob('*.yaml'), '-o', tmp_path / 'out', '--quiet')
+    assert result.returncode == 0, result.stderr
+    lines = sorted(result.stderr.splitlines())
+    assert len(lines) == 2
+    for line, name in zip(lines, ('corridor', 'hall'), strict=True):
+        assert line.startswith(f'{name}: warning: {maps / name}.yaml: 720 cells of grey 205')
+
+
 def test_two_files_of_one_name_in_folders_of_one_name_are_refused(tmp_path: Path) -> None:
     paths = [tmp_path / 'a' / 'x' / 'log.clf', tmp_path / 'b' / 'x' / 'log.clf.gz']
     with pytest.raises(InputError, match='x-log: expected files of different names'):

@@ -8,6 +8,7 @@ import platform
 import signal
 import subprocess
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from typing import Any, Protocol, TypeVar
 
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
 from thinmap_ros.files.safe import read_text, write_text
+from thinmap_ros.startup import print_warnings
 from thinmap_ros.view.progress_bar import ProgressBar
 
 Report = dict[str, Any]
@@ -186,7 +188,9 @@ def _on_cluster(
 
 def _attempted(work: Callable[[AnyJob], Report], job: AnyJob) -> Report | Failure:
     try:
-        return work(job)
+        with warnings.catch_warnings():
+            print_warnings(job.name)
+            return work(job)
     except (ThinmapError, OSError) as error:
         return Failure(one_line_reason(error))
     except Exception as error:

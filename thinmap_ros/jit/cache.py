@@ -182,7 +182,6 @@ def folder() -> Path | None:
     warnings.warn(
         'kernels are compiled at each start, because no cache folder is writable: set '
         f'NUMBA_CACHE_DIR to a writable folder ({"; ".join(refusals)})',
-        RuntimeWarning,
         stacklevel=2,
     )
     return None

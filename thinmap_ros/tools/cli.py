@@ -4,11 +4,9 @@ import argparse
 import shlex
 import signal
 import sys
-import warnings
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
@@ -20,6 +18,7 @@ from thinmap_ros.logs import reading
 from thinmap_ros.logs.frames import SOURCES
 from thinmap_ros.logs.log import LaserOptions, Log
 from thinmap_ros.logs.transforms import parse_pose
+from thinmap_ros.startup import print_warnings
 from thinmap_ros.tools.arguments import BAD_INPUT
 from thinmap_ros.tools.parameter_file import NodeParameters
 
@@ -37,7 +36,7 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
     """
     words = sys.argv[1:]
     arguments = parser.parse_args(_files_first(words) if _takes_files(parser) else words)
-    _print_warnings(parser.prog)
+    print_warnings(parser.prog)
     compilation = report_compilation()
     try:
         _catch_interrupts()
@@ -66,26 +65,6 @@ def _files_first(words: list[str]) -> list[str]:
     files = [word for word in words[begin:end] if '.' in word or Path(word).exists()]
     topics = [word for word in words[begin:end] if word not in files]
     return [*files, *words[:begin], *topics, *words[end:]]
-
-
-def _print_warnings(program: str) -> None:
-    """Have warnings for the user printed as one line each, without the place in the code."""
-    show = warnings.showwarning
-
-    def show_line(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
-        if category is UserWarning:
-            print(f'{program}: warning: {message}', file=sys.stderr)
-        else:
-            show(message, category, filename, lineno, file, line)
-
-    warnings.showwarning = show_line
 
 
 def command_line() -> str:
