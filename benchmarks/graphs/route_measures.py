@@ -11,7 +11,7 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -289,8 +289,7 @@ def _steps(number: Cells, down: int, right: int) -> tuple[Cells, Cells, Array]:
     rows, cols = number.shape
 
     def moved(row: float, col: float) -> Cells:
-        top, left = 2 + int(row), 2 + int(col)
-        return np.asarray(padded[top : top + rows, left : left + cols])
+        return np.asarray(padded[2 + int(row) :, 2 + int(col) :][:rows, :cols])
 
     there = moved(down, right)
     is_free = (number >= 0) & (there >= 0)
@@ -302,13 +301,13 @@ def _steps(number: Cells, down: int, right: int) -> tuple[Cells, Cells, Array]:
     return *ends, np.full(len(ends[0]), math.hypot(down, right))
 
 
-def made(path: Path, options: list[str]) -> WrittenGraph:
+def made(path: Path, options: Sequence[str | Path] = ()) -> WrittenGraph:
     """The graph that map_to_graph makes of a map, with some options."""
     with TemporaryDirectory() as folder:
         out = Path(folder) / 'graph.geojson'
         program = [sys.executable, '-m', 'thinmap_ros', 'map_to_graph']
         subprocess.run(
-            [*program, str(path), '-o', str(out), '--quiet', *options],
+            [*program, path, '-o', out, '--quiet', *options],
             check=True,
             stdout=subprocess.DEVNULL,
         )

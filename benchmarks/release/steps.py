@@ -68,6 +68,7 @@ def steps(folders: Folders) -> list[Step]:
         *_exploration(folders),
         *_localization(folders),
         *_papers(folders),
+        *_graphs(folders),
     ]
     return [*measured, *_pages(folders, [step.name for step in measured])]
 
@@ -150,6 +151,13 @@ def _papers(folders: Folders) -> list[Step]:
         Step('papers.experiments', _python(program, 'all', *out), 30),
         Step('papers.logs', _python(program, 'logs', *logs), 5),
     ]
+
+
+def _graphs(folders: Folders) -> list[Step]:
+    """The page of graphs, which are made and measured for it in a minute."""
+    maps = folders.data / 'maps'
+    page = _python('benchmarks.graphs.real_maps_page', maps, folders.docs)
+    return [Step('graphs.page', page, 1)]
 
 
 def _pages(folders: Folders, measured: list[str]) -> list[Step]:
