@@ -448,9 +448,9 @@ def test_a_graph_that_covers_little_of_the_floor_says_why(
 @pytest.mark.parametrize(
     ('name', 'nodes', 'parts'),
     [
-        ('marrtino_r3d/maps/garage', 14, 1),
-        ('marrtino_r3d/maps/casa', 10, 3),
-        ('ecn_house', 18, 6),
+        ('marrtino_r3d/maps/garage', 10, 1),
+        ('marrtino_r3d/maps/casa', 6, 3),
+        ('ecn_house', 15, 6),
         ('kobuki_lab', 10, 2),
         ('elsabot_4wd/maps/upstairs', 10, 1),
     ],
