@@ -1,15 +1,18 @@
 """Regions of a known floor: kinds, areas, doors, outlines, nodes and edges; and of a noisy one."""
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 from core.topology.floors import CELL_M, noisy, office, patch_of
 
+from thinmap_ros.core.grid.patch import UNKNOWN
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.regions import RegionKind, RegionMap, membership_of
 from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions, outline_of
 from thinmap_ros.core.topology.topology import build
+from thinmap_ros.files.occupancy_maps import read_map
 
 CORRIDOR = (7.0, 3.2)
 LEFT = (3.0, 7.0)
@@ -188,3 +191,90 @@ def test_outline_stays_with_the_largest_part_where_cells_meet_at_a_corner() -> N
     cells = np.array([[1, 1, 0], [0, 1, 0], [0, 0, 1]], dtype=np.bool_)
     corners = np.round((outline_of(cells, frame) - (-1.0, 2.0)) / CELL_M)
     assert corners.tolist() == [[0, 0], [2, 0], [2, 2], [1, 2], [1, 1], [0, 1]]
+
+
+def l_shaped() -> np.ndarray:
+    """A room with two legs of 9 x 4 m, and a block of 1.6 x 1.6 m in the bend."""
+    cells = np.full((114, 114), UNKNOWN, dtype=np.int8)
+    cells[10:104, 10:104] = 100
+    cells[12:102, 12:102] = 0
+    cells[52:102, 52:102] = 100
+    cells[24:40, 24:40] = 100
+    return cells
+
+
+def test_a_block_at_its_bend_does_not_divide_an_l_shaped_room() -> None:
+    found = find_regions(patch_of(l_shaped()))
+    assert [region.kind for region in found.regions.values()] == [RegionKind.ROOM]
+    assert not found.doors
+
+
+def test_the_rim_of_a_table_is_furniture_as_the_whole_table() -> None:
+    cells = l_shaped()
+    cells[25:39, 25:39] = 0
+    found = find_regions(patch_of(cells))
+    assert [region.kind for region in found.regions.values()] == [RegionKind.ROOM]
+
+
+@pytest.mark.parametrize('inside', [UNKNOWN, 0])
+def test_a_small_room_with_niches_is_no_corridor(inside: int) -> None:
+    """A room of 6 x 2.4 m with niches: a laser may have seen its rim only."""
+    cells = np.full((60, 90), UNKNOWN, dtype=np.int8)
+    cells[8:52, 8:82] = 100
+    cells[18:42, 14:74] = 0
+    for col in range(18, 74, 14):
+        cells[12:18, col : col + 8] = 0
+        cells[42:48, col : col + 8] = 0
+    cells[26:34, 22:66] = inside
+    found = find_regions(patch_of(cells))
+    assert [region.kind for region in found.regions.values()] == [RegionKind.ROOM]
+
+
+def test_rays_behind_glass_are_in_no_region() -> None:
+    """A gap of 1 m in the wall of the left room, and a fan of rays of 6 m behind it."""
+    cells = np.pad(office(), ((0, 0), (70, 0)), constant_values=UNKNOWN)
+    cells[45:55, 71] = 0
+    rows, cols = np.mgrid[0:75, 0:71]
+    away = 76 - cols
+    cells[:, :71][(np.abs(rows - 50) <= 0.35 * away) & (away < 60)] = 0
+    found = find_regions(patch_of(cells, (-8.0, 2.0)))
+    assert len(found.regions) == 3
+    assert not found.ids_at(np.array([(x, 7.0) for x in np.arange(-7.0, -2.5, 0.5)])).any()
+    assert len(set(at(found, CORRIDOR, (-0.5, 7.0), LEFT, RIGHT))) == 3
+
+
+ROOM = RegionKind.ROOM
+# By eye: a point in each region, m, and its kind.
+HOMES = {
+    'elsabot_4wd/maps/office': {(-1.3, -0.5): ROOM},
+    'elsabot_4wd/maps/upstairs': {(-1.7, 3.1): ROOM, (-7.2, 2.4): ROOM},
+    'elsabot_4wd/maps/upstairs2': {(-0.1, -1.3): ROOM, (1.0, -7.1): ROOM},
+    'ecn_house': {
+        (9.2, -5.0): ROOM,
+        (-3.4, -3.9): ROOM,
+        (-3.4, 2.9): ROOM,
+        (9.5, -0.2): ROOM,
+        (4.1, 2.0): ROOM,
+        (2.0, -0.2): ROOM,
+    },
+    'kobuki_lab': {(0.6, 6.4): ROOM, (-1.4, 0.1): ROOM, (-4.8, 4.5): ROOM},
+    'kobuki_aws_warehouse': {(-0.8, -2.4): ROOM, (-4.5, 5.8): ROOM},
+    'marrtino_r3d/maps/casa': {(3.5, -3.1): ROOM, (2.5, -5.3): ROOM, (1.2, -0.7): ROOM},
+    'marrtino_r3d/maps/garage': {
+        (8.0, 6.3): ROOM,
+        (1.3, 0.0): RegionKind.CORRIDOR,
+        (10.2, 3.9): ROOM,
+    },
+}
+
+
+@pytest.mark.filterwarnings('ignore:.*grey 205')
+@pytest.mark.parametrize('name', HOMES)
+def test_kinds_of_homes_are_those_that_one_sees(name: str, shared_data: Path) -> None:
+    path = shared_data / 'maps' / 'homes' / f'{name}.yaml'
+    if not path.exists():
+        pytest.skip(f'needs {path}')
+    found = find_regions(read_map(path, keeps_unknown=True))
+    numbers = at(found, *HOMES[name])
+    assert [found.regions[number].kind for number in numbers] == list(HOMES[name].values())
+    assert len(found.regions) == len(set(numbers))

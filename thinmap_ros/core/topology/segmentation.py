@@ -26,12 +26,21 @@ Labels = NDArray[np.int32]
 
 # Of passages.
 _JAMB_M = 0.6  # on each side of a passage, over which a straight wall is no jamb
+_SQUARE = np.ones((3, 3), dtype=np.bool_)  # a cell and its eight neighbours
 _FACE_M = 0.15  # up to which a straight wall is rough
 
 # Of furniture. Least area in relation to its squared length: a square has a half, a wall 0.15 m
-# thick and 1 m long 0.13.
+# thick and 1 m long 0.13. What it encloses counts: a laser sees the rim of a table.
 _COMPACT = 0.15
 _LEG = 0.2  # length up to which any shape is furniture, as a share of the largest
+
+# Of space behind glass: what a laser sees through it ends in the unknown, without walls around.
+_WALL_FRINGE_M = 0.15  # unknown cells this near to a wall are holes in it
+_DEEP_M = 0.1  # narrower strips of the unknown lie between two beams
+_VIEW_M = 3.0  # beyond, whatever ends a view is no part of the place
+_VIEW_STRIDE_M = 0.25  # between the places that are looked from
+_VIEWS = 24  # directions
+_OPEN = 0.6  # share of directions; it is a half at the edge of an explored hall
 
 # Area of a basin above its saddle, as a share of the least area of a region: more and small rooms
 # join the corridor, less and noise divides regions.
@@ -69,8 +78,8 @@ class RegionConfig(Config):
     neck_ratio: float = 0.75
     min_door_width_m: float = 0.5
     max_door_depth_m: float = 2.0
-    max_furniture_m: float = 2.0
-    corridor_ratio: float = 4.0
+    max_furniture_m: float = 2.5
+    corridor_ratio: float = 5.0
     max_door_width_m: float = parameter(
         2.6,
         'Widest passage that separates two regions (m). Raise it for gates, lower it if rooms are '
@@ -206,8 +215,7 @@ def passages_at(
     """One passage for each stretch of saddles (N, 3) between the same two basins, widest first."""
     is_saddle = np.zeros(basins.shape, dtype=np.bool_)
     is_saddle.ravel()[saddles[:, 0]] = True
-    around = np.ones((3, 3), dtype=np.bool_)
-    stretches = ndimage.label(ndimage.binary_dilation(is_saddle, around), around)[0].ravel()
+    stretches = ndimage.label(ndimage.binary_dilation(is_saddle, _SQUARE), _SQUARE)[0].ravel()
     widths_m = 2.0 * clearance.ravel()[saddles[:, 0]]
     found: dict[tuple[int, int, int], Passage] = {}
     for (cell, a, b), width_m in zip(saddles.tolist(), widths_m.tolist(), strict=True):
@@ -316,6 +324,7 @@ def room_space(patch: GridPatch, config: RegionConfig) -> Mask:
     """
     radius = config.robot_radius_m / patch.frame.resolution
     free = patch.free | _furniture(patch, config.max_furniture_m / patch.frame.resolution)
+    free &= ~behind_glass(patch)
     standing = _clearance_cells(free) > radius
     return np.asarray(distance_cells(standing) < radius)
 
@@ -350,9 +359,50 @@ def _furniture(patch: GridPatch, longest: float) -> Mask:
     for number, box in enumerate(ndimage.find_objects(numbers), 1):
         extent = math.hypot(*(side.stop - side.start for side in box))
         is_at_rim = any(s.start == 0 or s.stop == n for s, n in zip(box, patch.shape, strict=True))
-        is_compact = sizes[number] >= _COMPACT * extent**2 or extent <= _LEG * longest
-        small[number] = extent <= longest and is_compact and not is_at_rim
+        if extent > longest or is_at_rim:
+            continue
+        filled = ndimage.binary_fill_holes(numbers[box] == number)
+        small[number] = filled.sum() >= _COMPACT * extent**2 or extent <= _LEG * longest
     return np.asarray(small[numbers])
+
+
+def behind_glass(patch: GridPatch) -> Mask:
+    """Cells (H, W) that see the unknown in most directions: a laser saw them through glass."""
+    resolution = patch.frame.resolution
+    is_wall = ~patch.free & (distance_cells(patch.occupied) * resolution <= _WALL_FRINGE_M)
+    steps = max(1, round(0.5 * _DEEP_M / resolution))
+    deep = ndimage.binary_opening(patch.unknown & ~is_wall, iterations=steps)
+    stride = max(1, round(_VIEW_STRIDE_M / resolution))
+    return _sees_unknown(patch.free, is_wall, deep, stride, math.ceil(_VIEW_M / resolution))
+
+
+@kernel
+def _sees_unknown(free: Mask, is_wall: Mask, deep: Mask, stride: int, reach: int) -> Mask:
+    """Squares of a stride (H, W) whose middle is free and sees the unknown in most directions."""
+    rows, cols = free.shape
+    found = np.zeros(free.shape, dtype=np.bool_)
+    for row in range(stride // 2, rows, stride):
+        for col in range(stride // 2, cols, stride):
+            if not free[row, col]:
+                continue
+            unknown = 0
+            for k in range(_VIEWS):
+                if unknown + _VIEWS - k <= _OPEN * _VIEWS:
+                    break  # the directions that are left do not decide
+                angle = 2.0 * math.pi * k / _VIEWS
+                for step in range(1, reach):
+                    r = int(math.floor(row + 0.5 + step * math.sin(angle)))
+                    c = int(math.floor(col + 0.5 + step * math.cos(angle)))
+                    is_outside = not (0 <= r < rows and 0 <= c < cols)
+                    if is_outside or deep[r, c]:
+                        unknown += 1
+                        break
+                    if is_wall[r, c]:
+                        break
+            top = row - stride // 2
+            left = col - stride // 2
+            found[top : top + stride, left : left + stride] = unknown > _OPEN * _VIEWS
+    return found
 
 
 def outline_of(cells: Mask, frame: GridFrame) -> Array:
@@ -455,14 +505,20 @@ def describe(segmentation: Segmentation, ids: NDArray[np.int64], config: RegionC
     cell_m2 = found.patch.frame.resolution**2
     free = np.where(found.patch.free, found.labels, 0)
     areas = np.bincount(free.ravel(), minlength=len(ids)) * cell_m2
-    wide = wide_cells(found.clearance, config.max_corridor_width_m, found.patch.frame.resolution)
+    to_walls = clearance_m(
+        ~found.patch.occupied | (found.clearance > 0.0), found.patch.frame.resolution
+    )
     regions = {}
     for number, box in enumerate(ndimage.find_objects(found.labels), 1):
         if box is None:
             continue
         own = found.labels[box] == number
         clearance = np.where(own, found.clearance[box], 0.0)
-        kind = _kind(clearance, wide[box], float(own.sum()) * cell_m2, config)
+        if _is_corridor(np.where(own, to_walls[box], 0.0), found.patch.frame.resolution, config):
+            kind = RegionKind.CORRIDOR
+        else:
+            is_hall = 2.0 * float(clearance.max()) >= config.min_hall_width_m
+            kind = RegionKind.HALL if is_hall else RegionKind.ROOM
         low = (box[0].start, box[1].start)
         x, y = _centre(clearance * found.patch.free[box], low, found.patch)
         regions[int(ids[number])] = Region(
@@ -481,20 +537,20 @@ def _outline(found: Segmentation, number: int, box: tuple[slice, ...]) -> Array:
     own = labels == number
     if margin:
         beside = own | (found.patch.free[wider] & (labels == 0))
-        square = np.ones((3, 3), dtype=np.bool_)
-        own = ndimage.binary_dilation(own, square, iterations=margin, mask=beside)
+        own = ndimage.binary_dilation(own, _SQUARE, iterations=margin, mask=beside)
     return outline_of(own, found.patch.frame.with_origin_at(*low))
 
 
-def _kind(clearance: Array, wide: Mask, area_m2: float, config: RegionConfig) -> RegionKind:
-    """Kind of a region by its clearances, m, 0 outside, and where it is wider than a corridor."""
-    inside = clearance > 0.0
-    width_m = 4.0 * float(clearance[inside].mean())  # as in mean_widths_m
-    is_long = area_m2 >= config.corridor_ratio * width_m**2
-    if is_long and float(wide[inside].mean()) <= 0.5:
-        return RegionKind.CORRIDOR
-    is_wide = 2.0 * float(clearance.max()) >= config.min_hall_width_m
-    return RegionKind.HALL if is_wide else RegionKind.ROOM
+def _is_corridor(to_walls: Array, resolution_m: float, config: RegionConfig) -> bool:
+    """Whether a region is one, by the distances (H, W) of its cells from walls, m, 0 outside.
+
+    Discs of the width that a strip of its area and corridor_ratio has cover a room, and leave most
+    of a corridor: niches, bends and furniture along walls do not change which.
+    """
+    inside = to_walls > 0.0
+    strip_m = math.sqrt(float(inside.sum()) * resolution_m**2 / config.corridor_ratio)
+    wide = wide_cells(to_walls, min(strip_m, config.max_corridor_width_m), resolution_m)
+    return bool(wide[inside].mean() <= 0.5)
 
 
 def _centre(clearance: Array, low: tuple[int, int], patch: GridPatch) -> tuple[float, float]:
