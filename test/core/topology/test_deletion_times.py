@@ -85,5 +85,5 @@ def test_a_filled_layer_is_that_of_updates():
     filled.fill(GridPatch(GridFrame(0.0, 0.0, 0.1), cells), None, 0, 0)
     _, flipped = updated.update(cells, 0, 0)
     update_skeleton(updated.lattice, flipped)
-    for field in ('state', 'known', 'free', 'column', 'discs', 'time'):
+    for field in ('state', 'known', 'free', 'column', 'time'):
         assert np.array_equal(read(filled, field), read(updated, field)), field

@@ -25,11 +25,18 @@ from thinmap_ros.core.topology.layers.lattice import (
     Lattice,
     LatticeStore,
     cell_at,
+    cell_of,
     col_of,
     moved,
     row_of,
+    tiles_around,
 )
-from thinmap_ros.core.topology.thinning import column_distance, deletion_times, known_free
+from thinmap_ros.core.topology.thinning import (
+    column_distance,
+    deletion_times,
+    known_free,
+    standing_room,
+)
 from thinmap_ros.jit import inlined, kernel
 
 _MIN_FRONTIER_CELLS = 3
@@ -40,16 +47,16 @@ class FreeSpace:
 
     Known is what is free, or an unknown gap between two free cells of a row or column: specks
     between beams. A cell is traversable if every cell whose centre is nearer than the robot's
-    radius is known. The known cells of each disc are counted, so that a change costs the disc and
-    not the map. The rules are those of `select_free_space`.
+    radius is known: it is looked for again in the tiles around what changed. The rules are those of
+    `select_free_space`.
     Source: exploration paper section 2.1, "selection of free space"; the gaps are ours.
     """
 
     def __init__(self, config: TopologyConfig, resolution_m: float) -> None:
         self._config = config
-        self._disc = _disc(config.robot_radius_m / resolution_m)
+        self._radius = config.robot_radius_m / resolution_m
         self._gap = int(config.max_unknown_gap_m / resolution_m + 1e-6)
-        self._reach = max(int(np.abs(self._disc).max()), 2 * self._gap) + 2
+        self._reach = max(math.ceil(self._radius), 2 * self._gap) + 2
         self._store = LatticeStore(self._reach)
 
     @property
@@ -78,12 +85,11 @@ class FreeSpace:
         reach = self._reach
         cells = np.pad(patch.cells, reach, constant_values=UNKNOWN_PERCENT)
         known = known_free(GridPatch(patch.frame, cells), self._config)
-        discs = _count_all_discs(known, _half_widths(self._disc))
-        self._store.add(row, col, patch.cells >= 0)
-        fits = discs == len(self._disc) if free is None else np.pad(free, reach)
-        times = deletion_times(fits if lines is None else np.pad(lines, reach))
         columns = column_distance(known)
-        fields = _Fields(cells, known, fits, columns, discs, times)
+        self._store.add(row, col, patch.cells >= 0)
+        fits = standing_room(columns, self._radius) if free is None else np.pad(free, reach)
+        times = deletion_times(fits if lines is None else np.pad(lines, reach))
+        fields = _Fields(cells, known, fits, columns, times)
         _write_fields(self.lattice, fields, row - reach, col - reach)
         return skeleton_cells(self.lattice, times, row - reach, col - reach)
 
@@ -101,7 +107,10 @@ class FreeSpace:
         changed = _set_states(lattice, percent, row, col)
         known = _close_gaps(lattice, changed, self._gap)
         _update_columns(lattice, known)
-        return changed, _count_discs(lattice, known, self._disc)
+        reach = math.ceil(self._radius)
+        tiles = tiles_around(lattice, known, reach)
+        room = standing_room(_columns_of(lattice, tiles, reach), self._radius)
+        return changed, _set_free(lattice, tiles, room[:, reach:-reach])
 
 
 class _Fields(NamedTuple):
@@ -111,45 +120,7 @@ class _Fields(NamedTuple):
     known: Mask
     free: Mask
     column: NDArray[np.int16]
-    discs: NDArray[np.int16]
     time: NDArray[np.int16]
-
-
-def _disc(radius: float) -> Cells:
-    """Rows and columns (N, 2) of the cells nearer than a radius, in cells."""
-    reach = math.ceil(radius)
-    steps = np.arange(-reach, reach + 1)
-    places = np.stack(np.meshgrid(steps, steps, indexing='ij'), axis=-1).reshape(-1, 2)
-    inside = (places**2).sum(axis=1) < radius * radius - 1e-9
-    return np.ascontiguousarray(places[inside | (places == 0).all(axis=1)])
-
-
-def _half_widths(disc: Cells) -> Cells:
-    """Largest column of each row of a disc (N, 2), first to last row."""
-    rows = np.arange(disc[:, 0].min(), disc[:, 0].max() + 1)
-    return np.array([disc[disc[:, 0] == row, 1].max() for row in rows], dtype=np.int64)
-
-
-@kernel
-def _count_all_discs(known: Mask, half_widths: Cells) -> NDArray[np.int16]:
-    """Known cells (H, W) within the disc around each cell."""
-    rows, cols = known.shape
-    counts = np.zeros((rows, cols), dtype=np.int16)
-    sums = np.zeros((rows, cols + 1), dtype=np.int32)
-    for row in range(rows):
-        for col in range(cols):
-            sums[row, col + 1] = sums[row, col] + known[row, col]
-    reach = half_widths.size // 2
-    for row in range(rows):
-        for k in range(half_widths.size):
-            source = row + k - reach
-            width = half_widths[k]
-            if not 0 <= source < rows:
-                continue
-            for col in range(cols):
-                high = sums[source, min(col + width + 1, cols)]
-                counts[row, col] += high - sums[source, max(col - width, 0)]
-    return counts
 
 
 @inlined
@@ -177,7 +148,6 @@ def _write_fields(lattice: Lattice, fields: _Fields, row: int, col: int) -> None
                 cell['known'] = fields.known[i, j]
                 cell['free'] = fields.free[i, j]
                 cell['column'] = fields.column[i, j]
-                cell['discs'] = fields.discs[i, j]
                 cell['time'] = fields.time[i, j]
 
 
@@ -218,21 +188,33 @@ def _is_gap(lattice: Lattice, at: int, rows: int, cols: int, longest: int) -> bo
 @kernel
 def _close_gaps(lattice: Lattice, changed: Cells, gap: int) -> Cells:
     """Update the known cells near changed cells; returns those that changed."""
-    found = np.empty(changed.size * (4 * gap + 2), dtype=np.int64)
+    found = np.empty(changed.size * (4 * gap + 1), dtype=np.int64)
     count = 0
     for at in changed:
-        for down in range(2):
-            for k in range(-gap, gap + 1):
-                to = moved(lattice, at, k * down, k * (1 - down))
-                state = lattice.cells[to]['state']
-                is_known = state == FREE
-                if state == UNKNOWN and gap > 0:
-                    is_known = _is_gap(lattice, to, 0, 1, gap) or _is_gap(lattice, to, 1, 0, gap)
-                if is_known != lattice.cells[to]['known']:
-                    lattice.cells[to]['known'] = is_known
-                    found[count] = to
-                    count += 1
+        count = _close_gap(lattice, at, gap, found, count)
+        for k in range(0, 8, 2):
+            to = moved(lattice, at, ROWS[k], COLS[k])
+            length = 1
+            # Only the run of unknown cells that ends here may have become a gap, or ceased to be.
+            while length <= gap and lattice.cells[to]['state'] == UNKNOWN:
+                count = _close_gap(lattice, to, gap, found, count)
+                to = moved(lattice, to, ROWS[k], COLS[k])
+                length += 1
     return found[:count].copy()
+
+
+@inlined
+def _close_gap(lattice: Lattice, at: int, gap: int, found: Cells, count: int) -> int:
+    """Update whether a cell is known; if that changes it, it is appended to `found`."""
+    state = lattice.cells[at]['state']
+    is_known = state == FREE
+    if state == UNKNOWN and gap > 0:
+        is_known = _is_gap(lattice, at, 0, 1, gap) or _is_gap(lattice, at, 1, 0, gap)
+    if is_known != lattice.cells[at]['known']:
+        lattice.cells[at]['known'] = is_known
+        found[count] = at
+        count += 1
+    return count
 
 
 @kernel
@@ -249,6 +231,8 @@ def _update_columns(lattice: Lattice, changed: Cells) -> None:
                     cells[to]['column'] = k
                     k += 1
                     to = moved(lattice, to, sign, 0)
+            continue
+        if cells[at]['column'] > 0:  # done with another new cell of the same run
             continue
         top = moved(lattice, at, -1, 0)
         above = 1
@@ -267,22 +251,33 @@ def _update_columns(lattice: Lattice, changed: Cells) -> None:
 
 
 @kernel
-def _count_discs(lattice: Lattice, changed: Cells, disc: Cells) -> Cells:
-    """Update the counts and the traversable cells; returns those that changed."""
-    cells = lattice.cells
-    for at in changed:
-        gain = 1 if cells[at]['known'] else -1
-        for k in range(len(disc)):
-            cells[moved(lattice, at, disc[k, 0], disc[k, 1])]['discs'] += gain
-    flipped = np.empty(changed.size * len(disc), dtype=np.int64)
+def _columns_of(lattice: Lattice, tiles: Cells, margin: int) -> NDArray[np.int16]:
+    """Distances along columns (N * TILE, TILE + 2 * margin) in tiles, and on both sides."""
+    columns = np.empty((tiles.size * TILE, TILE + 2 * margin), dtype=np.int16)
+    for i in range(len(columns)):
+        tile = lattice.tiles[tiles[i // TILE]]
+        row = tile[0] * TILE + i % TILE
+        at = 0
+        for j in range(-margin, TILE + margin):
+            if j == -margin or j % TILE == 0:
+                at = cell_at(lattice, row, tile[1] * TILE + j)
+            elif at > 0:
+                at += 1
+            columns[i, j + margin] = lattice.cells[at]['column']
+    return columns
+
+
+@kernel
+def _set_free(lattice: Lattice, tiles: Cells, room: Mask) -> Cells:
+    """Set which cells (N * TILE, TILE) of tiles are traversable; returns those that changed."""
+    flipped = np.empty(room.size, dtype=np.int64)
     count = 0
-    for at in changed:
-        for k in range(len(disc)):
-            to = moved(lattice, at, disc[k, 0], disc[k, 1])
-            is_free = cells[to]['discs'] == len(disc)
-            if is_free != cells[to]['free']:
-                cells[to]['free'] = is_free
-                flipped[count] = to
+    for i in range(len(room)):
+        first = cell_of(tiles[i // TILE], i % TILE)
+        for j in range(TILE):
+            if lattice.cells[first + j]['free'] != room[i, j]:
+                lattice.cells[first + j]['free'] = room[i, j]
+                flipped[count] = first + j
                 count += 1
     return flipped[:count].copy()
 

@@ -24,7 +24,6 @@ CELL = np.dtype(
         ('free', np.uint8),  # traversable: the robot's centre may be here
         ('kept', np.uint8),  # belongs to the skeleton
         ('column', np.int16),  # rows to the nearest cell of the column that is not known
-        ('discs', np.int16),  # known cells within the robot's radius
         ('time', np.int16),  # sub-iteration that deletes it, see deletion_times.py
         ('owner', np.int32),  # chain + 1 in a chain, -(vertex + 1) at a vertex, 0: neither
     ]
@@ -216,6 +215,28 @@ def hash_of(lattice: Lattice, at: int) -> int:
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return int(np.int64(x ^ (x >> np.uint64(31))))
+
+
+@inlined
+def cell_of(slot: int, row: int) -> int:
+    """Index of the first cell in a row of the tile in a slot."""
+    return (slot << (2 * _BITS)) + (row << _BITS)
+
+
+@kernel
+def tiles_around(lattice: Lattice, cells: Cells, reach: int) -> Cells:
+    """Slots (T,) of the tiles with cells that are at most `reach` rows and columns from some."""
+    is_near = np.zeros(len(lattice.tiles), dtype=np.bool_)
+    for at in cells:
+        is_near[at >> (2 * _BITS)] = True
+        if is_inner(at, reach):
+            continue
+        for row in range(-reach, reach + TILE, TILE):
+            for col in range(-reach, reach + TILE, TILE):
+                to = moved(lattice, at, min(row, reach), min(col, reach))
+                is_near[to >> (2 * _BITS)] = True
+    is_near[0] = False
+    return np.flatnonzero(is_near)
 
 
 @kernel
