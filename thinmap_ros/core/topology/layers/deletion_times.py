@@ -21,22 +21,27 @@ Source: topological map paper section 2.1, steps 1 and 2.
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.se2 import Cells
+from thinmap_ros.core.grid.tiles import TILE
+from thinmap_ros.core.se2 import Cells, Mask
 from thinmap_ros.core.topology.layers.lattice import (
     Lattice,
+    cell_at,
+    cell_of,
     cells_at,
     find_neighbours,
-    is_inner,
     moved,
-    shift,
-    sorted_unique,
+    rows_and_cols,
+    tiles_around,
 )
-from thinmap_ros.core.topology.thinning import KEPT
+from thinmap_ros.core.topology.thinning import KEPT, deletion_times
 from thinmap_ros.jit import inlined, kernel
 
 _NEVER = 1 << 20
 _BUCKETS = 1 << 12  # times up to here are processed in order; later ones only take longer
-_SQUARE = 4  # cells of the last square of a part
+# Many flipped cells are thinned with those around them at once, where these are at most so many
+# cells for each; the repair of one costs as much.
+_AROUND = 64  # cells
+_WORTH = 256
 
 
 def _delays() -> NDArray[np.int64]:
@@ -60,7 +65,79 @@ def update_skeleton(lattice: Lattice, flipped: Cells) -> Cells:
     Returns the cells that enter or leave the skeleton, each once. They are not changed yet, so that
     what was traced along the old skeleton can be removed.
     """
-    return sorted_unique(_skeleton_changes(lattice, sorted_unique(_repair(lattice, flipped))))
+    begun, due = _thin_around(lattice, flipped)
+    touched = np.concatenate((begun, _repair(lattice, due)))
+    return _skeleton_changes(lattice, tiles_around(lattice, touched, 2))
+
+
+def _thin_around(lattice: Lattice, flipped: Cells) -> tuple[Cells, Cells]:
+    """Thin the rectangle of many flipped cells (N,) at once, as far as it knows.
+
+    Returns the cells whose time changed, and those that are to be repaired: all of whose times the
+    rectangle does not know, or the flipped ones where these are few.
+    """
+    if not flipped.size:
+        return flipped, flipped
+    places = rows_and_cols(lattice, flipped)
+    row, col = (places.min(axis=0) - _AROUND).tolist()
+    rows, cols = (np.ptp(places, axis=0) + 1 + 2 * _AROUND).tolist()
+    if flipped.size * _WORTH < rows * cols:
+        return flipped[:0], flipped
+    times = deletion_times(_free_cells(lattice, row, col, rows, cols))
+    return _take_times(lattice, times, row, col)
+
+
+@kernel
+def _free_cells(lattice: Lattice, row: int, col: int, rows: int, cols: int) -> Mask:
+    """Traversable cells of a rectangle (rows, cols), the first at (row, col)."""
+    free = np.empty((rows, cols), dtype=np.bool_)
+    for i in range(rows):
+        at = 0
+        for j in range(cols):
+            if j == 0 or (col + j) % TILE == 0:
+                at = cell_at(lattice, row + i, col + j)
+            elif at > 0:
+                at += 1
+            free[i, j] = lattice.cells[at]['free']
+    return free
+
+
+@kernel
+def _take_times(
+    lattice: Lattice, times: NDArray[np.int16], row: int, col: int
+) -> tuple[Cells, Cells]:
+    """Set the times of a rectangle (H, W), the first at (row, col), where they hold in the map.
+
+    A time depends on the cells that are at most so many steps away: it holds where these lie in the
+    rectangle. Elsewhere only that it is later than that is known. Returns the cells whose time
+    changed, and those whose time is not known.
+    """
+    cells = lattice.cells
+    rows, cols = times.shape
+    changed = np.empty(times.size, dtype=np.int64)
+    unknown = np.empty(times.size, dtype=np.int64)
+    changes = 0
+    count = 0
+    for i in range(rows):
+        at = 0
+        for j in range(cols):
+            if j == 0 or (col + j) % TILE == 0:
+                at = cell_at(lattice, row + i, col + j)
+            elif at > 0:
+                at += 1
+            if at == 0:
+                continue
+            steps = min(i, j, rows - 1 - i, cols - 1 - j)
+            if (times[i, j] <= steps or cells[at]['time'] <= steps) and (
+                times[i, j] != cells[at]['time']
+            ):
+                cells[at]['time'] = times[i, j]
+                changed[changes] = at
+                changes += 1
+            if cells[at]['time'] > steps:
+                unknown[count] = at
+                count += 1
+    return changed[:changes].copy(), unknown[:count].copy()
 
 
 def skeleton_cells(lattice: Lattice, times: NDArray[np.int16], row: int, col: int) -> Cells:
@@ -116,6 +193,7 @@ def _repair(lattice: Lattice, flipped: Cells) -> Cells:
     first = np.full(_BUCKETS, -1, dtype=np.int64)
     queue = np.empty((4 * flipped.size + 1024, 2), dtype=np.int64)  # cell, next of its bucket
     touched = np.empty(4 * flipped.size + 1024, dtype=np.int64)
+    beside = np.empty(1024, dtype=np.int64)
     around = np.empty(8, dtype=np.int64)
     near = np.empty(8, dtype=np.int64)
     queued = 0
@@ -129,36 +207,50 @@ def _repair(lattice: Lattice, flipped: Cells) -> Cells:
         if entry < 0:
             now += 1
             continue
-        first[now] = queue[entry, 1]
-        at = queue[entry, 0]
-        time = _deletion_time(lattice, at, near)
-        if time == cells[at]['time']:
-            continue
-        if queue.shape[0] - queued < 10:
-            queue = np.concatenate((queue, np.empty_like(queue)))
-        key = _first_difference(time, cells[at]['time'])
-        if key > now:  # a neighbour has changed since: they differ only later now
-            queued = _enqueue(first, queue, queued, at, key)
-            last = max(last, key)
-            continue
-        if time > cells[at]['time']:
-            # Not deleted now; when it will be is not final. Until it is, it counts as kept: with
-            # its present estimate two cells could postpone each other again and again.
-            cells[at]['time'] = KEPT
-            if time < KEPT:
-                queued = _enqueue(first, queue, queued, at, time)
-                last = max(last, time)
-        else:
-            cells[at]['time'] = time
-        if changes == touched.size:
-            touched = np.concatenate((touched, np.empty_like(touched)))
-        touched[changes] = at
-        changes += 1
-        find_neighbours(lattice, at, around)
-        for k in range(8):
-            to = around[k]
-            if cells[to]['time'] <= now:  # deleted before anything changes here
+        first[now] = -1
+        done = changes
+        while entry >= 0:
+            at = queue[entry, 0]
+            entry = queue[entry, 1]
+            time = _deletion_time(lattice, at, near)
+            if time == cells[at]['time']:
                 continue
+            if queue.shape[0] == queued:
+                queue = np.concatenate((queue, np.empty_like(queue)))
+            key = _first_difference(time, cells[at]['time'])
+            if key > now:  # a neighbour has changed since: they differ only later now
+                queued = _enqueue(first, queue, queued, at, key)
+                last = max(last, key)
+                continue
+            if time > cells[at]['time']:
+                # Not deleted now; when it will be is not final. Until it is, it counts as kept:
+                # with its present estimate two cells could postpone each other again and again.
+                cells[at]['time'] = KEPT
+                if time < KEPT:
+                    queued = _enqueue(first, queue, queued, at, time)
+                    last = max(last, time)
+            else:
+                cells[at]['time'] = time
+            if changes == touched.size:
+                touched = np.concatenate((touched, np.empty_like(touched)))
+            touched[changes] = at
+            changes += 1
+        # Each cell beside changed ones is looked at once, after all of them.
+        count = 0
+        for at in touched[done:changes]:
+            if beside.size - count < 8:
+                beside = np.concatenate((beside, np.empty_like(beside)))
+            find_neighbours(lattice, at, around)
+            for to in around:
+                # Not those deleted before anything changes here.
+                if cells[to]['time'] > now and not cells[to]['due']:
+                    cells[to]['due'] = True
+                    beside[count] = to
+                    count += 1
+        while queue.shape[0] - queued < count:
+            queue = np.concatenate((queue, np.empty_like(queue)))
+        for to in beside[:count]:
+            cells[to]['due'] = False
             time = _deletion_time(lattice, to, near)
             if time != cells[to]['time']:
                 key = _first_difference(time, cells[to]['time'])
@@ -215,28 +307,16 @@ def _is_last_square(lattice: Lattice, at: int) -> bool:
 
 
 @kernel
-def _skeleton_changes(lattice: Lattice, touched: Cells) -> Cells:
-    """Cells that enter or leave the skeleton after the times of some cells (N,) changed."""
+def _skeleton_changes(lattice: Lattice, tiles: Cells) -> Cells:
+    """Cells of tiles that enter or leave the skeleton by the deletion times."""
     cells = lattice.cells
-    found = np.empty(touched.size * 2 + 1024, dtype=np.int64)
+    found = np.empty(tiles.size * TILE * TILE, dtype=np.int64)
     count = 0
-    for at in touched:
-        if found.size - count < 4 * _SQUARE + 1:
-            found = np.concatenate((found, np.empty_like(found)))
-        if cells[at]['time'] == KEPT and not cells[at]['kept']:
-            found[count] = at
-            count += 1
-        # It may also begin or end a last square to which it belongs, or which it touches.
-        is_easy = is_inner(at, 3)
-        for row in range(-2, 2):
-            for col in range(-2, 2):
-                to = at + shift(row, col) if is_easy else moved(lattice, at, row, col)
-                time = cells[to]['time']
-                if time == KEPT:
-                    continue
-                if is_easy and not cells[to]['kept'] and cells[to + 1]['time'] != time:
-                    continue
-                if _is_kept(lattice, to) != cells[to]['kept']:
-                    found[count] = to
+    for slot in tiles:
+        for row in range(TILE):
+            first = cell_of(slot, row)
+            for at in range(first, first + TILE):
+                if _is_kept(lattice, at) != cells[at]['kept']:
+                    found[count] = at
                     count += 1
     return found[:count].copy()

@@ -23,6 +23,7 @@ CELL = np.dtype(
         ('known', np.uint8),  # free, or an unknown gap between free cells
         ('free', np.uint8),  # traversable: the robot's centre may be here
         ('kept', np.uint8),  # belongs to the skeleton
+        ('due', np.uint8),  # beside a cell whose deletion time has just changed
         ('column', np.int16),  # rows to the nearest cell of the column that is not known
         ('time', np.int16),  # sub-iteration that deletes it, see deletion_times.py
         ('owner', np.int32),  # chain + 1 in a chain, -(vertex + 1) at a vertex, 0: neither
