@@ -1,6 +1,7 @@
 """The map of a grid that changes: equal to the map of the whole grid, with stable ids."""
 
 import math
+import time
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +11,7 @@ from drawings import patch_of, world
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
-from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.graph import NodeKind, TopologyConfig
 from thinmap_ros.core.topology.topology import TopologyBuilder, build
 
 PAD = 200
@@ -161,6 +162,57 @@ def test_ids_stay_while_nothing_changes():
                 asked = asked + 1
                 kept = kept + (number in builder.map.nodes)
     assert asked > 100 and kept >= 0.99 * asked
+
+
+def test_what_comes_back_has_its_ids():
+    patch = building()
+    builder = TopologyBuilder()
+    builder.update(patch, np.array([5.0, 5.0, 0.0]))
+    before = set(builder.map.nodes)
+    closed = GridPatch(patch.frame, patch.cells.copy())
+    closed.cells[178:186] = 100  # the doors of the rooms
+    builder.update(closed, np.array([5.0, 5.0, 0.0]))
+    assert before - builder.map.nodes.keys()
+    builder.update(patch, np.array([5.0, 5.0, 0.0]))
+    assert set(builder.map.nodes) == before
+
+
+@pytest.mark.parametrize('shorter', [30, 60, 90])
+def test_corners_of_a_path_whose_end_moved_keep_their_ids(shorter):
+    cells = np.full((80, 420), 100)
+    for col in range(10, 400):  # the width grows: no corridor
+        cells[40 - 6 - col // 20 : 40 + 6 + col // 20, col] = 0
+    patch = patch_of(cells)
+    builder = TopologyBuilder()
+    robot = np.array([5.0, 4.0, 0.0])
+    builder.update(patch, robot)
+    before = corners(builder.map)
+    patch.cells[:, 400 - shorter :] = 100
+    builder.update(patch, robot)
+    after = corners(builder.map)
+    moved = [math.dist(before[number], after[number]) for number in before.keys() & after.keys()]
+    assert len(before) >= 3 and max(moved) > 0.5
+    assert len(before.keys() & after.keys()) == min(len(before), len(after))
+
+
+def corners(graph):
+    """Places of the nodes along paths, by id."""
+    return {n.id: (n.x, n.y) for n in graph.nodes.values() if n.kind == NodeKind.CORNER}
+
+
+def test_a_step_that_shows_a_hall_takes_no_longer_than_a_scan():
+    cells = np.full((400, 1200), UNKNOWN, dtype=np.int8)
+    builder = TopologyBuilder()
+    spent = []
+    for first in range(0, 1200, 200):
+        cells[40:360, first : first + 200] = 0
+        cells[80:340:60, first + 20 : first + 200 : 60] = 100
+        window = GridPatch(GridFrame(0.0, 0.0, 0.05), cells[:, max(first - 100, 0) :].copy())
+        window = GridPatch(window.frame.with_origin_at(0, max(first - 100, 0)), window.cells)
+        started = time.process_time()
+        builder.update(window, np.array([(first + 10) * 0.05, 10.0, 0.0]))
+        spent.append(time.process_time() - started)
+    assert min(spent[1:]) < 0.1
 
 
 def test_ids_given_after_a_state_was_kept_are_not_given_again_to_other_places():

@@ -6,6 +6,7 @@ from scipy import ndimage
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology.graph import TopologyConfig
+from thinmap_ros.core.topology.layers import deletion_times as layer
 from thinmap_ros.core.topology.layers.deletion_times import update_skeleton
 from thinmap_ros.core.topology.layers.free_space import FreeSpace
 from thinmap_ros.core.topology.thinning import KEPT, deletion_times, thin
@@ -58,8 +59,12 @@ def test_the_sub_iteration_of_each_deletion():
 CONFIG = TopologyConfig(robot_radius_m=0.01, max_unknown_gap_m=0.0)
 
 
+# Many cells that flip are thinned at once, with so many around them, and few are not.
+@pytest.mark.parametrize(('around', 'worth'), [(64, 256), (1, 256), (8, 256), (64, 0)])
 @pytest.mark.parametrize('seed', range(12))
-def test_repaired_times_are_those_of_the_whole(seed):
+def test_repaired_times_are_those_of_the_whole(seed, around, worth, monkeypatch):
+    monkeypatch.setattr(layer, '_AROUND', around)
+    monkeypatch.setattr(layer, '_WORTH', worth)
     rng = np.random.default_rng(seed)
     space = FreeSpace(CONFIG, 0.1)
     mask = blocks(rng, 0.6, int(rng.integers(1, 12)))

@@ -19,6 +19,9 @@ MATCH_RADIUS_M = 0.5
 _OTHER_KIND = 0.5  # share of MATCH_RADIUS_M by which a node of another kind is farther away
 _LONGEST_UNEVEN_M = 8.0
 _EVEN_M = 0.5
+# Where the path of an edge changes by a cell, its corners may move far along it, but not to the
+# next ones.
+_CORNER_REACH_M = 0.5 * _LONGEST_UNEVEN_M
 
 EMPTY_BOX = np.array([0, 0, -1, -1])
 _MORE_BOXES = 64
@@ -347,6 +350,8 @@ class Registry:
         self._passages: dict[int, _Passage] = {}
         self._nodes: dict[_Key, int] = {}
         self._boxes = _Boxes()
+        # Removed nodes: those that come back are the same.
+        self._removed = TopologicalMap()
 
     @property
     def hashes(self) -> set[int]:
@@ -356,8 +361,9 @@ class Registry:
     def update(self, lattice: Lattice, changes: Changes) -> bool:
         """Publish the changes; returns whether there were any.
 
-        A new node gets the id of a removed one within MATCH_RADIUS_M, nearest pairs
-        first; so does an edge between the same nodes.
+        A new node gets the id of a removed one within MATCH_RADIUS_M, nearest pairs first, those
+        that were removed now before those of earlier updates; a corner also that of one farther
+        along its edge; and an edge that of a removed one between the same nodes.
         """
         new = {
             number: _Passage.of(lattice, cells, self._limits)
@@ -371,6 +377,7 @@ class Registry:
         old_edges = self._remove_edges(gone)
         kept = {cell for passage in new.values() for cell in passage.ends}
         old_nodes = self._remove_nodes(gone, loose - kept)
+        reach_m = _CORNER_REACH_M if self._predecessor is None else MATCH_RADIUS_M
         if self._predecessor is not None:
             old_edges += self._predecessor.edges.values()
             old_nodes += self._predecessor.nodes.values()
@@ -378,7 +385,8 @@ class Registry:
         wanted = {(cell, 0) for cell in kept}
         for number, passage in new.items():
             wanted |= {(cell, number) for cell in passage.corners}
-        self._put_nodes(lattice, wanted - self._nodes.keys(), old_nodes)
+        self._put_nodes(lattice, wanted - self._nodes.keys(), old_nodes, reach_m)
+        self._keep_removed(old_nodes)
         self._put_passages(new, old_edges)
         for cell in loose | kept:
             if (cell, 0) in self._nodes:
@@ -416,8 +424,13 @@ class Registry:
             self.map.drop_node(node.id)
         return old
 
-    def _put_nodes(self, lattice: Lattice, fresh: set[_Key], old: list[Node]) -> None:
-        """Put new nodes into the map, with the ids of old ones that they continue."""
+    def _put_nodes(
+        self, lattice: Lattice, fresh: set[_Key], old: list[Node], reach_m: float
+    ) -> None:
+        """Put new nodes into the map, with the ids of old ones that they continue.
+
+        reach_m: from a new corner to an old one.
+        """
         if not fresh:
             return
         array = np.array(list(fresh), dtype=np.int64)
@@ -428,12 +441,30 @@ class Registry:
             self._node(0, NodeKind.CORNER if number else NodeKind.END, lattice, cell)
             for cell, number in places
         ]
-        ids = self._continued(nodes, old)
+        ids = self._continued(nodes, old, reach_m)
         for k, place in enumerate(places):
-            self._nodes[place] = ids.get(k) or self._new_id()
+            self._nodes[place] = ids.get(k) or self._returned(nodes[k]) or self._new_id()
             self.map.put_node(replace(nodes[k], id=self._nodes[place]))
 
-    def _continued(self, fresh: list[Node], old: list[Node]) -> dict[int, int]:
+    def _keep_removed(self, nodes: list[Node]) -> None:
+        """Remember nodes that no new one continues, at most one within MATCH_RADIUS_M."""
+        for node in nodes:
+            if node.id not in self.map.nodes:
+                self._returned(node)
+                self._removed.put_node(node)
+
+    def _returned(self, node: Node) -> int:
+        """Id of the nearest node within MATCH_RADIUS_M that was removed earlier; 0: none.
+
+        It is no longer remembered.
+        """
+        nearest = self._removed.nearest_node(node.x, node.y)
+        if nearest is None or math.dist(nearest.position, node.position) > MATCH_RADIUS_M:
+            return 0
+        self._removed.drop_node(nearest.id)
+        return nearest.id
+
+    def _continued(self, fresh: list[Node], old: list[Node], reach_m: float) -> dict[int, int]:
         """Ids of old nodes by the index of the new node that continues each."""
         if not fresh or not old:
             return {}
@@ -444,7 +475,9 @@ class Registry:
         )
         penalty = _OTHER_KIND * MATCH_RADIUS_M * (corner[:, None] != old_corner)
         cost = distance + penalty * (distance > 0.1 * self._frame.resolution)
-        pairs = np.argwhere(distance <= MATCH_RADIUS_M)
+        is_near = distance <= MATCH_RADIUS_M
+        cost[~is_near] += reach_m  # after all that are near
+        pairs = np.argwhere(is_near | (corner[:, None] & old_corner & (distance <= reach_m)))
         ids: dict[int, int] = {}
         used: set[int] = set()
         for i, j in pairs[np.argsort(cost[pairs[:, 0], pairs[:, 1]], kind='stable')].tolist():

@@ -193,8 +193,6 @@ def _repair(lattice: Lattice, flipped: Cells) -> Cells:
     first = np.full(_BUCKETS, -1, dtype=np.int64)
     queue = np.empty((4 * flipped.size + 1024, 2), dtype=np.int64)  # cell, next of its bucket
     touched = np.empty(4 * flipped.size + 1024, dtype=np.int64)
-    beside = np.empty(1024, dtype=np.int64)
-    around = np.empty(8, dtype=np.int64)
     near = np.empty(8, dtype=np.int64)
     queued = 0
     for at in flipped:
@@ -235,21 +233,10 @@ def _repair(lattice: Lattice, flipped: Cells) -> Cells:
                 touched = np.concatenate((touched, np.empty_like(touched)))
             touched[changes] = at
             changes += 1
-        # Each cell beside changed ones is looked at once, after all of them.
-        count = 0
-        for at in touched[done:changes]:
-            if beside.size - count < 8:
-                beside = np.concatenate((beside, np.empty_like(beside)))
-            find_neighbours(lattice, at, around)
-            for to in around:
-                # Not those deleted before anything changes here.
-                if cells[to]['time'] > now and not cells[to]['due']:
-                    cells[to]['due'] = True
-                    beside[count] = to
-                    count += 1
-        while queue.shape[0] - queued < count:
+        beside = _beside(lattice, touched[done:changes], now)
+        while queue.shape[0] - queued < beside.size:
             queue = np.concatenate((queue, np.empty_like(queue)))
-        for to in beside[:count]:
+        for to in beside:
             cells[to]['due'] = False
             time = _deletion_time(lattice, to, near)
             if time != cells[to]['time']:
@@ -257,6 +244,22 @@ def _repair(lattice: Lattice, flipped: Cells) -> Cells:
                 queued = _enqueue(first, queue, queued, to, key)
                 last = max(last, key)
     return touched[:changes].copy()
+
+
+@kernel
+def _beside(lattice: Lattice, changed: Cells, now: int) -> Cells:
+    """Cells beside changed ones that are not deleted by now, each once; they are marked as due."""
+    found = np.empty(8 * changed.size, dtype=np.int64)
+    near = np.empty(8, dtype=np.int64)
+    count = 0
+    for at in changed:
+        find_neighbours(lattice, at, near)
+        for to in near:
+            if lattice.cells[to]['time'] > now and not lattice.cells[to]['due']:
+                lattice.cells[to]['due'] = True
+                found[count] = to
+                count += 1
+    return found[:count]
 
 
 @inlined

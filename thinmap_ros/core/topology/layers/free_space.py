@@ -347,28 +347,37 @@ def nearest_free(lattice: Lattice, row: int, col: int, reach: int) -> int:
 
 
 @kernel
-def nearest_kept(lattice: Lattice, at: int, reach: int) -> int:
-    """The skeleton cell that the fewest steps over traversable cells lead to; 0: none."""
+def kept_above(lattice: Lattice, at: int, reach: int) -> int:
+    """A skeleton cell of the part of a traversable cell, within a reach in cells; 0: none.
+
+    No step is to a cell that is deleted earlier: what is left last of the surroundings of each cell
+    is of the skeleton.
+    """
     side = 2 * reach + 1
     first_row = row_of(lattice, at) - reach
     first_col = col_of(lattice, at) - reach
     seen = np.zeros(side * side, dtype=np.bool_)
-    queue = np.empty(side * side, dtype=np.int64)
-    queue[0] = at
+    stack = np.empty(side * side, dtype=np.int64)
+    stack[0] = at
     count = 1
-    head = 0
-    while head < count:
-        cell = queue[head]
-        head += 1
+    while count > 0:
+        count -= 1
+        cell = stack[count]
         if lattice.cells[cell]['kept']:
             return int(cell)
         for k in range(8):
             to = moved(lattice, cell, ROWS[k], COLS[k])
             row = row_of(lattice, to) - first_row
             col = col_of(lattice, to) - first_col
-            inside = 0 <= row < side and 0 <= col < side
-            if inside and lattice.cells[to]['free'] and not seen[row * side + col]:
+            if not (0 <= row < side and 0 <= col < side) or seen[row * side + col]:
+                continue
+            time = lattice.cells[to]['time']
+            if time >= lattice.cells[cell]['time'] and time > 0:
                 seen[row * side + col] = True
-                queue[count] = to
+                stack[count] = to
                 count += 1
+                # The latest one is the next.
+                if count > 1 and lattice.cells[stack[count - 2]]['time'] > time:
+                    stack[count - 1] = stack[count - 2]
+                    stack[count - 2] = to
     return 0

@@ -9,7 +9,7 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array, Cell, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.layers.deletion_times import update_skeleton
-from thinmap_ros.core.topology.layers.free_space import FreeSpace, nearest_free, nearest_kept
+from thinmap_ros.core.topology.layers.free_space import FreeSpace, kept_above, nearest_free
 from thinmap_ros.core.topology.layers.lattice import Lattice, rows_and_cols
 from thinmap_ros.core.topology.layers.pruning import (
     COLUMNS,
@@ -25,7 +25,7 @@ from thinmap_ros.core.topology.layers.skeleton_graph import CELL, NONE, A, Skele
 from thinmap_ros.core.topology.registry import EMPTY_BOX, Changes
 
 _BLOCK = 10  # cells; one place of the robot in a block is enough
-_REACH = 160  # steps from a place to the skeleton that are tried first, in cells
+_REACH = 160  # cells from a place to the skeleton that are tried first
 _MAX_REACH = 2560
 
 
@@ -38,7 +38,7 @@ class RobotPlaces:
     def __init__(self, reach: int) -> None:
         """reach: largest distance from the robot to a traversable cell, in cells."""
         self._reach = reach
-        # Of each place a traversable cell, and the skeleton cell nearest to it; 0: removed.
+        # Of each place a traversable cell, and a skeleton cell of its part; 0: removed.
         self._cells: Cells = np.empty(0, dtype=np.int64)
         self._kept: Cells = np.empty(0, dtype=np.int64)
         self._numbers: dict[tuple[int, int], int] = {}
@@ -63,23 +63,23 @@ class RobotPlaces:
         return True
 
     def owners(self, lattice: Lattice) -> Cells:
-        """Chain or vertex of the skeleton nearest to each place, as `owner` of the cell."""
+        """Chain or vertex of the skeleton in the part of each place, as `owner` of a cell."""
         is_gone = lattice.cells['free'][self._cells] == 0
         self._cells[is_gone] = 0
         self._kept[is_gone] = 0
         is_stale = (lattice.cells['kept'][self._kept] == 0) & ~is_gone
         for k in np.flatnonzero(is_stale).tolist():
-            self._kept[k] = _nearest_kept(lattice, int(self._cells[k]))
+            self._kept[k] = _kept_near(lattice, int(self._cells[k]))
         return np.asarray(lattice.cells['owner'][self._kept], dtype=np.int64)
 
 
-def _nearest_kept(lattice: Lattice, cell: int) -> int:
-    """The skeleton cell nearest to a cell over traversable cells; 0: none."""
+def _kept_near(lattice: Lattice, cell: int) -> int:
+    """A skeleton cell of the part of a traversable cell; 0: none."""
     reach = _REACH
-    found = int(nearest_kept(lattice, cell, reach))
+    found = int(kept_above(lattice, cell, reach))
     while found == 0 and reach < _MAX_REACH:
         reach *= 2
-        found = int(nearest_kept(lattice, cell, reach))
+        found = int(kept_above(lattice, cell, reach))
     return found
 
 
