@@ -110,7 +110,8 @@ class FreeSpace:
         reach = math.ceil(self._radius)
         tiles = tiles_around(lattice, known, reach)
         room = standing_room(_columns_of(lattice, tiles, reach), self._radius)
-        return changed, _set_free(lattice, tiles, room[:, reach:-reach])
+        # Of no tile the view would be contiguous, and compile the kernel once more.
+        return changed, _set_free(lattice, tiles, np.ascontiguousarray(room[:, reach:-reach]))
 
 
 class _Fields(NamedTuple):
