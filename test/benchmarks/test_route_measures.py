@@ -32,7 +32,7 @@ AT_MOST = {
     'overlong': 0,
     'overwide': 0,
     'extra_parts': 0,
-    'uncovered': 0.2,  # a graph that covers less is said to
+    'uncovered': 0.2,  # the tool warns of less
     'route_median': 1.3,
 }
 # Where some places in niches see no node. A finer lattice of places gives nodes to nearly all

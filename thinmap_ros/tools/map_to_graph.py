@@ -38,7 +38,7 @@ from thinmap_ros.view.summary import summary_figure
 
 _DEFAULTS = TopologyConfig()
 _DESCRIPTIONS = ('.yaml', '.yml')
-_MIN_COVERED = 0.8  # of the reachable floor; a graph of less is told
+_MIN_COVERED = 0.8  # of the reachable floor; less is a warning
 _FORMATS = ('geojson', 'graphml', 'tmap2.yaml')
 # Arguments that decide about a graph.
 _OPTIONS = (

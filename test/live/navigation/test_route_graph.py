@@ -77,10 +77,10 @@ class Mapping:
 
 def is_same(route_graph, other):
     """Whether two route graphs have the same places and ways, whatever their ids."""
-    return _places_and_ways(route_graph) == _places_and_ways(other)
+    return _nodes_and_edges(route_graph) == _nodes_and_edges(other)
 
 
-def _places_and_ways(route_graph):
+def _nodes_and_edges(route_graph):
     places = {number: (x, y) for number, (x, y, _, _) in route_graph.nodes.items()}
     ways = [
         (places[start], places[end], metadata['class'], metadata['length'], metadata['clearance'])
@@ -90,7 +90,7 @@ def _places_and_ways(route_graph):
 
 
 def crosses(route_graph, area):
-    """Whether a straight way of a route graph leads through an area."""
+    """Whether a straight edge of a route graph leads through an area."""
     places = {number: (x, y) for number, (x, y, _, _) in route_graph.nodes.items()}
     ways = [
         np.linspace(places[start], places[end], 200) for start, end, _ in route_graph.edges.values()

@@ -22,10 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.tiles import TILE
-from thinmap_ros.core.se2 import Cells, Mask
+from thinmap_ros.core.se2 import Cells
 from thinmap_ros.core.topology.layers.lattice import (
     Lattice,
-    cell_at,
     cell_of,
     cells_at,
     find_neighbours,
@@ -83,30 +82,14 @@ def _thin_around(lattice: Lattice, flipped: Cells) -> tuple[Cells, Cells]:
     rows, cols = (np.ptp(places, axis=0) + 1 + 2 * _AROUND).tolist()
     if flipped.size * _WORTH < rows * cols:
         return flipped[:0], flipped
-    times = deletion_times(_free_cells(lattice, row, col, rows, cols))
-    return _take_times(lattice, times, row, col)
+    at = cells_at(lattice, np.argwhere(np.ones((rows, cols), dtype=np.bool_)) + (row, col))
+    times = deletion_times(lattice.cells['free'][at].astype(np.bool_).reshape(rows, cols))
+    return _take_times(lattice, times, at.reshape(rows, cols))
 
 
 @kernel
-def _free_cells(lattice: Lattice, row: int, col: int, rows: int, cols: int) -> Mask:
-    """Traversable cells of a rectangle (rows, cols), the first at (row, col)."""
-    free = np.empty((rows, cols), dtype=np.bool_)
-    for i in range(rows):
-        at = 0
-        for j in range(cols):
-            if j == 0 or (col + j) % TILE == 0:
-                at = cell_at(lattice, row + i, col + j)
-            elif at > 0:
-                at += 1
-            free[i, j] = lattice.cells[at]['free']
-    return free
-
-
-@kernel
-def _take_times(
-    lattice: Lattice, times: NDArray[np.int16], row: int, col: int
-) -> tuple[Cells, Cells]:
-    """Set the times of a rectangle (H, W), the first at (row, col), where they hold in the map.
+def _take_times(lattice: Lattice, times: NDArray[np.int16], places: Cells) -> tuple[Cells, Cells]:
+    """Set the times of a rectangle (H, W) of cells, 0 where there is none, where they hold.
 
     A time depends on the cells that are at most so many steps away: it holds where these lie in the
     rectangle. Elsewhere only that it is later than that is known. Returns the cells whose time
@@ -119,12 +102,8 @@ def _take_times(
     changes = 0
     count = 0
     for i in range(rows):
-        at = 0
         for j in range(cols):
-            if j == 0 or (col + j) % TILE == 0:
-                at = cell_at(lattice, row + i, col + j)
-            elif at > 0:
-                at += 1
+            at = places[i, j]
             if at == 0:
                 continue
             steps = min(i, j, rows - 1 - i, cols - 1 - j)

@@ -110,7 +110,7 @@ class FreeSpace:
         reach = math.ceil(self._radius)
         tiles = tiles_around(lattice, known, reach)
         room = standing_room(_columns_of(lattice, tiles, reach), self._radius)
-        # Of no tile the view would be contiguous, and compile the kernel once more.
+        # Of no tile the view is contiguous, and would compile a second variant of the kernel.
         return changed, _set_free(lattice, tiles, np.ascontiguousarray(room[:, reach:-reach]))
 
 
@@ -351,7 +351,7 @@ def nearest_free(lattice: Lattice, row: int, col: int, reach: int) -> int:
 def kept_above(lattice: Lattice, at: int, reach: int) -> int:
     """A skeleton cell of the part of a traversable cell, within a reach in cells; 0: none.
 
-    No step is to a cell that is deleted earlier: what is left last of the surroundings of each cell
+    No step is to a cell that is deleted earlier: the last remaining cell around each cell
     is of the skeleton.
     """
     side = 2 * reach + 1
