@@ -190,9 +190,10 @@ def test_corners_of_a_path_whose_end_moved_keep_their_ids(shorter):
     patch.cells[:, 400 - shorter :] = 100
     builder.update(patch, robot)
     after = corners(builder.map)
-    moved = [math.dist(before[number], after[number]) for number in before.keys() & after.keys()]
-    assert len(before) >= 3 and max(moved) > 0.5
-    assert len(before.keys() & after.keys()) == min(len(before), len(after))
+    kept = before.keys() & after.keys()
+    assert len(before) >= 3
+    assert len(kept) == min(len(before), len(after))
+    assert max(math.dist(before[number], after[number]) for number in kept) > 0.5
 
 
 def corners(graph):
@@ -200,19 +201,23 @@ def corners(graph):
     return {n.id: (n.x, n.y) for n in graph.nodes.values() if n.kind == NodeKind.CORNER}
 
 
-def test_a_step_that_shows_a_hall_takes_no_longer_than_a_scan():
+def test_a_step_that_shows_a_hall_costs_little_more_than_thinning_it_at_once():
     cells = np.full((400, 1200), UNKNOWN, dtype=np.int8)
     builder = TopologyBuilder()
-    spent = []
+    ratios = []
     for first in range(0, 1200, 200):
         cells[40:360, first : first + 200] = 0
         cells[80:340:60, first + 20 : first + 200 : 60] = 100
         window = GridPatch(GridFrame(0.0, 0.0, 0.05), cells[:, max(first - 100, 0) :].copy())
         window = GridPatch(window.frame.with_origin_at(0, max(first - 100, 0)), window.cells)
-        started = time.process_time()
-        builder.update(window, np.array([(first + 10) * 0.05, 10.0, 0.0]))
-        spent.append(time.process_time() - started)
-    assert min(spent[1:]) < 0.1
+        robot = np.array([(first + 10) * 0.05, 10.0, 0.0])
+        began = time.process_time()
+        builder.update(window, robot)
+        updated = time.process_time()
+        build(window, (robot[0], robot[1]), TopologyConfig())
+        ratios.append((updated - began) / (time.process_time() - updated))
+    # 2 where many cells are thinned at once, 30 where each is a change of its own.
+    assert np.median(ratios[1:]) < 8.0
 
 
 def test_ids_given_after_a_state_was_kept_are_not_given_again_to_other_places():
