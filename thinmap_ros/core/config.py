@@ -44,6 +44,9 @@ def parameter(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+MAX_ROBOT_RADIUS_M = 5.0
+
+
 def robot_radius() -> Any:
     """Declare the field `robot_radius_m`: one name and one default for all parts and nodes."""
     return _shared(
@@ -51,7 +54,7 @@ def robot_radius() -> Any:
         'Radius of the robot (m), the same for all nodes. Set it to the distance from the centre '
         'of rotation to the farthest point of the footprint.',
         low=0.0,
-        high=5.0,
+        high=MAX_ROBOT_RADIUS_M,
         safe=SAFE_HIGHER,
     )
 

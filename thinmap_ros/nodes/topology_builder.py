@@ -102,7 +102,6 @@ class TopologyBuilderNode(ThinmapNode):
         RegionNaming(self, self._regions)
         parameters.reject_unknown(self)
         kernels.topology_builder()
-        kernels.route_graph()
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(self, LocalGrid, 'local_grid', self._on_local_grid, qos.STREAM)
         offer_saving(self, self._save_directory, TOPOLOGY, self._save_and_route)

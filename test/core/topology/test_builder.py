@@ -72,7 +72,7 @@ def ids(graph):
 
 def whole(builder):
     """The map of the whole grid that the builder has seen, from the same places."""
-    return TopologyBuilder.from_state(builder.state()).map
+    return TopologyBuilder.from_state(builder.state(), builder.config).map
 
 
 def loops(graph):
@@ -95,10 +95,20 @@ def random_cells(rng, shape):
 
 @pytest.mark.parametrize('seed', range(8))
 def test_the_map_is_that_of_the_whole_grid_after_every_update(seed):
+    check_updates(seed, TopologyConfig())
+
+
+@pytest.mark.parametrize('radius_m', [0.0, 0.05])
+def test_so_it_is_for_a_robot_that_is_a_point(radius_m):
+    check_updates(3, TopologyConfig(robot_radius_m=radius_m))
+
+
+def check_updates(seed, config):
+    """Update a map by random windows, and compare it with that of the whole grid each time."""
     rng = np.random.default_rng(seed)
     shape = (120, 150)
     cells = np.full(shape, UNKNOWN, dtype=np.int8)
-    builder = TopologyBuilder()
+    builder = TopologyBuilder(config)
     for _ in range(20):
         low = rng.integers(0, (80, 110))
         size = rng.integers(10, 80, 2)

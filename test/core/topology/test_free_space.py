@@ -49,6 +49,10 @@ def test_nav2_calls_no_cell_beyond_the_radius_inscribed(resolution, radius_m):
     assert np.array_equal(standing, free & ~inscribed)
 
 
+def test_the_largest_robot_has_no_larger_radius():
+    assert beyond_radius(TopologyConfig(robot_radius_m=5.0), 0.05).robot_radius_m == 5.0
+
+
 @given(st.integers(0, 10_000))
 @settings(max_examples=60)
 def test_squared_clearance_is_exact(seed):

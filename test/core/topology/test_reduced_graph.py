@@ -166,6 +166,10 @@ def test_a_graph_between_walls_covers_all() -> None:
     assert (found.unknown, found.rays) == (0.0, 0.0)
 
 
+def test_a_corridor_that_is_narrower_than_a_step_of_places_is_covered() -> None:
+    assert coverage_of(room(7, 300)).covered == 1.0
+
+
 def test_floor_without_walls_is_not_covered() -> None:
     found = coverage_of(rooms_of(1.0))
     assert found.rays > 0.8
@@ -325,3 +329,11 @@ def test_a_corridor_has_nodes_within_three_spacings() -> None:
         _, reduced = graphs_of(cells, spacing_m)
         assert seen_from(patch, standing, reduced).max() < 3.0 * spacing_m + 0.4
         assert len(reduced.nodes) <= most
+
+
+def test_places_of_a_hall_are_near_a_node_whatever_the_spacing() -> None:
+    cells = room(260, 400)
+    standing = select_free_space(patch_of(cells), None, CONFIG)
+    for spacing_m in (3.5, 7.0):
+        _, reduced = graphs_of(cells, spacing_m)
+        assert seen_from(patch_of(cells), standing, reduced).max() <= 3.0 * spacing_m + 0.5

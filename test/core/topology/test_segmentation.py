@@ -243,6 +243,11 @@ def test_rays_behind_glass_are_in_no_region() -> None:
     assert len(set(at(found, CORRIDOR, (-0.5, 7.0), LEFT, RIGHT))) == 3
 
 
+def test_a_free_map_that_was_cut_out_of_a_larger_one_is_a_region() -> None:
+    found = find_regions(patch_of(np.zeros((50, 50), dtype=np.int8)))
+    assert len(found.regions) == 1
+
+
 ROOM = RegionKind.ROOM
 # By eye: a point in each region, m, and its kind.
 HOMES = {

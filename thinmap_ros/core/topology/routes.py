@@ -292,8 +292,8 @@ def coverage(
     radius = config.robot_radius_m / patch.frame.resolution
     room = known_free(patch, config) & standing_room(column_distance(~patch.occupied), radius)
     floor = reachable(room, true_cells(standing))
-    step = max(round(_SPLIT_STEP_M / patch.frame.resolution), 1)
-    cells = np.argwhere(floor[::step, ::step]) * step
+    # Not a lattice: all of its lines may miss a narrow corridor.
+    cells = true_cells(floor)[:: max(round(_SPLIT_STEP_M / patch.frame.resolution), 1) ** 2]
     beyond = standing_room(column_distance(~standing), radius)[cells[:, 0], cells[:, 1]]
     kept = whole.copy()
     drop_rays(kept, patch)
@@ -408,7 +408,8 @@ def _enclosed(known: Mask, ring: Cells) -> int:
 class Sight:
     """Places on a lattice of traversable cells, the node nearest to each, and whether it is seen.
 
-    A route server starts at the node nearest to the robot, whatever walls are between.
+    A route server starts at the node nearest to the robot, whatever walls are between. reach_m: how
+    far a node may be that is added.
     """
 
     def __init__(
@@ -416,6 +417,7 @@ class Sight:
     ) -> None:
         """Begin with some nodes: standing (H, W), traversable cells; known (H, W), cells seen."""
         step = max(round(_LATTICE_M / frame.resolution), 1)
+        self.reach_m = _SIGHT_REACH_M
         self._frame = frame
         self._known = known
         self._cells = np.ascontiguousarray(np.argwhere(standing[::step, ::step]) * step)
@@ -448,15 +450,18 @@ class Sight:
 
     def add(self, node: Node, least_gain: int = _MIN_GAIN) -> bool:
         """Add a node, if so some more places see the node nearest to them."""
-        near = np.array(self._tree.query_ball_point(node.position, _SIGHT_REACH_M), dtype=np.int64)
+        near = np.array(self._tree.query_ball_point(node.position, self.reach_m), dtype=np.int64)
         away = np.hypot(*(self._xy[near] - node.position).T)
         closer = away < self._away[near]
         places = near[closer]
         seen = self._sees(node, places)
         if seen.sum() < self._seen[places].sum() + least_gain:
             return False
-        for owner in np.unique(self._owner[places]).tolist():
-            self._places[owner] = np.setdiff1d(self._places[owner], places)
+        owners = np.unique(self._owner[places]).tolist()
+        self._owner[places] = -1
+        for owner in owners:
+            had = self._places[owner]
+            self._places[owner] = had[self._owner[had] == owner]
         self._seen[places] = seen
         self._away[places] = away[closer]
         self._give(node.id, places)
@@ -677,6 +682,7 @@ def spread_nodes(graph: EditedGraph, sight: Sight, reach_m: float, gone: list[No
     On an edge within reach, else in open space that is in sight of a node: `cross_edges` joins it.
     gone: nodes of space that shall have none.
     """
+    sight.reach_m = max(sight.reach_m, 2.0 * reach_m)
     for node in graph.map.nodes.values():
         sight.add(node, 0)
     points = _EdgePoints(graph)

@@ -393,8 +393,9 @@ def _sees_unknown(free: Mask, is_wall: Mask, deep: Mask, stride: int, reach: int
                 for step in range(1, reach):
                     r = int(math.floor(row + 0.5 + step * math.sin(angle)))
                     c = int(math.floor(col + 0.5 + step * math.cos(angle)))
-                    is_outside = not (0 <= r < rows and 0 <= c < cols)
-                    if is_outside or deep[r, c]:
+                    if not (0 <= r < rows and 0 <= c < cols):
+                        break  # the map may be cut out of a larger one
+                    if deep[r, c]:
                         unknown += 1
                         break
                     if is_wall[r, c]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.config import MAX_ROBOT_RADIUS_M
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.fields import label, nearest_true, reachable
 from thinmap_ros.core.grid.patch import GridPatch
@@ -54,10 +55,12 @@ def beyond_radius(config: TopologyConfig, resolution: float) -> TopologyConfig:
 
     Nav2's inflation layer calls a cell inscribed, and refuses it, whose centre is up to the radius,
     included, from that of an obstacle. Squared distances between centres, in cells, are whole
-    numbers: the next one above the radius is the radius to be at least away.
+    numbers: the next one above the radius is the radius to be at least away, up to the largest
+    radius of a robot.
     """
     squared = math.floor((config.robot_radius_m / resolution) ** 2 + 1e-6) + 1
-    return replace(config, robot_radius_m=resolution * math.sqrt(squared))
+    radius_m = min(resolution * math.sqrt(squared), MAX_ROBOT_RADIUS_M)
+    return replace(config, robot_radius_m=radius_m)
 
 
 def known_free(patch: GridPatch, config: TopologyConfig) -> Mask:

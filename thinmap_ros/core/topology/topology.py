@@ -216,7 +216,7 @@ def build_routes(
     touching: whether gaps that are exactly as wide as the robot count, which Nav2 refuses.
     Raises InputError where a place is not finite.
     """
-    # Imported here: a robot that maps needs neither it nor the search tree of scipy.
+    # Imported here: without a route graph, a node needs neither it nor the search tree of scipy.
     from thinmap_ros.core.topology.routes import DETAIL_M, route_graph
 
     resolution = patch.frame.resolution

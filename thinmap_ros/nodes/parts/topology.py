@@ -19,12 +19,13 @@ from thinmap_msgs.msg import KeepOut as KeepOutMsg
 from thinmap_msgs.msg import Region as RegionMsg
 from thinmap_msgs.msg import RegionArray
 from thinmap_msgs.srv import NameRegion
+from thinmap_ros import kernels
 from thinmap_ros.core import errors
 from thinmap_ros.core.config import Config, parameter, part
-from thinmap_ros.core.errors import InputError, one_line_reason
+from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
 from thinmap_ros.core.grid.edits import KeepOut
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Cells
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.regions import (
@@ -343,7 +344,7 @@ class RouteGraph:
         self._write = write
         self._next_id = _FIRST_ID
         self._graph = TopologicalMap()
-        self._source: tuple[GridPatch, set[int]] | None = None
+        self._source: tuple[GridPatch, set[int], Cells] | None = None
 
     def update(self, state: State, keep_out: KeepOut, is_forced: bool) -> TopologicalMap:
         """Write the graph of the `state` of a builder; the one of before, if it is the same.
@@ -355,14 +356,20 @@ class RouteGraph:
         patch = keep_out.as_walls(saved.patch)
         nodes = set(saved.map.nodes)
         before = self._source
-        if before is None or nodes != before[1] or not _shows_the_same(patch, before[0]):
+        places = saved.robot_places
+        if (
+            before is None
+            or nodes != before[1]
+            or not np.array_equal(places, before[2])
+            or not _shows_the_same(patch, before[0])
+        ):
             graph = self._continued(saved, patch)
             is_forced |= not _is_same(graph, self._graph)
         else:
             graph = self._graph
         if is_forced and graph.edges:
             self._write(graph)
-        self._source = (patch, nodes)
+        self._source = (patch, nodes, places)
         self._graph = graph if is_forced else self._graph
         return self._graph
 
@@ -415,6 +422,7 @@ class RouteGraphUpdates:
         self._pending: AnswerFuture | None = None
         self.reset()
         if self._config.route_graph_period_s > 0.0:
+            kernels.route_graph()
             self._client = node.create_client(SetRouteGraph, _SERVICE)
             subscribe_guarded(node, KeepOutMsg, 'keep_out', self._on_keep_out, qos.LATCHED)
             node.create_active_timer(self._config.route_graph_period_s, self._update, clock=STEADY)
@@ -485,7 +493,7 @@ class RouteGraphUpdates:
         self._job = None
         try:
             graph = job.result()
-        except (InputError, OSError) as error:
+        except (ThinmapError, OSError) as error:
             self._is_changed = True
             self._warn(f'route graph not written: {one_line_reason(error)}')
             return

@@ -109,9 +109,9 @@ class FreeSpace:
         _update_columns(lattice, known)
         reach = math.ceil(self._radius)
         tiles = tiles_around(lattice, known, reach)
-        room = standing_room(_columns_of(lattice, tiles, reach), self._radius)
+        room = standing_room(_columns_of(lattice, tiles, reach), self._radius)[:, reach:]
         # Of no tile the view is contiguous, and would compile a second variant of the kernel.
-        return changed, _set_free(lattice, tiles, np.ascontiguousarray(room[:, reach:-reach]))
+        return changed, _set_free(lattice, tiles, np.ascontiguousarray(room[:, :TILE]))
 
 
 class _Fields(NamedTuple):
