@@ -12,7 +12,8 @@ from thinmap_ros.core.grid.edits import KeepOut, MapEdits, require_count
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.alignment import LEAST_FOUND, align, fitted
-from thinmap_ros.core.places.recognition import JOIN_ODDS, Placement, recognize
+from thinmap_ros.core.places.recognition import JOIN_ODDS, Placement, on_one_storey, recognize
+from thinmap_ros.core.places.structure import structure_evidence
 from thinmap_ros.core.se2 import Array, is_bounded_pose
 from thinmap_ros.core.slam.joining.join import join
 from thinmap_ros.core.slam.joining.pieces import SlamPiece
@@ -257,10 +258,13 @@ class _Merging:
             return _Candidate(path, -math.inf, None)
         fits = [fitted(query, known, T) for T in (alignment.T_known_query, alignment.second)]
         self._fits[path] = [fit.T_known_query for fit in fits]
-        placement = fits[0].placement(query, alignment.log_odds)
+        motion = MapMotion.rigid(fits[0].T_known_query)
+        ratio = structure_evidence(query, known, motion, math.inf)
+        log_odds = on_one_storey(alignment.log_odds, ratio, self._join_odds)
+        placement = fits[0].placement(query, log_odds)
         return _Candidate(
             path,
-            alignment.log_odds,
+            log_odds,
             None if fits[0].is_contrary else placement,
             fits[0].found,
         )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.places.views import PlacedScan, View, views_of
@@ -300,6 +301,9 @@ def _counted(poses: Array, weights: Array) -> tuple[Array, Array]:
     return votes, np.column_stack([x, y, np.arctan2(sin, cos)])
 
 
+_BESIDE_CELLS = 1.5  # the eight cells around one
+
+
 class MapPiece:
     """A piece of map in which views of another one are looked for, or whose views these are.
 
@@ -332,6 +336,12 @@ class MapPiece:
         """Distances to its walls."""
         poses = np.array([frame.T_map_base for frame in self.keyframes]).reshape(-1, 3)
         return WallField(self.patch, poses[:, :2])
+
+    @cached_property
+    def walls(self) -> Array:
+        """Centres (N, 2) of the cells of walls beside free ones."""
+        is_seen = self.patch.occupied & (distance_cells(self.patch.free) < _BESIDE_CELLS)
+        return self.patch.frame.centres_of(np.argwhere(is_seen))
 
     @cached_property
     def landmarks(self) -> Landmarks:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.places.piece import (
     DRIFT,
     SAME_M,
@@ -24,6 +25,7 @@ from thinmap_ros.core.places.piece import (
     agree,
     are_same,
 )
+from thinmap_ros.core.places.structure import structure_evidence
 from thinmap_ros.core.places.views import SPACING_M, WINDOW_M, View
 from thinmap_ros.core.se2 import Array, inverse
 
@@ -176,6 +178,13 @@ class PieceHypothesis:
         others = np.array([other.poses[k] for k in shared]).reshape(-1, 3)
         return bool(are_same(poses, others).any())
 
+    def motion(self, views: Sequence[View]) -> MapMotion:
+        """How the piece moves into the map; views: all of it, by number."""
+        return MapMotion(
+            np.array([views[number].T_piece_view for number in self.poses]),
+            np.array([*self.poses.values()]),
+        )
+
     def predicted(self, view: View, views: Sequence[View]) -> tuple[Array, float]:
         """Pose T_map_view (3,) by the nearest view along the path, and the path between both, m.
 
@@ -226,12 +235,23 @@ class Recognition:
             self._propose(view, T_map_view)
         self._prune()
 
-    def placement(self) -> Placement | None:
-        """The most likely place, and its odds against all others and none; None without one."""
+    def placement(
+        self, query: MapPiece | None = None, least: float = -math.inf
+    ) -> Placement | None:
+        """The most likely place, and its odds against all others and none; None without one.
+
+        query: the piece as it is now. Walls that contradict other places count against these, where
+        the log odds of the best one against none are above `least`.
+        """
         if not self.hypotheses:
             return None
         best = self.hypotheses[0]
         logs = [other.evidence - self._log_alternatives for other in self.hypotheses]
+        if query is not None and logs[0] > least:
+            for k, other in enumerate(self.hypotheses[1:], 1):
+                if logs[k] > 0.0:  # one that is less likely than none is no rival
+                    ratio = structure_evidence(query, self.known, other.motion(self.views))
+                    logs[k] += min(ratio, 0.0)
         log_odds = logs[0] - float(np.logaddexp.reduce([0.0, *logs[1:]]))
         return Placement(*self._transform(best), log_odds, best)
 
@@ -321,7 +341,7 @@ class JoinDecision:
     """The most likely place of a piece in a map, or None; whether it is accepted.
 
     log_odds: of the place by the views of the piece, or by those of the map in the piece if these
-    are less; views: how many views of the piece were looked for.
+    are less, and of one storey; views: how many views of the piece were looked for.
     """
 
     is_joined: bool
@@ -333,19 +353,29 @@ class JoinDecision:
 def decide(
     recognition: Recognition, query: MapPiece, known: MapPiece, join_odds: float = JOIN_ODDS
 ) -> JoinDecision:
-    """Decide whether a piece lies in a map: by the views of each of the two.
+    """Decide whether a piece lies in a map: by the views of each of the two, and by their walls.
 
     recognition: of the views of the piece in the map so far; query: the piece as it is now.
     """
-    placement = recognition.placement()
+    least = math.log(join_odds)
+    placement = recognition.placement(query, least)
     views = recognition.views
     if placement is None:
         return JoinDecision(False, None, -math.inf, len(views))
     log_odds = placement.log_odds
-    if log_odds > math.log(join_odds):
+    if log_odds > least:
         back = log_odds_back(query, known, views, placement.hypothesis)
-        log_odds = min(log_odds, back)
-    return JoinDecision(log_odds > math.log(join_odds), placement, log_odds, len(views))
+        ratio = structure_evidence(query, known, placement.hypothesis.motion(views))
+        log_odds = on_one_storey(min(log_odds, back), ratio, join_odds)
+    return JoinDecision(log_odds > least, placement, log_odds, len(views))
+
+
+def on_one_storey(log_odds: float, ratio: float, join_odds: float) -> float:
+    """Log odds of a place, given those without regard to storeys, and `structure_evidence`.
+
+    The same place on another storey is as rare beforehand as a false join that is accepted.
+    """
+    return -float(np.logaddexp(-log_odds, -math.log(join_odds) - ratio))
 
 
 def recognize(

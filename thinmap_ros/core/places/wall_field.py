@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.fields import distance_cells
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.places.views import LATTICE_M, View
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.jit import inlined, kernel
 
 # States of a cell.
@@ -189,6 +189,8 @@ def _count_agreement(
     return matched, contrary, blocked
 
 
+_OTHER_M = 0.5  # from all walls: a wall there is another one
+
 REACH_M = 1.0  # larger distances to walls count as this
 
 # Walls farther from all keyframes were seen in part. Where these contradicted views, the right
@@ -252,6 +254,16 @@ class WallField:
         )
         told = matched + contrary + blocked
         return matched / max(told, 1), (matched + contrary) / max(len(view.walls), 1)
+
+    def told(self, walls: Array) -> tuple[Mask, Mask]:
+        """Which wall points (N, 2) the map shows again, and which lie in its free space, (N,)."""
+        field = self._arrays
+        cells = GridFrame(field.origin_x, field.origin_y, field.cell_m).cells_of(walls)
+        is_inside = np.all((cells >= 0) & (cells < field.state.shape), axis=1)
+        rows, cols = np.where(is_inside[:, None], cells, 0).T  # the first cell is in the margin
+        state = field.state[rows, cols]
+        near_m = field.near[rows, cols] * field.cell_m
+        return (near_m <= LATTICE_M) & (state != FAR), (near_m > _OTHER_M) & (state == FREE)
 
 
 def _thinned(walls: Array) -> Array:
