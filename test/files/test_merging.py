@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.driven_pieces import driven_piece, true_transform
 from support.rooms import KITCHEN, room, turned
+from support.storeys import storey
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
@@ -323,3 +324,40 @@ def test_given_poses_join_maps_of_a_chain_in_any_order(tmp_path):
         paths.append(str(write_map(tmp_path / name, GridPatch(whole.frame, cells))))
     joins = merge_maps(paths, at=[np.zeros(3), np.zeros(3)]).joins
     assert [join.path for join in joins] == [paths[2], paths[1]]
+
+
+def save_storey(path, moved_m=0.0, tag=''):
+    return str(write_map(path, storey(moved_m), tag))
+
+
+def test_storeys_are_joined_where_their_tags_are_equal_and_only_there(tmp_path):
+    first = save_storey(tmp_path / 'first', 0.0)
+    above = save_storey(tmp_path / 'above', 1.6)
+    with pytest.raises(NotTheSamePlaceError, match=r'above.yaml: not the same place \(log odds -'):
+        merge_maps([first, above])
+    merged = merge_maps([first, above], tag='hall')
+    assert merged.joins[0].log_odds > 50.0
+    merged.save(str(tmp_path / 'both'))
+    assert sessions.load_tag(str(tmp_path / 'both')) == 'hall'
+    assert read_piece(str(tmp_path / 'both')).tag == 'hall'
+
+
+@pytest.mark.parametrize('at', [(), (np.zeros(3),)])
+def test_maps_with_different_tags_are_never_joined(tmp_path, at):
+    first = save_storey(tmp_path / 'first', 0.0, 'floor 1')
+    second = save_storey(tmp_path / 'second', 0.0, 'floor 2')
+    reason = "second.yaml: another storey: map_tag = 'floor 2': expected 'floor 1', the storey of "
+    with pytest.raises(NotTheSamePlaceError, match=reason) as refused:
+        merge_maps([first, second], at=at)
+    assert refused.value.log_odds == -math.inf
+    with pytest.raises(NotTheSamePlaceError, match="'floor 1': expected 'hall', the storey of --t"):
+        merge_maps([first, second], at=at, tag='hall')
+
+
+def test_a_tag_that_is_none_is_refused(tmp_path):
+    first = save_storey(tmp_path / 'first')
+    second = save_storey(tmp_path / 'second', 0.0, 'x' * 65)
+    with pytest.raises(InputError, match=r'second\.yaml: map_tag = .*at most 64 printable char'):
+        merge_maps([first, second])
+    with pytest.raises(InputError, match=r"tag = 'a\\n': expected at most 64 printable"):
+        merge_maps([first, first.replace('first', 'other')], tag='a\n')

@@ -15,6 +15,8 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, pose
 from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.track import LocalizerConfig
+from thinmap_ros.core.stage import LOCALIZATION
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.files.occupancy_maps import write_map
@@ -25,6 +27,8 @@ from thinmap_ros.files.sessions import (
     TOPOLOGY,
     load_edits,
     load_grid,
+    load_localizer,
+    load_tag,
     save_grid,
     save_localizer,
     stem_of,
@@ -321,3 +325,58 @@ def test_the_part_of_the_localizer_is_loaded_archived_or_rejected(tmp_path):
         LOCALIZER.load_optional(str(tmp_path / 'bad'))
     assert 'office.slam.npz.old' in LOCALIZER.archive(stem)
     assert LOCALIZER.load_optional(stem) is None
+
+
+def named(tag: str) -> LocalizerConfig:
+    return LocalizerConfig(map_tag=tag)
+
+
+def test_the_tag_of_a_storey_is_saved_with_the_map(tmp_path: Path) -> None:
+    stem = str(tmp_path / 'tagged')
+    save_localizer(stem, Localizer(named('floor 2')))
+    assert load_tag(stem) == 'floor 2'
+    loaded = [load_localizer(stem, named(tag)) for tag in ('', 'floor 2')]
+    loaded.append(load_localizer(stem, LocalizerConfig(mode=LOCALIZATION)))
+    assert [each.map_tag for each in loaded if isinstance(each, Localizer)] == 3 * ['floor 2']
+    with pytest.raises(InputError, match=r"map_tag = 'floor 1': the map is of 'floor 2': expect"):
+        load_localizer(stem, named('floor 1'))
+
+
+def test_a_session_without_a_tag_holds_what_it_held_before_there_were_tags(tmp_path: Path) -> None:
+    stem = str(tmp_path / 'plain')
+    save_localizer(stem, Localizer())
+    with np.load(LOCALIZER.file(stem)) as arrays:
+        assert 'map_tag' not in arrays
+    assert load_tag(stem) == ''
+    localizer = load_localizer(stem, named('floor 1'))
+    assert isinstance(localizer, Localizer)
+    assert localizer.map_tag == 'floor 1'
+
+
+def test_a_map_of_any_program_has_the_tag_of_its_yaml_file(tmp_path: Path) -> None:
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((4, 5), dtype=np.int8))
+    path = str(write_map(tmp_path / 'foreign', patch))
+    assert load_tag(path) == ''
+    with Path(path).open('a', encoding='utf-8') as stream:
+        stream.write('map_tag: 2\n')
+    assert load_tag(path) == '2'
+    localizer = load_localizer(path, LocalizerConfig())
+    assert isinstance(localizer, Localizer)
+    assert localizer.map_tag == '2'
+    with pytest.raises(InputError, match="map_tag = '3': the map is of '2'"):
+        load_localizer(path, named('3'))
+
+
+@pytest.mark.parametrize('tag', ['x' * 65, ' 2', 'a\nb'])
+def test_a_text_that_is_no_tag_is_refused(tmp_path: Path, tag: str) -> None:
+    with pytest.raises(InputError, match=r'map_tag = .*expected at most 64 printable characters'):
+        Localizer(named(tag))
+    state = Localizer().state() | {'map_tag': np.frombuffer(tag.encode(), dtype=np.uint8)}
+    with pytest.raises(InputError, match=r'map_tag of the map = .*expected at most 64'):
+        Localizer.from_state(state)
+
+
+def test_a_saved_tag_that_is_no_text_is_refused() -> None:
+    state = Localizer().state() | {'map_tag': np.array([255, 254], dtype=np.uint8)}
+    with pytest.raises(InputError, match=r'saved state: map_tag: .*expected UTF-8'):
+        Localizer.from_state(state)

@@ -45,10 +45,10 @@ def storey(moved_m=0.0, cupboards=0, seed=0):
     return GridPatch(GridFrame(0.0, 0.0, _CELL_M), cells)
 
 
-def piece_of(patch):
+def piece_of(patch, tag=''):
     """A map as a piece, with its topological map and scans that are drawn from it."""
     graph = build(patch, None, TopologyConfig())
-    return MapPiece(drawn_scans(patch, graph), patch, graph)
+    return MapPiece(drawn_scans(patch, graph), patch, graph, tag=tag)
 
 
 def _cells(length_m):

@@ -71,6 +71,25 @@ def split_number(state: State, name: str) -> tuple[int, dict[str, NDArray[Any]]]
     return int(number), {key: array for key, array in state.items() if key != name}
 
 
+def text_array(text: str) -> NDArray[np.uint8]:
+    """A text as an array (N,), for `split_text`."""
+    return np.frombuffer(text.encode(), dtype=np.uint8)
+
+
+def split_text(state: State, name: str) -> tuple[str, dict[str, NDArray[Any]]]:
+    """Split the state of a node into a text, '' where there is none, and the other arrays.
+
+    Raises InputError where it is none.
+    """
+    own = {name: np.asarray(state.get(name, np.empty(0, dtype=np.uint8)))}
+    codes = validate(own, {name: Field(np.uint8, ('n',))}, 'state')[name]
+    try:
+        text = bytes(codes).decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f'saved state: {name}: {error}: expected UTF-8') from error
+    return text, {key: array for key, array in state.items() if key != name}
+
+
 def require(is_so: bool, what: str, expected: str) -> None:
     """Raise InputError with what was found and what was expected, unless is_so."""
     if not is_so:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import ConfigError, quoted
+from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
@@ -26,8 +26,25 @@ EKF_FULL = 'ekf_full'
 MAPPING = 'mapping'
 LOCALIZATION = 'localization'
 
+MAX_TAG = 64  # characters
+
 Input = TypeVar('Input', contravariant=True)
 Output = TypeVar('Output', covariant=True)
+
+
+def checked_tag(name: str, tag: str) -> str:
+    """The tag of a storey, '' for none. Raises InputError with its name where it is none."""
+    if len(tag) > MAX_TAG or not tag.isprintable() or tag != tag.strip():
+        raise InputError(
+            f'{name} = {quoted(tag)}: expected at most {MAX_TAG} printable characters, without '
+            'blanks around them'
+        )
+    return tag
+
+
+def are_two_storeys(tag: str, other: str) -> bool:
+    """Whether the tags of two maps say that these show different storeys."""
+    return bool(tag and other and tag != other)
 
 
 @dataclass(frozen=True)

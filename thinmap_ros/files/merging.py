@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,11 @@ from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.alignment import LEAST_FOUND, align, fitted
 from thinmap_ros.core.places.recognition import JOIN_ODDS, Placement, on_one_storey, recognize
-from thinmap_ros.core.places.structure import structure_evidence
+from thinmap_ros.core.places.structure import storey_evidence
 from thinmap_ros.core.se2 import Array, is_bounded_pose
 from thinmap_ros.core.slam.joining.join import join
 from thinmap_ros.core.slam.joining.pieces import SlamPiece
+from thinmap_ros.core.stage import checked_tag
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import TopologyBuilder, build
@@ -89,7 +90,7 @@ class MergedMap:
     """The map of several, in the frame of the first of them.
 
     keep_out: areas of all of them; maps: these, by path; joins: of all but the first, in the order
-    in which they were joined.
+    in which they were joined; tag: of their storey, '' where nobody knows it.
     """
 
     grid: OccupancyGrid
@@ -98,12 +99,14 @@ class MergedMap:
     keep_out: KeepOut
     maps: dict[str, SlamPiece]
     joins: list[MapJoin]
+    tag: str = ''
 
     def save(self, path: str) -> list[str]:
         """Write a session, as `sessions.save_session`; returns what was written, a line each."""
         edits = MapEdits(self.keep_out)
         return sessions.save_session(
-            path, sessions.SessionMap(self.grid, self.topology, self.regions, edits)
+            path,
+            sessions.SessionMap(self.grid, self.topology, self.regions, edits, tag=self.tag),
         )
 
 
@@ -113,15 +116,16 @@ def merge_maps(
     report: Report = warn,
     progress: Callable[[float, str], None] = lambda _share, _text: None,
     at: Sequence[Array] = (),
+    tag: str = '',
 ) -> MergedMap:
     """Merge sessions and map_server maps (YAML files) of one place, in the frame of the first.
 
     join_odds: from which a map is joined, at most one false join in so many. report: receives lines
     on maps that are read; progress: the share of the work that is done, and what is done next. at:
     the pose (3,), m, m, rad, of each map after the first in the frame of the first; none: they are
-    found. Raises InputError where a map cannot be read or contradicts its pose,
-    NotTheSamePlaceError where one has no place in the others, CannotTellError, which is one, where
-    the odds are for it but too small.
+    found. tag: of the storey of all maps that have none. Raises InputError where a map cannot be
+    read or contradicts its pose, NotTheSamePlaceError where one has another tag, or no place in the
+    others, CannotTellError, which is one, where the odds are for it but too small.
     """
     if isinstance(paths, str | Path) or not isinstance(paths, Sequence):
         raise InputError(f'paths = {quoted(paths)}: expected a list of paths')
@@ -131,15 +135,34 @@ def merge_maps(
     if not join_odds > 1.0:
         raise InputError(f'join odds {join_odds:g}: expected more than 1')
     given = _given_poses(names[1:], at)
-    maps = {name: read_piece(name, report) for name in names}
+    checked_tag('tag', tag)
+    maps = _tagged({name: read_piece(name, report) for name in names}, tag)
     merging = _Merging(maps, join_odds, progress, given)
     while merging.waiting:
         merging.join_next()
     regions = merging.drawn.regions
     regions.update(merging.known.patch)
     return MergedMap(
-        merging.grid, merging.topology, regions, merging.drawn.keep_out, maps, merging.joins
+        merging.grid,
+        merging.topology,
+        regions,
+        merging.drawn.keep_out,
+        maps,
+        merging.joins,
+        merging.known.tag,
     )
+
+
+def _tagged(maps: dict[str, SlamPiece], tag: str) -> dict[str, SlamPiece]:
+    """The maps, those without a tag with the given one. Raises NotTheSamePlaceError."""
+    all_tags = {'--tag': tag, **{path: piece.tag for path, piece in maps.items()}}
+    tags = {source: each for source, each in all_tags.items() if each}
+    for source, each in tags.items():
+        first, expected = next(iter(tags.items()))
+        if each != expected:
+            reason = f'map_tag = {quoted(each)}: expected {quoted(expected)}, the storey of {first}'
+            raise NotTheSamePlaceError(source, -math.inf, f'another storey: {reason}')
+    return {path: replace(piece, tag=piece.tag or tag) for path, piece in maps.items()}
 
 
 def _given_poses(names: Sequence[str], at: Sequence[Array]) -> dict[str, Array]:
@@ -259,7 +282,7 @@ class _Merging:
         fits = [fitted(query, known, T) for T in (alignment.T_known_query, alignment.second)]
         self._fits[path] = [fit.T_known_query for fit in fits]
         motion = MapMotion.rigid(fits[0].T_known_query)
-        ratio = structure_evidence(query, known, motion, math.inf)
+        ratio = storey_evidence(query, known, motion, math.inf)
         log_odds = on_one_storey(alignment.log_odds, ratio, self._join_odds)
         placement = fits[0].placement(query, log_odds)
         return _Candidate(
@@ -296,7 +319,7 @@ class _Merging:
         for drawn, motion in zip((self.drawn, self._drawn[path]), joined.motions, strict=True):
             drawn.move(motion)
         self.drawn.add(self._drawn[path])
-        self.known = joined.piece
+        self.known = replace(joined.piece, tag=self.known.tag or self._maps[path].tag)
         self.grid = joined.grid
         self.topology = joined.topology
 
@@ -308,6 +331,7 @@ def read_piece(path: str, report: Report = warn) -> SlamPiece:
     grid; such a map stays rigid.
     Raises InputError where a file is missing or broken.
     """
+    tag = sessions.load_tag(path)
     if GRID.exists(path):
         patch = GRID.load(path).known_area()
     else:
@@ -318,9 +342,11 @@ def read_piece(path: str, report: Report = warn) -> SlamPiece:
         if saved is not None:
             edges = [*saved.steps, *saved.edges]
             erased = sessions.load_edits(path).erasures.items
-            return SlamPiece(saved.frames, edges, patch, builder.map, builder.next_id, erased)
-        return SlamPiece.of_bare_map(patch, builder.map, builder.next_id)
-    return SlamPiece.of_bare_map(patch, build(patch, None, TopologyConfig()))
+            return SlamPiece(saved.frames, edges, patch, builder.map, builder.next_id, erased, tag)
+        bare = SlamPiece.of_bare_map(patch, builder.map, builder.next_id)
+    else:
+        bare = SlamPiece.of_bare_map(patch, build(patch, None, TopologyConfig()))
+    return replace(bare, tag=tag)
 
 
 def write_ids(path: Path, merged: MergedMap) -> None:

@@ -22,6 +22,7 @@ from thinmap_ros.core.errors import InputError, one_line_reason, quoted, require
 from thinmap_ros.core.grid.moved import aligned_patch
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
+from thinmap_ros.core.stage import checked_tag
 from thinmap_ros.files.safe import (
     FILES,
     PIECE_BYTES,
@@ -159,6 +160,7 @@ def _colour_pixels(strip: 'Image.Image', least_alpha: int) -> _Pixels:
 # Receives a line that the user of a map should know.
 Report = Callable[[str], object]
 _MARK = '# written by thinmap'
+TAG = 'map_tag'  # key
 # map_saver writes 0.25 beside the same grey values, but map_server takes each pixel below
 # free_thresh as free, and unknown is 50/255 = 0.19608 dark: the map would lose what is unknown.
 # Another grey value would not be unknown to readers that expect 205.
@@ -173,8 +175,11 @@ class _Grey(IntEnum):
     OCCUPIED = 0
 
 
-def write_map(stem: Path | str, patch: GridPatch) -> Path:
-    """Write STEM.pgm and STEM.yaml (trinary mode); returns the path of the YAML file."""
+def write_map(stem: Path | str, patch: GridPatch, tag: str = '') -> Path:
+    """Write STEM.pgm and STEM.yaml (trinary mode); returns the path of the YAML file.
+
+    tag: of the storey, which other readers of such files ignore.
+    """
     from PIL import Image  # imported here: most processes never write or read a map
 
     stem = path_of(stem)
@@ -187,7 +192,8 @@ def write_map(stem: Path | str, patch: GridPatch) -> Path:
     with atomic_write(image) as aside:
         Image.fromarray(grey[::-1]).save(aside, format='PPM')
         # The image is renamed last: if the disk is full, the old map remains unchanged.
-        content = yaml.safe_dump(_description(image.name, patch), sort_keys=False)
+        description_of = _description(image.name, patch) | ({TAG: tag} if tag else {})
+        content = yaml.safe_dump(description_of, sort_keys=False)
         write_text(description, f'{_MARK}\n{content}')
     return description
 
@@ -245,6 +251,14 @@ def read_map(
         if keeps_unknown:
             read = _read_image(path, image, replace(shades, keeps_unknown=True))
     return aligned_patch(origin, resolution, read.cells, FILES.image_pixels)
+
+
+def read_tag(path: Path) -> str:
+    """The tag of the storey of a map, from its YAML file; '' for none. Raises InputError."""
+    tag = read_texts(path, 'a map_server YAML file').get(TAG, '')
+    if not isinstance(tag, str):
+        raise InputError(f'{path}: {TAG} = {quoted(tag)}: expected a text')
+    return checked_tag(f'{path}: {TAG}', tag)
 
 
 def read_resolution(path: Path) -> float:

@@ -21,7 +21,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
-from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_class
+from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_class, tag_of
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import StartConfig
@@ -33,6 +33,7 @@ from thinmap_ros.files.occupancy_maps import (
     is_own_map,
     read_map,
     read_resolution,
+    read_tag,
     warn,
     write_map,
 )
@@ -266,20 +267,22 @@ def save_grid(
     shown: GridPatch | None = None,
     edits: MapEdits | None = None,
     overwrite: bool = False,
+    tag: str = '',
 ) -> str:
     """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written.
 
     Raises as `SessionPart.save`.
 
     shown: the cells of the image, where they differ from those of the grid. edits: of the map, in
-    STEM.edits.npz; where there are none, those of an earlier session are archived.
+    STEM.edits.npz; where there are none, those of an earlier session are archived. tag: of the
+    storey, in STEM.yaml.
     """
     stem = stem_of(path)
     GRID.require_no_loss(path, grid, overwrite)
     # No file takes its name before all are written: a full disk leaves the old session unchanged.
     with atomic_write(GRID.file(path)) as aside:
         GRID.write(aside, grid)
-        write_map(stem, grid.known_area() if shown is None else shown)
+        write_map(stem, grid.known_area() if shown is None else shown, tag)
         if edits:
             EDITS.save(path, edits)
             return f'{stem}.pgm, {_MAP_ENDING}, {EDITS.ending} and {GRID.ending}'
@@ -376,15 +379,23 @@ def _keyframes_of(localizer: AnyLocalizer | None) -> SavedKeyframes | None:
     return localizer.saved_keyframes()
 
 
+def _tag_of(localizer: AnyLocalizer | None) -> str:
+    return localizer.map_tag if isinstance(localizer, Localizer) else ''
+
+
 @dataclass(frozen=True, eq=False)
 class SessionMap:
-    """What a session holds of a map. localizer: None where there is none in it."""
+    """What a session holds of a map. localizer: None where there is none in it.
+
+    tag: of the storey, where the localizer does not know it.
+    """
 
     grid: OccupancyGrid
     topology: TopologyBuilder
     regions: RegionTracker
     edits: MapEdits
     localizer: AnyLocalizer | None = None
+    tag: str = ''
 
 
 def save_session(path: str, session: SessionMap) -> list[str]:
@@ -405,7 +416,8 @@ def save_session(path: str, session: SessionMap) -> list[str]:
     with ExitStack() as stack:
         for part, value in written:
             part.write(stack.enter_context(atomic_write(part.file(path))), value)
-        grid = save_grid(path, session.grid, edits=session.edits)
+        tag = _tag_of(session.localizer) or session.tag
+        grid = save_grid(path, session.grid, edits=session.edits, tag=tag)
     *endings, last = [part.ending for part, _ in written]
     archived = [part.archive(path) for part, value in parts if value is None]
     return [f'{grid}, {", ".join(endings)} and {last}', *filter(None, archived)]
@@ -418,14 +430,18 @@ def load_localizer(
 
     One that maps by scan matching has the keyframes of the session, if there are any.
     folder, report: as in `read_map`. None: no map that this localizer can use.
-    Raises InputError where a file is broken, or the path names no map.
+    Raises InputError where a file is broken, the path names no map, or one of another storey.
     """
     if LOCALIZER.exists(path):
-        return _load_own_localizer(path, config)
-    if not isinstance(config, LocalizerConfig):
+        localizer = _load_own_localizer(path, config)
+    elif isinstance(config, LocalizerConfig):
+        grid = load_grid(path, None, folder, report)
+        localizer = Localizer.in_occupancy_map(grid.known_area(), config)
+    else:
         return None
-    grid = load_grid(path, None, folder, report)
-    return Localizer.in_occupancy_map(grid.known_area(), config)
+    if isinstance(localizer, Localizer):
+        localizer.tag_map(_given_tag(path))
+    return localizer
 
 
 def _load_own_localizer(path: str, config: StartConfig) -> AnyLocalizer:
@@ -438,6 +454,29 @@ def _load_own_localizer(path: str, config: StartConfig) -> AnyLocalizer:
         return Localizer.from_state(state, config, keyframes)
 
     return replace(LOCALIZER, restore=restore).load(path, config)
+
+
+def load_tag(path: str) -> str:
+    """The tag of the storey of a session or map_server map; '' for none. Raises InputError."""
+    given = _given_tag(path)
+    return _saved_tag(LOCALIZER.file(path)) if LOCALIZER.exists(path) and not given else given
+
+
+def _saved_tag(file: Path) -> str:
+    """The tag in STEM.slam.npz."""
+    try:
+        with open_regular_file(file) as stream:
+            return tag_of(read_snapshot(stream, LOCALIZER.name))
+    except OSError as error:
+        raise InputError(f'{file}: {error.strerror or one_line_reason(error)}') from error
+    except InputError as error:
+        raise InputError(f'{file}: {error}') from error
+
+
+def _given_tag(path: str) -> str:
+    """The tag in STEM.yaml."""
+    description = description_of(path)
+    return read_tag(description) if _exists(description) else ''
 
 
 def load_topology(path: str, config: TopologyConfig | None = None) -> TopologyBuilder:

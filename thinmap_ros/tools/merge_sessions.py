@@ -65,7 +65,11 @@ def _merge(arguments: argparse.Namespace) -> MergedMap:
     with ProgressBar('merge_sessions', arguments.quiet) as bar:
         try:
             return merge_maps(
-                arguments.maps, arguments.join_odds, progress=bar.show, at=arguments.at
+                arguments.maps,
+                arguments.join_odds,
+                progress=bar.show,
+                at=arguments.at,
+                tag=arguments.tag,
             )
         except NotTheSamePlaceError as error:
             bar.close()
@@ -123,6 +127,12 @@ def main() -> None:
         metavar='X,Y,YAW',
         help='pose of the second map in the first one (m, m, rad), to some 0.5 m and 0.1 rad, '
         'instead of looking for it; again for each further map',
+    )
+    parser.add_argument(
+        '--tag',
+        default='',
+        help='storey that all maps show which have no map_tag, any name: their places are found by '
+        'views alone, and maps of another storey are refused',
     )
     parser.add_argument('--picture', type=Path, help='FILE.png: the maps, and the merged one')
     parser.add_argument('--ids', type=Path, help='FILE.csv: ids of nodes in the merged map')

@@ -77,3 +77,20 @@ def test_walls_where_the_other_map_is_unknown_tell_nothing():
         known.keyframes, GridPatch(known.patch.frame, unseen.astype(np.int8)), known.graph
     )
     assert structure_evidence(query, walls_only, motion, math.inf) > 0.0
+
+
+@pytest.mark.parametrize(
+    ('own', 'other', 'moved_m', 'is_joined'),
+    [
+        ('first', 'first', 1.6, True),
+        ('first', 'second', 0.0, False),
+        ('first', '', 0.0, True),
+        ('first', '', 1.6, False),
+    ],
+)
+def test_the_tags_of_storeys_decide_before_walls(own, other, moved_m, is_joined):
+    known = piece_of(storey(), own)
+    decision = recognize(piece_of(storey(moved_m), other), known)
+    assert decision.is_joined == is_joined
+    if own == other:
+        assert decision.log_odds > 50.0

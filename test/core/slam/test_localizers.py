@@ -18,6 +18,7 @@ from thinmap_ros.core.slam.track import LocalizerConfig
 FILTERS = ('association.', 'features.')
 MATCHING = (
     'lost_threshold',
+    'map_tag',
     'odometry.noise_window',
     'matching.',
     'local_map.',

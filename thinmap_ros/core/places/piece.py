@@ -316,11 +316,14 @@ class MapPiece:
         patch: GridPatch,
         graph: TopologicalMap,
         views: list[View] | None = None,
+        tag: str = '',
     ) -> None:
         """keyframes: in the order of the path; all in the frame of the piece.
 
-        views: along the keyframes, if they are made already.
+        views: along the keyframes, if they are made already; tag: of its storey, '' where nobody
+        knows it.
         """
+        self.tag = tag
         self.keyframes = keyframes
         self._views = views
         self.patch = patch

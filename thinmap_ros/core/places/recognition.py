@@ -25,9 +25,10 @@ from thinmap_ros.core.places.piece import (
     agree,
     are_same,
 )
-from thinmap_ros.core.places.structure import structure_evidence
+from thinmap_ros.core.places.structure import storey_evidence, structure_evidence
 from thinmap_ros.core.places.views import SPACING_M, WINDOW_M, View
 from thinmap_ros.core.se2 import Array, inverse
+from thinmap_ros.core.stage import are_two_storeys
 
 # Share of its walls that a view finds again at the right place, in the map of another visit.
 # Measured: median 0.80, 5 % quantile 0.54.
@@ -355,23 +356,24 @@ def decide(
 ) -> JoinDecision:
     """Decide whether a piece lies in a map: by the views of each of the two, and by their walls.
 
-    recognition: of the views of the piece in the map so far; query: the piece as it is now.
+    recognition: of the views of the piece in the map so far; query: the piece as it is now. Pieces
+    with different tags are never joined, those with equal ones whatever their walls.
     """
     least = math.log(join_odds)
     placement = recognition.placement(query, least)
     views = recognition.views
-    if placement is None:
+    if placement is None or are_two_storeys(query.tag, known.tag):
         return JoinDecision(False, None, -math.inf, len(views))
     log_odds = placement.log_odds
     if log_odds > least:
         back = log_odds_back(query, known, views, placement.hypothesis)
-        ratio = structure_evidence(query, known, placement.hypothesis.motion(views))
+        ratio = storey_evidence(query, known, placement.hypothesis.motion(views))
         log_odds = on_one_storey(min(log_odds, back), ratio, join_odds)
     return JoinDecision(log_odds > least, placement, log_odds, len(views))
 
 
 def on_one_storey(log_odds: float, ratio: float, join_odds: float) -> float:
-    """Log odds of a place, given those without regard to storeys, and `structure_evidence`.
+    """Log odds of a place, given those without regard to storeys, and `storey_evidence`.
 
     The same place on another storey is as rare beforehand as a false join that is accepted.
     """

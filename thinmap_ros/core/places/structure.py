@@ -40,6 +40,18 @@ def structure_evidence(
     return (expected - math.log(_OTHER_RATE / _SAME_RATE) * contrary_m) / _WALL_M
 
 
+def storey_evidence(
+    query: MapPiece, known: MapPiece, motion: MapMotion, reach_m: float = RANGE_M
+) -> float:
+    """Log likelihood ratio of one storey against two, as `structure_evidence`.
+
+    Infinite where the tags of both maps say that it is one.
+    """
+    if query.tag and query.tag == known.tag:
+        return math.inf
+    return structure_evidence(query, known, motion, reach_m)
+
+
 def _wall_lengths(
     own: MapPiece, other: MapPiece, motion: MapMotion, reach_m: float
 ) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from thinmap_ros.core.ekf_slam.features import (
     extract_lines,
     odometry_variances,
 )
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
@@ -53,12 +53,14 @@ from thinmap_ros.core.slam.odometry import OdometryCalibration, PoseUncertainty
 from thinmap_ros.core.slam.track import LocalizerConfig, Surroundings, Tracked, Tracker
 from thinmap_ros.core.slam.wall_compass import Heading, Reference, WallCompass
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.stage import Correction, Estimate, StartConfig
+from thinmap_ros.core.stage import Correction, Estimate, StartConfig, are_two_storeys, checked_tag
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 # A scan is added to the local map after so much motion: nearer ones show the same walls again.
 _UPDATE_M = 0.2
 _UPDATE_RAD = 0.2
+
+_TAG = 'map_tag'  # in a saved state
 
 _VIEW_M = 1.0  # path length after which the errors of two matches are independent
 
@@ -237,6 +239,7 @@ class Localizer:
     def reset(self) -> None:
         """Discard map, path and pose; the next scan starts at the configured initial pose."""
         config = self.config
+        self.map_tag = checked_tag('map_tag', config.map_tag)
         self._tracker = Tracker(config)
         calibration = self._tracker.prediction.calibration
         self._heading = HeadingCorrection(config.lines, calibration)
@@ -321,7 +324,21 @@ class Localizer:
 
     def state(self) -> State:
         """The published local map as arrays by name, for `from_state`; without the pose."""
-        return self._local.published(self.keyframes).state()
+        state = self._local.published(self.keyframes).state()
+        return {**state, _TAG: snapshot.text_array(self.map_tag)} if self.map_tag else state
+
+    def tag_map(self, tag: str) -> None:
+        """Take the tag of the map that it was loaded from; '' is none.
+
+        Raises InputError where it is in a map of another storey than the configured one.
+        """
+        checked_tag('map_tag of the map', tag)
+        if are_two_storeys(self.map_tag, tag):
+            raise InputError(
+                f'map_tag = {quoted(self.map_tag)}: the map is of {quoted(tag)}: expected a map of '
+                'the same storey'
+            )
+        self.map_tag = self.map_tag or tag
 
     def saved_keyframes(self, since_ns: int = 0) -> SavedKeyframes | None:
         """The keyframes of the published map, for `from_state`, from the one of a stamp on.
@@ -341,12 +358,14 @@ class Localizer:
         keyframes: those of that map, with which it is corrected like a map that has never been
         saved. It is delocalized until scans fit. Raises InputError if the state is invalid.
         """
-        checked = snapshot.validate(state, local_map.FIELDS, 'local map')
+        tag, cells = snapshot.split_text(state, _TAG)
+        checked = snapshot.validate(cells, local_map.FIELDS, 'local map')
         possible = bool((checked['hits'] <= checked['seen']).all())
         snapshot.require(
             possible, 'local map: hits: more than observations', 'no more hits than observations'
         )
         localizer = Localizer(config)
+        localizer.tag_map(tag)
         localizer._local.map.restore(checked)
         localizer._start_delocalized(checked, keyframes)
         return localizer
@@ -628,6 +647,11 @@ class Localizer:
 
 
 AnyLocalizer = Localizer | EkfLocalizer
+
+
+def tag_of(state: State) -> str:
+    """The tag of the storey in a `Localizer.state`; '' for none. Raises InputError."""
+    return snapshot.split_text(state, _TAG)[0]
 
 
 class LocalizerClass(Protocol):

@@ -61,6 +61,12 @@ class LocalizerConfig(StartConfig):
         low=0.1,
         high=1000.0,
     )
+    map_tag: str = parameter(
+        '',
+        'Storey that the map shows, any name; empty: not known. Maps of two storeys are never '
+        'joined, those of one are joined by their views alone. It is saved with the map, and a map '
+        'of another storey is not loaded.',
+    )
     odometry: MotionConfig = part(MotionConfig)
     lines: LineConfig = part(LineConfig)
     matching: MatchingConfig = part(MatchingConfig)

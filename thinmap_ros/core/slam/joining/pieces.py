@@ -95,7 +95,7 @@ class SlamPiece:
 
     edges: between keyframes, by their numbers; without any the piece is rigid. next_id: smallest
     number that no node or edge of the graph has had. erased: parts of which no earlier scan shows
-    anything.
+    anything. tag: of its storey, '' where nobody knows it.
     """
 
     frames: Sequence[Keyframe]
@@ -104,6 +104,7 @@ class SlamPiece:
     graph: TopologicalMap
     next_id: int
     erased: Sequence[Erasure] = ()
+    tag: str = ''
 
     @staticmethod
     def of_bare_map(patch: GridPatch, graph: TopologicalMap, next_id: int = 1) -> 'SlamPiece':
@@ -136,7 +137,7 @@ class SlamPiece:
     @cached_property
     def places(self) -> MapPiece:
         """The piece for recognition."""
-        return MapPiece(self.frames, self.patch, self.graph)
+        return MapPiece(self.frames, self.patch, self.graph, tag=self.tag)
 
 
 @dataclass(frozen=True, eq=False)
