@@ -133,3 +133,14 @@ def test_a_checkpoint_that_is_none_is_refused_in_words(killed):
         saved_pose({})
     with pytest.raises(InputError, match='local map'):
         restored(recovery.last.state(), CONFIG)
+
+
+def test_the_tag_of_the_map_is_that_of_before_the_kill(killed):
+    localizer, recovery, _, _ = killed
+    localizer.enter_storey('second')
+    state = {**Recovery().map_state(localizer), **recovery.pose_state(localizer)}
+    for saved in (state, {**localizer.state(), **recovery.last.state()}):
+        resumed, _ = restored(saved, replace(CONFIG, map_tag='first'))
+        assert resumed.map_tag == 'second'
+    resumed, _ = restored({k: v for k, v in state.items() if k != 'map_tag'}, CONFIG)
+    assert resumed.map_tag == ''

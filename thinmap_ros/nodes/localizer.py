@@ -3,12 +3,14 @@
 import math
 from dataclasses import dataclass, field
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
 
 from thinmap_msgs.msg import (
     LineFeature,
@@ -17,10 +19,11 @@ from thinmap_msgs.msg import (
     SlamStatus,
     TopologicalMap,
 )
+from thinmap_msgs.srv import SetMapTag
 from thinmap_ros import kernels
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import TILTED, Scan
@@ -60,8 +63,9 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_msg
 from thinmap_ros.ros.maps import UNKNOWN, new_map_id
 from thinmap_ros.ros.save_directory import SaveDirectory
+from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.session_services import offer_loading, offer_saving, save_on_exit
-from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded
 from thinmap_ros.ros.tf import MapBroadcaster, OdometrySource
 
 _HEALTH = {
@@ -174,6 +178,8 @@ class LocalizerNode(ThinmapNode):
     /localized_scan with all that a mapper needs of a scan; /trajectory after a loop closure;
     /keyframes and /keyframe_poses for map_joiner.
 
+    /map_tag, or the service set_map_tag, says on which storey the robot is.
+
     Services ~/pause, ~/reset, save_localizer, load_localizer, and check_localizer, which reads a
     saved map without replacing the present one. In a given map it is lost until
     /initialpose arrives or a scan matches at its start pose. In mode localization the map does not
@@ -223,6 +229,13 @@ class LocalizerNode(ThinmapNode):
         )
         self._given.source.subscribe(self, self._on_new_map)
         self._given.create_interface(self._output.map_frame, poses)
+        AdaptiveSubscription(self, String, 'map_tag', self._on_map_tag, qos.LATCHED)
+        offer(
+            self.create_service,
+            SetMapTag,
+            'set_map_tag',
+            lambda request: self._enter_storey(request.tag),
+        )
         offer_saving(self, self._save_directory, LOCALIZER, self._save)
         offer_loading(self, LOCALIZER, self._check, self._load)
 
@@ -235,12 +248,16 @@ class LocalizerNode(ThinmapNode):
     def reset_state(self) -> None:
         """Discard the map, or return to the session that the node was started with.
 
-        The robot is at the start pose.
+        The robot is at the start pose. A new map is of the storey that the robot is on.
         """
         if self._map_ids is not None:
             self._map_ids.begin()
         self._output.reset()
+        before = self._localizer.config
         self._begin()
+        tag = before.map_tag if isinstance(before, LocalizerConfig) else ''
+        if tag and not len(self._localizer.known_places()):
+            self._enter_storey(tag)
 
     def _begin(self) -> None:
         self._localizer = self._given.create_localizer()
@@ -287,6 +304,20 @@ class LocalizerNode(ThinmapNode):
         require_near_map(T_map_base, self._localizer)
         self._localizer.set_pose(T_map_base, covariance)
         self._given.pose_set(covariance)
+
+    def _on_map_tag(self, message: String, _: dict[str, Any]) -> None:
+        try:
+            self.get_logger().info(self._enter_storey(message.data))
+        except InputError as error:
+            self.get_logger().warning(f'topic map_tag: {error}')
+
+    def _enter_storey(self, tag: str) -> str:
+        """The robot is on a storey: a lift has taken it there."""
+        if not isinstance(self._localizer, Localizer):
+            raise InputError(f'map_tag: slam is {self._config.slam}: expected {SCAN_MATCHING}')
+        self._localizer.enter_storey(tag)
+        here = 'the map is' if self._localizer.map_tag == tag else 'a piece of map apart is'
+        return f'{here} of {quoted(tag)}'
 
     def _on_new_map(self) -> None:
         """Localize in the map that topic map has brought."""
@@ -394,7 +425,7 @@ class LocalizerNode(ThinmapNode):
 
     def _read(self, path: str) -> AnyLocalizer | None:
         """Localizer in a saved map, at the present pose; None where there is no such map."""
-        config = config_at(self._config, self._localizer.pose)
+        config = config_at(self._localizer.config, self._localizer.pose)
         folder = self._save_directory
         return load_localizer(folder.resolve(path), config, folder.path, self.get_logger().warning)
 

@@ -7,9 +7,11 @@ import pytest
 from support.carried_robot import carried
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.places.recognition import JOIN_ODDS
 from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.stage import Destination
+from thinmap_ros.core.slam.track import LocalizerConfig
+from thinmap_ros.core.stage import LOCALIZATION, Destination
 
 
 def localized(moments):
@@ -91,3 +93,68 @@ def test_scans_of_another_place_do_not_change_the_map_until_it_agrees_with_them(
     found = localized(carried(*drives))
     later = [estimate for drive, estimate, _ in found if drive == 1]
     assert later[-1].is_mapping_apart
+
+
+def test_a_robot_on_another_storey_stays_apart_whatever_it_recognizes():
+    """It drives on where it was, in what is to be the storey above: all looks alike."""
+    localizer = Localizer(LocalizerConfig(map_tag='first'))
+    apart = []
+    for moment in carried((1, 0, 70.0)):
+        estimate = localizer.step(moment.scan, moment.T_odom_base)
+        if apart:
+            apart.append(estimate)
+        elif len(localizer.keyframes) > 40:
+            before = [frame.T_map_base for frame in localizer.keyframes]
+            localizer.enter_storey('second')
+            apart.append(estimate)
+    assert all(estimate.is_mapping_apart for estimate in apart[1:])
+    assert apart[-1].apart.path_m > 20.0
+    assert localizer.map_tag == 'first'
+    saved = localizer.saved_keyframes().frames
+    np.testing.assert_array_equal([frame.T_map_base for frame in saved], before)
+
+
+def test_a_robot_that_is_back_on_its_storey_joins_its_map():
+    localizer = Localizer(LocalizerConfig(map_tag='first'))
+    drive = 0
+    found = []
+    for moment in carried((1, 0, 60.0), (4, 1, 15.0), (1, 3, 70.0)):
+        if moment.drive != drive:
+            drive = moment.drive
+            localizer.enter_storey(['first', 'second', 'first'][drive])
+        estimate = localizer.step(moment.scan, moment.T_odom_base)
+        found.append((drive, estimate, moment.T_world_base))
+    assert all(estimate.is_mapping_apart for drive, estimate, _ in found if drive == 1)
+    _, last, T_world_base = found[-1]
+    off = se2.between(se2.compose(found[0][2], last.T_map_base), T_world_base)
+    assert is_mapped(last)
+    assert np.hypot(off[0], off[1]) < 0.1
+    assert len(localizer.apart_points()), 'what it has seen of the second storey stays apart'
+
+
+def test_a_map_gets_the_first_tag_that_is_known():
+    localizer = Localizer()
+    moments = list(carried((1, 0, 4.0)))
+    localizer.enter_storey('hall')
+    localizer.enter_storey('first')  # nothing is mapped yet
+    for moment in moments:
+        localizer.step(moment.scan, moment.T_odom_base)
+    unnamed = Localizer.from_state({k: v for k, v in localizer.state().items() if k != 'map_tag'})
+    unnamed.enter_storey('second')
+    assert (localizer.map_tag, unnamed.map_tag) == ('first', 'second')
+    assert not unnamed.step(moments[0].scan, moments[0].T_odom_base).is_mapping_apart
+
+
+def test_a_storey_without_a_name_or_that_the_given_map_does_not_show_is_refused():
+    localizer = Localizer(LocalizerConfig(map_tag='first'))
+    for moment in carried((1, 0, 2.0)):
+        localizer.step(moment.scan, moment.T_odom_base)
+    given = Localizer.from_state(localizer.state(), LocalizerConfig(mode=LOCALIZATION))
+    with pytest.raises(InputError, match="map_tag = '': expected the name of a storey"):
+        given.enter_storey('')
+    with pytest.raises(
+        InputError, match="map_tag = 'second': the map is of 'first', and mode: loc"
+    ):
+        given.enter_storey('second')
+    given.enter_storey('first')
+    assert given.map_tag == 'first'

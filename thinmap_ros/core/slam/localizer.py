@@ -60,7 +60,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 _UPDATE_M = 0.2
 _UPDATE_RAD = 0.2
 
-_TAG = 'map_tag'  # in a saved state
+TAG = 'map_tag'  # in a saved state
 
 _VIEW_M = 1.0  # path length after which the errors of two matches are independent
 
@@ -239,13 +239,13 @@ class Localizer:
     def reset(self) -> None:
         """Discard map, path and pose; the next scan starts at the configured initial pose."""
         config = self.config
-        self.map_tag = checked_tag('map_tag', config.map_tag)
         self._tracker = Tracker(config)
         calibration = self._tracker.prediction.calibration
         self._heading = HeadingCorrection(config.lines, calibration)
         self._loops = LoopClosure(
             config.loop_closure, config.keyframes, config.matching, config.local_map, calibration
         )
+        self._loops.pieces.tag = checked_tag('map_tag', config.map_tag)
         self._atlas = Atlas(self._loops)
         self._local = ActiveMap(config.local_map, self._loops.pieces)
         self._path = KeyframeTrajectory()
@@ -283,6 +283,11 @@ class Localizer:
     def edges(self) -> list[Edge]:
         """Edges of the pose graph between the keyframes: their steps, and those of loops."""
         return [*self._loops.keyframes.steps, *self._loops.graph.edges]
+
+    @property
+    def map_tag(self) -> str:
+        """Tag of the storey that the published map shows; '' where it is not known."""
+        return self._loops.pieces.published_tag
 
     @property
     def published_graph(self) -> LoopClosure | None:
@@ -325,7 +330,11 @@ class Localizer:
     def state(self) -> State:
         """The published local map as arrays by name, for `from_state`; without the pose."""
         state = self._local.published(self.keyframes).state()
-        return {**state, _TAG: snapshot.text_array(self.map_tag)} if self.map_tag else state
+        return {**state, **self.tag_state()}
+
+    def tag_state(self) -> State:
+        """The tag of the published map as an array by name; nothing where it has none."""
+        return {TAG: snapshot.text_array(self.map_tag)} if self.map_tag else {}
 
     def tag_map(self, tag: str) -> None:
         """Take the tag of the map that it was loaded from; '' is none.
@@ -338,7 +347,26 @@ class Localizer:
                 f'map_tag = {quoted(self.map_tag)}: the map is of {quoted(tag)}: expected a map of '
                 'the same storey'
             )
-        self.map_tag = self.map_tag or tag
+        self._loops.pieces.tag = self.map_tag or tag
+
+    def enter_storey(self, tag: str) -> None:
+        """Continue on a storey: in the map, which gets the tag if it has none, or in a piece apart.
+
+        A piece begins where the robot was on another storey, and joins the map where both have one
+        tag. Raises InputError where the tag is none, or the map of another storey stays as it is.
+        """
+        if not checked_tag('map_tag', tag):
+            raise InputError(f'map_tag = {quoted(tag)}: expected the name of a storey')
+        pieces = self._loops.pieces
+        if are_two_storeys(pieces.tag, tag) and not self._local.map.is_empty:
+            if not self.config.is_mapping:
+                raise InputError(
+                    f'map_tag = {quoted(tag)}: the map is of {quoted(pieces.tag)}, and mode: '
+                    f'{self.config.mode}: expected that a map of that storey is loaded'
+                )
+            self._start_submap()
+        pieces.tag = tag
+        self.config = replace(self.config, map_tag=tag)
 
     def saved_keyframes(self, since_ns: int = 0) -> SavedKeyframes | None:
         """The keyframes of the published map, for `from_state`, from the one of a stamp on.
@@ -358,7 +386,7 @@ class Localizer:
         keyframes: those of that map, with which it is corrected like a map that has never been
         saved. It is delocalized until scans fit. Raises InputError if the state is invalid.
         """
-        tag, cells = snapshot.split_text(state, _TAG)
+        tag, cells = snapshot.split_text(state, TAG)
         checked = snapshot.validate(cells, local_map.FIELDS, 'local map')
         possible = bool((checked['hits'] <= checked['seen']).all())
         snapshot.require(
@@ -651,7 +679,7 @@ AnyLocalizer = Localizer | EkfLocalizer
 
 def tag_of(state: State) -> str:
     """The tag of the storey in a `Localizer.state`; '' for none. Raises InputError."""
-    return snapshot.split_text(state, _TAG)[0]
+    return snapshot.split_text(state, TAG)[0]
 
 
 class LocalizerClass(Protocol):

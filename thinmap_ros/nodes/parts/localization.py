@@ -13,7 +13,7 @@ from thinmap_ros.core.odometry import FIELDS, OdometryAnchor
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.slam.joining.messages import KeyframeSender
-from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_class
+from thinmap_ros.core.slam.localizer import TAG, AnyLocalizer, Localizer, localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.snapshot import MAX_COUNT, Field, State
 from thinmap_ros.core.stage import StartConfig
@@ -128,7 +128,11 @@ class Recovery:
         self._newest_ns = 0 if keyframes is None else keyframes.stamps_ns[-1]
         if keyframes is None or not isinstance(localizer, Localizer):
             return localizer.state()
-        return {**_packed(keyframes), _CALIBRATION: localizer.calibration}
+        return {
+            **_packed(keyframes),
+            _CALIBRATION: localizer.calibration,
+            **localizer.tag_state(),
+        }
 
     def pose_state(self, localizer: AnyLocalizer) -> State | None:
         """The last known pose, and the keyframes since the map was saved; None before the first."""
@@ -153,8 +157,12 @@ def restored(state: State, config: StartConfig) -> tuple[AnyLocalizer, OdometryA
     """
     last = saved_pose(state)
     own = {name: array for name, array in state.items() if name not in FIELDS}
-    if _STAMPS not in own or not isinstance(config, LocalizerConfig):
+    if not isinstance(config, LocalizerConfig):
         return localizer_class(config).from_state(own, config), last
+    tag, own = snapshot.split_text(own, TAG)
+    config = replace(config, map_tag=tag or config.map_tag)
+    if _STAMPS not in own:
+        return Localizer.from_state(own, config), last
     calibration = _calibration({n: own.pop(n) for n in [*own] if n == _CALIBRATION})
     newer = {name: array for name, array in own.items() if name.startswith(_NEWER)}
     keyframes = _unpacked({name: array for name, array in own.items() if name not in newer})

@@ -38,7 +38,7 @@ from thinmap_ros.core.slam.graph.tables import EdgeTable
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 from thinmap_ros.core.slam.odometry import CHI2, OdometryCalibration
-from thinmap_ros.core.stage import Correction
+from thinmap_ros.core.stage import Correction, are_two_storeys
 
 AGAIN_M = 8.0  # smallest path length between two visits of a place
 
@@ -155,10 +155,12 @@ class Pieces:
     A piece holds submaps whose places relative to each other are known.
     A submap that begins because scans contradict the map is a piece of its own. Matches of the
     robot's piece with another one are stored; enough that agree are loop edges, which join the two.
+    A piece may have the tag of its storey; those of two storeys are never joined.
     """
 
     def __init__(self) -> None:
         self._piece_of = [_PUBLISHED]  # by the number of the submap
+        self._tags: dict[int, str] = {}  # by the number of the piece
         self._matches: deque[Edge] = deque(maxlen=_RECENT_SUBMAPS)
 
     @property
@@ -176,13 +178,33 @@ class Pieces:
         """Whether the place of the robot in the published map is unknown."""
         return self._piece_of[-1] != _PUBLISHED
 
+    @property
+    def tag(self) -> str:
+        """Tag of the piece that the robot is in; '' where its storey is not known."""
+        return self._tags.get(self.piece, '')
+
+    @tag.setter
+    def tag(self, tag: str) -> None:
+        self._tags[self.piece] = tag
+
+    @property
+    def published_tag(self) -> str:
+        """Tag of the published map."""
+        return self._tags.get(_PUBLISHED, '')
+
+    def is_other_storey(self, submap: int = 0) -> bool:
+        """Whether a submap, by default of the published map, is of another storey than here."""
+        return are_two_storeys(self.tag, self._tags.get(self._piece_of[submap], ''))
+
     def load(self, submaps: int) -> None:
         """Begin a submap of the published map, after a number of others of it."""
         self._piece_of = [_PUBLISHED] * (submaps + 1)
 
     def begin(self) -> None:
-        """Begin a submap, apart from all others."""
+        """Begin a submap, apart from all others; of the storey that the robot was on."""
+        tag = self.tag
         self._piece_of.append(len(self._piece_of))
+        self.tag = tag
 
     def return_to_published(self) -> None:
         """The pose in the published map was given: leave a piece that is apart."""
@@ -202,6 +224,7 @@ class Pieces:
         for edge in edges:
             ends = (frames[edge.a].submap, frames[edge.b].submap)
             kept, gone = sorted(self._piece_of[submap] for submap in ends)
+            self._tags[kept] = self._tags.get(kept) or self._tags.get(gone, '')
             self._piece_of = [kept if piece == gone else piece for piece in self._piece_of]
 
     def add_match(self, edge: Edge) -> None:
@@ -666,6 +689,8 @@ class LoopClosure:
     def _match(self, job: _Job) -> None:
         """Match keyframe k, or the pending one, with the submap around j; add the edge."""
         j = job.j
+        if self.pieces.is_other_storey(self.keyframes.frames[j].submap):
+            return
         k = job.k
         here = self._frame(k)
         frames = self.keyframes.frames

@@ -21,6 +21,7 @@ from thinmap_ros.core.slam.graph.loop_closure import (
     EDGE_NOISE,
     LoopClosure,
     LoopClosureConfig,
+    Pieces,
     Submaps,
 )
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
@@ -201,8 +202,8 @@ class _PieceSearch:
                 self._known.add(number, frames[number])
             if not self._waiting:
                 self._known.end_path()
-        elif self._has_view:
-            self._look(join_odds)
+        elif self._has_view and not loops.pieces.is_other_storey():
+            self._look(loops.pieces, join_odds)
         else:
             self._grow(loops)
         return None
@@ -222,16 +223,17 @@ class _PieceSearch:
                 self._query.add(number, frames[number])
                 return
 
-    def _look(self, join_odds: float) -> None:
+    def _look(self, pieces: Pieces, join_odds: float) -> None:
         """Look for the next view, and begin to join if the place is sure."""
         if not len(self._known):
             return
         if self._recognition is None:
-            self._recognition = Recognition(self._known.map_piece())
+            self._recognition = Recognition(self._known.map_piece(pieces.published_tag))
         recognition = self._recognition
         view = self._query.views[len(recognition.views)]
         recognition.add(view, self._query.landmarks(view))
-        decision = decide(recognition, self._query.map_piece(), recognition.known, join_odds)
+        query = self._query.map_piece(pieces.tag)
+        decision = decide(recognition, query, recognition.known, join_odds)
         self._log_odds = decision.log_odds
         if decision.is_joined and decision.placement is not None:
             placement = decision.placement

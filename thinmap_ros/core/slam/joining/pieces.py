@@ -68,9 +68,9 @@ class GrowingPiece:
         """Make the views at the end of the path, after the last keyframe."""
         self.views += self._views.finish()
 
-    def map_piece(self) -> MapPiece:
-        """The piece as it is now."""
-        return MapPiece(self.frames, self._grid.known_area(), self._topology.map, self.views)
+    def map_piece(self, tag: str = '') -> MapPiece:
+        """The piece as it is now; tag: of its storey."""
+        return MapPiece(self.frames, self._grid.known_area(), self._topology.map, self.views, tag)
 
     def landmarks(self, view: View) -> Landmarks:
         """Landmarks around a view of this piece."""
