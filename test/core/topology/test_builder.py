@@ -174,19 +174,6 @@ def test_ids_stay_while_nothing_changes():
     assert asked > 100 and kept >= 0.99 * asked
 
 
-def test_what_comes_back_has_its_ids():
-    patch = building()
-    builder = TopologyBuilder()
-    builder.update(patch, np.array([5.0, 5.0, 0.0]))
-    before = set(builder.map.nodes)
-    closed = GridPatch(patch.frame, patch.cells.copy())
-    closed.cells[178:186] = 100  # the doors of the rooms
-    builder.update(closed, np.array([5.0, 5.0, 0.0]))
-    assert before - builder.map.nodes.keys()
-    builder.update(patch, np.array([5.0, 5.0, 0.0]))
-    assert set(builder.map.nodes) == before
-
-
 @pytest.mark.parametrize('shorter', [30, 60, 90])
 def test_corners_of_a_path_whose_end_moved_keep_their_ids(shorter):
     cells = np.full((80, 420), 100)

@@ -350,8 +350,6 @@ class Registry:
         self._passages: dict[int, _Passage] = {}
         self._nodes: dict[_Key, int] = {}
         self._boxes = _Boxes()
-        # Removed nodes: those that come back are the same.
-        self._removed = TopologicalMap()
 
     @property
     def hashes(self) -> set[int]:
@@ -361,9 +359,9 @@ class Registry:
     def update(self, lattice: Lattice, changes: Changes) -> bool:
         """Publish the changes; returns whether there were any.
 
-        A new node gets the id of a removed one within MATCH_RADIUS_M, nearest pairs first, those
-        that were removed now before those of earlier updates; a corner also that of one farther
-        along its edge; and an edge that of a removed one between the same nodes.
+        A new node gets the id of a removed one within MATCH_RADIUS_M, nearest pairs first; a corner
+        also that of a corner farther off, as along its edge; and an edge that of a removed one
+        between the same nodes.
         """
         new = {
             number: _Passage.of(lattice, cells, self._limits)
@@ -386,7 +384,6 @@ class Registry:
         for number, passage in new.items():
             wanted |= {(cell, number) for cell in passage.corners}
         self._put_nodes(lattice, wanted - self._nodes.keys(), old_nodes, reach_m)
-        self._keep_removed(old_nodes)
         self._put_passages(new, old_edges)
         for cell in loose | kept:
             if (cell, 0) in self._nodes:
@@ -443,26 +440,8 @@ class Registry:
         ]
         ids = self._continued(nodes, old, reach_m)
         for k, place in enumerate(places):
-            self._nodes[place] = ids.get(k) or self._returned(nodes[k]) or self._new_id()
+            self._nodes[place] = ids.get(k) or self._new_id()
             self.map.put_node(replace(nodes[k], id=self._nodes[place]))
-
-    def _keep_removed(self, nodes: list[Node]) -> None:
-        """Remember nodes that no new one continues, at most one within MATCH_RADIUS_M."""
-        for node in nodes:
-            if node.id not in self.map.nodes:
-                self._returned(node)
-                self._removed.put_node(node)
-
-    def _returned(self, node: Node) -> int:
-        """Id of the nearest node within MATCH_RADIUS_M that was removed earlier; 0: none.
-
-        It is no longer remembered.
-        """
-        nearest = self._removed.nearest_node(node.x, node.y)
-        if nearest is None or math.dist(nearest.position, node.position) > MATCH_RADIUS_M:
-            return 0
-        self._removed.drop_node(nearest.id)
-        return nearest.id
 
     def _continued(self, fresh: list[Node], old: list[Node], reach_m: float) -> dict[int, int]:
         """Ids of old nodes by the index of the new node that continues each."""
