@@ -1,4 +1,4 @@
-"""What contradicts a place: walls of one map that stand in what the other one has seen to be free.
+"""What contradicts a place: walls of one map in what the other one has seen to be free.
 
 Storeys of a building have one outline, and rooms along a corridor one shape: views of one fit into
 another. Inner walls tell them apart.
@@ -55,7 +55,7 @@ def storey_evidence(
 def _wall_lengths(
     own: MapPiece, other: MapPiece, motion: MapMotion, reach_m: float
 ) -> tuple[float, float]:
-    """Length of the walls of a map that another one shows again, and that stand in its free space.
+    """Length of the walls of a map that another one shows again, and that lie in its free space.
 
     motion: of places from the other map to this one. In m.
     """
