@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from thinmap_ros.core.grid.fields import reachable
@@ -15,11 +14,14 @@ from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.se2 import Array, Cells, Mask, distances_from_line, path_length
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.thinning import (
+    VIEW_M,
     column_distance,
     known_free,
     squared_clearance,
     standing_room,
     true_cells,
+    view_ends,
+    view_from,
 )
 from thinmap_ros.jit import inlined, kernel
 
@@ -27,12 +29,6 @@ DETAIL_M = 1.2  # a small table; nodes are as far apart, unless another spacing 
 MIN_NODE_SPACING_M = 0.05  # a cell of most maps
 
 _DIRECTIONS = 72  # of straight lines from a cell
-_RAY_REACH_M = 3.0  # beyond, whatever ends a view is no part of the place
-_DEPTH_M = 0.25  # less of the unknown is specks between beams, and the fringe before walls
-_BESIDE_M = 0.15  # of a wall: a hole between beams of 2 degrees at 8 m is twice as wide
-# States of cells, besides 0, free.
-_UNKNOWN = 1
-_WALL = 2
 
 _LATTICE_M = 0.5  # between the places that should see a node
 _SIGHT_REACH_M = 10.0  # a node that is farther off is out of sight
@@ -205,11 +201,10 @@ def drop_rays(topology: TopologicalMap, patch: GridPatch) -> None:
     """Drop ends that see more of the unknown than of walls, back to the first node that does not.
 
     Such a branch is a ray: space that a laser saw through glass, without walls around.
-    A node without edges counts as an end, unless nothing else is left. Walls that a cheap laser
-    draws have holes: unknown cells beside a wall count as wall, others only where they are deep.
+    A node without edges counts as an end, unless nothing else is left.
     """
-    states = _states(patch)
-    reach = _RAY_REACH_M / patch.frame.resolution
+    ends = view_ends(patch)
+    reach = VIEW_M / patch.frame.resolution
     open_ids = [number for number in topology.nodes if len(topology.edges_at(number)) < 2]
     while open_ids and len(topology.nodes) > 1:
         number = open_ids.pop()
@@ -217,51 +212,10 @@ def drop_rays(topology: TopologicalMap, patch: GridPatch) -> None:
         if number not in topology.nodes or len(edges) > 1:
             continue
         row, col = patch.frame.cells_of(topology.nodes[number].position)[0].tolist()
-        walls, unknown = _view(states, row, col, reach, _DIRECTIONS)
+        walls, unknown = view_from(ends, row, col, reach, _DIRECTIONS)
         if unknown > walls:
             open_ids += [edge.other(number) for edge in edges if edge.a != edge.b]
             topology.drop_node(number)
-
-
-def _states(patch: GridPatch) -> NDArray[np.uint8]:
-    """What ends a view in each cell (H, W): a wall, the unknown, or, 0, nothing."""
-    depth = _DEPTH_M / 2.0 / patch.frame.resolution
-    core = standing_room(column_distance(patch.unknown), depth)
-    deep = patch.unknown & ~standing_room(column_distance(~core), depth)
-    beside = _BESIDE_M / patch.frame.resolution
-    margin = math.ceil(beside)  # cells outside are no walls
-    no_wall = np.pad(~patch.occupied, margin, constant_values=True)
-    apart = standing_room(column_distance(no_wall), beside)[margin:-margin, margin:-margin]
-    walls = patch.occupied | (patch.unknown & ~apart)
-    return np.where(walls, np.uint8(_WALL), _UNKNOWN * deep.astype(np.uint8))
-
-
-@kernel
-def _view(
-    states: NDArray[np.uint8], row: int, col: int, reach: float, directions: int
-) -> tuple[int, int]:
-    """Directions in which a view from a cell ends at a wall, and in the unknown, within a reach.
-
-    states (H, W): see the constants, 0 for what ends no view; reach in cells. The end of the map is
-    neither: it may be cut out of a larger one.
-    """
-    walls = 0
-    unknown = 0
-    for k in range(directions):
-        angle = 2.0 * math.pi * k / directions
-        away = 0.0
-        while away < reach:
-            r = int(math.floor(row + 0.5 + away * math.sin(angle)))
-            c = int(math.floor(col + 0.5 + away * math.cos(angle)))
-            if not (0 <= r < states.shape[0] and 0 <= c < states.shape[1]):
-                break
-            state = states[r, c]
-            if state != 0:
-                walls += state == _WALL
-                unknown += state == _UNKNOWN
-                break
-            away += 0.5
-    return walls, unknown
 
 
 @dataclass(frozen=True)

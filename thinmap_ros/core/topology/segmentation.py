@@ -20,6 +20,7 @@ from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.snapshot import MAX_COUNT, MAX_ID, Field
 from thinmap_ros.core.topology import regions as region_names
 from thinmap_ros.core.topology.regions import Door, Region, RegionKind, RegionMap, RegionNames
+from thinmap_ros.core.topology.thinning import VIEW_M, view_ends, view_from
 from thinmap_ros.jit import inlined, kernel
 
 Labels = NDArray[np.int32]
@@ -35,9 +36,6 @@ _COMPACT = 0.15
 _LEG = 0.2  # length up to which any shape is furniture, as a share of the largest
 
 # Of space behind glass: what a laser sees through it ends in the unknown, without walls around.
-_WALL_FRINGE_M = 0.15  # unknown cells this near to a wall are holes in it
-_DEEP_M = 0.1  # narrower strips of the unknown lie between two beams
-_VIEW_M = 3.0  # beyond, whatever ends a view is no part of the place
 _VIEW_STRIDE_M = 0.25  # between the places that are looked from
 _VIEWS = 24  # directions
 _OPEN = 0.6  # share of directions; it is a half at the edge of an explored hall
@@ -369,40 +367,22 @@ def _furniture(patch: GridPatch, longest: float) -> Mask:
 def behind_glass(patch: GridPatch) -> Mask:
     """Cells (H, W) that see the unknown in most directions: a laser saw them through glass."""
     resolution = patch.frame.resolution
-    is_wall = ~patch.free & (distance_cells(patch.occupied) * resolution <= _WALL_FRINGE_M)
-    steps = max(1, round(0.5 * _DEEP_M / resolution))
-    deep = ndimage.binary_opening(patch.unknown & ~is_wall, iterations=steps)
     stride = max(1, round(_VIEW_STRIDE_M / resolution))
-    return _sees_unknown(patch.free, is_wall, deep, stride, math.ceil(_VIEW_M / resolution))
+    return _sees_unknown(patch.free, view_ends(patch), stride, VIEW_M / resolution)
 
 
 @kernel
-def _sees_unknown(free: Mask, is_wall: Mask, deep: Mask, stride: int, reach: int) -> Mask:
+def _sees_unknown(free: Mask, ends: NDArray[np.uint8], stride: int, reach: float) -> Mask:
     """Squares of a stride (H, W) whose middle is free and sees the unknown in most directions."""
     rows, cols = free.shape
     found = np.zeros(free.shape, dtype=np.bool_)
     for row in range(stride // 2, rows, stride):
         for col in range(stride // 2, cols, stride):
-            if not free[row, col]:
-                continue
-            unknown = 0
-            for k in range(_VIEWS):
-                if unknown + _VIEWS - k <= _OPEN * _VIEWS:
-                    break  # the directions that are left do not decide
-                angle = 2.0 * math.pi * k / _VIEWS
-                for step in range(1, reach):
-                    r = int(math.floor(row + 0.5 + step * math.sin(angle)))
-                    c = int(math.floor(col + 0.5 + step * math.cos(angle)))
-                    if not (0 <= r < rows and 0 <= c < cols):
-                        break  # the map may be cut out of a larger one
-                    if deep[r, c]:
-                        unknown += 1
-                        break
-                    if is_wall[r, c]:
-                        break
-            top = row - stride // 2
-            left = col - stride // 2
-            found[top : top + stride, left : left + stride] = unknown > _OPEN * _VIEWS
+            if free[row, col]:
+                unknown = view_from(ends, row, col, reach, _VIEWS)[1]
+                top = row - stride // 2
+                left = col - stride // 2
+                found[top : top + stride, left : left + stride] = unknown > _OPEN * _VIEWS
     return found
 
 

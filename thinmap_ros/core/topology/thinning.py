@@ -15,6 +15,13 @@ from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.jit import inlined, kernel
 
 FAR = 1 << 14  # rows; "nothing in this column"
+
+VIEW_M = 3.0  # beyond, whatever ends a view is no part of the place
+_DEPTH_M = 0.25  # less of the unknown is specks between beams, and the fringe before walls
+_BESIDE_M = 0.15  # of a wall: a hole between beams of 2 degrees at 8 m is twice as wide
+# What ends a view.
+_UNKNOWN = 1
+_WALL = 2
 _ISLAND_M2 = 2.0
 _ISLAND_SHARE = 0.05  # of the largest part
 
@@ -101,6 +108,50 @@ def without_islands(standing: Mask, resolution: float) -> Mask:
     _, sizes = label(standing)
     largest = float(sizes[1:].max(initial=0))
     return without_specks(standing, min(_ISLAND_M2 / resolution**2, _ISLAND_SHARE * largest))
+
+
+def view_ends(patch: GridPatch) -> NDArray[np.uint8]:
+    """What ends a view in each cell (H, W): a wall, the unknown, or, 0, nothing.
+
+    Walls that a cheap laser draws have holes: unknown cells beside a wall count as wall, others
+    only where they are deep.
+    """
+    depth = _DEPTH_M / 2.0 / patch.frame.resolution
+    core = standing_room(column_distance(patch.unknown), depth)
+    deep = patch.unknown & ~standing_room(column_distance(~core), depth)
+    beside = _BESIDE_M / patch.frame.resolution
+    margin = math.ceil(beside)  # cells outside are no walls
+    no_wall = np.pad(~patch.occupied, margin, constant_values=True)
+    apart = standing_room(column_distance(no_wall), beside)[margin:-margin, margin:-margin]
+    walls = patch.occupied | (patch.unknown & ~apart)
+    return np.where(walls, np.uint8(_WALL), _UNKNOWN * deep.astype(np.uint8))
+
+
+@kernel
+def view_from(
+    ends: NDArray[np.uint8], row: int, col: int, reach: float, directions: int
+) -> tuple[int, int]:
+    """Directions in which a view from a cell ends at a wall, and in the unknown, within a reach.
+
+    ends (H, W): from `view_ends`; reach in cells. The end of the map is neither: it may be cut out
+    of a larger one.
+    """
+    walls = 0
+    unknown = 0
+    for k in range(directions):
+        angle = 2.0 * math.pi * k / directions
+        away = 0.0
+        while away < reach:
+            r = int(math.floor(row + 0.5 + away * math.sin(angle)))
+            c = int(math.floor(col + 0.5 + away * math.cos(angle)))
+            if not (0 <= r < ends.shape[0] and 0 <= c < ends.shape[1]):
+                break
+            if ends[r, c] != 0:
+                walls += ends[r, c] == _WALL
+                unknown += ends[r, c] == _UNKNOWN
+                break
+            away += 0.5
+    return walls, unknown
 
 
 @kernel
