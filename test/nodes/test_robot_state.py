@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from rclpy.clock import ROSClock
 from rclpy.time import Time
+from support.slam_room import ROOM, drive, scan_in
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.nodes.parts.driving import RobotState
 from thinmap_ros.ros.time_jumps import ElapsedTime
@@ -271,3 +273,19 @@ def test_one_of_two_lasers_on_one_topic_that_is_silent_is_named():
         robot.state.add_scan(replace(scan, frame=frame))
     robot.state.stop_reason()
     assert any(text.startswith("laser 'front' silent for") for text in robot.run(2))
+
+
+@pytest.mark.parametrize('late_steps', [0, 4, 10])
+def test_scans_received_after_later_odometry_do_not_make_a_laser_that_drops_out(late_steps):
+    """A busy machine handles the scans of a robot that looks round a hall late."""
+    rng = np.random.default_rng(4)
+    robot = Robot()
+    late = []
+    for k, (truth, odom) in enumerate(drive(400, rng, se2.pose(2.0, 2.0, 0.0))):
+        stamp_ns = 10 * S + k * STEP_NS
+        robot.state.add_odometry(stamp_ns, odom)
+        scan = replace(scan_in(ROOM, truth, rng, stamp_ns), range_max_m=2.5)
+        late.append(scan)
+        if len(late) > late_steps:
+            robot.state.add_scan(late.pop(0))
+            assert not robot.state.scans[0].drops_out

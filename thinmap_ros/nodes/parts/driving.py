@@ -294,8 +294,12 @@ class RobotState:
         if scan.frame not in self._lasers and len(self._lasers) >= _MAX_LASERS:
             self._lasers.clear()
         laser = self._lasers.setdefault(scan.frame, _Laser(topic))
-        if self._T_odom_base is not None:
-            scan = laser.monitor.checked(scan, self._T_odom_base)
+        # On a busy machine the last odometry is of another time than the scan.
+        T_odom_base = self._odometry.interpolate(scan.odometry_ns)
+        if T_odom_base is None:
+            T_odom_base = self._T_odom_base
+        if T_odom_base is not None:
+            scan = laser.monitor.checked(scan, T_odom_base)
         laser.blind_reason = scan.blind_reason
         laser.stamp_ns = scan.odometry_ns
         if not scan.is_blind:
