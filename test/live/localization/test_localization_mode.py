@@ -70,6 +70,15 @@ class Robot:
     def is_lost(self, scans=1):
         return [s.state for s in self.status[-scans:]] == [SlamStatus.LOST] * scans
 
+    def lost_share(self):
+        """Share of its path on which it is lost."""
+        truth = {messages.stamp_ns(m.header.stamp): m.pose.position for m in self.truth}
+        heard = [(s, truth.get(messages.stamp_ns(s.header.stamp))) for s in self.status]
+        known = [(s.state == SlamStatus.LOST, at.x, at.y) for s, at in heard if at is not None]
+        lost, x, y = np.array(known).T
+        steps_m = np.hypot(np.diff(x), np.diff(y))
+        return (lost[1:] * steps_m).sum() / steps_m.sum()
+
     def states(self):
         return {message.state for message in self.status}
 
@@ -123,8 +132,7 @@ def test_it_tracks_in_a_map_of_another_program_and_remembers_the_last_pose(graph
     amcl = graph.heard('amcl_pose', PoseWithCovarianceStamped, qos.LATCHED)
     start = {f'initial_pose.{key}': v for key, v in zip(('x', 'y', 'yaw'), START, strict=True)}
     robot.localize(map_file_name=str(path), set_initial_pose=True, **start)
-    # A busy machine does not hear all poses.
-    robot.drive_until(lambda: robot.travelled_m() > 12.0 and len(robot.poses) > 220, 'a drive')
+    robot.drive_until(lambda: robot.travelled_m() > 12.0, 'a drive')
     clouds = graph.heard('particle_cloud', ParticleCloud, qos.SENSOR)
     robot.drive_until(lambda: clouds, 'a cloud')
     assert robot.states() == {SlamStatus.TRACKING}
@@ -155,9 +163,9 @@ def test_it_is_lost_in_the_wrong_building(graph, tmp_path):
     robot = Robot(graph)
     robot.localize(map_file_name=str(path))
     robot.send_initial_pose(START)
-    robot.drive_until(lambda: robot.travelled_m() > 16.0, 'sixteen metres')
+    robot.drive_until(lambda: robot.travelled_m() > 12.0, 'twelve metres')
     # For three metres, a corner of this building looks like one of the other.
-    assert np.mean([status.state == SlamStatus.LOST for status in robot.status]) > 0.7
+    assert robot.lost_share() > 0.7
     assert robot.status[-1].state == SlamStatus.LOST
 
 
@@ -170,10 +178,11 @@ def test_a_loaded_map_of_another_building_leads_to_lost(graph, tmp_path):
     robot.send_initial_pose(START)
     graph.until(robot.is_tracking, 'tracking')
     load_map(graph, 'office.yaml')
-    began_m = robot.travelled_m()
-    # A busy machine hears late what was said before.
-    robot.drive_until(lambda: robot.is_lost(20), 'lost')
-    assert robot.travelled_m() < began_m + 5.0
+    robot.status.clear()
+    end_m = robot.travelled_m() + 1.5
+    # On a busy machine it may stand at first, where scans fit both buildings.
+    robot.drive_until(lambda: len(robot.status) > 30 and robot.travelled_m() > end_m, '1.5 m')
+    assert robot.is_lost(20)
     load_map(graph, 'drawn.yaml')
     robot.send_initial_pose(robot.true_pose())
     robot.drive_until(robot.is_tracking, 'tracking again')
