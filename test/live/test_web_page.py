@@ -34,6 +34,8 @@ AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.0}
 STANDS = (0.0, 0.0)
 # Time waits for the nodes, which a busy machine delays: three subscribe to scans.
 PACED = {'lockstep': 'local_topology', 'wait_for_subscribers': 3}
+# Of a navigator while simulated time passes four times as fast: ten in each of its seconds.
+COMMANDS_A_SECOND = 40
 
 
 class Site:
@@ -52,6 +54,19 @@ class Site:
 
     def until(self, condition, what):
         self.graph.until(condition, what)
+
+
+def held_joystick(page, is_done, **values):
+    """A condition that drives as a page does, ten times a second; more would close the page."""
+    asked = [0.0]
+
+    def drives():
+        if time.monotonic() - asked[0] >= 0.1:
+            asked[0] = time.monotonic()
+            page.ask('drive', **values)
+        return is_done()
+
+    return drives
 
 
 def news(page):
@@ -89,10 +104,11 @@ def test_a_robot_is_seen_sent_and_stopped(graph):
 
     page.ask('goal', x=2.0, y=4.5, theta=0.0)
     site.until(lambda: commands and commands[-1].linear.x > 0.1, 'the robot drives')
+    asked = len(commands)
     other.ask('stop')
-    began = time.monotonic()
     site.until(lambda: velocities(commands[-1:]) == [STANDS], 'a stop')
-    assert time.monotonic() - began < 1.0  # of a busy machine; its usual time is measured elsewhere
+    # Within a second, of which a busy machine makes more; its usual time is measured elsewhere.
+    assert len(commands) - asked < COMMANDS_A_SECOND
     for each in (page, other):
         each.until(lambda each=each: each.items['held'] and each.items['goal'] is None, 'held')
     page.ask('goal', x=2.0, y=4.5, theta=0.0)
@@ -141,18 +157,21 @@ def test_a_joystick_drives_while_it_is_held_and_no_longer(graph):
     page = site.open()
     other = site.open()
 
-    def drives():
-        page.ask('drive', ahead=0.5, left=-1.0)
-        return commands
+    def until_driven(by, velocity, what, **values):
+        site.until(
+            held_joystick(by, lambda: velocities(commands[-1:]) == [velocity], **values), what
+        )
 
-    site.until(drives, 'commands')
+    until_driven(page, (0.1, -0.5), 'commands', ahead=0.5, left=-1.0)
     assert set(velocities(commands)) == {(0.1, -0.5)}
-    other.ask('drive', ahead=1.0, left=0.0)
-    other.until(lambda: other.refusals, 'a refusal')
-    assert 'another page drives' in other.refusals[0]
+    # One of two joysticks is refused, whichever a busy machine has held up.
+    both = held_joystick(other, lambda: page.refusals or other.refusals, ahead=1.0, left=0.0)
+    site.until(held_joystick(page, both, ahead=0.5, left=-1.0), 'a refusal')
+    assert 'another page drives' in (page.refusals + other.refusals)[0]
+    site.until(lambda: velocities(commands[-1:]) == [STANDS], 'the stop of both')
+    until_driven(page, (0.1, -0.5), 'commands of the first', ahead=0.5, left=-1.0)
     page.refusals.clear()
     # Held no longer, without a word.
-    page.ask('drive', ahead=0.5, left=-1.0)
     site.until(lambda: velocities(commands[-1:]) == [STANDS], 'the stop of a silent page')
     # The node is held up: what the page has asked for meanwhile is old when it is read.
     process = graph.processes['web'].pid
@@ -163,27 +182,26 @@ def test_a_joystick_drives_while_it_is_held_and_no_longer(graph):
         page.ask_at(heard, 'drive', ahead=0.5, left=-1.0)
     page.ask_at(heard, 'initial_pose', x=1.0, y=1.0, theta=0.0)
     time.sleep(2.1)
+    graph.drain()
     commands.clear()
     os.kill(process, signal.SIGCONT)
-    page.until(lambda: len(page.refusals) == 21, 'refusals')
+    # The last is refused when all before it were; what was on its way before is late as well.
+    page.until(lambda: any('initial_pose' in text for text in page.refusals), 'the last refusal')
+    assert len(page.refusals) >= 21
     assert all('late' in text for text in page.refusals)
     assert set(velocities(commands)) <= {STANDS}
     page.ask('resume')
     site.until(lambda: 'no exploration is paused' in news(page), 'nothing to continue')
     # The connection is lost.
-    commands.clear()
-    site.until(drives, 'commands again')
+    until_driven(page, (0.1, -0.5), 'commands again', ahead=0.5, left=-1.0)
     page.drop()
     site.until(lambda: velocities(commands[-1:]) == [STANDS], 'the stop of a lost page')
 
-    def other_drives():
-        other.ask('drive', ahead=1.0, left=0.0)
-        return velocities(commands[-1:]) == [(0.2, 0.0)]
-
-    site.until(other_drives, 'the other page drives')
+    until_driven(other, (0.2, 0.0), 'the other page drives', ahead=1.0, left=0.0)
     # Somebody else stops the robot.
     graph.node.create_publisher(Bool, 'stop', qos.LATCHED).publish(Bool(data=True))
     site.until(lambda: other.items['held'], 'held')
+    site.until(lambda: velocities(commands[-1:]) == [STANDS], 'the stop of somebody else')
     commands.clear()
     other.ask('drive', ahead=1.0, left=0.0)
     site.until(lambda: len(commands) > 3, 'stops')
@@ -196,11 +214,7 @@ def test_a_dead_node_leaves_no_command(graph):
     commands = graph.heard('cmd_vel', Twist)
     page = site.open()
 
-    def drives():
-        page.ask('drive', ahead=1.0, left=0.0)
-        return commands
-
-    site.until(drives, 'commands')
+    site.until(held_joystick(page, lambda: commands, ahead=1.0, left=0.0), 'commands')
     assert graph.stop('web') == 0
     graph.drain()
     assert velocities(commands[-1:]) == [STANDS]

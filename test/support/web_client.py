@@ -75,12 +75,16 @@ class WebClient:
         await self._socket.write_message(text, binary=isinstance(text, bytes))
 
     def ask(self, action, **values):
-        self.ask_at(self.items.get('beat'), action, **values)
+        # First: the answer may come before anything that follows.
         self._asked[action] = values
+        self._ask(self.items.get('beat'), action, **values)
 
     def ask_at(self, beat, action, **values):
         """Ask as a page that has heard nothing since a beat, once."""
         self._asked.pop(action, None)
+        self._ask(beat, action, **values)
+
+    def _ask(self, beat, action, **values):
         heard = {} if beat is None else {'beat': beat}
         self.send_text(json.dumps({'action': action, **heard, **values}))
 
@@ -97,5 +101,6 @@ class WebClient:
         """Wait without spinning a graph."""
         end = time.monotonic() + PATIENCE_S
         while not condition():
-            assert time.monotonic() < end, f'never came: {what}'
+            reason = f'{what}: closed: {self.refusals}' if self.closed.is_set() else what
+            assert time.monotonic() < end, f'never came: {reason}'
             time.sleep(0.01)
