@@ -102,7 +102,9 @@ class Graph:
             heard_too = self.node.create_publisher(kind, 'heard_too', qos.STREAM)
             self.node.create_subscription(kind, topic, heard_too.publish, qos.STREAM)
             self._pacemaker = heard_too
-        return (f'{topic}:=heard_too',)
+        # With the topic pose, lockstep goes on with the status of a scan as well.
+        own = ('slam_status:=unheard',) if topic == 'pose' else ()
+        return (f'{topic}:=heard_too', *own)
 
     def drain(self) -> None:
         """Receive queued messages until there are no more: stopped nodes publish nothing later."""

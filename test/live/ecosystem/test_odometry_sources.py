@@ -202,9 +202,7 @@ def test_every_lookup_at_the_present_time_succeeds(graph, seconds):
     """
     graph.start('localizer', use_sim_time=True, **AT_START)
     client = TransformClient(graph)
-    relay = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose_received', 50)
-    graph.node.create_subscription(PoseWithCovarianceStamped, 'pose', relay.publish, 50)
-    drive = Drive(graph, remap=('pose:=pose_received',), rate=1.0)
+    drive = Drive(graph, remap=graph.paced('pose', PoseWithCovarianceStamped), rate=1.0)
     graph.until(drive.estimates, 'poses')
     graph.until(lambda: not client.failure('map', 'odom', drive.now_ns()), 'the first transforms')
     end_ns = drive.now_ns() + round(1e9 * seconds)
