@@ -7,6 +7,7 @@ from geometry_msgs.msg import Twist
 from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import Path
 from rclpy.action import ActionClient
+from support.doctor import Doctor
 from support.peers.still_robot import PERIOD_S, StillRobot
 from support.team_talk import ME, T_ME_OTHER, TeamTalk
 
@@ -26,6 +27,7 @@ class Driver:
         self.graph = graph
         self.robot = StillRobot(graph)
         self.talk = TeamTalk(graph)
+        self.doctor = Doctor(graph)
         self.commands = graph.heard('cmd_vel', Twist)
         self.plans = graph.heard('plan', Path, qos.LATCHED)
         self._client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
@@ -35,6 +37,22 @@ class Driver:
         pose = messages.pose_stamped_msg(np.array([x, y, 0.0]), 'map', 0)
         handle = self.graph.send_goal(self._client, NavigateToPose.Goal(pose=pose))
         return handle.get_result_async()
+
+    def hears_robot(self):
+        """Wait until the navigator has heard more of the other robot."""
+        topics = ('/join_status', '/team/claims')
+
+        def received():
+            return [self.doctor.number('navigator', f'{topic}: received') for topic in topics]
+
+        _, before = received()
+
+        def is_heard():
+            joined, claims = received()
+            # Those after the first were told since.
+            return joined and claims > before + 20
+
+        self.graph.until(is_heard, 'the other robot is heard')
 
     def ended(self, future):
         self.graph.until(future.done, 'the goal ends')
@@ -47,18 +65,18 @@ def driver(graph):
 
 
 def test_it_does_not_drive_into_a_robot_that_stands(graph, driver):
-    timer = graph.node.create_timer(PERIOD_S, lambda: driver.talk.stands_at(0.6, 0.0))
+    place = [0.6, 0.0]
+    graph.node.create_timer(PERIOD_S, lambda: driver.talk.stands_at(*place))
     driver.talk.join()
-    driver.commands.clear()
+    driver.hears_robot()
     # The laser shows nothing there.
     status, reason = driver.ended(driver.goes_to(3.0, 0.0))
     assert status == GoalStatus.STATUS_ABORTED, reason
     # It may turn, to drive around, but this robot does not move.
     assert {each.linear.x for each in driver.commands} == {0.0}
 
-    timer.destroy()
-    driver.talk.stands_at(0.6, 1.5)
-    driver.commands.clear()
+    place[1] = 1.5
+    driver.hears_robot()
     driver.goes_to(3.0, 0.0)
     graph.until(lambda: any(each.linear.x > 0.0 for each in driver.commands), 'it drives')
 
