@@ -109,12 +109,13 @@ def test_time_waits_for_the_results_of_both_robots(graph):
 
     def only_robot2_waits():
         answer('robot1')
-        waiting.append((count('robot1'), count('robot2')))
-        return len(waiting) > 1 and waiting[-1][1] > waiting[0][1] + 3
+        counts.append((count('robot1'), count('robot2')))
+        # Since the first answer has arrived, which a busy machine may take a while for.
+        since = next(second for first, second in counts if first == counts[-1][0])
+        return counts[-1][1] > since + 3
 
-    waiting = []
-    graph.until(only_robot2_waits, 'the first scan of robot2 again and again')
-    assert waiting[-1][0] <= waiting[0][0] + 2
+    counts = []
+    graph.until(only_robot2_waits, 'the first scan of robot2 alone again and again')
     assert {stamp(scan) for name in NAMES for scan in scans[name]} == {0}
 
     def later():
