@@ -1,7 +1,6 @@
 """The navigator's actions as clients of Nav2 use them: frames, preemption, feedback, codes."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from support.doctor import Doctor
 from support.halls import AT_START, START
 from support.peers.still_robot import StillRobot
 
-from thinmap_msgs.msg import SlamStatus
+from thinmap_msgs.msg import LocalGrid, SlamStatus
 from thinmap_msgs.srv import ReleaseStop
 from thinmap_ros.ros import messages, qos
 
@@ -89,16 +88,18 @@ def client(graph):
 
 
 def test_a_goal_in_another_frame_is_transformed_when_it_arrives(client):
-    now_ns = client.graph.node.get_clock().now().nanoseconds
     for place, where, expected in (
         ((2.0, 1.0), {'frame': ''}, (2.0, 1.0)),
         ((2.2, 1.0), {'frame': '/map'}, (2.2, 1.0)),
         ((2.0, 1.0), {'frame': 'odom'}, (3.0, 3.0)),
         ((2.4, 1.0), {'frame': 'base_link'}, (2.4, 1.0)),
-        ((2.0, 2.0), {'frame': 'odom', 'ns': now_ns}, (3.0, 4.0)),
     ):
         client.to(*place, **where)
         client.drives_to(*expected)
+    then_ns = client.robot.stamp_ns
+    client.graph.until(lambda: client.robot.stamp_ns > then_ns + 2e8, 'later transforms')
+    client.to(2.0, 2.0, frame='odom', ns=then_ns)
+    client.drives_to(3.0, 4.0)
 
 
 def test_an_invalid_goal_is_aborted_with_the_reason_and_the_old_one_goes_on(client):
@@ -112,6 +113,8 @@ def test_an_invalid_goal_is_aborted_with_the_reason_and_the_old_one_goes_on(clie
         ({'frame': 'odom', 'ns': now_ns + 60 * 10**9}, {}, 9002, 'older than requested'),
         ({'frame': 'odom', 'ns': now_ns - 60 * 10**9}, {}, 9002, 'odom'),
     )
+    # Silent, so that the first goal waits: that of a robot that does not move ends after 3 s.
+    client.robot.timer.cancel()
     for where, change, code, reason in cases:
         pose = pose_at(where.get('x', 1.0), 1.0, where.get('frame', 'map'), where.get('ns', 0))
         if change:
@@ -125,6 +128,7 @@ def test_an_invalid_goal_is_aborted_with_the_reason_and_the_old_one_goes_on(clie
             assert reason in error_msg and '\n' not in error_msg
     status, code, reason = client.ended(client.through())
     assert (status, code) == (GoalStatus.STATUS_ABORTED, 9000) and '0 poses' in reason
+    client.robot.timer.reset()
     client.feedback.clear()
     client.graph.until(lambda: len(client.feedback) > 3, 'feedback of the first goal')
     assert not client.first.done()
@@ -181,9 +185,17 @@ def test_feedback_has_the_fields_of_nav2_several_times_a_second(client):
         assert feedback.distance_remaining == pytest.approx(5.0, abs=0.3)
         assert feedback.number_of_recoveries == 0
     times = [messages.seconds(feedback.navigation_time) for feedback in received]
-    gaps = [after - before for before, after in pairwise(times)]
-    assert min(gaps) > 0.0
-    assert float(np.median(gaps)) == pytest.approx(0.1, abs=0.05)
+    assert min(np.diff(times)) > 0.0
+    goals = [first]
+
+    def is_regular():
+        """Whether the last ten came ten times a second: a busy machine holds up some."""
+        if goals[-1].done():  # the robot does not move
+            goals.append(client.to(4.0, 3.0))
+        times = [messages.seconds(feedback.navigation_time) for feedback in client.feedback[-10:]]
+        return float(np.median(np.diff(times))) == pytest.approx(0.1, abs=0.05)
+
+    client.graph.until(is_regular, 'ten in a row, ten times a second')
     # The commanded speed is that of a robot that does not move: nothing to estimate while it turns.
     client.to(4.0, 0.0)
     client.graph.until(
@@ -203,7 +215,9 @@ def test_goal_pose_of_rviz_is_a_goal_of_the_action(client):
     statuses = graph.heard('navigate_to_pose/_action/status', GoalStatusArray, qos.LATCHED)
     doctor = Doctor(graph)
     publisher = graph.node.create_publisher(PoseStamped, 'goal_pose', 10)
+    client.robot.timer.cancel()  # the first goal waits
     graph.until(publisher.get_subscription_count, 'a subscription')
+    client.robot.timer.reset()
     publisher.publish(pose_at(2.0, 2.0, 'odom'))
     client.drives_to(3.0, 4.0)
     assert client.ended(client.first) == (GoalStatus.STATUS_ABORTED, 0, 'replaced by a newer goal')
@@ -224,6 +238,7 @@ def test_after_a_protective_stop_it_drives_on_only_when_it_is_told_to(graph):
     StillRobot(graph)
     client = Client(graph)
     states = graph.node.create_publisher(SlamStatus, 'slam_status', 10)
+    graph.until(states.get_subscription_count, 'a subscription')
     first = client.to(-3.0, -3.0)
     graph.until(lambda: any(abs(c.angular.z) > 0.1 for c in client.commands), 'it turns')
     states.publish(SlamStatus(state=SlamStatus.LOST))
@@ -295,12 +310,14 @@ def test_the_robot_reaches_its_goal_with_odometry_by_tf_and_without_any(graph, s
     graph.start('localizer', use_sim_time=True, odom_source=source, **AT_START)
     graph.start('grid_mapper', use_sim_time=True)
     graph.start('navigator', use_sim_time=True, odom_source=source)
+    tf = '/tf:=/tf' if source == 'tf' else '/tf:=/unheard_tf'
     graph.start(
         'sim',
-        remap=('odom:=unheard', '/tf:=/tf' if source == 'tf' else '/tf:=/unheard_tf'),
+        remap=('odom:=unheard', tf, *graph.paced('local_grid', LocalGrid)),
         start=START,
         wait_for_subscribers=2,
         real_time_factor=2.0,
+        lockstep='local_grid',
     )
     goal = pose_at(3.0, 2.6)
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)

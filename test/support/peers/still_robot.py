@@ -18,7 +18,8 @@ PERIOD_S = 0.1
 class StillRobot:
     """Publishes map, pose, odometry, transforms and scans ten times a second.
 
-    Its pose in the map is the origin; `odom` is at T_MAP_ODOM.
+    Its pose in the map is the origin; `odom` is at T_MAP_ODOM. timer: which publishes; stamp_ns: of
+    what was published last.
     """
 
     def __init__(self, graph, base_frame='base_link', hall=None):
@@ -31,10 +32,12 @@ class StillRobot:
         self._tf = node.create_publisher(TFMessage, '/tf', qos.TRANSFORMS)
         self._map = node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
         self._map.publish(empty_hall() if hall is None else hall)
-        node.create_timer(PERIOD_S, self.publish)
+        self.stamp_ns = 0
+        self.timer = node.create_timer(PERIOD_S, self.publish)
 
     def publish(self):
         ns = self._now().nanoseconds
+        self.stamp_ns = ns
         T_odom_base = -T_MAP_ODOM
         transforms = [
             messages.transform_msg(T_MAP_ODOM, 'map', 'odom', ns),
