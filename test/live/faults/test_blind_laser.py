@@ -56,7 +56,14 @@ def test_a_blind_laser_pauses_an_exploration_until_ranges_return(graph, values):
     graph.start(
         'thinmap', arguments=NODES, use_sim_time=True, **{'controller.max_speed_m_s': 0.5}, **start
     )
-    graph.start('sim', start='2.0,2.0,0.9', remap=('scan:=raw_scan',), wait_for_subscribers=1)
+    # Time waits for the nodes, and for the test, through which the scans go.
+    graph.start(
+        'sim',
+        start='2.0,2.0,0.9',
+        remap=('scan:=raw_scan',),
+        wait_for_subscribers=1,
+        lockstep='local_topology',
+    )
     client = ActionClient(graph.node, Explore, 'explore')
     graph.send_goal(client, Explore.Goal())
     graph.until(lambda: truth and statuses, 'where it is, and how it stands')

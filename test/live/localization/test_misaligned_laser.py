@@ -55,8 +55,14 @@ class Robot:
         speed = {'controller.max_speed_m_s': 0.5}
         graph.start('thinmap', arguments=NODES, use_sim_time=True, **speed, **start)
         laser = {'beams': BEAMS, 'field_of_view_deg': 360.0, 'range_max_m': 20.0}
+        # Time waits for the nodes, and for the test, through which the scans go.
         graph.start(
-            'sim', start='2.0,2.0,0.9', remap=('scan:=raw_scan',), wait_for_subscribers=1, **laser
+            'sim',
+            start='2.0,2.0,0.9',
+            remap=('scan:=raw_scan',),
+            wait_for_subscribers=1,
+            lockstep='local_topology',
+            **laser,
         )
         graph.until(lambda: self.statuses, 'a status')
 
