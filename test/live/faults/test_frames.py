@@ -96,6 +96,7 @@ def test_odometry_of_other_frames_is_refused_unless_static_transforms_connect_th
         before = robot.doctor.number('localizer', 'odom: rejected')
         robot.rejected('odom', before + 5)
         graph.until(lambda t=text: t in graph.log('localizer'), 'it is named')
+        graph.drain()
         robot.poses.clear()
         robot.rejected('odom', before + 25)
         # Scans that had their odometry before the change may still have been processed.

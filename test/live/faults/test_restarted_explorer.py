@@ -9,7 +9,7 @@ from action_msgs.msg import GoalStatus, GoalStatusArray
 from rclpy.action import ActionClient
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
-from support.peers.room_robot import RoomRobot
+from support.peers.room_robot import RoomRobot, replace_nav2
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
@@ -49,12 +49,16 @@ class Exploration:
             recovery_timeout_s=recovery_timeout_s,
             **parameters,
         )
+        if self.robot.timer.is_canceled():
+            self.graph.until(lambda: 'ready' in self.graph.log('explorer'), 'the explorer')
+            self.robot.timer.reset()
 
     def kill(self):
-        """Kill the explorer once it has saved its present state."""
+        """Kill the explorer once it has saved its present state; time stands until the next one."""
         since_ns = time.time_ns()
         (file,) = (self.graph.folder / 'state').glob('[!.]*.explorer.npz')
         self.graph.until(lambda: file.stat().st_mtime_ns > since_ns, 'a checkpoint')
+        self.robot.timer.cancel()
         self.graph.stop('explorer', signal.SIGKILL)
         self.status.clear()
         self.words.clear()
@@ -124,8 +128,7 @@ def test_an_ordinary_client_has_feedback_again_can_cancel_and_asks_again_for_the
     assert messages.seconds(feedback[-1].feedback.status.elapsed) > 10.0
     # Nav2 is killed before it has reported on its goal: the server in its place gets it again.
     drive = exploration.until_driving()
-    graph.stop('nav2', signal.SIGKILL)
-    exploration.start_nav2()
+    replace_nav2(graph, exploration.robot, exploration.start_nav2)
     graph.until(lambda: exploration.until_driving() != drive, 'Nav2 has the goal again')
     assert len(graph.cancel(handle, AGAIN_S).goals_canceling) == 1
     ended = graph.result(handle, 'the goal', AGAIN_S)

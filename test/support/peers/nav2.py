@@ -3,10 +3,12 @@
 A lifecycle node with the action navigate_to_pose. Unconfigured there is no server; an inactive one
 rejects goals. A newer goal preempts the running one, which is aborted with an empty result. On
 nav2_mode (std_msgs/String) it is told how to behave from the next goal on: drive, refuse, abort,
-abort_once: abort one goal, then drive; or stall: accept, and neither drive nor report.
+abort_once: abort one goal, then drive; stall: accept, and neither drive nor report; or mute: from
+now on, do nothing and answer nothing, but stay on the graph.
 """
 
 import math
+import time
 from contextlib import suppress
 
 import rclpy
@@ -138,6 +140,9 @@ class BtNavigator(LifecycleNode):
 
     def _on_mode(self, message):
         self._mode = message.data
+        # A process that is halted would be gone from the graph after its lease of 20 s.
+        while self._mode == 'mute':
+            time.sleep(_POLL_S)
 
     def _on_map(self, message):
         self._patch = messages.grid_from_msg(message)

@@ -1,6 +1,7 @@
 """Messages of a robot that stands in a room with another SLAM: map, transforms, scans, clock."""
 
 import math
+import signal
 from itertools import count
 
 import numpy as np
@@ -38,7 +39,7 @@ class RoomRobot:
     """Publishes them faster than the clock of the machine, ten times unless speak_s is given.
 
     topic: of the map; base: frame of the robot; scans, maps: whether these are published; at: pose
-    (3,); patch: the map; time_ns: of the clock.
+    (3,); patch: the map; time_ns: of the clock; timer: which publishes: without it, time stands.
     """
 
     def __init__(self, graph, topic='map', base='base_link', scans=True, speak_s=SPEAK_S):
@@ -55,7 +56,7 @@ class RoomRobot:
         self._scan = self.node.create_publisher(LaserScan, 'scan', qos.STREAM)
         self._clock = self.node.create_publisher(Clock, '/clock', qos.STREAM)
         self.targets = graph.heard('exploration_target', PoseStamped, qos.LATCHED)
-        self.node.create_timer(speak_s, self._speak)
+        self.timer = self.node.create_timer(speak_s, self._speak)
 
     def _speak(self):
         number = next(self._numbers)
@@ -74,3 +75,24 @@ class RoomRobot:
         x, y = self.at[:2] / CELL_M
         ranges = CELL_M * cast_rays(opaque, x, y, ANGLES + self.at[2], 8.0 / CELL_M)
         return Scan.create(ns, ranges, -0.5 * math.pi, math.pi / 180.0, 0.05, 8.0)
+
+
+def replace_nav2(graph, robot, start):
+    """Kill the Nav2 of a robot, and start another one.
+
+    Time stands until that is discovered: to those who wait for an answer, the start of a process
+    would be minutes.
+    """
+
+    def servers():
+        topic = '/navigate_to_pose/_action/status'
+        infos = graph.node.get_publishers_info_by_topic(topic)
+        return {bytes(info.endpoint_gid) for info in infos}
+
+    before = servers()
+    robot.timer.cancel()
+    graph.stop('nav2', signal.SIGKILL)
+    graph.drain()
+    start()
+    graph.until(lambda: servers() - before, 'another Nav2')
+    robot.timer.reset()
