@@ -19,7 +19,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.ros import messages, qos
 
-pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.live
 START = (2.0, 2.0, 0.0)
 WORLD = 'room_10x10'
 COVARIANCE = np.diag([0.04, 0.04, 0.01])

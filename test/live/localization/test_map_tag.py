@@ -8,7 +8,7 @@ from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import SaveMap, SetMapTag
 from thinmap_ros.files.sessions import load_tag
 
-pytestmark = [pytest.mark.live, pytest.mark.timeout(200)]
+pytestmark = pytest.mark.live
 
 
 def is_apart(status):
