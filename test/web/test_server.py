@@ -8,10 +8,11 @@ import socket
 import time
 
 import pytest
+from support.timeouts import PATIENCE_S
 from support.web_client import WebClient
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.web import handlers
+from thinmap_ros.web import handlers, pages
 from thinmap_ros.web.access import Gate, Role, Tokens
 from thinmap_ros.web.pages import MAX_PAGES, MAX_STRANGERS, Board, Pages
 from thinmap_ros.web.requests import beat
@@ -58,12 +59,12 @@ class Site:
         return self.clients[-1]
 
     def connect(self, text=b''):
-        stream = socket.create_connection(('127.0.0.1', self.port), timeout=10)
+        stream = socket.create_connection(('127.0.0.1', self.port), timeout=PATIENCE_S)
         stream.sendall(text)
         return stream
 
     def get(self, path, host=None, method='GET', body=None):
-        connection = http.client.HTTPConnection('127.0.0.1', self.port, timeout=10)
+        connection = http.client.HTTPConnection('127.0.0.1', self.port, timeout=PATIENCE_S)
         headers = {} if host is None else {'Host': host}
         connection.request(method, path, body=body, headers=headers)
         answer = connection.getresponse()
@@ -86,6 +87,15 @@ def site():
     yield make
     for one in made:
         one.server.close()
+
+
+@pytest.fixture
+def patient(monkeypatch):
+    """A server that closes nobody who is slow, as a test is on a busy machine."""
+    limits = ((handlers, ('_HEADERS_S', '_PING_S')), (pages, ('_HELLO_S', '_STUCK_S')))
+    for module, names in limits:
+        for name in names:
+            monkeypatch.setattr(module, name, PATIENCE_S)
 
 
 def test_pages_see_what_is_shown_and_agree(site):
@@ -125,7 +135,7 @@ def test_a_wrong_token_sees_nothing(site, token):
     page = one.open(token=token)
     if token is None:  # it says nothing, and then asks at once
         page.ask('stop')
-    assert page.closed.wait(10)
+    assert page.closed.wait(PATIENCE_S)
     assert not page.items and not one.robot.requests
 
 
@@ -188,22 +198,23 @@ def test_too_many_messages_too_long_ones_and_too_many_pages_are_ended(site):
     fast = one.open()
     for _ in range(300):
         fast.ask('cancel')
-    assert fast.closed.wait(10) and len(one.robot.requests) <= 100
+    assert fast.closed.wait(PATIENCE_S) and len(one.robot.requests) <= 100
     long = one.open()
     long.send_text('x' * 100_000)
-    assert long.closed.wait(10)
+    assert long.closed.wait(PATIENCE_S)
     fast.until(lambda: not one.pages.open, 'no page')
-    pages = [one.open() for _ in range(MAX_PAGES)]
-    for page in pages:
+    opened = [one.open() for _ in range(MAX_PAGES)]
+    for page in opened:
         page.until(lambda page=page: 'hello' in page.items, 'the answer')
-    assert one.open().closed.wait(10) and not one.pages.has_place(Role.STEER)
-    assert all(not page.closed.is_set() for page in pages)
-    pages[0].close()
-    pages[1].until(lambda: one.pages.has_place(Role.STEER), 'room for a page')
+    assert one.open().closed.wait(PATIENCE_S) and not one.pages.has_place(Role.STEER)
+    assert all(not page.closed.is_set() for page in opened)
+    opened[0].close()
+    opened[1].until(lambda: one.pages.has_place(Role.STEER), 'room for a page')
     late = one.open()
     late.until(lambda: 'hello' in late.items, 'the answer')
 
 
+@pytest.mark.usefixtures('patient')
 def test_a_page_that_takes_nothing_does_not_fill_the_memory(site):
     """What is not yet sent is one message; what changes meanwhile is sent once, as it is then."""
     one = site()
@@ -266,6 +277,7 @@ def test_a_stop_at_the_end_of_what_a_cut_has_held_back_is_heard(site):
     assert one.robot.requests == [(1, 'stop')]
 
 
+@pytest.mark.usefixtures('patient')
 @pytest.mark.parametrize('text', [b'', b'GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n', HELLO])
 def test_connections_that_say_no_token_keep_nobody_out(site, text):
     """Whatever they wait with, the oldest is closed for the newest."""
@@ -296,7 +308,7 @@ def test_connections_that_say_no_token_keep_nobody_out(site, text):
 def test_headers_that_come_slowly_have_an_end(site, monkeypatch):
     monkeypatch.setattr(handlers, '_HEADERS_S', 0.3)
     slow = site().connect(b'GET / HTTP/1.1\r\n')
-    end = time.monotonic() + 10
+    end = time.monotonic() + PATIENCE_S
     with pytest.raises(OSError, match=r'reset|pipe'):
         while time.monotonic() < end:
             slow.sendall(b'X: y\r\n')
@@ -308,7 +320,7 @@ def test_who_watches_takes_no_place_of_those_who_steer(site):
     for _ in range(MAX_PAGES):
         page = one.open(token=TOKENS.watch)
         page.until(lambda page=page: 'hello' in page.items, 'the answer')
-    assert one.open(token=TOKENS.watch).closed.wait(10)
+    assert one.open(token=TOKENS.watch).closed.wait(PATIENCE_S)
     driver = one.open(token=TOKENS.steer)
     driver.ask('stop')
     driver.until(lambda: one.robot.requests, 'the stop')
