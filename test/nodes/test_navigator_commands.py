@@ -1,5 +1,6 @@
 """What a navigator commands while it knows everything, and while it must not drive."""
 
+from time import monotonic
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,7 @@ import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from rclpy.time import Time
 from support.halls import empty_hall
+from support.timeouts import PATIENCE_S
 
 from thinmap_msgs.msg import SlamStatus
 from thinmap_ros.core.planning.navigator import CONTROL_PERIOD_S
@@ -214,6 +216,9 @@ def test_a_base_that_is_discovered_is_told_to_stand_and_one_that_creeps_as_long_
 ):
     heard = []
     assert other.create_subscription(Twist, 'cmd_vel', heard.append, 10)
+    end_s = monotonic() + PATIENCE_S
+    while not driven.node.count_subscribers('cmd_vel') and monotonic() < end_s:
+        rclpy.spin_once(other, timeout_sec=0.05)
     told = commands_of_idle(driven, other, heard)
     assert 0 < len(told) <= 10 and set(told) == {(0.0, 0.0)}
     assert not commands_of_idle(driven, other, heard)
