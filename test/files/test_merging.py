@@ -113,7 +113,8 @@ def test_sessions_with_keyframes_are_bent_until_they_agree(tmp_path):
     merged = merge_maps(paths)
     require_right(merged.joins[0], SECOND)
     merged.save(str(tmp_path / 'both'))
-    assert not sessions.KEYFRAMES.exists(str(tmp_path / 'both'))
+    assert sessions.KEYFRAMES.exists(str(tmp_path / 'both'))
+    assert not read_piece(str(tmp_path / 'both')).is_rigid
 
 
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

@@ -8,15 +8,25 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core.errors import InputError, ThinmapError, quoted
-from thinmap_ros.core.grid.edits import KeepOut, MapEdits, require_count
+from thinmap_ros.core.grid.edits import (
+    Erasures,
+    KeepOut,
+    MapEdits,
+    require_count,
+    require_erasures,
+)
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.alignment import LEAST_FOUND, align, fitted
 from thinmap_ros.core.places.recognition import JOIN_ODDS, Placement, on_one_storey, recognize
 from thinmap_ros.core.places.structure import storey_evidence
 from thinmap_ros.core.se2 import Array, is_bounded_pose
+from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.slam.joining.join import join
 from thinmap_ros.core.slam.joining.pieces import SlamPiece
+from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
+from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import checked_tag
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.segmentation import RegionTracker
@@ -89,25 +99,42 @@ class MapJoin:
 class MergedMap:
     """The map of several, in the frame of the first of them.
 
-    keep_out: areas of all of them; maps: these, by path; joins: of all but the first, in the order
-    in which they were joined; tag: of their storey, '' where nobody knows it.
+    keep_out: areas of all of them; piece: with the keyframes of all of them, if all have some, and
+    the tag of their storey; cells: of a local map of these; maps: by path; joins: of all but the
+    first, in the order in which they were joined.
     """
 
     grid: OccupancyGrid
     topology: TopologyBuilder
     regions: RegionTracker
     keep_out: KeepOut
+    piece: SlamPiece
+    cells: LocalMapConfig
     maps: dict[str, SlamPiece]
     joins: list[MapJoin]
-    tag: str = ''
 
     def save(self, path: str) -> list[str]:
-        """Write a session, as `sessions.save_session`; returns what was written, a line each."""
-        edits = MapEdits(self.keep_out)
+        """Write a session, as `sessions.save_session`; returns what was written, a line each.
+
+        It has keyframes, and a local map of these, if all maps have some.
+        """
+        edits = MapEdits(self.keep_out, Erasures(list(self.piece.erased)))
         return sessions.save_session(
             path,
-            sessions.SessionMap(self.grid, self.topology, self.regions, edits, tag=self.tag),
+            sessions.SessionMap(
+                self.grid, self.topology, self.regions, edits, self._localizer(), self.piece.tag
+            ),
         )
+
+    def _localizer(self) -> Localizer | None:
+        """A localizer of any robot in the map of the keyframes; None without any."""
+        if self.piece.is_rigid:
+            return None
+        keyframes = SavedKeyframes.of_graph(self.piece.frames, self.piece.edges)
+        config = LocalizerConfig(local_map=self.cells)
+        localizer = Localizer.from_keyframes(keyframes, Localizer().calibration, config)
+        localizer.tag_map(self.piece.tag)
+        return localizer
 
 
 def merge_maps(
@@ -147,9 +174,10 @@ def merge_maps(
         merging.topology,
         regions,
         merging.drawn.keep_out,
+        merging.known,
+        sessions.load_cells(names[0]),
         maps,
         merging.joins,
-        merging.known.tag,
     )
 
 
@@ -229,6 +257,7 @@ class _Merging:
         self._fits: dict[str, list[Array]] = {}  # poses (3,) at which a whole map fits best
         self._drawn = {path: _Drawn.of(path) for path in maps}
         require_count(sum(len(drawn.keep_out.areas) for drawn in self._drawn.values()))
+        require_erasures(sum(len(piece.erased) for piece in maps.values()))
         self.drawn = self._drawn[first]
         self.known = maps[first]
         self.grid = OccupancyGrid()

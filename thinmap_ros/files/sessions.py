@@ -4,14 +4,16 @@ A session has a path STEM. `PARTS` lists its files, one for each node. Beside ST
 same grid as a map_server map, STEM.pgm and STEM.yaml, and STEM.edits.npz of a map that was edited.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shutil import copyfile
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.correction import CorrectableGrid
@@ -22,6 +24,8 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_class, tag_of
+from thinmap_ros.core.slam.matching import local_map
+from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import StartConfig
@@ -42,6 +46,7 @@ from thinmap_ros.files.safe import (
     is_snapshot,
     open_regular_file,
     read_snapshot,
+    uninterrupted,
     write_snapshot,
 )
 
@@ -56,6 +61,7 @@ class _HasState(Protocol):
 
 Value = TypeVar('Value', bound=_HasState)
 PartConfig = TypeVar('PartConfig')
+Read = TypeVar('Read')
 
 
 @dataclass(frozen=True)
@@ -413,13 +419,40 @@ def save_session(path: str, session: SessionMap) -> list[str]:
         (EXPLORATION, None),
     ]
     written = [(part, value) for part, value in parts if value is not None]
-    with ExitStack() as stack:
-        for part, value in written:
-            part.write(stack.enter_context(atomic_write(part.file(path))), value)
-        tag = _tag_of(session.localizer) or session.tag
-        grid = save_grid(path, session.grid, edits=session.edits, tag=tag)
-    *endings, last = [part.ending for part, _ in written]
-    archived = [part.archive(path) for part, value in parts if value is None]
+    with uninterrupted():
+        with ExitStack() as stack:
+            for part, value in written:
+                part.write(stack.enter_context(atomic_write(part.file(path))), value)
+            tag = _tag_of(session.localizer) or session.tag
+            grid = save_grid(path, session.grid, edits=session.edits, tag=tag)
+        archived = [part.archive(path) for part, value in parts if value is None]
+    return _said(grid, [part for part, _ in written], archived)
+
+
+def copy_map(path: str, to: str) -> list[str]:
+    """Copy all of a session but its exploration under another name, all files or none.
+
+    Returns what was written, and raises, as `save_session`.
+    """
+    require_own_files(to, GRID)
+    parts = (TOPOLOGY, REGIONS, KEYFRAMES, LOCALIZER, EXPLORATION)
+    copied = [part for part in parts if part is not EXPLORATION and part.exists(path)]
+    with uninterrupted():
+        with ExitStack() as stack:
+            for part in copied:
+                aside = stack.enter_context(atomic_write(part.file(to)))
+                copyfile(part.file(path), aside)
+            # Not copied: the description of the map names its image.
+            grid = save_grid(to, load_grid(path), edits=load_edits(path), tag=load_tag(path))
+        archived = [part.archive(to) for part in parts if part not in copied]
+    return _said(grid, copied, archived)
+
+
+def _said(
+    grid: str, written: Sequence[SessionPart[Any, Any]], archived: Sequence[str]
+) -> list[str]:
+    """Lines on what was written beside a grid, and on what was archived."""
+    *endings, last = [part.ending for part in written]
     return [f'{grid}, {", ".join(endings)} and {last}', *filter(None, archived)]
 
 
@@ -459,14 +492,31 @@ def _load_own_localizer(path: str, config: StartConfig) -> AnyLocalizer:
 def load_tag(path: str) -> str:
     """The tag of the storey of a session or map_server map; '' for none. Raises InputError."""
     given = _given_tag(path)
-    return _saved_tag(LOCALIZER.file(path)) if LOCALIZER.exists(path) and not given else given
+    return _read_localizer(path, tag_of) if LOCALIZER.exists(path) and not given else given
 
 
-def _saved_tag(file: Path) -> str:
-    """The tag in STEM.slam.npz."""
+def load_cells(path: str) -> LocalMapConfig:
+    """The cells of the local map of a session; those of any new one where it has none.
+
+    Raises InputError.
+    """
+    return _read_localizer(path, _cells_of) if LOCALIZER.exists(path) else LocalMapConfig()
+
+
+def _cells_of(state: State) -> LocalMapConfig:
+    if 'cell_m' not in state:  # line features
+        return LocalMapConfig()
+    own = {'cell_m': state['cell_m']}
+    checked = snapshot.validate(own, {'cell_m': local_map.FIELDS['cell_m']}, 'local map')
+    return LocalMapConfig(resolution_m=float(checked['cell_m']))
+
+
+def _read_localizer(path: str, read: Callable[[State], Read]) -> Read:
+    """What is read of the arrays in STEM.slam.npz, of any localizer."""
+    file = LOCALIZER.file(path)
     try:
         with open_regular_file(file) as stream:
-            return tag_of(read_snapshot(stream, LOCALIZER.name))
+            return read(read_snapshot(stream, LOCALIZER.name))
     except OSError as error:
         raise InputError(f'{file}: {error.strerror or one_line_reason(error)}') from error
     except InputError as error:

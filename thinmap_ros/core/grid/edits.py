@@ -282,6 +282,12 @@ def require_count(count: int) -> None:
         raise InputError(f'{count} keep-out areas: expected at most {MAX_AREAS}')
 
 
+def require_erasures(count: int) -> None:
+    """Raise InputError where there are more erased parts than a map may have."""
+    if count > MAX_ERASURES:
+        raise InputError(f'{count} erased parts: expected at most {MAX_ERASURES}')
+
+
 def require_corners(
     what: str,
     corners: Array,

@@ -26,8 +26,7 @@ from thinmap_msgs.action import Explore
 from thinmap_msgs.srv import AddKeepOut, EraseArea, LoadMap, NameRegion, RemoveKeepOut, SaveMap
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line, one_line_reason
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.files.merging import MergedMap
-from thinmap_ros.files.sessions import GRID, PARTS, REGIONS, load_edits, load_grid, load_topology
+from thinmap_ros.files.sessions import GRID, PARTS, copy_map
 from thinmap_ros.nodes.parts.localization import GIVEN_COVARIANCE
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -132,7 +131,7 @@ class SessionMerge:
         self._trial: _Trial | None = None
         self._is_shown = False
         self._saver = ThreadPoolExecutor(1, thread_name_prefix='merge')
-        self._saving: Future[str] | None = None
+        self._saving: Future[list[str]] | None = None
 
     def list_sessions(self) -> None:
         """Show the names of the sessions in the directory."""
@@ -162,7 +161,7 @@ class SessionMerge:
         path = self._directory.resolve_for_saving(name, GRID)
         if any(part.exists(path) for part in PARTS):
             raise InputError(f'merge: {name}: exists: expected a new name')
-        self._saving = self._saver.submit(_save, trial.stem, path)
+        self._saving = self._saver.submit(copy_map, trial.stem, path)
 
     def drop(self) -> None:
         """Forget the joint map, or the work on it."""
@@ -195,10 +194,10 @@ class SessionMerge:
         elif trial.code is not None:
             self._forget('failed', trial.lines()[-1:] or [f'ended with {trial.code}'])
 
-    def _end_saving(self, saving: Future[str]) -> None:
+    def _end_saving(self, saving: Future[list[str]]) -> None:
         self._saving = None
         try:
-            said = saving.result()
+            said = '; '.join(saving.result())
         except (ThinmapError, OSError) as error:
             self._tell(f'merge: {one_line_reason(error)}')
             return
@@ -215,13 +214,6 @@ class SessionMerge:
         own = f'{self._directory.path}/'
         shown = [one_line(line.replace(own, '')) for line in words]
         self._board.put('merge', {'state': state, 'words': shown, 'picture': picture})
-
-
-def _save(stem: str, path: str) -> str:
-    """Save a merged session under another name, all files or none; returns what was written."""
-    keep_out = load_edits(stem).keep_out
-    merged = MergedMap(load_grid(stem), load_topology(stem), REGIONS.load(stem), keep_out, {}, [])
-    return '; '.join(merged.save(path))
 
 
 NAVIGATE = 'navigate_to_pose'

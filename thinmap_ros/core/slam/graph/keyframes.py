@@ -676,6 +676,36 @@ class SavedKeyframes:
             [frames[k].scan.stamp_ns for k in kept],
         )
 
+    @staticmethod
+    def of_graph(frames: Sequence[Keyframe], edges: Sequence[Edge]) -> 'SavedKeyframes':
+        """Those of a graph that was joined, with covariances along all of its edges.
+
+        The step to a keyframe is the first edge to it that is no loop. The others are between
+        visits.
+        """
+        steps: dict[int, Edge] = {}
+        others: list[Edge] = []
+        for edge in edges:
+            if edge.robust or edge.a > edge.b or edge.b in steps:
+                others.append(edge)
+            else:
+                steps[edge.b] = edge
+        numbers = range(1, len(frames))
+        all_steps = [steps.get(k) or _unknown_step(frames, k - 1, k) for k in numbers]
+        poses = np.array([frame.T_map_base for frame in frames])
+        headings = np.array([tables.heading_row(frame.heading) for frame in frames])
+        covariances, _ = covariances_from(
+            Start(0, frames[0].covariance),
+            poses,
+            [EdgeTable(all_steps), EdgeTable(others)],
+            heading_errors(headings, poses),
+        )
+        own = [
+            replace(frame, scan=replace(frame.scan, stamp_ns=k + 1), covariance=covariance)
+            for k, (frame, covariance) in enumerate(zip(frames, covariances, strict=True))
+        ]
+        return SavedKeyframes(own, all_steps, others)
+
     def extended(self, tail: 'SavedKeyframes') -> 'SavedKeyframes':
         """With the keyframes that came next; the first of these is the last one here.
 
@@ -758,10 +788,13 @@ class SavedKeyframes:
 
 def _step(step: Edge, frames: Sequence[Keyframe], before: int, is_saved: Sequence[bool]) -> Edge:
     """The step to a keyframe, or one from the keyframe before if its anchor is not saved."""
-    if is_saved[step.a]:
-        return step
-    T = se2.between(frames[before].T_map_base, frames[step.b].T_map_base)
-    return Edge(before, step.b, T, inverse(UNKNOWN), False)
+    return step if is_saved[step.a] else _unknown_step(frames, before, step.b)
+
+
+def _unknown_step(frames: Sequence[Keyframe], a: int, b: int) -> Edge:
+    """A step between two keyframes that says nothing about how they lie."""
+    T = se2.between(frames[a].T_map_base, frames[b].T_map_base)
+    return Edge(a, b, T, inverse(UNKNOWN), False)
 
 
 def with_calibration(edge: Edge, calibration: OdometryCalibration) -> Edge:

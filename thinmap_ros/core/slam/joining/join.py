@@ -358,7 +358,8 @@ def _optimized_together(
 ) -> JoinedMap:
     count = len(first.frames)
     poses = np.vstack([first.poses, [se2.compose(T, own) for own in second.poses]])
-    frames = _at([*first.frames, *second.frames], _bent(poses, first, second, links))
+    both = [*first.frames, *_later(second.frames, first.frames)]
+    frames = _at(both, _bent(poses, first, second, links))
     # Again, where the other keyframes are now: those of the views alone left a third more error.
     nearby = enumerate(frame.T_map_base for frame in frames[count:])
     links = found(match_keyframes(frames[:count], frames[count:], nearby))
@@ -383,6 +384,19 @@ def _optimized_together(
     nearest = links[0].b if links else 0
     T_joined = se2.compose(poses[count + nearest], se2.invert(second.poses[nearest]))
     return JoinedMap(piece, grid, topology, T_joined, ids, len(links), motions)
+
+
+def _later(frames: Sequence[Keyframe], earlier: Sequence[Keyframe]) -> Iterator[Keyframe]:
+    """The keyframes, with submaps and a path of their own after those of others.
+
+    Without headings: those are relative to the first keyframe of the piece that they come from.
+    """
+    submaps = 1 + max(frame.submap for frame in earlier)
+    path_m = max(frame.path_m for frame in earlier)
+    for frame in frames:
+        yield replace(
+            frame, submap=submaps + frame.submap, path_m=path_m + frame.path_m, heading=None
+        )
 
 
 def _erased(
