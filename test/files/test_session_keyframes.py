@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.laps import driven
 from support.slam_room import drive_round_the_block
 
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfLocalizer
@@ -162,6 +163,15 @@ def test_a_robot_that_starts_elsewhere_is_bound_to_the_keyframes_there(half: Hal
     for edge in own:
         places = [keyframes.frames[k].T_map_base[:2] for k in (edge.a, edge.b)]
         assert math.dist(*places) < 3.0
+
+
+def test_a_session_of_many_laps_is_saved_with_the_keyframes_of_the_last(tmp_path: Path) -> None:
+    laps = driven(3)
+    localizer = Localizer.from_keyframes(laps, Localizer().calibration)
+    save_localizer(str(tmp_path / 'laps'), localizer)
+    again = KEYFRAMES.load(str(tmp_path / 'laps'))
+    assert len(again.frames) < 0.5 * len(laps.frames) == 0.5 * len(localizer.keyframes)
+    assert load_localizer(str(tmp_path / 'laps'), START) is not None
 
 
 def test_localization_reads_no_keyframes(half: Half) -> None:

@@ -23,6 +23,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
+from thinmap_ros.core.slam.graph.reduction import reduced
 from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_class, tag_of
 from thinmap_ros.core.slam.matching import local_map
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
@@ -378,11 +379,15 @@ def save_localizer(path: str, localizer: AnyLocalizer, overwrite: bool = False) 
 
 
 def _keyframes_of(localizer: AnyLocalizer | None) -> SavedKeyframes | None:
-    """The keyframes of a map that is made of such; its local map is complete with them."""
+    """The keyframes of a map that is made of such; its local map is complete with them.
+
+    Without those of which later visits show the place as well.
+    """
     if not isinstance(localizer, Localizer):
         return None
     localizer.complete_map()
-    return localizer.saved_keyframes()
+    keyframes = localizer.saved_keyframes()
+    return None if keyframes is None else reduced(keyframes)
 
 
 def _tag_of(localizer: AnyLocalizer | None) -> str:

@@ -15,7 +15,7 @@ from thinmap_ros.jit import kernel
 
 
 @kernel
-def _passed_cells(
+def passed_cells(
     poses: Array, ranges: Array, bearings: Array, cell_m: float, half: int
 ) -> NDArray[np.bool_]:
     """Which cells of a lattice (2 half, 2 half) around the origin the beams of scans pass.
@@ -192,5 +192,5 @@ def _free_places(scans: Sequence[Scan], poses: Array) -> Array:
         [se2.compose(T, scan.T_base_laser) for T, scan in zip(poses, scans, strict=True)]
     )
     half = round(_MAX_OFFSET_M / LATTICE_M)
-    cells = np.argwhere(_passed_cells(lasers, ranges, bearings, LATTICE_M, half))
+    cells = np.argwhere(passed_cells(lasers, ranges, bearings, LATTICE_M, half))
     return np.asarray((cells[:, ::-1] - half + 0.5) * LATTICE_M)
