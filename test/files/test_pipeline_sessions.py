@@ -21,6 +21,8 @@ from thinmap_ros.files.sessions import KEYFRAMES, LOCALIZER
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.drives import DriveSample
 
+OF_LOCALIZER = (LOCALIZER, KEYFRAMES)
+
 EVERY = 6  # scans of a drive that are used
 
 
@@ -76,9 +78,13 @@ def test_sessions_of_two_days_are_merged(
     truth = true_poses(first_day[0], second_day[:1])[0]
     x, y, yaw = (joined.T_merged_map - truth).tolist()
     assert np.hypot(x, y) < 0.12 and abs(se2.wrap(yaw)) < 0.01
+    earlier = {part: part.file(str(tmp_path / 'second')).read_bytes() for part in OF_LOCALIZER}
     merged.save(str(tmp_path / 'second'))
-    for part in (LOCALIZER, KEYFRAMES):  # they are not of the merged map
-        assert not part.exists(str(tmp_path / 'second'))
+    for part, content in earlier.items():  # they are of the merged map now
+        assert part.file(str(tmp_path / 'second')).read_bytes() != content
+    poses = {frame.T_map_base.tobytes() for frame in merged.piece.frames}
+    saved = KEYFRAMES.load(str(tmp_path / 'second')).frames
+    assert {frame.T_map_base.tobytes() for frame in saved} <= poses
 
 
 def test_the_same_way_again_does_not_double_the_walls(
