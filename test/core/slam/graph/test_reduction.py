@@ -26,7 +26,7 @@ def covariance_of(saved: SavedKeyframes, place: Array) -> Array:
                 H[i, :, j] += left.T @ W @ right
     whole = H.reshape(3 * len(poses), -1)[3:, 3:]
     k = int(np.argmin(np.abs(poses - place).sum(axis=1)))
-    return np.linalg.inv(whole)[3 * k - 3 : 3 * k, 3 * k - 3 : 3 * k]
+    return np.asarray(np.linalg.inv(whole)[3 * k - 3 : 3 * k, 3 * k - 3 : 3 * k], dtype=np.float64)
 
 
 def test_a_way_that_is_driven_each_day_does_not_grow() -> None:
