@@ -262,16 +262,38 @@ def test_covariances_along_the_graph_are_the_same_in_plain_python(rng, monkeypat
     np.testing.assert_allclose(by, derivatives, rtol=1e-9, atol=1e-12)
 
 
-def test_a_measured_heading_makes_the_covariance_that_of_a_bayes_update(rng):
+def test_a_measured_heading_turns_the_pose_and_moves_it_nowhere(rng):
+    """Its errors are those of a pose whose heading alone is updated, by the best gain for that."""
     covariance = random_covariance(rng)
-    variance = 1e-4
-    information = inverse(covariance) + np.diag([0.0, 0.0, 1.0 / variance])
     derivative = rng.normal(0.0, 1.0, (3, 4))
-    found, by = with_heading(covariance, derivative, independent(variance))
-    np.testing.assert_allclose(found, inverse(information), atol=1e-12)
-    np.testing.assert_allclose(by, found @ inverse(covariance) @ derivative, atol=1e-9)
+    variance = 1e-4
+    direction = np.array([0.1, -0.2, 0.3, 0.0])
+    error = np.array([variance, 0.0, *direction])
+    found, by = with_heading(covariance, derivative, error)
+    gain = covariance[2, 2] / (covariance[2, 2] + variance)
+    turned = np.diag([1.0, 1.0, 1.0 - gain])
+    measured = np.diag([0.0, 0.0, gain])
+    np.testing.assert_allclose(
+        found, turned @ covariance @ turned + variance * measured @ measured, atol=1e-15
+    )
+    np.testing.assert_allclose(by, turned @ derivative + measured[:, 2:] * direction, atol=1e-12)
+    np.testing.assert_array_equal(found[:2, :2], covariance[:2, :2])
+    np.testing.assert_array_equal(by[:2], derivative[:2])
     unmeasured, _ = with_heading(covariance, derivative, independent(np.inf))
     np.testing.assert_array_equal(unmeasured, covariance)
+
+
+def test_the_covariance_of_a_measured_heading_is_one(rng):
+    """Also of a pose whose position follows from its heading all but exactly, many times over."""
+    lever = np.array([3.0, -8.0, 1.0])
+    covariance = 0.1**2 * np.outer(lever, lever) + 1e-9 * np.eye(3)
+    for shared in (0.0, 0.005**2):
+        found = covariance
+        for _ in range(50):
+            error = np.array([rng.uniform(1e-6, 1e-2), shared, *np.zeros(4)])
+            found, _ = with_heading(found, np.zeros((3, 4)), error)
+            np.testing.assert_array_equal(found, found.T)
+            assert np.linalg.eigvalsh(found).min() > 0.0
 
 
 def test_measured_headings_are_no_better_than_the_walls_they_are_measured_by(rng):

@@ -365,10 +365,11 @@ def heading_errors(rows: Array, poses: Array) -> Array:
 
 
 def with_heading(covariance: Array, derivative: Array, error: Array) -> tuple[Array, Array]:
-    """Covariance (3, 3) and derivative (3, 4) of a pose after a heading measurement.
+    """Covariance (3, 3) and derivative (3, 4) of a pose that is turned to a measured heading.
 
-    error (6,): of the measurement, as in `heading_errors`. The error of the main direction is that
-    of earlier headings: it is in both, and stays.
+    The position stays where it is, and so do its variance and its derivative. error (6,): of the
+    measurement, as in `heading_errors`. The error of the main direction is that of earlier
+    headings: it is in both, and stays.
     """
     found = (np.array(covariance), np.array(derivative))
     _measure_heading(*found, error)
@@ -381,16 +382,16 @@ def _measure_heading(covariance: Array, derivative: Array, error: Array) -> None
     own = covariance[2, 2] - error[1]  # not in common with the main direction
     if own <= 0.0 or not np.isfinite(error[0]):
         return
-    share = own / covariance[2, 2]
-    shared = (share * covariance[2, 0], share * covariance[2, 1], share * covariance[2, 2])
-    gain = 1.0 / (own + error[0])
+    gain = own / (own + error[0])
     for j in range(4):
-        change = gain * (error[2 + j] - derivative[2, j])
-        for i in range(3):
-            derivative[i, j] += shared[i] * change
+        derivative[2, j] += gain * (error[2 + j] - derivative[2, j])
+    # The update of a gain that turns the pose alone (Joseph form). An optimal one would also move
+    # it by its correlation with the heading, but nothing moves it: the scan is turned in place.
+    kept = 1.0 - gain * own / covariance[2, 2]
     for i in range(3):
-        for j in range(3):
-            covariance[i, j] -= gain * shared[i] * shared[j]
+        covariance[i, 2] *= kept
+        if i < 2:
+            covariance[2, i] = covariance[i, 2]
 
 
 class Start(NamedTuple):
