@@ -10,20 +10,20 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.loop_closure import AGAIN_M, Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
+from thinmap_ros.core.slam.matching.scan_matcher import Matcher
 from thinmap_ros.core.slam.matching.surface import surface_points
 
 CONFIG = LocalMapConfig()
 
 
+def there_in(segments, pose, k):
+    scan = scan_in(segments, pose, stamp_ns=k)
+    return Keyframe(scan, surface_points(scan), pose, float(k), np.zeros((3, 3)), 0)
+
+
 @pytest.fixture(scope='module')
 def frames():
-    kept = []
-    for k in range(30):
-        pose = se2.pose(2.0 + 0.2 * k, 2.0 + 0.1 * k, 0.1 * k)
-        scan = scan_in(ROOM, pose, stamp_ns=k)
-        points = surface_points(scan)
-        kept.append(Keyframe(scan, points, pose, float(k), np.zeros((3, 3)), 0))
-    return kept
+    return [there_in(ROOM, se2.pose(2.0 + 0.2 * k, 2.0 + 0.1 * k, 0.1 * k), k) for k in range(30)]
 
 
 def expected(frames, base, numbers):
@@ -78,3 +78,24 @@ def test_few_are_kept(frames):
     for j in (4, 8, 12):
         submaps.around(frames, j, 29.0)
     assert submaps.around(frames, 0, 29.0)[1] is not first
+
+
+def test_a_scan_of_the_way_back_stays_where_it_is():
+    """In a smooth corridor, seen by a laser that looks ahead: the other way, it sees other walls.
+
+    Where too little of what it sees is known, it slides to known walls, past the niches.
+    """
+    ends = [[0.0, 26.0], [28.5, 60.0]]
+    walls = [[a, y, b, y] for y in (0.0, 2.0) for a, b in ends]
+    niches = [[26.0, y, 28.5, y] for y in (-0.4, 2.4)]
+    corridor = np.array(walls + niches)
+    frames = [there_in(corridor, se2.pose(5.0 + 0.7 * k, 1.0, 0.0), k) for k in range(60)]
+    here = se2.pose(frames[36].T_map_base[0], 1.0, np.pi)
+    scan = scan_in(corridor, here)
+    base, submap = Submaps(CONFIG).around(frames, 36, 100.0, looks_back=True)
+    prior = se2.between(base, here)
+    sure_of_line = np.diag([4.0, 0.01, 1e-3])
+    found = (
+        Matcher().match(surface_points(scan), scan.T_base_laser, submap, prior, sure_of_line).pose
+    )
+    assert np.hypot(*(found - prior)[:2]) < 0.1

@@ -43,6 +43,12 @@ from thinmap_ros.core.stage import Correction, are_two_storeys
 AGAIN_M = 8.0  # smallest path length between two visits of a place
 
 
+# Keyframes to either side in a submap for a scan that looks back: as far as a laser sees well. Of
+# what lies before it, those beside it saw nothing; along a smooth wall it would slide by metres to
+# where more is known, and its neighbours would do alike and agree.
+_AROUND_BACK = 12
+
+
 class Submaps:
     """Cache of submaps around keyframes, with which the scans of later visits are matched.
 
@@ -60,22 +66,27 @@ class Submaps:
         self._around = around
         self._stride = stride
         self._capacity = capacity
-        self._kept: OrderedDict[tuple[int, int], tuple[Array, LocalMap]] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, int, bool], tuple[Array, LocalMap]] = OrderedDict()
 
     def clear(self) -> None:
         """Drop all submaps, after keyframes have moved."""
         self._kept.clear()
 
-    def around(self, frames: Sequence[Keyframe], j: int, path_m: float) -> tuple[Array, LocalMap]:
+    def around(
+        self, frames: Sequence[Keyframe], j: int, path_m: float, looks_back: bool = False
+    ) -> tuple[Array, LocalMap]:
         """Pose (3,) of a submap around keyframe j, and the map in the frame of this pose.
 
         path_m: length of the path now; keyframes after j that belong to the current visit are not
-        part of the submap.
+        part of the submap; looks_back: whether it is for a scan that faces the other way.
         """
         centre = min(j - j % self._stride + self._stride // 2, len(frames) - 1)
-        key = (centre, frames[j].submap)
+        key = (centre, frames[j].submap, looks_back)
         if key not in self._kept:
-            self._kept[key] = self._built(frames, centre, j, path_m)
+            around = _AROUND_BACK if looks_back else self._around
+            near = range(max(0, centre - around), min(centre + around + 1, len(frames)))
+            earlier = [i for i in near if i <= j or path_m - frames[i].path_m > AGAIN_M]
+            self._kept[key] = self._built(frames, centre, j, earlier)
             if len(self._kept) > self._capacity:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
@@ -83,17 +94,16 @@ class Submaps:
 
     def before(self, frames: Sequence[Keyframe], j: int) -> tuple[Array, LocalMap]:
         """Pose (3,) of a submap of keyframe j and of those before it, and the map in its frame."""
-        return self._built(frames, j, j, -math.inf)
+        return self._built(frames, j, j, range(max(0, j - self._around), j + 1))
 
     def _built(
-        self, frames: Sequence[Keyframe], centre: int, j: int, path_m: float
+        self, frames: Sequence[Keyframe], centre: int, j: int, numbers: Iterable[int]
     ) -> tuple[Array, LocalMap]:
+        """The submap of those of the numbers that are of the local map of keyframe j."""
         base = frames[centre].T_map_base
         submap = LocalMap(self._config)
-        for i in range(max(0, centre - self._around), min(centre + self._around + 1, len(frames))):
-            frame = frames[i]
-            is_earlier = i <= j or path_m - frame.path_m > AGAIN_M
-            if is_earlier and frame.submap == frames[j].submap:
+        for frame in (frames[i] for i in numbers):
+            if frame.submap == frames[j].submap:
                 T = se2.between(base, frame.T_map_base)
                 with suppress(InputError):  # kilometres away: nothing to match there
                     submap.add_scan(frame.points, frame.scan.T_base_laser, T)
@@ -698,7 +708,9 @@ class LoopClosure:
         if is_step:
             base, submap = self._submaps.before(frames, j)
         else:
-            base, submap = self._submaps.around(frames, j, here.path_m)
+            turn = float(se2.between(frames[j].T_map_base, here.T_map_base)[2])
+            looks_back = abs(turn) > 0.75 * math.pi  # within 45 degrees of the way back
+            base, submap = self._submaps.around(frames, j, here.path_m, looks_back)
         config = self._config
         prior = se2.between(base, here.T_map_base)
         relative = rotated_covariance(job.covariance, -float(base[2])) + 4.0 * EDGE_NOISE
