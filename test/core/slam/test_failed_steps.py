@@ -12,7 +12,8 @@ from thinmap_ros.core.slam.localizer import ActiveMap, HeadingCorrection, Locali
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
 from thinmap_ros.core.slam.odometry import OdometryCalibration
-from thinmap_ros.core.slam.track import LocalizerConfig, MapEvidence, Tracker
+from thinmap_ros.core.slam.place_belief import PlaceBelief
+from thinmap_ros.core.slam.track import LocalizerConfig, Tracker
 
 FAILING = 4  # calls in a row
 
@@ -22,7 +23,7 @@ FAILING = 4  # calls in a row
     ('part', 'name'),
     [
         (Matcher, 'match'),
-        (MapEvidence, 'update'),
+        (PlaceBelief, 'update'),
         (OdometryCalibration, 'update'),
         (Tracker, '_record_agreement'),
         (HeadingCorrection, 'correct'),

@@ -347,6 +347,17 @@ def test_wheel_slip_is_corrected_by_matching():
     assert most < 0.1
 
 
+@pytest.mark.parametrize('turn', [2.6, -2.2, np.pi])
+def test_a_turn_that_the_odometry_has_not_seen_is_found_in_the_map(turn):
+    """The robot is turned on the spot between two scans, and drives on."""
+    rows, localizer = driven(300)
+    truth, _, odom = rows[-1]
+    turned = se2.compose(truth, np.array([0.0, 0.0, turn]))
+    rows = on(localizer, 40, turned, odom, np.random.default_rng(8))
+    assert not any(estimate.is_lost for _, estimate, _ in rows)
+    assert worst(rows) < 0.1
+
+
 def test_odometry_that_is_stuck_for_two_seconds_is_made_up_by_the_walls():
     def stuck(odom):
         last.append(odom)

@@ -39,6 +39,7 @@ from thinmap_ros.core.slam.graph.keyframes import (
 )
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, Pieces
 from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
+from thinmap_ros.core.slam.graph.reckoned import Reckoned
 from thinmap_ros.core.slam.graph.tables import KeyframeTrajectory, heading_row
 from thinmap_ros.core.slam.joining.join import Atlas
 from thinmap_ros.core.slam.matching import local_map
@@ -50,6 +51,7 @@ from thinmap_ros.core.slam.matching.surface import (
     surface_points,
 )
 from thinmap_ros.core.slam.odometry import OdometryCalibration, PoseUncertainty
+from thinmap_ros.core.slam.place_belief import SURE
 from thinmap_ros.core.slam.track import LocalizerConfig, Surroundings, Tracked, Tracker
 from thinmap_ros.core.slam.wall_compass import Heading, Reference, WallCompass
 from thinmap_ros.core.snapshot import State
@@ -320,7 +322,7 @@ class Localizer:
             return
         T_map_base = se2.pose(*T_map_base.tolist())
         self._place(T_map_base, covariance)
-        self._tracker.evidence.place(is_map_given=not self.config.is_mapping)
+        self._tracker.belief.place(is_map_given=not self.config.is_mapping)
         self._local.rerender(self.keyframes, T_map_base)
 
     def complete_map(self) -> None:
@@ -450,12 +452,12 @@ class Localizer:
         """
         points = surface_points(scan)
         tracked = self._tracker.step(scan, points, T_odom_base, self._surroundings)
-        evidence = self._tracker.evidence
+        belief = self._tracker.belief
         if not self.config.is_mapping:
             self._detect_loss()
-        elif not evidence.is_delocalized:
+        elif not belief.is_delocalized:
             self._add_scan(scan, points)
-        elif evidence.needs_submap:
+        elif belief.needs_submap:
             self._start_submap()  # the robot is not where it was placed
         correction = self._close_loops()
         self._record_pose(scan.stamp_ns)
@@ -514,7 +516,7 @@ class Localizer:
             self._local.load(given, len(self.keyframes))
         self._place(start, self._tracker.slip_covariance())
         is_believed = self.config.is_start_given or not self.config.is_mapping
-        self._tracker.evidence.start_delocalized(is_believed, is_guess=is_guess)
+        self._tracker.belief.start_delocalized(is_believed, is_guess=is_guess)
 
     def _detect_loss(self) -> None:
         """In a map that does not change, the robot is delocalized if scans contradict it.
@@ -522,18 +524,18 @@ class Localizer:
         Dead reckoning continues from the last scan that agreed.
         """
         track = self._tracker
-        if track.evidence.is_delocalized or not track.evidence.needs_submap:
+        if track.belief.is_delocalized or not track.belief.needs_submap:
             return
         covariance = track.fall_back()
         track.uncertainty.place(track.T_anchor_base, covariance)
-        track.evidence.lose()
+        track.belief.lose()
 
     def _estimate(self, tracked: Tracked) -> Estimate:
-        evidence = self._tracker.evidence
+        belief = self._tracker.belief
         anchor = self._loops.anchor
         T_map_base = self.pose
         apart = self._atlas.apart
-        is_lost = apart is not None or evidence.is_lost
+        is_lost = apart is not None or belief.is_lost
         match = tracked.match
         return Estimate(
             T_map_base,
@@ -542,7 +544,7 @@ class Localizer:
             inlier_ratio=0.0 if match is None else match.inlier_ratio,
             is_lost=is_lost,
             apart=apart,
-            is_contradicted=self.config.is_mapping and not evidence.permits_mapping,
+            is_contradicted=self.config.is_mapping and not belief.permits_mapping,
             blind_reason=tracked.blind_reason,
             odometry_discontinuity=tracked.discontinuity,
             scan_information=match.scan_information if match and tracked.fits else None,
@@ -589,9 +591,9 @@ class Localizer:
         is_near = path_m < _UPDATE_M and turn < _UPDATE_RAD
         if moved is not None and is_near:
             return
-        if track.evidence.needs_submap:
+        if track.belief.needs_submap:
             self._start_submap()
-        elif track.evidence.forbids_mapping:
+        elif track.belief.forbids_mapping:
             return
         self._correct_heading(scan)
         if not self._local.add_scan(points, scan.T_base_laser, self.pose):
@@ -610,8 +612,11 @@ class Localizer:
         track = self._tracker
         covariance = track.fall_back()
         track.uncertainty.start_submap(track.T_anchor_base, covariance)
-        track.evidence.start_submap()
-        self._loops.pieces.begin()
+        own = rotated_covariance(track.reckoned.covariance, float(self._loops.anchor.T_map[2]))
+        log_odds = -SURE if track.belief.is_delocalized else track.belief.log_odds
+        path_m = self._loops.anchor.path_m_at(track.T_anchor_base)
+        self._loops.pieces.begin(Reckoned(log_odds, self.pose, own, path_m))
+        track.belief.start_submap()
         self._local.start_submap()
 
     def _close_loops(self) -> Correction | None:
@@ -640,7 +645,7 @@ class Localizer:
             anchor.pose(track.T_anchor_base),
             track.uncertainty,
             anchor.path_m_at(track.T_anchor_base),
-            track.evidence.agrees,
+            track.belief.agrees,
             Reference(variance, self._share(derivative)),
             self._loops.keyframes.revision,
         )
@@ -656,7 +661,7 @@ class Localizer:
         covariance, jump = uncertainty.step()
         step = Step(covariance, self._share(uncertainty.systematic))
         # In a new submap the heading is unknown, also by multiples of 90 degrees.
-        is_lost = loops.pieces.is_apart or tracker.evidence.is_lost
+        is_lost = loops.pieces.is_apart or tracker.belief.is_lost
         heading = None if is_lost else self._heading.measured
         (error,) = heading_errors(np.array([heading_row(heading)]), T_map_base[None])
         covariance, systematic = with_heading(

@@ -5,8 +5,8 @@ has to be told.
 """
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter, parameters_of, part
 from thinmap_ros.core.ekf_slam.features import LineConfig, odometry_slip
 from thinmap_ros.core.grid.tiles import NO_TILE
-from thinmap_ros.core.places.views import WINDOW_M
 from thinmap_ros.core.scan import Scan, few_beams_reason, is_most_missed
 from thinmap_ros.core.se2 import (
     BOUND_SIGMAS,
@@ -23,6 +22,7 @@ from thinmap_ros.core.se2 import (
     rotated_covariance,
     rotation,
 )
+from thinmap_ros.core.slam.continuity import Motion, continuity, goes_on
 from thinmap_ros.core.slam.graph.keyframes import Anchor, KeyframeConfig
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.matching.local_map import (
@@ -42,6 +42,12 @@ from thinmap_ros.core.slam.odometry import (
     OdometryPrediction,
     PoseUncertainty,
     Prediction,
+)
+from thinmap_ros.core.slam.place_belief import (
+    INLIERS_PER_CONTRADICTION,
+    NOTHING,
+    PlaceBelief,
+    SeenThrough,
 )
 from thinmap_ros.core.stage import SCAN_MATCHING, StartConfig
 from thinmap_ros.jit import kernel
@@ -113,16 +119,6 @@ def misses_walls(scan: Scan, local_map: LocalMap, T_map_base: Array, covariance:
     angles = T_map_laser[2] + scan.angles_rad[scan.no_return]
     missed = _count_walls(angles, T_map_laser, reach_m, local_map.lattice, MIN_HIT_RATIO)
     return is_most_missed(scan, missed)
-
-
-class SeenThrough(NamedTuple):
-    """Walls of the map (M, 2), m, map frame, behind which a scan has returns; ratio: of all."""
-
-    walls: Array
-    ratio: float
-
-
-NOTHING = SeenThrough(np.empty((0, 2)), 0.0)
 
 
 def seen_through(
@@ -219,235 +215,6 @@ def _count_walls(
     return count
 
 
-# Inliers for each contradicting point with which a match overrides the odometry.
-INLIERS_PER_CONTRADICTION = 3.0
-
-# Ratio of returns behind walls, between that of the worst real log (mean 0.11, of an office with
-# much glass) and that of robots that were kidnapped (mean 0.4 in the first seconds).
-_SEEN_THROUGH = 0.25
-
-_OPENING_RADIUS_M = 1.5  # a gate for hospital beds, or two leaves of an automatic door
-
-# Of a pose that no scan has confirmed: less than a scan with 30 % inliers removes.
-_UNCONFIRMED_EVIDENCE = 0.3 / INLIERS_PER_CONTRADICTION
-
-
-class _Trial:
-    """A start pose that nobody gave: it is confirmed by scans that fit over the path of a view.
-
-    Some scans fit anywhere, and a map that they change soon agrees with all that follow. Of 20
-    starts elsewhere in generated buildings, 13 were mapped at a wrong pose without a trial, 3 with
-    one of 1.5 m or of 3 m, and none with this.
-    """
-
-    def __init__(self, is_guess: bool) -> None:
-        """is_guess: whether the robot is lost until the pose is confirmed."""
-        self.is_guess = is_guess
-        self._path_m = 0.0
-        self._fitting_m = 0.0  # path since a scan did not fit
-
-    def add(self, moved_m: float, fits: bool) -> None:
-        """Add a scan that was made after some more path; fits: whether it agrees with the map."""
-        self._path_m += moved_m
-        self._fitting_m = self._fitting_m + moved_m if fits else 0.0
-
-    @property
-    def is_passed(self) -> bool:
-        """Whether the pose is confirmed."""
-        return self._fitting_m > WINDOW_M
-
-    @property
-    def is_failed(self) -> bool:
-        """Whether no view has confirmed it where there was room for two."""
-        return not self.is_passed and self._path_m > 2.0 * WINDOW_M
-
-
-class _Opening:
-    """Whether one opening explains what is seen through: a door, or a cupboard that is gone.
-
-    A kidnapped robot sees through walls all around. One that waits before an automatic door
-    and then drives through it sees through that alone, with most of its beams for some metres.
-    """
-
-    def __init__(self) -> None:
-        self._centre: Array | None = None
-        self._within = 0.0  # sums of ratios of returns, since there is evidence
-        self._beside = 0.0
-
-    @property
-    def explains_most(self) -> bool:
-        """Whether most of what was seen through since there is evidence is within one opening."""
-        return self._within > self._beside
-
-    def add(self, seen: SeenThrough) -> None:
-        """Add what a scan sees through."""
-        if not len(seen.walls):
-            return
-        if self._centre is None:
-            self._centre = np.median(seen.walls, axis=0)
-        is_beside = np.hypot(*(seen.walls - self._centre).T) > _OPENING_RADIUS_M
-        beside = seen.ratio * float(np.mean(is_beside))
-        self._beside += beside
-        self._within += seen.ratio - beside
-
-
-class MapEvidence:
-    """Detects by CUSUM tests that scans contradict the map.
-
-    The evidence sums up the contradiction ratio less a third of the inlier ratio, and is never
-    negative. A map that grows soon fits wherever the robot is: the walls that are seen through are
-    evidence of their own, which no inlier reduces.
-    Source: Page, "Continuous inspection schemes", 1954.
-    """
-
-    def __init__(
-        self,
-        lost_threshold: float,
-        least_fit: float,
-        loaded_evidence: float = 0.5,
-    ) -> None:
-        """loaded_evidence: initial evidence in a loaded map: one or two fitting scans remove it."""
-        self._loaded_evidence = loaded_evidence
-        self.level = 0.0
-        self._seen_through = 0.0
-        self._before_look = 0.0  # the same before the present look
-        self._opening = _Opening()
-        self._is_foreign = False  # whether the last scan may be one of another place
-        self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
-        self._trial: _Trial | None = None
-        self.is_unconfirmed = False  # after a scan without a match, until one fits
-        self.adjust(lost_threshold, least_fit)
-
-    def adjust(self, lost_threshold: float, least_fit: float) -> None:
-        """Set the evidence at which the robot is lost, and the inlier ratio of a scan that fits."""
-        self._lost_evidence = lost_threshold
-        self._least_fit = least_fit
-
-    @property
-    def agrees(self) -> bool:
-        """Whether there is no evidence against the map."""
-        return self.level == 0.0 and self._seen_through == 0.0
-
-    @property
-    def permits_mapping(self) -> bool:
-        """Whether scans agree with the map, and do so at a pose that is given or confirmed."""
-        return self.agrees and self._trial is None
-
-    @property
-    def forbids_mapping(self) -> bool:
-        """Whether the last scan may show another place than the map does.
-
-        A map that such scans change soon agrees with them, wherever the robot is. A scan that fits
-        shows this place, with people or furniture.
-        """
-        return self._is_foreign
-
-    @property
-    def _is_grave(self) -> bool:
-        """Whether the evidence is more than half of what makes the robot lost."""
-        return 2.0 * max(self.level, self._seen_through) > self._lost_evidence
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether scans have not confirmed the pose at which the robot was placed in the map."""
-        is_guess = self._trial is not None and self._trial.is_guess
-        return self.is_delocalized and (is_guess or not self.agrees)
-
-    @property
-    def needs_submap(self) -> bool:
-        """Whether the evidence against the map, or against a given pose, reaches the threshold."""
-        if self._trial is not None and self._trial.is_failed:
-            return True
-        if self.level >= self._lost_evidence:
-            return True
-        return self._seen_through >= self._lost_evidence and not self._opening.explains_most
-
-    def update(
-        self,
-        match: Match | None,
-        seen_through: SeenThrough = NOTHING,
-        is_stationary: bool = False,
-        moved_m: float = 0.0,
-    ) -> None:
-        """Update the evidence by a match; None (no match was possible) leaves it unchanged.
-
-        seen_through: walls of the map that it sees through; is_stationary: whether the scan is of
-        the same look as the last one, and no evidence of its own; moved_m: path since that one.
-        """
-        if match is None:
-            self.is_unconfirmed = True
-            return
-        fits = match.inlier_ratio >= self._least_fit
-        if fits:
-            self.is_unconfirmed = False
-        more = match.contradiction_ratio
-        if fits or not self._is_grave:  # a third of the points fit anywhere
-            more -= match.inlier_ratio / INLIERS_PER_CONTRADICTION
-        self._is_foreign = not fits and (more > 0.0 or self._is_grave)
-        self.level = max(self.level + more, 0.0)
-        if not is_stationary:
-            self._end_look(self._seen_through)
-        self._seen_through = max(self._before_look + seen_through.ratio - _SEEN_THROUGH, 0.0)
-        if self._seen_through > 0.0:
-            self._opening.add(seen_through)
-        if self.is_delocalized:
-            self.level = min(self.level, self._lost_evidence)
-            agrees = self.agrees and fits
-            is_confirmed = self._is_confirmed(moved_m, agrees)
-            self.is_delocalized = not (agrees and is_confirmed)
-
-    def _is_confirmed(self, moved_m: float, fits: bool) -> bool:
-        """Whether the start pose is confirmed, or none has to be."""
-        if self._trial is None:
-            return True
-        self._trial.add(moved_m, fits)
-        if self._trial.is_passed:
-            self._trial = None
-        return self._trial is None
-
-    def _end_look(self, seen_through: float) -> None:
-        """Set the evidence of walls that were seen through before the present look."""
-        self._before_look = seen_through
-        self._seen_through = seen_through
-        if seen_through == 0.0:
-            self._opening = _Opening()
-
-    def place(self, is_map_given: bool = False) -> None:
-        """The pose was given: the robot is delocalized until scans fit.
-
-        is_map_given: the map does not change: the robot is also lost until the first scan that
-        fits. Outside of the map no scan contradicts it.
-        """
-        self.is_delocalized = True
-        self._trial = None
-        self.is_unconfirmed = False
-        self.level = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
-        self._end_look(0.0)
-
-    def start_delocalized(self, is_pose_given: bool = True, is_guess: bool = False) -> None:
-        """Start in a loaded map; is_pose_given: one scan that fits confirms the pose.
-
-        is_guess: the robot may be anywhere; scans that fit on the way confirm it.
-        """
-        self.is_delocalized = True
-        self._trial = None if is_pose_given and not is_guess else _Trial(is_guess)
-        self.level = self._loaded_evidence
-
-    def lose(self) -> None:
-        """The robot is delocalized in the map as it is, until scans fit."""
-        self.is_delocalized = True
-        self.level = min(self.level, self._lost_evidence)
-        self._end_look(0.0)
-
-    def start_submap(self) -> None:
-        """Start a new local map, which no scan contradicts."""
-        self.level = 0.0
-        self._is_foreign = False
-        self._end_look(0.0)
-        self._trial = None
-        self.is_delocalized = False
-
-
 @dataclass(frozen=True, eq=False)
 class DeadReckoning:
     """Dead-reckoned pose (3,) since the last scan that agreed, with covariance (3, 3)."""
@@ -470,6 +237,18 @@ class DeadReckoning:
             se2.between(T_old_new, self.T_anchor_base),
             rotated_covariance(self.covariance, -float(T_old_new[2])),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class LastLook:
+    """A scan with which the next ones of its laser are compared; T_scan_base (3,): odometry since.
+
+    is_kept: whether the last scan was compared with it, too.
+    """
+
+    scan: Scan
+    T_scan_base: Array
+    is_kept: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -505,7 +284,7 @@ class Tracker:
     """Predicts, matches and updates the pose relative to the anchor, T_anchor_base (3,).
 
     uncertainty, reckoned, T_anchor_update: relative to the anchor, too; the last is the pose of the
-    scan that was last added to the map, None before the first. evidence: against the map.
+    scan that was last added to the map, None before the first. belief: of the place.
     """
 
     def __init__(self, config: LocalizerConfig) -> None:
@@ -515,15 +294,16 @@ class Tracker:
         start = se2.pose(config.initial_x_m, config.initial_y_m, config.initial_yaw_rad)
         self.T_anchor_base = start
         self.uncertainty = PoseUncertainty(start)
-        self.evidence = MapEvidence(config.lost_threshold, config.matching.min_inlier_ratio)
+        self.belief = PlaceBelief(config.lost_threshold, config.matching.min_inlier_ratio)
         self.reckoned = DeadReckoning(start, np.zeros((3, 3)))
         self.T_anchor_update: Array | None = None
+        self._looks: dict[str, LastLook] = {}  # by the frame of the laser
 
     def adjust(self, config: LocalizerConfig) -> None:
         """Continue with other values of `LIVE_PARAMETERS`."""
         self._config = config
         self._matcher = Matcher(config.matching)
-        self.evidence.adjust(config.lost_threshold, config.matching.min_inlier_ratio)
+        self.belief.adjust(config.lost_threshold, config.matching.min_inlier_ratio)
 
     @property
     def since_update(self) -> Array | None:
@@ -544,12 +324,17 @@ class Tracker:
             before, prediction.prior, prediction.covariance, is_stationary, by_calibration
         )
         self.reckoned = self.reckoned.moved(prediction)
+        self._move_looks(se2.between(before, prediction.prior))
         try:
-            return self._measure(scan, points, prediction, is_stationary, there)
+            tracked = self._measure(scan, points, prediction, is_stationary, there)
         except Exception:
             self.T_anchor_base = prediction.prior
             self.uncertainty.coast(prediction.prior, prediction.covariance, is_stationary)
             raise
+        if not self.belief.is_doubted:
+            self._move_looks(se2.between(prediction.prior, self.T_anchor_base))
+        self._take_look(scan)
+        return tracked
 
     def _measure(
         self,
@@ -564,8 +349,9 @@ class Tracker:
         match = self._match(scan, points, prediction.prior, there)
         moved_m = 0.0 if is_stationary else float(np.hypot(*(prediction.prior - before)[:2]))
         through = self._seen_through(scan, match, there)
-        self.evidence.update(match, through, is_stationary, moved_m)
         own = None if match is None else match.seen_from(there.anchor.T_map)
+        self._judge_motion(scan, prediction, own)
+        self.belief.update(match, through, is_stationary, moved_m)
         fits = self._update(own, prediction, is_stationary)
         if fits and match is not None:
             systematic = self.systematic(there.anchor)
@@ -577,6 +363,7 @@ class Tracker:
     def place(self, T_anchor_base: Array, covariance: Array) -> None:
         """Set the pose (3,) with covariance (3, 3), relative to any anchor, without any motion."""
         self.prediction.reset_segment()
+        self._looks.clear()
         self.T_anchor_base = T_anchor_base
         self.T_anchor_update = None
         self.uncertainty.place(T_anchor_base, covariance)
@@ -628,7 +415,7 @@ class Tracker:
 
     def _record_agreement(self) -> None:
         """Restart dead reckoning at the pose of this scan if the scan agrees with the map."""
-        if self.evidence.agrees:
+        if self.belief.agrees:
             self.reckoned = DeadReckoning(self.T_anchor_base, self.uncertainty.since_match)
 
     def _is_stationary(self, prediction: Prediction) -> bool:
@@ -637,8 +424,48 @@ class Tracker:
         is_still = self.uncertainty.is_stationary(prediction.prior, slip)
         return prediction.motion.is_stationary and is_still
 
+    def _judge_motion(self, scan: Scan, prediction: Prediction, match: Match | None) -> None:
+        """Update the belief by what a scan shows of the last one; match: relative to the anchor."""
+        look = self._looks.get(scan.frame)
+        if look is None:
+            return
+        motions = [Motion(look.T_scan_base)]
+        if match is not None:
+            off = se2.pose_difference(match.pose, prediction.prior)
+            expected = prediction.covariance + self.slip_covariance() / BOUND_SIGMAS**2
+            likelihood = -0.5 * float(off @ np.linalg.solve(expected, off))
+            by_match = se2.compose(look.T_scan_base, se2.between(prediction.prior, match.pose))
+            motions.append(Motion(by_match, likelihood))
+        is_again = look.is_kept and self._is_at_rest(look)
+        self.belief.move(continuity(look.scan, scan, motions), is_again)
+
+    def _is_at_rest(self, look: LastLook) -> bool:
+        """Whether the robot has not moved since a look, but for the noise of the odometry."""
+        slip = BOUND_SIGMAS * odometry_slip(self._config.odometry)
+        return bool((np.abs(look.T_scan_base) <= slip).all())
+
+    def _move_looks(self, moved: Array) -> None:
+        """Move on by a motion (3,) since all looks."""
+        for frame, last in self._looks.items():
+            self._looks[frame] = replace(last, T_scan_base=se2.compose(last.T_scan_base, moved))
+
+    def _take_look(self, scan: Scan) -> None:
+        """Compare the next scans with this one, unless the robot rests.
+
+        At rest they are compared with the first: who is carried off slowly sees the walls go by.
+        """
+        look = self._looks.get(scan.frame)
+        if look is None or not self._is_at_rest(look):
+            self._looks[scan.frame] = LastLook(scan, np.zeros(3))
+        else:
+            self._looks[scan.frame] = replace(look, is_kept=True)
+
     def _match(self, scan: Scan, points: Array, prior: Array, there: Surroundings) -> Match | None:
-        """Match a scan with the local map; None if scan or map have too little structure."""
+        """Match a scan with the local map; None if scan or map have too little structure.
+
+        Where it fits badly and does not go on as the last one, neither as the odometry nor as the
+        match has it, all headings are searched: the odometry may not have seen a turn.
+        """
         if len(points) < MIN_POINTS or there.local_map.is_empty:
             return None
         if np.ptp(points[:, :2], axis=0).max() < self._config.local_map.resolution_m:
@@ -646,7 +473,16 @@ class Tracker:
         T_map = there.anchor.T_map
         covariance = rotated_covariance(self.uncertainty.since_match, float(T_map[2]))
         prior = there.anchor.pose(prior)
-        return self._matcher.match(points, scan.T_base_laser, there.local_map, prior, covariance)
+        given = (points, scan.T_base_laser, there.local_map, prior, covariance)
+        match = self._matcher.match(*given)
+        fits = match.inlier_ratio >= self._config.matching.min_inlier_ratio
+        look = self._looks.get(scan.frame)
+        if fits or look is None:
+            return match
+        by_match = se2.compose(look.T_scan_base, se2.between(prior, match.pose))
+        if any(goes_on(look.scan, scan, T) for T in (look.T_scan_base, by_match)):
+            return match
+        return self._matcher.match(*given, is_turned=True)
 
     def _seen_through(self, scan: Scan, match: Match | None, there: Surroundings) -> SeenThrough:
         """Walls of the map that this localizer makes, and that a scan sees through.
@@ -657,7 +493,7 @@ class Tracker:
         if match is None or not self._config.is_mapping:
             return NOTHING
         # At a given pose no drift explains them: it is right or wrong.
-        is_given = self.evidence.is_delocalized
+        is_given = self.belief.is_delocalized
         covariance = np.zeros((3, 3)) if is_given else self.covariance(there.anchor)
         return seen_through(scan, there.local_map, match.pose, covariance)
 
@@ -671,7 +507,7 @@ class Tracker:
         is_unexpected = match is not None and uncertainty.is_unexpected(match, prior)
         accepted = match is not None and not self._is_rejected(match, is_unexpected)
         # After set_pose an innovation is due to the given pose, and not to the odometry.
-        if match is not None and is_unexpected and not self.evidence.is_delocalized:
+        if match is not None and is_unexpected and not self.belief.is_delocalized:
             self.prediction.contradict(prediction, match, accepted)
         if match is None or not accepted:
             self.T_anchor_base = prior
@@ -687,17 +523,20 @@ class Tracker:
     def _is_rejected(self, match: Match, is_unexpected: bool) -> bool:
         """Whether the pose of a match is worse than the predicted one.
 
-        An unexpected match is, if many of its points contradict the map. After scans that could
-        not be matched, one that fits badly is: a few points fit somewhere within a wide prior.
+        So it is where the robot was carried off. An unexpected match is, if many of its points
+        contradict the map. After scans that could not be matched, one that fits badly is: a few
+        points fit somewhere within a wide prior.
         """
-        if self.evidence.is_delocalized:
+        if self.belief.is_elsewhere:
+            return True
+        if self.belief.is_delocalized:
             return False
         if is_unexpected and (
             match.inlier_ratio < INLIERS_PER_CONTRADICTION * match.contradiction_ratio
         ):
             return True
         is_wide = self._config.matching.is_wide(self.uncertainty.since_match)
-        return self.evidence.is_unconfirmed and is_wide
+        return self.belief.is_unconfirmed and is_wide
 
     def _blind_reason(
         self, scan: Scan, points: Array, match: Match | None, there: Surroundings
@@ -706,9 +545,9 @@ class Tracker:
         if match is not None or scan.is_blind:
             return scan.blind_reason
         has_confirmed = not self._config.is_mapping or there.has_keyframes
-        is_confirmed = has_confirmed and not self.evidence.is_delocalized
+        is_confirmed = has_confirmed and not self.belief.is_delocalized
         sparse_reason = few_beams_reason(scan) or _sparse_reason(scan, points, is_confirmed)
-        if sparse_reason or there.is_apart or self.evidence.is_lost:
+        if sparse_reason or there.is_apart or self.belief.is_lost:
             return sparse_reason
         T_map_base = there.anchor.pose(self.T_anchor_base)
         covariance = self.uncertainty.since_match

@@ -15,6 +15,7 @@ from thinmap_ros.core.slam.graph import pose_graph
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Keyframes, Step
 from thinmap_ros.core.slam.graph.loop_closure import KeyframeGraph, LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
+from thinmap_ros.core.slam.graph.reckoned import Reckoned
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MatchingConfig
 from thinmap_ros.core.slam.matching.surface import surface_points
@@ -97,7 +98,7 @@ class Drive:
 
     def carried(self):
         """Scans contradict the map: a piece of its own begins."""
-        self.loops.pieces.begin()
+        self.loops.pieces.begin(Reckoned(0.0, np.zeros(3), np.eye(3), 0.0))
         self.ahead()
         self.ahead()
 

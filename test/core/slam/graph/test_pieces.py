@@ -7,8 +7,10 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.loop_closure import Pieces
 from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.graph.reckoned import Reckoned, Search
 
 SCAN = Scan.create(1, np.ones(3), 0.0, 0.1, 0.05, 8.0, np.zeros(3))
+SEARCH = Search(2.0, 0.5)
 
 
 def frame(submap, x):
@@ -19,10 +21,14 @@ def edge(a, b, x=0.0):
     return Edge(a, b, np.array([x, 0.0, 0.0]), np.eye(3) / 0.1**2, True)
 
 
+def reckoned(log_odds):
+    return Reckoned(log_odds, np.zeros(3), 1e-4 * np.eye(3), 0.0)
+
+
 def test_a_new_submap_is_apart_until_a_pose_in_the_map_is_given():
     pieces = Pieces()
     assert not pieces.is_apart
-    pieces.begin()
+    pieces.begin(reckoned(0.0))
     assert pieces.is_apart and pieces.current == 1
     assert not pieces.is_here(0) and pieces.is_published(0) and not pieces.is_published(1)
     pieces.return_to_published()
@@ -32,41 +38,47 @@ def test_a_new_submap_is_apart_until_a_pose_in_the_map_is_given():
     assert pieces.current == 2, 'it was there already'
 
 
-@pytest.mark.parametrize(('step_m', 'joins'), [(1.0, False), (3.0, True)])
-def test_as_many_matches_as_close_a_loop_join_pieces_if_each_is_of_another_view(step_m, joins):
+@pytest.mark.parametrize(('step_m', 'closes'), [(1.0, False), (3.0, True)])
+def test_ambiguous_matches_close_a_loop_if_each_is_of_another_view(step_m, closes):
     pieces = Pieces()
-    pieces.begin()
-    frames = [frame(0, 0.0), *(frame(1, 50.0 + step_m * k) for k in range(5))]
+    frames = [frame(0, 0.0), *(frame(0, 50.0 + step_m * k) for k in range(5))]
     for k in range(5):
         assert pieces.take_edges(frames, 5) == []
         pieces.add_match(edge(0, 1 + k, step_m * k))
-    edges = pieces.take_edges(frames, 5)
-    assert bool(edges) == joins
-    pieces.join(frames, edges)
-    assert pieces.is_apart != joins
+    assert bool(pieces.take_edges(frames, 5)) == closes
+    assert pieces.take_edges(frames, 5) == []
 
 
-def test_matches_that_do_not_agree_or_are_with_several_pieces_join_nothing():
+def test_a_piece_returns_once_the_odds_of_its_place_are_high_enough():
     pieces = Pieces()
-    pieces.begin()
-    pieces.begin()
-    frames = [frame(0, 0.0), frame(1, 9.0), *(frame(2, 50.0 + 3.0 * k) for k in range(6))]
-    for k in range(6):
-        pieces.add_match(edge(k % 2, 2 + k, 20.0 * k))
-    assert pieces.take_edges(frames, 3) == [], 'they do not agree'
-    for k in range(6):
-        pieces.add_match(edge(k % 2, 2 + k, 3.0 * k))
-    assert pieces.take_edges(frames, 4) == [], 'three with each piece'
-    edges = pieces.take_edges(frames, 3)
+    pieces.begin(reckoned(-4.0))
+    frames = [frame(0, 0.0), frame(1, 0.0), frame(1, 3.0)]
+    own = pieces.reckoned_to(0)
+    own.add(np.zeros(2), edge(0, 1), np.zeros(3), 1e-4 * np.eye(3), SEARCH)
+    assert pieces.take_returning() == []
+    own.add(np.array([3.0, 0.0]), edge(0, 2), np.zeros(3), 1e-4 * np.eye(3), SEARCH)
+    edges = pieces.take_returning()
+    assert [each.b for each in edges] == [1, 2]
+    assert pieces.take_returning() == []
     pieces.join(frames, edges)
     assert not pieces.is_apart
-    assert not pieces.is_published(1), 'it is still apart from the other two'
+    assert pieces.reckoned_to(0) is None
 
 
-def test_matches_of_a_piece_that_was_left_say_nothing_on_the_next():
+def test_a_piece_that_was_left_is_judged_from_the_published_map_and_not_from_another_piece():
     pieces = Pieces()
-    pieces.begin()
-    frames = [frame(0, 0.0), frame(1, 50.0), frame(2, 60.0)]
-    pieces.add_match(edge(0, 1))
-    pieces.begin()
-    assert pieces.take_edges(frames, 1) == []
+    pieces.begin(reckoned(-2.0))
+    pieces.begin(reckoned(-3.0))
+    assert pieces.reckoned_to(1) is None
+    assert pieces.reckoned_to(0).log_odds == pytest.approx(-np.logaddexp(2.0, 3.0))
+    pieces.return_to_published()
+    assert pieces.reckoned_to(1).log_odds == -2.0
+    assert pieces.reckoned_to(0) is None
+
+
+def test_a_piece_that_recognition_joins_is_judged_no_longer():
+    pieces = Pieces()
+    pieces.begin(reckoned(3.0))
+    pieces.join([frame(0, 0.0), frame(1, 0.0)], [edge(0, 1)])
+    pieces.begin(reckoned(-1.0))
+    assert pieces.reckoned_to(0).log_odds == -1.0

@@ -11,6 +11,7 @@ from thinmap_ros.core.se2 import inverse
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, Step
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.graph.reckoned import Reckoned
 from thinmap_ros.core.slam.graph.tables import EdgeTable
 from thinmap_ros.core.slam.joining.messages import KeyframeMessage, KeyframeSender
 from thinmap_ros.core.slam.joining.pieces import ReceivedKeyframes
@@ -165,7 +166,7 @@ def test_a_gap_ends_what_is_known_and_another_session_replaces_it(loops):
 def test_what_is_apart_is_told_when_it_is_joined(loops):
     sender = KeyframeSender(loops)
     add(loops, 0, 1)
-    loops.pieces.begin()
+    loops.pieces.begin(Reckoned(0.0, np.zeros(3), np.eye(3), 0.0))
     add(loops, 2, 3)
     messages = told(sender)
     assert len(messages) == 2
@@ -179,7 +180,7 @@ def test_what_is_apart_is_told_when_it_is_joined(loops):
 def test_a_keyframe_whose_anchor_is_not_told_hangs_on_the_last_one(loops):
     sender = KeyframeSender(loops)
     add(loops, 0)
-    loops.pieces.begin()
+    loops.pieces.begin(Reckoned(0.0, np.zeros(3), np.eye(3), 0.0))
     add(loops, 1)
     loops.pieces.return_to_published()
     add(loops, 2)

@@ -5,7 +5,7 @@ Several mutually consistent matches close a loop. Then the pose graph is optimiz
 """
 
 import math
-from collections import OrderedDict, defaultdict, deque
+from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -34,6 +34,7 @@ from thinmap_ros.core.slam.graph.keyframes import (
     view_difference_m,
 )
 from thinmap_ros.core.slam.graph.pose_graph import Edge, EdgeArrays, last, rounds
+from thinmap_ros.core.slam.graph.reckoned import CONTRARY_RATIO, RETURNS, Reckoned, Search
 from thinmap_ros.core.slam.graph.tables import EdgeTable
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
@@ -163,14 +164,15 @@ class Pieces:
     """The submaps by number, each in a piece; one of the pieces is the published map.
 
     A piece holds submaps whose places relative to each other are known.
-    A submap that begins because scans contradict the map is a piece of its own. Matches of the
-    robot's piece with another one are stored; enough that agree are loop edges, which join the two.
+    A submap that begins because scans contradict the map is a piece of its own. It returns where
+    dead reckoning has it once the odds of that place are high enough (`Reckoned`).
     A piece may have the tag of its storey; those of two storeys are never joined.
     """
 
     def __init__(self) -> None:
         self._piece_of = [_PUBLISHED]  # by the number of the submap
         self._tags: dict[int, str] = {}  # by the number of the piece
+        self._reckoned: dict[int, Reckoned] = {}  # of pieces that are apart
         self._matches: deque[Edge] = deque(maxlen=_RECENT_SUBMAPS)
 
     @property
@@ -210,10 +212,15 @@ class Pieces:
         """Begin a submap of the published map, after a number of others of it."""
         self._piece_of = [_PUBLISHED] * (submaps + 1)
 
-    def begin(self) -> None:
-        """Begin a submap, apart from all others; of the storey that the robot was on."""
+    def begin(self, reckoned: Reckoned) -> None:
+        """Begin a submap, apart from all others; of the storey that the robot was on.
+
+        reckoned: whether it lies where dead reckoning has it in the piece where the robot was.
+        """
         tag = self.tag
+        outer = self._reckoned.get(self.piece)
         self._piece_of.append(len(self._piece_of))
+        self._reckoned[self.piece] = reckoned if outer is None else reckoned.within(outer)
         self.tag = tag
 
     def return_to_published(self) -> None:
@@ -235,28 +242,44 @@ class Pieces:
             ends = (frames[edge.a].submap, frames[edge.b].submap)
             kept, gone = sorted(self._piece_of[submap] for submap in ends)
             self._tags[kept] = self._tags.get(kept) or self._tags.get(gone, '')
+            if kept != gone:
+                self._reckoned.pop(gone, None)
             self._piece_of = [kept if piece == gone else piece for piece in self._piece_of]
 
+    def reckoned_to(self, submap: int) -> Reckoned | None:
+        """Of the piece that is apart, of that of the robot and that of a submap; None if both are.
+
+        And where they are one piece.
+        """
+        pieces = {self.piece, self._piece_of[submap]}
+        if _PUBLISHED not in pieces:
+            return None
+        return self._reckoned.get(max(pieces))
+
+    def take_returning(self) -> list[Edge]:
+        """Edges of a piece that returns to where dead reckoning has it; none where none does."""
+        for piece, reckoned in self._reckoned.items():
+            if reckoned.log_odds >= RETURNS:
+                del self._reckoned[piece]
+                return reckoned.edges
+        return []
+
     def add_match(self, edge: Edge) -> None:
-        """Add a match of a keyframe in the robot's piece, edge.b, with one in another piece."""
+        """Add a match that is ambiguous."""
         self._matches.append(edge)
 
     def take_edges(self, frames: Sequence[Keyframe], fewest: int) -> list[Edge]:
-        """Loop edges that join the robot's piece with another one; none while too few agree.
+        """Loop edges of ambiguous matches; none while too few agree.
 
-        fewest: matches, each of another view, that join two pieces.
+        fewest: matches, each of another view, that close a loop.
         """
-        of_piece: dict[int, list[Edge]] = defaultdict(list)
-        for edge in self._matches:
-            if self.is_here(frames[edge.b].submap):
-                of_piece[self._piece_of[frames[edge.a].submap]].append(edge)
-        for edges in of_piece.values():
-            agreeing = largest_consistent(edges, frames)
-            along_path = sorted(edge.b for edge in agreeing)
-            if _count_views([frames[b].T_map_base for b in along_path]) >= fewest:
-                self._matches.clear()
-                return agreeing
-        return []
+        own = [edge for edge in self._matches if self.is_here(frames[edge.b].submap)]
+        agreeing = largest_consistent(own, frames)
+        along_path = sorted(edge.b for edge in agreeing)
+        if _count_views([frames[b].T_map_base for b in along_path]) < fewest:
+            return []
+        self._matches.clear()
+        return agreeing
 
 
 def _count_views(poses: list[Array]) -> int:
@@ -605,7 +628,10 @@ class LoopClosure:
         if j == self.keyframes.anchor:  # of another submap: the step is measured again
             return False
         frame = self.keyframes.frames[j]
-        return frame.path_m <= here.path_m - AGAIN_M or frame.submap != here.submap
+        if frame.submap == here.submap:
+            return frame.path_m <= here.path_m - AGAIN_M
+        reckoned = self.pieces.reckoned_to(frame.submap)
+        return reckoned is None or reckoned.is_told_by(frame.path_m)
 
     def _as_seen_from(self, near: list[int], here: Keyframe) -> list[Array]:
         """Covariance (3, 3), map frame, of the pending keyframe relative to each keyframe."""
@@ -694,7 +720,8 @@ class LoopClosure:
         evidence = sum(edge.inlier_ratio for edge in consistent)
         if consistent and evidence >= fewest * self._config.min_inlier_ratio:
             return consistent
-        return self.pieces.take_edges(self.keyframes.frames, fewest)
+        returning = self.pieces.take_returning()
+        return returning or self.pieces.take_edges(self.keyframes.frames, fewest)
 
     def _match(self, job: _Job) -> None:
         """Match keyframe k, or the pending one, with the submap around j; add the edge."""
@@ -717,7 +744,10 @@ class LoopClosure:
         is_ambiguous = not is_step and self._is_ambiguous(job.covariance)
         matcher = self._far_matcher if is_ambiguous else self._matcher
         match = matcher.match(here.points, here.scan.T_base_laser, submap, prior, relative)
+        reckoned = self.pieces.reckoned_to(frames[j].submap)
         if match.inlier_ratio < config.min_inlier_ratio:
+            if reckoned is not None and match.contradiction_ratio > CONTRARY_RATIO:
+                reckoned.add_contrary(here.T_map_base[:2])
             return
         covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + EDGE_NOISE
         off = se2.pose_difference(match.pose, prior)
@@ -727,7 +757,11 @@ class LoopClosure:
         covariance = rotated_covariance(covariance, float(T_j_base[2]))
         T_j_k = se2.compose(T_j_base, match.pose)
         edge = Edge(j, k, T_j_k, inverse(covariance), True, inlier_ratio=match.inlier_ratio)
-        if is_ambiguous or not self.pieces.is_here(frames[j].submap):
+        if not self.pieces.is_here(frames[j].submap):
+            self._add_pending()
+            if reckoned is not None:
+                self._look_at(reckoned, edge, matcher.searched(relative))
+        elif is_ambiguous:
             self._add_pending()
             self.pieces.add_match(edge)
         elif is_step:
@@ -736,6 +770,15 @@ class LoopClosure:
             self._confirm(edge)
         else:
             self._requested.append(edge)
+
+    def _look_at(self, reckoned: Reckoned, edge: Edge, reach: Array) -> None:
+        """Add a match between two pieces to the odds; reach (3,): of its search, m, m, rad."""
+        T_map_a = self.keyframes.frames[edge.a].T_map_base
+        T_map_b = self._frame(edge.b).T_map_base
+        off = se2.pose_difference(se2.compose(T_map_a, edge.T_a_b), T_map_b)
+        own = rotated_covariance(inverse(edge.information), float(T_map_a[2]))
+        search = Search(float(reach[:2].max()), float(reach[2]))
+        reckoned.add(T_map_b[:2], edge, off, own, search)
 
     def _is_ambiguous(self, covariance: Array) -> bool:
         """Whether several places that look alike may be within a covariance (3, 3), map frame.

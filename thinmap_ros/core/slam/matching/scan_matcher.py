@@ -343,6 +343,8 @@ def search(
 
 MIN_POINTS = 10  # of a scan that is matched
 
+_TURNED_NODES = 20_000  # of a search of all headings
+
 
 @dataclass(frozen=True)
 class MatchingConfig(Config):
@@ -430,10 +432,12 @@ class Matcher:
         local_map: LocalMap,
         prior: Array,
         covariance: Array,
+        is_turned: bool = False,
     ) -> Match:
         """Match a scan with a local map, given a prior (3,) with covariance (3, 3), in its frame.
 
-        points (N, 5): surface points, robot frame; T_base_laser (3,): pose of the laser.
+        points (N, 5): surface points, robot frame; T_base_laser (3,): pose of the laser; is_turned:
+        the robot may have turned by any angle that the prior does not know.
         """
         scan = weighted_points(points, T_base_laser, local_map.config.resolution_m)
         information = inverse(covariance)
@@ -446,18 +450,28 @@ class Matcher:
             reach = self.config.search_sigmas * np.sqrt(
                 np.diag(covariance) + np.square(self.config.wheel_slip)
             )
+        half = np.minimum(reach, self.config.max_search)
+        nodes = self.config.search_nodes
+        if is_turned:
+            half[2] = math.pi
+            nodes = _TURNED_NODES
         start = search(
             _thinned(scan, self.config.search_points),
             prior,
             information,
-            np.minimum(reach, self.config.max_search),
+            half,
             match.pose,
             local_map.lattice,
             *self._noise,
-            self.config.search_nodes,
+            nodes,
         )
         other = self._refined(scan, local_map, start, prior, information)
         return other if other.cost < match.cost else match
+
+    def searched(self, covariance: Array) -> Array:
+        """Half of the window (3,) that is searched around a prior with a covariance (3, 3)."""
+        reach = self.config.search_sigmas * np.sqrt(np.diag(covariance))
+        return np.minimum(reach, self.config.max_search)
 
     @property
     def _noise(self) -> tuple[float, float]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.slam.matching.scan_matcher import Match
-from thinmap_ros.core.slam.track import MapEvidence, SeenThrough
+from thinmap_ros.core.slam.place_belief import SURE, PlaceBelief, SeenThrough
 
 ANGLES = np.linspace(-np.pi, np.pi, 90)
 ALL_AROUND = 4.0 * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
@@ -17,7 +17,7 @@ def match(inlier_ratio: float, contradiction_ratio: float) -> Match:
 
 @pytest.mark.parametrize(('inlier_ratio', 'scans'), [(1.0, 2), (0.7, 3)])
 def test_two_scans_that_fit_well_or_three_that_fit_place_a_robot(inlier_ratio, scans):
-    evidence = MapEvidence(4.0, 0.6)
+    evidence = PlaceBelief(4.0, 0.6)
     evidence.start_delocalized()
     for _ in range(scans):
         assert evidence.is_lost
@@ -28,7 +28,7 @@ def test_two_scans_that_fit_well_or_three_that_fit_place_a_robot(inlier_ratio, s
 
 def tried(*rows, is_guess=False):
     """Evidence at a start pose that nobody gave, after scans: path, m, and inlier ratio of each."""
-    evidence = MapEvidence(4.0, 0.6)
+    evidence = PlaceBelief(4.0, 0.6)
     evidence.start_delocalized(is_pose_given=is_guess, is_guess=is_guess)
     for moved_m, inlier_ratio in rows:
         evidence.update(match(inlier_ratio, 0.0), moved_m=moved_m)
@@ -64,7 +64,7 @@ def test_a_scan_that_does_not_fit_begins_the_path_anew_and_without_a_view_the_ro
 
 
 def test_points_that_contradict_count_three_times_as_much_as_points_that_fit():
-    evidence = MapEvidence(4.0, 0.6)
+    evidence = PlaceBelief(4.0, 0.6)
     evidence.update(match(0.75, 0.5))
     assert evidence.level == 0.25
     evidence.update(match(0.75, 0.0))
@@ -72,7 +72,7 @@ def test_points_that_contradict_count_three_times_as_much_as_points_that_fit():
 
 
 def test_evidence_that_is_high_is_limited_when_the_robot_is_lost_so_that_scans_place_it_again():
-    evidence = MapEvidence(4.0, 0.6)
+    evidence = PlaceBelief(4.0, 0.6)
     for _ in range(20):
         evidence.update(match(0.0, 1.0))
     assert evidence.level == pytest.approx(20.0)
@@ -92,7 +92,7 @@ def test_evidence_that_is_high_is_limited_when_the_robot_is_lost_so_that_scans_p
 
 def test_in_a_given_map_a_pose_is_lost_until_a_scan_fits():
     for is_map_given in (False, True):
-        evidence = MapEvidence(4.0, 0.6)
+        evidence = PlaceBelief(4.0, 0.6)
         evidence.place(is_map_given)
         for update in (None, match(0.0, 0.0)):
             assert evidence.is_lost == is_map_given
@@ -103,7 +103,7 @@ def test_in_a_given_map_a_pose_is_lost_until_a_scan_fits():
 
 
 def test_walls_that_are_seen_through_are_evidence_that_no_inlier_reduces():
-    evidence = MapEvidence(4.0, 0.6)
+    evidence = PlaceBelief(4.0, 0.6)
     scans = 0
     while not evidence.needs_submap:
         evidence.update(match(1.0, 0.0), through(ALL_AROUND, 0.5))
@@ -115,14 +115,14 @@ def test_walls_that_are_seen_through_are_evidence_that_no_inlier_reduces():
 
 
 def test_glass_is_seen_through_and_no_evidence():
-    evidence = MapEvidence(4.0, 0.6)
+    evidence = PlaceBelief(4.0, 0.6)
     for _ in range(1000):
         evidence.update(match(0.9, 0.05), through(ALL_AROUND, 0.2))
     assert evidence.agrees
 
 
 def test_a_door_that_opens_before_the_robot_is_no_evidence_of_another_place():
-    evidence = MapEvidence(4.0, 0.6)
+    evidence = PlaceBelief(4.0, 0.6)
     for _ in range(30):
         evidence.update(match(0.95, 0.0), through(DOOR, 0.7))
         assert not evidence.needs_submap
@@ -135,7 +135,7 @@ def test_a_door_that_opens_before_the_robot_is_no_evidence_of_another_place():
 
 
 def test_after_a_door_another_place_is_noticed_as_soon():
-    evidence = MapEvidence(4.0, 0.6)
+    evidence = PlaceBelief(4.0, 0.6)
     for _ in range(10):
         evidence.update(match(0.95, 0.0), through(DOOR, 0.7))
     for _ in range(50):
@@ -144,6 +144,40 @@ def test_after_a_door_another_place_is_noticed_as_soon():
     for _ in range(16):
         evidence.update(match(1.0, 0.0), through(ALL_AROUND, 0.5))
     assert evidence.needs_submap
+
+
+@pytest.mark.parametrize(
+    ('continuity', 'is_elsewhere'), [(-5.0, False), (-8.0, False), (-12.0, True)]
+)
+def test_a_robot_is_elsewhere_where_that_it_was_carried_off_is_likelier(continuity, is_elsewhere):
+    belief = PlaceBelief(4.0, 0.6)
+    assert belief.log_odds == SURE
+    belief.move(continuity)
+    assert belief.is_elsewhere == belief.needs_submap == is_elsewhere
+    assert belief.agrees == (continuity == -5.0)
+    belief.update(match(1.0, 0.0))
+    belief.move(0.0)
+    for _ in range(20):
+        belief.update(match(1.0, 0.0))
+    assert belief.agrees != is_elsewhere
+    belief.start_submap()
+    assert belief.agrees and not belief.is_elsewhere
+
+
+def test_at_rest_the_last_scan_counts_and_a_robot_that_was_put_back_is_here():
+    belief = PlaceBelief(4.0, 0.6)
+    belief.move(-12.0)
+    belief.move(-12.0, is_again=True)
+    assert belief.is_elsewhere and belief.log_odds < 0.0
+    belief.move(0.0, is_again=True)
+    assert belief.agrees and belief.log_odds == SURE
+
+
+def test_of_a_robot_that_is_placed_the_last_scan_says_nothing():
+    belief = PlaceBelief(4.0, 0.6)
+    belief.place()
+    belief.move(-30.0)
+    assert not belief.is_elsewhere
 
 
 def through(walls, ratio):
