@@ -1,6 +1,7 @@
 """A kidnapped robot maps a piece apart, and joins it where it recognizes the place."""
 
 import math
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.places.recognition import JOIN_ODDS
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.track import LocalizerConfig
-from thinmap_ros.core.stage import LOCALIZATION, Destination
+from thinmap_ros.core.stage import LOCALIZATION, Destination, config_at
 
 
 def localized(moments):
@@ -34,7 +35,7 @@ def is_mapped(estimate):
 
 
 def test_a_robot_that_was_carried_off_joins_its_map_where_it_is():
-    found = localized(carried((1, 0, 60.0), (1, 3, 70.0)))
+    found = localized(carried((9, 0, 60.0), (9, 1, 70.0)))
     later = [(estimate, off_m) for drive, estimate, off_m in found if drive == 1]
     assert any(estimate.is_mapping_apart for estimate, _ in later)
     assert all(off_m < 0.5 for estimate, off_m in later if is_mapped(estimate))
@@ -87,6 +88,35 @@ def test_a_session_is_not_changed_from_an_unknown_start_until_the_robot_recogniz
     assert is_mapped(last) and off_m < 0.1
 
 
+@pytest.fixture(scope='module')
+def session():
+    """State and keyframes of a map, and the pose (3,) of its frame in the world."""
+    localizer = Localizer()
+    moments = list(carried((2, 0, 70.0)))
+    for moment in moments:
+        localizer.step(moment.scan, moment.T_odom_base)
+    return localizer.state(), localizer.saved_keyframes(), moments[0].T_world_base
+
+
+@pytest.mark.parametrize(
+    ('off', 'is_right'),
+    [((0.0, 0.0, 0.0), True), ((0.0, 0.0, np.pi), False), ((5.0, 3.0, 1.0), False)],
+)
+def test_a_start_that_was_given_wrong_is_not_drawn(session, off, is_right):
+    """Turned by half a turn, or in another room; one that is right is mapped at once."""
+    state, keyframes, T_world_map = session
+    moments = list(islice(carried((2, 1, 30.0)), 150))
+    start = se2.between(T_world_map, moments[0].T_world_base) + np.array(off)
+    localizer = Localizer.from_state(
+        state, config_at(LocalizerConfig(), start), keyframes=keyframes
+    )
+    estimates = [localizer.step(moment.scan, moment.T_odom_base) for moment in moments]
+    drawn = [is_mapped(estimate) for estimate in estimates]
+    assert any(drawn) == is_right
+    if is_right:
+        assert all(drawn[5:])
+
+
 @pytest.mark.parametrize('drives', [((3, 0, 30.0), (4, 1, 5.0)), ((2, 0, 25.0), (5, 1, 5.0))])
 def test_scans_of_another_place_do_not_change_the_map_until_it_agrees_with_them(drives):
     """Neither those that contradict it, nor, once there is much evidence, those that fit badly."""
@@ -118,7 +148,7 @@ def test_a_robot_that_is_back_on_its_storey_joins_its_map():
     localizer = Localizer(LocalizerConfig(map_tag='first'))
     drive = 0
     found = []
-    for moment in carried((1, 0, 60.0), (4, 1, 15.0), (1, 3, 70.0)):
+    for moment in carried((9, 0, 60.0), (3, 1, 15.0), (9, 1, 70.0)):
         if moment.drive != drive:
             drive = moment.drive
             localizer.enter_storey(['first', 'second', 'first'][drive])

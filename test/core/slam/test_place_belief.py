@@ -49,6 +49,30 @@ def test_a_robot_at_a_guessed_pose_is_lost_until_its_way_confirms_it(path_m):
     assert evidence.permits_mapping == (not evidence.is_lost) == (path_m > 6.0)
 
 
+@pytest.mark.parametrize(('log_ratio', 'permits'), [(2.0, True), (0.0, True), (-0.5, False)])
+def test_a_given_start_is_believed_unless_a_look_speaks_against_it(log_ratio, permits):
+    belief = PlaceBelief(4.0, 0.6)
+    belief.start_delocalized(is_tried=True)
+    assert belief.is_start_judged
+    belief.judge_start(log_ratio)
+    for _ in range(2):
+        belief.update(match(1.0, 0.0))
+    assert belief.permits_mapping == permits
+    assert not belief.needs_submap
+    if not permits:
+        belief.judge_start(-log_ratio)
+        belief.update(match(1.0, 0.0))
+        assert belief.permits_mapping, 'the next look speaks for it'
+
+
+def test_a_given_start_is_left_where_the_odds_are_against_it():
+    belief = PlaceBelief(4.0, 0.6)
+    belief.start_delocalized(is_tried=True)
+    belief.judge_start(-6.0)
+    belief.update(match(1.0, 0.0))
+    assert belief.needs_submap
+
+
 def test_a_given_pose_ends_a_guess():
     evidence = tried((0.0, 1.0), is_guess=True)
     evidence.place()
@@ -132,6 +156,14 @@ def test_a_door_that_opens_before_the_robot_is_no_evidence_of_another_place():
         evidence.update(match(0.95, 0.0), through(ALL_AROUND, 0.7))
         scans += 1
     assert 20 < scans < 60
+
+
+@pytest.mark.parametrize(('step_m', 'is_elsewhere'), [(0.1, False), (0.15, True)])
+def test_a_robot_that_sees_through_an_opening_for_metres_is_elsewhere(step_m, is_elsewhere):
+    belief = PlaceBelief(4.0, 0.6)
+    for _ in range(30):
+        belief.update(match(0.95, 0.0), through(DOOR, 0.7), moved_m=step_m)
+    assert belief.needs_submap == is_elsewhere
 
 
 def test_after_a_door_another_place_is_noticed_as_soon():

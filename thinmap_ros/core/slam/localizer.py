@@ -515,8 +515,11 @@ class Localizer:
         else:
             self._local.load(given, len(self.keyframes))
         self._place(start, self._tracker.slip_covariance())
-        is_believed = self.config.is_start_given or not self.config.is_mapping
-        self._tracker.belief.start_delocalized(is_believed, is_guess=is_guess)
+        is_mapping = self.config.is_mapping
+        is_given = self.config.is_start_given
+        self._tracker.belief.start_delocalized(
+            is_given or not is_mapping, is_guess, is_tried=is_given and is_mapping and not is_guess
+        )
 
     def _detect_loss(self) -> None:
         """In a map that does not change, the robot is delocalized if scans contradict it.

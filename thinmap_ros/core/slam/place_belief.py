@@ -27,6 +27,8 @@ NOTHING = SeenThrough(np.empty((0, 2)), 0.0)
 # Log odds of a robot that nothing contradicts: how rarely one is carried off, or let out of a lift.
 SURE = math.log(1e4)
 
+_GIVEN = math.log(1e2)  # of a start pose that a user gave: how rarely it is another one
+
 _LEAST_ODDS = 0.05  # of having been carried off, that are followed up: a crowd passes
 
 # Inliers for each contradicting point with which a match overrides the odometry.
@@ -38,21 +40,29 @@ _SEEN_THROUGH = 0.25
 
 _OPENING_RADIUS_M = 1.5  # a gate for hospital beds, or two leaves of an automatic door
 
+_OPENING_PATH_M = 4.0  # of a robot that drives up to an opening and through it
+
 # Of a pose that no scan has confirmed: less than a scan with 30 % inliers removes.
 _UNCONFIRMED_EVIDENCE = 0.3 / INLIERS_PER_CONTRADICTION
 
 
 class _Trial:
-    """A start pose that nobody gave: it is confirmed by scans that fit over the path of a view.
+    """A start pose in a map: it is confirmed by scans that fit over the path of a view.
 
     Some scans fit anywhere, and a map that they change soon agrees with all that follow. Of 20
     starts elsewhere in generated buildings, 13 were mapped at a wrong pose without a trial, 3 with
-    one of 1.5 m or of 3 m, and none with this.
+    one of 1.5 m or of 3 m, and none with this. One that a user gave has odds of its own: scans that
+    fit there, and at no other heading, confirm it at once.
     """
 
-    def __init__(self, is_guess: bool) -> None:
-        """is_guess: whether the robot is lost until the pose is confirmed."""
+    def __init__(self, is_guess: bool, log_odds: float = 0.0) -> None:
+        """is_guess: whether the robot is lost until the pose is confirmed.
+
+        log_odds: of the pose; 0 where nobody gave it.
+        """
         self.is_guess = is_guess
+        self.log_odds = log_odds
+        self.is_judged = False
         self._path_m = 0.0
         self._fitting_m = 0.0  # path since a scan did not fit
 
@@ -64,12 +74,12 @@ class _Trial:
     @property
     def is_passed(self) -> bool:
         """Whether the pose is confirmed."""
-        return self._fitting_m > WINDOW_M
+        return self._fitting_m > WINDOW_M or (self.is_judged and self.log_odds >= _GIVEN)
 
     @property
     def is_failed(self) -> bool:
-        """Whether no view has confirmed it where there was room for two."""
-        return not self.is_passed and self._path_m > 2.0 * WINDOW_M
+        """Whether the odds are against it, or no view confirmed it where there was room for two."""
+        return not self.is_passed and (self._path_m > 2.0 * WINDOW_M or self.log_odds < 0.0)
 
 
 class _Opening:
@@ -83,14 +93,16 @@ class _Opening:
         self._centre: Array | None = None
         self._within = 0.0  # sums of ratios of returns, since there is evidence
         self._beside = 0.0
+        self._path_m = 0.0
 
     @property
     def explains_most(self) -> bool:
         """Whether most of what was seen through since there is evidence is within one opening."""
-        return self._within > self._beside
+        return self._within > self._beside and self._path_m < _OPENING_PATH_M
 
-    def add(self, seen: SeenThrough) -> None:
-        """Add what a scan sees through."""
+    def add(self, seen: SeenThrough, moved_m: float) -> None:
+        """Add what a scan sees through that was made after some more path."""
+        self._path_m += moved_m
         if not len(seen.walls):
             return
         if self._centre is None:
@@ -243,7 +255,7 @@ class PlaceBelief:
             self._end_look(self._seen_through)
         self._seen_through = max(self._before_look + seen_through.ratio - _SEEN_THROUGH, 0.0)
         if self._seen_through > 0.0:
-            self._opening.add(seen_through)
+            self._opening.add(seen_through, moved_m)
         if self.is_delocalized:
             self.level = min(self.level, self._lost_evidence)
             agrees = self.agrees and fits
@@ -280,15 +292,31 @@ class PlaceBelief:
         self.level = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
         self._end_look(0.0)
 
-    def start_delocalized(self, is_pose_given: bool = True, is_guess: bool = False) -> None:
+    @property
+    def is_start_judged(self) -> bool:
+        """Whether a start pose that was given waits for looks that speak for it."""
+        return self._trial is not None and self._trial.log_odds > 0.0
+
+    def judge_start(self, log_ratio: float) -> None:
+        """Add the log likelihood ratio of a look from another place to a given start pose."""
+        assert self._trial is not None
+        self._trial.log_odds += log_ratio
+        self._trial.is_judged = True
+
+    def start_delocalized(
+        self, is_pose_given: bool = True, is_guess: bool = False, is_tried: bool = False
+    ) -> None:
         """Start in a loaded map; is_pose_given: one scan that fits confirms the pose.
 
-        is_guess: the robot may be anywhere; scans that fit on the way confirm it.
+        is_guess: the robot may be anywhere; scans that fit on the way confirm it; is_tried: the
+        pose was given, and is judged by `judge_start`.
         """
         self.is_delocalized = True
         self._carried = 0.0
         self._is_elsewhere = False
         self._trial = None if is_pose_given and not is_guess else _Trial(is_guess)
+        if is_tried:
+            self._trial = _Trial(is_guess=False, log_odds=_GIVEN)
         self.level = self._loaded_evidence
 
     def lose(self) -> None:

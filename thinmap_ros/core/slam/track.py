@@ -22,7 +22,7 @@ from thinmap_ros.core.se2 import (
     rotated_covariance,
     rotation,
 )
-from thinmap_ros.core.slam.continuity import Motion, continuity, goes_on
+from thinmap_ros.core.slam.continuity import Motion, continuity, goes_on, log_ratio
 from thinmap_ros.core.slam.graph.keyframes import Anchor, KeyframeConfig
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.matching.local_map import (
@@ -92,6 +92,8 @@ LIVE_PARAMETERS = (
 _NO_RETURNS = 'no returns from walls of the map'
 
 # Of the walls of the local map that beams would hit, or have passed through.
+_START_LOOK_M = 1.0  # between two looks that judge a start pose
+
 _REACH = 0.9  # of range_max: a farther wall may be out of range
 
 _STEP_CELLS = 0.5
@@ -298,6 +300,8 @@ class Tracker:
         self.reckoned = DeadReckoning(start, np.zeros((3, 3)))
         self.T_anchor_update: Array | None = None
         self._looks: dict[str, LastLook] = {}  # by the frame of the laser
+        # Of a start that is judged: its pose (3,), and that of the last look, map frame.
+        self._start: tuple[Array, Array] | None = None
 
     def adjust(self, config: LocalizerConfig) -> None:
         """Continue with other values of `LIVE_PARAMETERS`."""
@@ -351,6 +355,8 @@ class Tracker:
         through = self._seen_through(scan, match, there)
         own = None if match is None else match.seen_from(there.anchor.T_map)
         self._judge_motion(scan, prediction, own)
+        if match is not None and self.belief.is_start_judged:
+            self._judge_start(scan, points, match, there)
         self.belief.update(match, through, is_stationary, moved_m)
         fits = self._update(own, prediction, is_stationary)
         if fits and match is not None:
@@ -364,6 +370,7 @@ class Tracker:
         """Set the pose (3,) with covariance (3, 3), relative to any anchor, without any motion."""
         self.prediction.reset_segment()
         self._looks.clear()
+        self._start = None
         self.T_anchor_base = T_anchor_base
         self.T_anchor_update = None
         self.uncertainty.place(T_anchor_base, covariance)
@@ -439,6 +446,32 @@ class Tracker:
         is_again = look.is_kept and self._is_at_rest(look)
         self.belief.move(continuity(look.scan, scan, motions), is_again)
 
+    def _judge_start(self, scan: Scan, points: Array, match: Match, there: Surroundings) -> None:
+        """Judge a start pose by how a scan fits on the way from there, and at other headings.
+
+        Each place counts once: the robot may be elsewhere, or it stands turned by a right angle, as
+        walls do.
+        """
+        here = match.pose
+        start, last = self._start or (here, None)
+        if last is not None and math.dist(here[:2], last[:2]) < _START_LOOK_M:
+            return
+        self._start = (start, here)
+        there_fits = log_ratio(match.inlier_ratio, 0.0)
+        since = se2.between(start, here)
+        others = [
+            self._matcher.match(
+                points,
+                scan.T_base_laser,
+                there.local_map,
+                se2.compose(se2.compose(start, np.array([0.0, 0.0, turn])), since),
+                self.slip_covariance(),
+            ).inlier_ratio
+            for turn in (0.5 * math.pi, math.pi, -0.5 * math.pi)
+        ]
+        turned = there_fits - log_ratio(max(others), 0.0)
+        self.belief.judge_start(min(there_fits, turned))
+
     def _is_at_rest(self, look: LastLook) -> bool:
         """Whether the robot has not moved since a look, but for the noise of the odometry."""
         slip = BOUND_SIGMAS * odometry_slip(self._config.odometry)
@@ -464,7 +497,8 @@ class Tracker:
         """Match a scan with the local map; None if scan or map have too little structure.
 
         Where it fits badly and does not go on as the last one, neither as the odometry nor as the
-        match has it, all headings are searched: the odometry may not have seen a turn.
+        match has it, all headings are searched: the odometry may not have seen a turn. After a turn
+        it goes on, and after a flight to a place that looks alike it does not.
         """
         if len(points) < MIN_POINTS or there.local_map.is_empty:
             return None
@@ -479,10 +513,15 @@ class Tracker:
         look = self._looks.get(scan.frame)
         if fits or look is None:
             return match
-        by_match = se2.compose(look.T_scan_base, se2.between(prior, match.pose))
-        if any(goes_on(look.scan, scan, T) for T in (look.T_scan_base, by_match)):
+
+        def shows_last(T_map_base: Array) -> bool:
+            moved = se2.compose(look.T_scan_base, se2.between(prior, T_map_base))
+            return goes_on(look.scan, scan, moved)
+
+        if shows_last(prior) or shows_last(match.pose):
             return match
-        return self._matcher.match(*given, is_turned=True)
+        turned = self._matcher.match(*given, is_turned=True)
+        return turned if shows_last(turned.pose) else match
 
     def _seen_through(self, scan: Scan, match: Match | None, there: Surroundings) -> SeenThrough:
         """Walls of the map that this localizer makes, and that a scan sees through.

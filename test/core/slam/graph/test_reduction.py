@@ -36,6 +36,12 @@ def test_a_way_that_is_driven_each_day_does_not_grow() -> None:
     assert counts[-1] - counts[-2] <= 1
 
 
+def test_a_single_keyframe_stays() -> None:
+    before = driven(1)
+    one = replace(before, frames=before.frames[:1], steps=[], edges=[])
+    assert len(reduced(one).frames) == 1
+
+
 def test_the_newest_stay_with_their_poses_covariances_and_stamps() -> None:
     before = driven(3)
     after = reduced(before)

@@ -12,8 +12,8 @@ import numpy as np
 from thinmap_ros.core.se2 import Array, propagated_covariance
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 
-# Log odds with which a piece returns to the map.
-RETURNS = 4.0
+# Log odds with which a piece returns to the map: one look at a place that is alike is too little.
+RETURNS = 8.0
 # Of the points of a look that the map contradicts, where the robot is elsewhere.
 CONTRARY_RATIO = 0.1
 
@@ -22,6 +22,7 @@ _FITS_ELSEWHERE = 0.2  # and somewhere within the search, wherever the robot is
 _ALIGNED = 0.3  # share of these with the same heading: walls are parallel all over a building
 _CAREFUL = 0.05  # share of looks that fit elsewhere in the search though the robot is here
 _MOST_OF_A_LOOK = 6.0  # nats, as of a view in recognition
+_LATE_M = 8.0  # of path, within which a robot that was carried off is noticed
 _LOOK_M = 1.0  # looks nearer to each other count once, by the best
 _CONTRARY = math.log(0.2 / 0.5)  # share of looks that contradict the map here, and elsewhere
 
@@ -110,7 +111,7 @@ class Reckoned:
 
         Those just before the piece begins may be of the place of the piece: it was noticed late.
         """
-        return path_m <= self._begin_m - _LOOK_M
+        return path_m <= self._begin_m - _LATE_M
 
     def add_contrary(self, place: Array) -> None:
         """Add a look from a place (2,), m, that finds nothing of the map, and contradicts it."""

@@ -47,7 +47,8 @@ def reduced(saved: SavedKeyframes, config: ReductionConfig | None = None) -> Sav
     """
     is_kept = needed(saved.frames, config or ReductionConfig())
     # Nothing but its edges between visits says where a keyframe is that was come to unknowingly.
-    is_kept[1:] |= [_variance(inverse(step.information)) > _UNKNOWN_M2 for step in saved.steps]
+    variances = np.array([_variance(inverse(step.information)) for step in saved.steps])
+    is_kept[1:] |= variances > _UNKNOWN_M2
     if is_kept.all():
         return saved
     kept = np.flatnonzero(is_kept).tolist()
