@@ -71,7 +71,9 @@ def continuity(before: Scan, scan: Scan, motions: list[Motion]) -> float:
         share = seen_again(before, scan, motion.T)
         told = 0.0 if share is None else log_ratio(share, moved_m)
         best = max(best, motion.log_likelihood + told)
-    return min(best, 0.0)
+        if best >= 0.0:
+            return 0.0
+    return best
 
 
 def goes_on(before: Scan, scan: Scan, T: Array) -> bool:
