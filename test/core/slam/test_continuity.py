@@ -1,4 +1,4 @@
-"""A scan against the scan before: the robot that goes on, a crowd, and a robot carried off."""
+"""A scan against the previous one: a robot that drives on, a crowd, and a kidnapped robot."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.continuity import Motion, continuity, goes_on, log_ratio, seen_again
+from thinmap_ros.core.slam.continuity import Motion, continues, continuity, log_ratio, seen_again
 
 HERE = np.array([3.0, 2.0, 0.3])
 MOVED = np.array([0.4, 0.0, 0.2])
@@ -22,7 +22,7 @@ def test_a_scan_shows_the_last_one_again_at_the_motion_between_both():
     before = seen_from(HERE)
     scan = seen_from(se2.compose(HERE, MOVED))
     assert seen_again(before, scan, MOVED) > 0.97
-    assert goes_on(before, scan, MOVED)
+    assert continues(before, scan, MOVED)
     assert continuity(before, scan, [Motion(MOVED)]) == 0.0
 
 
@@ -30,7 +30,7 @@ def test_a_turn_that_the_odometry_did_not_see_does_not_go_on_but_by_its_match():
     before = seen_from(HERE)
     turn = np.array([0.0, 0.0, 1.5])
     scan = seen_from(se2.compose(HERE, turn))
-    assert not goes_on(before, scan, np.zeros(3))
+    assert not continues(before, scan, np.zeros(3))
     assert continuity(before, scan, [Motion(np.zeros(3))]) < 0.0
     assert continuity(before, scan, [Motion(np.zeros(3)), Motion(turn)]) == 0.0
 
@@ -48,7 +48,7 @@ def test_who_stands_beside_the_laser_hides_what_he_hides_and_is_no_other_place()
     hidden = type(scan).create(
         2, ranges, scan.angle_min_rad, scan.angle_increment_rad, 0.05, scan.range_max_m
     )
-    assert goes_on(before, hidden, MOVED)
+    assert continues(before, hidden, MOVED)
 
 
 def test_a_scan_without_returns_tells_nothing():

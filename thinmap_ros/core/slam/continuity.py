@@ -1,6 +1,6 @@
-"""Whether a scan goes on where the scan before it was: a look that needs no map.
+"""Whether a scan continues the previous one: evidence of the place that needs no map.
 
-A robot that was carried off sees other walls than a moment ago, though a map that grows soon agrees
+A kidnapped robot sees other walls than a moment ago, though a map that grows soon agrees
 with them. A crowd, a door that is shut and wheels that slip change a scan as well; each has its
 share in the likelihood.
 """
@@ -61,7 +61,7 @@ def _log_density(off: float, sigma: float) -> float:
 
 
 def continuity(before: Scan, scan: Scan, motions: list[Motion]) -> float:
-    """Log likelihood ratio, at most 0, that the robot was not carried off between two scans.
+    """Log likelihood ratio, at most 0, that the robot was not kidnapped between two scans.
 
     motions: any of which may be right, the first is that of the odometry.
     """
@@ -76,8 +76,8 @@ def continuity(before: Scan, scan: Scan, motions: list[Motion]) -> float:
     return best
 
 
-def goes_on(before: Scan, scan: Scan, T: Array) -> bool:
-    """Whether a scan, T (3,) from the one before, shows that again, or does not tell."""
+def continues(before: Scan, scan: Scan, T: Array) -> bool:
+    """Whether a scan, T (3,) from the previous one, shows it again, or cannot tell."""
     share = seen_again(before, scan, T)
     return share is None or log_ratio(share, math.hypot(*T)) >= 0.0
 

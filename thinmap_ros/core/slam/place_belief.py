@@ -24,12 +24,12 @@ class SeenThrough(NamedTuple):
 NOTHING = SeenThrough(np.empty((0, 2)), 0.0)
 
 
-# Log odds of a robot that nothing contradicts: how rarely one is carried off, or let out of a lift.
+# Log odds of a robot that nothing contradicts: how rarely one is kidnapped, or let out of a lift.
 SURE = math.log(1e4)
 
 _GIVEN = math.log(1e2)  # of a start pose that a user gave: how rarely it is another one
 
-_LEAST_ODDS = 0.05  # of having been carried off, that are followed up: a crowd passes
+_LEAST_ODDS = 0.05  # of a kidnapping, that are followed up: a crowd passes
 
 # Inliers for each contradicting point with which a match overrides the odometry.
 INLIERS_PER_CONTRADICTION = 3.0
@@ -119,7 +119,7 @@ class PlaceBelief:
     Two CUSUM tests detect that scans contradict the map. The level sums up the contradiction ratio
     less a third of the inlier ratio, and is never negative. A map that grows soon fits wherever the
     robot is: the walls that are seen through are evidence of their own, which no inlier reduces.
-    What a scan shows of the one before it tells of no map at all.
+    What a scan shows of the previous one needs no map at all.
     Source: Page, "Continuous inspection schemes", 1954.
     """
 
@@ -139,8 +139,8 @@ class PlaceBelief:
         self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
         self._trial: _Trial | None = None
         self.is_unconfirmed = False  # after a scan without a match, until one fits
-        self._carried = 0.0  # odds of having been carried off by the last motion
-        self._is_elsewhere = False  # it was carried off before
+        self._carried = 0.0  # odds of a kidnapping by the last motion
+        self._is_elsewhere = False  # it was kidnapped before
         self.adjust(lost_threshold, least_fit)
 
     def adjust(self, lost_threshold: float, least_fit: float) -> None:
@@ -196,7 +196,7 @@ class PlaceBelief:
     def move(self, continuity: float, is_again: bool = False) -> None:
         """Update the belief by a motion after which the robot may be anywhere.
 
-        continuity: log likelihood ratio that it was not carried off, at most 0; is_again: since the
+        continuity: log likelihood ratio that it was not kidnapped, at most 0; is_again: since the
         same scan as the last one, which it then replaces. An event, and no further evidence of what
         was before: its odds are added, where those are multiplied.
         """
@@ -208,12 +208,12 @@ class PlaceBelief:
 
     @property
     def is_doubted(self) -> bool:
-        """Whether the robot may have been carried off by the last motion."""
+        """Whether the robot may have been kidnapped by the last motion."""
         return self._carried > 0.0
 
     @property
     def is_elsewhere(self) -> bool:
-        """Whether the robot was carried off."""
+        """Whether the robot was kidnapped."""
         return self._is_elsewhere or (self._carried > 0.0 and self._log_odds_of_level <= 0.0)
 
     @property

@@ -22,7 +22,7 @@ from thinmap_ros.core.se2 import (
     rotated_covariance,
     rotation,
 )
-from thinmap_ros.core.slam.continuity import Motion, continuity, goes_on, log_ratio
+from thinmap_ros.core.slam.continuity import Motion, continues, continuity, log_ratio
 from thinmap_ros.core.slam.graph.keyframes import Anchor, KeyframeConfig
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.matching.local_map import (
@@ -485,7 +485,8 @@ class Tracker:
     def _take_look(self, scan: Scan) -> None:
         """Compare the next scans with this one, unless the robot rests.
 
-        At rest they are compared with the first: who is carried off slowly sees the walls go by.
+        At rest they are compared with the first one: a robot that is carried away slowly sees the
+        walls move.
         """
         look = self._looks.get(scan.frame)
         if look is None or not self._is_at_rest(look):
@@ -496,9 +497,9 @@ class Tracker:
     def _match(self, scan: Scan, points: Array, prior: Array, there: Surroundings) -> Match | None:
         """Match a scan with the local map; None if scan or map have too little structure.
 
-        Where it fits badly and does not go on as the last one, neither as the odometry nor as the
-        match has it, all headings are searched: the odometry may not have seen a turn. After a turn
-        it goes on, and after a flight to a place that looks alike it does not.
+        Where it fits badly and does not continue the last one, neither at the motion of the
+        odometry nor at that of the match, all headings are searched: the odometry may not have seen
+        a turn. After a turn it continues the last one, and at a place that looks alike it does not.
         """
         if len(points) < MIN_POINTS or there.local_map.is_empty:
             return None
@@ -516,7 +517,7 @@ class Tracker:
 
         def shows_last(T_map_base: Array) -> bool:
             moved = se2.compose(look.T_scan_base, se2.between(prior, T_map_base))
-            return goes_on(look.scan, scan, moved)
+            return continues(look.scan, scan, moved)
 
         if shows_last(prior) or shows_last(match.pose):
             return match
@@ -562,7 +563,7 @@ class Tracker:
     def _is_rejected(self, match: Match, is_unexpected: bool) -> bool:
         """Whether the pose of a match is worse than the predicted one.
 
-        So it is where the robot was carried off. An unexpected match is, if many of its points
+        So it is where the robot was kidnapped. An unexpected match is, if many of its points
         contradict the map. After scans that could not be matched, one that fits badly is: a few
         points fit somewhere within a wide prior.
         """

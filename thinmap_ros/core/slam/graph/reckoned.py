@@ -22,7 +22,7 @@ _FITS_ELSEWHERE = 0.2  # and somewhere within the search, wherever the robot is
 _ALIGNED = 0.3  # share of these with the same heading: walls are parallel all over a building
 _CAREFUL = 0.05  # share of looks that fit elsewhere in the search though the robot is here
 _MOST_OF_A_LOOK = 6.0  # nats, as of a view in recognition
-_LATE_M = 8.0  # of path, within which a robot that was carried off is noticed
+_LATE_M = 8.0  # of path, within which a kidnapped robot is noticed
 _LOOK_M = 1.0  # looks nearer to each other count once, by the best
 _CONTRARY = math.log(0.2 / 0.5)  # share of looks that contradict the map here, and elsewhere
 
