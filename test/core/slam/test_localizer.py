@@ -518,6 +518,25 @@ def test_kidnapping_starts_a_new_submap_and_reports_lost():
     np.testing.assert_allclose(found, steps, atol=0.06)
 
 
+def test_a_robot_with_two_lasers_is_kidnapped_once():
+    rng = np.random.default_rng(8)
+    localizer = at_start()
+    rows = [*drive(300, rng, START)]
+    truth, odom = rows[-1]
+    elsewhere = se2.pose(8.5, 5.0, -2.0)
+    for number in range(40):
+        # At once far enough for a scan of the first laser to be drawn.
+        step = se2.pose(0.02 if number else 0.25, 0.0, 0.1)
+        elsewhere = se2.compose(elsewhere, step)
+        odom = se2.compose(odom, step)
+        rows.append((elsewhere, odom))
+    for k, (truth, odom) in enumerate(rows):
+        for laser in range(2):
+            scan = scan_in(ROOM, truth, rng, k * PERIOD_NS + laser)
+            localizer.step(replace(scan, frame=f'laser_{laser}'), odom)
+    assert localizer._loops.pieces.current == 1
+
+
 def driven_elsewhere(localizer, start, odom_before=None):
     """Estimates of a drive that starts at another place (3,) than the localizer believes."""
     rng = np.random.default_rng(5)

@@ -70,7 +70,21 @@ def test_a_given_start_is_left_where_the_odds_are_against_it():
     belief.start_delocalized(is_tried=True)
     belief.judge_start(-6.0)
     belief.update(match(1.0, 0.0))
+    assert not belief.needs_submap, 'one place alone'
+    belief.judge_start(-6.0)
+    belief.update(match(1.0, 0.0))
     assert belief.needs_submap
+
+
+def test_a_robot_that_was_kidnapped_in_a_given_map_is_lost_until_scans_fit():
+    belief = PlaceBelief(4.0, 0.6)
+    belief.move(-13.0)
+    belief.update(match(0.2, 0.1), is_stationary=True)
+    assert belief.needs_submap
+    belief.lose()
+    assert belief.is_lost and not belief.is_elsewhere
+    belief.update(match(1.0, 0.0))
+    assert belief.is_lost
 
 
 def test_a_given_pose_ends_a_guess():

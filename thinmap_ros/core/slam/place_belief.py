@@ -298,9 +298,12 @@ class PlaceBelief:
         return self._trial is not None and self._trial.log_odds > 0.0
 
     def judge_start(self, log_ratio: float) -> None:
-        """Add the log likelihood ratio of a look from another place to a given start pose."""
+        """Add the log likelihood ratio of a look from another place to a given start pose.
+
+        One place alone, with people around, does not outweigh the pose.
+        """
         assert self._trial is not None
-        self._trial.log_odds += log_ratio
+        self._trial.log_odds += max(log_ratio, -0.75 * _GIVEN)
         self._trial.is_judged = True
 
     def start_delocalized(
@@ -324,7 +327,7 @@ class PlaceBelief:
         self._carried = 0.0
         self._is_elsewhere = False
         self.is_delocalized = True
-        self.level = min(self.level, self._lost_evidence)
+        self.level = self._lost_evidence
         self._end_look(0.0)
 
     def start_submap(self) -> None:

@@ -329,13 +329,14 @@ class Tracker:
         )
         self.reckoned = self.reckoned.moved(prediction)
         self._move_looks(se2.between(before, prediction.prior))
+        is_known = not self.belief.is_delocalized  # else a match corrects the pose that was given
         try:
             tracked = self._measure(scan, points, prediction, is_stationary, there)
         except Exception:
             self.T_anchor_base = prediction.prior
             self.uncertainty.coast(prediction.prior, prediction.covariance, is_stationary)
             raise
-        if not self.belief.is_doubted:
+        if is_known and not self.belief.is_doubted:
             self._move_looks(se2.between(prediction.prior, self.T_anchor_base))
         self._take_look(scan)
         return tracked
@@ -397,6 +398,7 @@ class Tracker:
         Returns its covariance (3, 3).
         """
         self.prediction.reset_segment()
+        self._looks.clear()
         self.T_anchor_base = self.reckoned.T_anchor_base
         return self.reckoned.covariance + self.slip_covariance()
 
@@ -512,7 +514,8 @@ class Tracker:
         match = self._matcher.match(*given)
         fits = match.inlier_ratio >= self._config.matching.min_inlier_ratio
         look = self._looks.get(scan.frame)
-        if fits or look is None:
+        is_parked = look is not None and look.is_kept and self.belief.is_doubted
+        if fits or look is None or is_parked:
             return match
 
         def shows_last(T_map_base: Array) -> bool:

@@ -53,7 +53,7 @@ def test_a_piece_returns_once_the_odds_of_its_place_are_high_enough():
     pieces = Pieces()
     pieces.begin(reckoned(-4.0))
     frames = [frame(0, 0.0), frame(1, 0.0), frame(1, 3.0)]
-    own = pieces.reckoned_to(0)
+    own = pieces.reckoned_between(0, pieces.current)
     own.add(np.zeros(2), edge(0, 1), np.zeros(3), 1e-4 * np.eye(3), SEARCH)
     assert pieces.take_returning() == []
     own.add(np.array([3.0, 0.0]), edge(0, 2), np.zeros(3), 1e-4 * np.eye(3), SEARCH)
@@ -62,23 +62,34 @@ def test_a_piece_returns_once_the_odds_of_its_place_are_high_enough():
     assert pieces.take_returning() == []
     pieces.join(frames, edges)
     assert not pieces.is_apart
-    assert pieces.reckoned_to(0) is None
+    assert pieces.reckoned_between(0, pieces.current) is None
 
 
 def test_a_piece_that_was_left_is_judged_from_the_published_map_and_not_from_another_piece():
     pieces = Pieces()
     pieces.begin(reckoned(-2.0))
     pieces.begin(reckoned(-3.0))
-    assert pieces.reckoned_to(1) is None
-    assert pieces.reckoned_to(0).log_odds == pytest.approx(-np.logaddexp(2.0, 3.0))
+    assert pieces.reckoned_between(1, pieces.current) is None
+    assert pieces.reckoned_between(0, pieces.current).log_odds == pytest.approx(
+        -np.logaddexp(2.0, 3.0)
+    )
     pieces.return_to_published()
-    assert pieces.reckoned_to(1).log_odds == -2.0
-    assert pieces.reckoned_to(0) is None
+    assert pieces.reckoned_between(1, pieces.current).log_odds == -2.0
+    assert pieces.reckoned_between(0, pieces.current) is None
 
 
 def test_a_piece_that_recognition_joins_is_judged_no_longer():
     pieces = Pieces()
-    pieces.begin(reckoned(3.0))
+    pieces.begin(reckoned(-3.0))
     pieces.join([frame(0, 0.0), frame(1, 0.0)], [edge(0, 1)])
     pieces.begin(reckoned(-1.0))
-    assert pieces.reckoned_to(0).log_odds == -1.0
+    assert pieces.reckoned_between(0, pieces.current).log_odds == -1.0
+
+
+def test_a_piece_without_a_look_does_not_return():
+    pieces = Pieces()
+    pieces.begin(reckoned(9.0))
+    assert pieces.take_returning() == []
+    own = pieces.reckoned_between(0, 1)
+    own.add(np.zeros(2), edge(0, 1), np.zeros(3), 1e-4 * np.eye(3), SEARCH)
+    assert pieces.take_returning() == [], 'one place alone'

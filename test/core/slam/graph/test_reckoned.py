@@ -42,7 +42,7 @@ def test_looks_from_one_place_count_once_and_the_piece_returns_by_those_of_two()
     assert reckoned.log_odds < RETURNS
     reckoned.add(at(2.0), edge(5), np.zeros(3), EXACT, SEARCH)
     assert reckoned.log_odds >= RETURNS
-    assert [each.b for each in reckoned.edges] == [0, 1, 2, 3, 4, 5]
+    assert [each.b for each in reckoned.edges] == [4, 5]
 
 
 def test_looks_that_find_nothing_speak_against_it_and_leave_no_edge():
@@ -64,6 +64,25 @@ def test_the_longer_the_way_the_less_a_match_at_the_place_tells():
 
 
 def test_a_piece_within_a_piece_is_there_only_if_both_are():
-    outer = begun(1.0)
-    inner = Reckoned(2.0, np.array([3.0, 0.0, 0.0]), EXACT, 3.0).within(outer)
-    assert inner.log_odds == pytest.approx(-np.logaddexp(-1.0, -2.0))
+    outer = begun(-1.0)
+    inner = Reckoned(-2.0, np.array([3.0, 0.0, 0.0]), EXACT, 3.0).within(outer)
+    assert inner.log_odds == pytest.approx(-np.logaddexp(1.0, 2.0))
+
+
+def test_a_piece_that_begins_is_not_sure_of_its_place():
+    assert begun(9.0).log_odds == 0.0
+
+
+@pytest.mark.parametrize(
+    ('path_m', 'begin_m', 'is_told'),
+    [(1.0, 4.0, True), (3.0, 4.0, False), (91.0, 100.0, True), (93.0, 100.0, False)],
+)
+def test_keyframes_just_before_the_beginning_tell_nothing(path_m, begin_m, is_told):
+    assert Reckoned(0.0, np.zeros(3), EXACT, begin_m).is_told_by(path_m) == is_told
+
+
+def test_looks_at_one_place_are_kept_once():
+    reckoned = begun()
+    for k in range(1000):
+        reckoned.add_contrary(at(0.01 * k))
+    assert len(reckoned._looks) <= 11

@@ -246,20 +246,21 @@ class Pieces:
                 self._reckoned.pop(gone, None)
             self._piece_of = [kept if piece == gone else piece for piece in self._piece_of]
 
-    def reckoned_to(self, submap: int) -> Reckoned | None:
-        """Of the piece that is apart, of that of the robot and that of a submap; None if both are.
+    def are_one(self, a: int, b: int) -> bool:
+        """Whether two submaps are of one piece."""
+        return self._piece_of[a] == self._piece_of[b]
 
-        And where they are one piece.
-        """
-        pieces = {self.piece, self._piece_of[submap]}
-        if _PUBLISHED not in pieces:
+    def reckoned_between(self, a: int, b: int) -> Reckoned | None:
+        """Of the piece that is apart, where one of two submaps is of it and one published."""
+        pieces = {self._piece_of[a], self._piece_of[b]}
+        if len(pieces) == 1 or _PUBLISHED not in pieces:
             return None
         return self._reckoned.get(max(pieces))
 
     def take_returning(self) -> list[Edge]:
         """Edges of a piece that returns to where dead reckoning has it; none where none does."""
         for piece, reckoned in self._reckoned.items():
-            if reckoned.log_odds >= RETURNS:
+            if reckoned.edges and reckoned.log_odds >= RETURNS:
                 del self._reckoned[piece]
                 return reckoned.edges
         return []
@@ -630,8 +631,16 @@ class LoopClosure:
         frame = self.keyframes.frames[j]
         if frame.submap == here.submap:
             return frame.path_m <= here.path_m - AGAIN_M
-        reckoned = self.pieces.reckoned_to(frame.submap)
-        return reckoned is None or reckoned.is_told_by(frame.path_m)
+        return self.pieces.are_one(frame.submap, here.submap) or (
+            self._reckoned(frame, here) is not None
+        )
+
+    def _reckoned(self, frame: Keyframe, here: Keyframe) -> Reckoned | None:
+        """Odds to which a match of two keyframes is a look; None where it tells nothing of them."""
+        reckoned = self.pieces.reckoned_between(frame.submap, here.submap)
+        if reckoned is None or not self.pieces.is_published(frame.submap):
+            return reckoned
+        return reckoned if reckoned.is_told_by(frame.path_m) else None
 
     def _as_seen_from(self, near: list[int], here: Keyframe) -> list[Array]:
         """Covariance (3, 3), map frame, of the pending keyframe relative to each keyframe."""
@@ -744,23 +753,24 @@ class LoopClosure:
         is_ambiguous = not is_step and self._is_ambiguous(job.covariance)
         matcher = self._far_matcher if is_ambiguous else self._matcher
         match = matcher.match(here.points, here.scan.T_base_laser, submap, prior, relative)
-        reckoned = self.pieces.reckoned_to(frames[j].submap)
+        reckoned = self._reckoned(frames[j], here)
         if match.inlier_ratio < config.min_inlier_ratio:
             if reckoned is not None and match.contradiction_ratio > CONTRARY_RATIO:
                 reckoned.add_contrary(here.T_map_base[:2])
             return
         covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + EDGE_NOISE
         off = se2.pose_difference(match.pose, prior)
-        if float(off @ np.linalg.solve(relative + covariance, off)) > CHI2:
-            return
+        is_far = float(off @ np.linalg.solve(relative + covariance, off)) > CHI2
         T_j_base = se2.between(frames[j].T_map_base, base)
         covariance = rotated_covariance(covariance, float(T_j_base[2]))
         T_j_k = se2.compose(T_j_base, match.pose)
         edge = Edge(j, k, T_j_k, inverse(covariance), True, inlier_ratio=match.inlier_ratio)
-        if not self.pieces.is_here(frames[j].submap):
+        if not self.pieces.are_one(frames[j].submap, here.submap):
             self._add_pending()
             if reckoned is not None:
                 self._look_at(reckoned, edge, matcher.searched(relative))
+        elif is_far:
+            return
         elif is_ambiguous:
             self._add_pending()
             self.pieces.add_match(edge)

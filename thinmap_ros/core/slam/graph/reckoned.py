@@ -80,7 +80,7 @@ class Reckoned:
 
         path_m: length of the path up to there.
         """
-        self._prior = log_odds
+        self._prior = min(log_odds, 0.0)  # a piece that begins is never sure of its place
         self._begin_m = path_m
         self._begin = T_map_base
         self._covariance = covariance
@@ -94,11 +94,7 @@ class Reckoned:
     @property
     def log_odds(self) -> float:
         """Log odds of here to elsewhere."""
-        counted: list[_Look] = []
-        for look in sorted(self._looks, key=lambda each: -each.log_ratio):
-            if all(math.dist(look.place, other.place) >= _LOOK_M for other in counted):
-                counted.append(look)
-        return self._prior + sum(look.log_ratio for look in counted)
+        return self._prior + sum(look.log_ratio for look in self._looks)
 
     def within(self, outer: 'Reckoned') -> 'Reckoned':
         """Of a piece that begins in another one that is apart: either may be elsewhere."""
@@ -111,16 +107,23 @@ class Reckoned:
 
         Those just before the piece begins may be of the place of the piece: it was noticed late.
         """
-        return path_m <= self._begin_m - _LATE_M
+        return path_m <= self._begin_m - min(_LATE_M, 0.5 * self._begin_m)
 
     def add_contrary(self, place: Array) -> None:
         """Add a look from a place (2,), m, that finds nothing of the map, and contradicts it."""
-        self._looks.append(_Look(place, _CONTRARY, None))
+        self._count(_Look(place, _CONTRARY, None))
 
     def add(self, place: Array, edge: Edge, off: Array, own: Array, search: Search) -> None:
         """Add a match from a place (2,), m, off (3,) with covariance `own` (3, 3), map frame."""
         expected = self._covariance_at(place) + own
-        self._looks.append(_Look(place, look_log_ratio(off, expected, search), edge))
+        self._count(_Look(place, look_log_ratio(off, expected, search), edge))
+
+    def _count(self, look: _Look) -> None:
+        """Keep a look instead of those near it that tell less; none if one of these tells more."""
+        near = [each for each in self._looks if math.dist(each.place, look.place) < _LOOK_M]
+        if all(each.log_ratio <= look.log_ratio for each in near):
+            self._looks = [each for each in self._looks if each not in near]
+            self._looks.append(look)
 
     def _covariance_at(self, place: Array) -> Array:
         """Covariance (3, 3) of the piece at a place (2,), m, that lies away from its beginning.
