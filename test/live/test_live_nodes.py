@@ -258,7 +258,11 @@ def test_what_is_recorded_is_played_again(graph, tmp_path):
         LaserScan, 'scan', lambda scan: heard_it.publish(TopologicalMap(header=scan.header)), 10
     )
     player = graph.start(
-        'bag_player', bag=str(tmp_path / 'bag'), rate=20.0, lockstep='local_topology'
+        'bag_player',
+        bag=str(tmp_path / 'bag'),
+        rate=20.0,
+        lockstep='local_topology',
+        wait_for_subscribers=2,
     )
     graph.until(
         lambda: player.poll() == 0 and len(scans) == len(kept), 'as many scans as were recorded'
