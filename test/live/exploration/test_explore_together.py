@@ -102,6 +102,7 @@ class Robot:
             use_sim_time=True,
             drive=False,
             autostart_exploration=True,
+            progress_timeout_s=1000.0,  # they stand, and keep what they claim
             **parameters,
         )
 
