@@ -51,8 +51,8 @@ class _Trial:
 
     Some scans fit anywhere, and a map that they change soon agrees with all that follow. Of 20
     starts elsewhere in generated buildings, 13 were mapped at a wrong pose without a trial, 3 with
-    one of 1.5 m or of 3 m, and none with this. One that a user gave has odds of its own: scans that
-    fit there, and at no other heading, confirm it at once.
+    one of 1.5 m or of 3 m, and none with this. One that a user gave has odds of its own: the first
+    scan that fits confirms it, unless the looks speak against it.
     """
 
     def __init__(self, is_guess: bool, log_odds: float = 0.0) -> None:

@@ -44,9 +44,9 @@ from thinmap_ros.core.stage import Correction, are_two_storeys
 AGAIN_M = 8.0  # smallest path length between two visits of a place
 
 
-# Keyframes to either side in a submap for a scan that looks back: as far as a laser sees well. Of
-# what lies before it, those beside it saw nothing; along a smooth wall it would slide by metres to
-# where more is known, and its neighbours would do alike and agree.
+# Keyframes to either side in a submap for a scan that looks back: as far as a laser sees well.
+# Those beside it saw nothing of the walls ahead of it; along a smooth wall it would slide by metres
+# to where more is known, and its neighbours would do alike and agree.
 _AROUND_BACK = 12
 
 
@@ -745,7 +745,7 @@ class LoopClosure:
             base, submap = self._submaps.before(frames, j)
         else:
             turn = float(se2.between(frames[j].T_map_base, here.T_map_base)[2])
-            looks_back = abs(turn) > 0.75 * math.pi  # within 45 degrees of the way back
+            looks_back = abs(turn) > 0.75 * math.pi  # within 45 degrees of the opposite heading
             base, submap = self._submaps.around(frames, j, here.path_m, looks_back)
         config = self._config
         prior = se2.between(base, here.T_map_base)

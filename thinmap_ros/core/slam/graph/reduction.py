@@ -2,7 +2,7 @@
 
 So the map of many days over one floor has about as many keyframes as that of one day.
 Source: Kretzschmar and Stachniss, "Information-theoretic compression of pose graphs for laser-based
-robot mapping", 2012: scans that say little go, and the graph of what is left stays a sparse one.
+robot mapping", 2012: scans that say little go, and the graph of the others stays a sparse one.
 """
 
 from collections import Counter, deque
@@ -43,7 +43,7 @@ class ReductionConfig:
 def reduced(saved: SavedKeyframes, config: ReductionConfig | None = None) -> SavedKeyframes:
     """The keyframes without those of which later visits show the place as well.
 
-    What is left has its poses, their covariances, and a graph of its own.
+    The kept keyframes have their poses, covariances, and a graph of their own.
     """
     is_kept = needed(saved.frames, config or ReductionConfig())
     # Nothing but its edges between visits says where a keyframe is that was come to unknowingly.
@@ -86,7 +86,7 @@ def needed(frames: Sequence[Keyframe], config: ReductionConfig) -> NDArray[np.bo
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """The cells (H, W) that a scan shows, the first one at (row, col), and how far they are, m."""
+    """The cells (H, W) that a scan shows, the first one at (row, col), and their distances, m."""
 
     row: int
     col: int
