@@ -50,12 +50,26 @@ def test_it_tells_its_version() -> None:
     assert run('--version').stdout == f'thinmap {__version__}\n'
 
 
-@pytest.mark.parametrize('words', [['frobnicate'], []], ids=['unknown', 'none'])
-def test_a_wrong_subcommand_is_one_line_and_exit_code_2(words: list[str]) -> None:
+def test_without_words_it_prints_the_help() -> None:
+    done = run()
+    assert done.returncode == 0
+    assert done.stdout == run('--help').stdout
+
+
+@pytest.mark.parametrize(
+    ('words', 'expected'),
+    [
+        (['frobnicate'], "'frobnicate': no such subcommand"),
+        (['nodes', 'loclizer'], "'loclizer': no such node (did you mean localizer?)"),
+        (['nodes', 'sim', 'sim'], 'a name twice: expected each node once'),
+    ],
+    ids=['subcommand', 'node', 'node twice'],
+)
+def test_a_wrong_name_is_one_line_and_exit_code_2(words: list[str], expected: str) -> None:
     done = run(*words)
+    assert expected in done.stderr
     assert done.returncode == 2
     assert done.stdout == ''
-    assert done.stderr.startswith('thinmap: error: ')
     assert done.stderr.count('\n') == 1
 
 

@@ -1,13 +1,13 @@
 """The command `thinmap`: all programs of the package, each as a subcommand."""
 
 import sys
-from difflib import get_close_matches
 from importlib import import_module
 from typing import NamedTuple
 
 import thinmap_ros.startup  # isort: skip  # noqa: F401  before all other modules
 from thinmap_ros import __version__
-from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.core.errors import ThinmapError, did_you_mean
+from thinmap_ros.nodes.thinmap import NODES
 from thinmap_ros.tools.arguments import BAD_INPUT, is_asked, require_ros, subcommand
 
 
@@ -89,7 +89,7 @@ def main() -> None:
         _complete()
     arguments = sys.argv[1:]
     if not arguments:
-        _fail('expected a subcommand: thinmap help lists them')
+        arguments = ['--help']
     if arguments[0] == 'help':
         arguments = [*arguments[1:2], '--help']
     name = _full(arguments[0])
@@ -99,8 +99,11 @@ def main() -> None:
         print(f'thinmap {__version__}')
     elif name in PROGRAMS:
         _run(name, arguments[1:])
+    elif name in NODES:
+        _fail(f'{name!r}: no such subcommand, but a node: expected thinmap nodes {name}')
     else:
-        _fail(f'{name!r}: no such subcommand{_meant(name)}: expected one of {", ".join(PROGRAMS)}')
+        likely = did_you_mean(name, [*PROGRAMS, *_SHORT])
+        _fail(f'{name!r}: no such subcommand{likely}: expected one of {", ".join(PROGRAMS)}')
 
 
 def _full(name: str) -> str:
@@ -117,11 +120,6 @@ def _complete() -> None:
         _run(name, ['--help'])  # which needs no ROS
     sys.exit()
 
-
-def _meant(name: str) -> str:
-    """The subcommand that a word is most like."""
-    likely = get_close_matches(name, [*PROGRAMS, *_SHORT], n=1)
-    return f' (did you mean {likely[0]}?)' if likely else ''
 
 
 if __name__ == '__main__':

@@ -14,9 +14,9 @@ from thinmap_ros.__main__ import main
 
 # FILE: a text file; MAP: a map; LOG: a CARMEN log; DIR: an empty folder.
 WRONG = [
-    ('', 'expected a subcommand: thinmap help lists them'),
     ('repaly LOG', "'repaly': no such subcommand (did you mean replay?)"),
     ('explore room_10x10', "'explore': no such subcommand (did you mean explore_world?)"),
+    ('localizer', "'localizer': no such subcommand, but a node: expected thinmap nodes localizer"),
     ('-v', "'-v': no such subcommand"),
     ('Replay LOG', "'Replay': no such subcommand (did you mean replay?)"),
     ('replay', 'the following arguments are required: '),

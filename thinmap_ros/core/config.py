@@ -9,10 +9,9 @@ fixed: they are set in Python only, and are no parameters of nodes.
 import dataclasses
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any, TypeVar
 
-from thinmap_ros.core.errors import ConfigError, quoted, with_article
+from thinmap_ros.core.errors import ConfigError, did_you_mean, quoted, with_article
 
 SAFE_LOWER = 'lower'
 SAFE_HIGHER = 'higher'
@@ -154,8 +153,7 @@ def suggestion(
         return f' (only with {elsewhere[name]})'
     last = name.split('.')[-1]
     same = [other for other in sorted(known) if other.split('.')[-1] == last]
-    likely = same or get_close_matches(name, sorted(known), n=1, cutoff=0.75)
-    return f' (did you mean {", ".join(likely)}?)' if likely else ''
+    return f' (did you mean {", ".join(same)}?)' if same else did_you_mean(name, known, 0.75)
 
 
 def check_safety(start: Config, changed: Config) -> None:

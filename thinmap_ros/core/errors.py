@@ -3,6 +3,7 @@
 import math
 import reprlib
 from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 from itertools import accumulate
 
 import numpy as np
@@ -42,6 +43,15 @@ def require_type(what: str, value: object, *kinds: type) -> None:
     if not isinstance(value, kinds):
         names = ' or '.join(kind.__name__ for kind in kinds if kind is not type(None))
         raise InputError(f'{what} = {quoted(value)}: expected {with_article(names)}')
+
+
+def did_you_mean(word: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """The known name that a word is most like, for an error message; '' where none is.
+
+    cutoff: least similarity, 0 to 1.
+    """
+    likely = get_close_matches(word, sorted(known), n=1, cutoff=cutoff)
+    return f' (did you mean {likely[0]}?)' if likely else ''
 
 
 def with_article(noun: str) -> str:

@@ -5,11 +5,10 @@ folders of ROS where colcon installed it; they are looked for in this order.
 """
 
 from collections.abc import Iterator
-from difflib import get_close_matches
 from importlib import resources, util
 from pathlib import Path
 
-from thinmap_ros.core.errors import InputError, quoted
+from thinmap_ros.core.errors import InputError, did_you_mean, quoted
 from thinmap_ros.files.safe import path_of
 
 _PACKAGE = 'thinmap_ros'
@@ -28,8 +27,7 @@ def world_path(name: str | Path) -> Path:
     if name in worlds:
         return worlds[name]
     installed = ', '.join(sorted(worlds)) or 'none installed'
-    likely = get_close_matches(name, worlds, n=1)
-    meant = f' (did you mean {likely[0]}?)' if likely else ''
+    meant = did_you_mean(name, worlds)
     raise InputError(f'world {quoted(name)}{meant}: expected a file, or one of {installed}')
 
 

@@ -8,12 +8,11 @@ import os
 import re
 import sys
 from collections.abc import Iterable
-from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
-from thinmap_ros.core.errors import InputError, ThinmapError
+from thinmap_ros.core.errors import InputError, ThinmapError, did_you_mean
 
 _ASKED = '_ARGCOMPLETE'
 # What argcomplete is to take for the name of the program: the subcommand, the second word.
@@ -86,10 +85,8 @@ class Parser(argparse.ArgumentParser):
         """The options that are most like those which do not exist."""
         if not message.startswith(_UNKNOWN):
             return ''
-        known = sorted(self._option_string_actions)
-        unknown = message.removeprefix(_UNKNOWN).split()
-        likely = [match for word in unknown for match in get_close_matches(word, known, n=1)]
-        return f' (did you mean {", ".join(likely)}?)' if likely else ''
+        words = message.removeprefix(_UNKNOWN).split()
+        return ''.join(did_you_mean(word, self._option_string_actions) for word in words)
 
 
 def add_out(parser: argparse.ArgumentParser, default: str) -> None:
