@@ -34,6 +34,7 @@ ROS_DATA = [
     (f'share/{NAME}/config/robots', glob('config/robots/*.yaml')),
     (f'share/{NAME}/config/sensors', glob('config/sensors/*.yaml')),
     (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
+    (f'share/{NAME}/launch', glob('launch/*.py')),
     # colcon puts it on PATH.
     ('bin', ['scripts/thinmap']),
 ]

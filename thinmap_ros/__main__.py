@@ -37,6 +37,7 @@ PROGRAMS = {
     'record_bags': _Program('tools.record_bags', 'the drives of the experiments as bags'),
     'warm_up': _Program('tools.warm_up', 'compile all kernels, once, so that programs start fast'),
     'doctor': _Program('tools.doctor', 'what a running robot lacks, in one table', True),
+    'robot': _Program('tools.robot', 'a robot checked, mapped, driven and saved', True),
     'demo': _Program('tools.demo', 'a simulated robot explores a room on a live ROS 2 graph', True),
     'nodes': _Program('nodes.thinmap', 'ROS 2 nodes in one process', True),
 }
@@ -119,7 +120,6 @@ def _complete() -> None:
     if name in PROGRAMS and name != 'nodes':
         _run(name, ['--help'])  # which needs no ROS
     sys.exit()
-
 
 
 if __name__ == '__main__':

@@ -136,7 +136,7 @@ def run(*arguments):
 def test_what_cannot_be_run_is_reported_in_one_line(ros_domain):
     assert 'usage: thinmap' in run('--help').stdout
     done = run('localizer', 'pilot')
-    assert done.returncode == 2 and done.stderr.startswith('error: pilot')
+    assert done.returncode == 2 and done.stderr.startswith("error: 'pilot': no such node")
     strict = ('-p', 'gaet:=1.0', '-p', 'strict_parameters:=true')
     done = run('localizer', 'grid_mapper', '--ros-args', *strict)
     unknown = 'nodes localizer, grid_mapper have no parameter gaet'

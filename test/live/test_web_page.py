@@ -104,6 +104,9 @@ def test_a_robot_is_seen_sent_and_stopped(graph):
 
     page.ask('goal', x=2.0, y=4.5, theta=0.0)
     site.until(lambda: commands and commands[-1].linear.x > 0.1, 'the robot drives')
+    accepted = page.news.count('goal accepted')
+    page.ask('goal', x=2.2, y=4.4, theta=0.0)
+    site.until(lambda: page.news.count('goal accepted') > accepted, 'a newer goal')
     asked = len(commands)
     other.ask('stop')
     site.until(lambda: velocities(commands[-1:]) == [STANDS], 'a stop')
@@ -146,6 +149,7 @@ def test_a_robot_is_seen_sent_and_stopped(graph):
     page.ask('save', name='room')
     site.until(lambda: news(page).startswith('save:'), 'saved')
     assert (graph.folder / 'room.pgm').exists() and 'room' in news(page)
+    assert not any('replaced' in told for told in page.news)  # goals that the page has replaced
     for name in list(graph.processes):
         assert graph.stop(name, signal.SIGTERM) == 0
     page.until(page.closed.is_set, 'the end')

@@ -15,13 +15,14 @@ _LATE = 's late: nothing is done'
 class WebClient:
     """A socket of a page, in a thread of its own.
 
-    items: the newest value of each item; refusals: errors that were shown here; opened, then
-    closed: events; bytes: received so far. Each request says the newest beat, as those of the
-    page do; one that a busy machine delays too long is asked again, as by a person.
+    items: the newest value of each item; news: all that was told; refusals: errors that were shown
+    here; opened, then closed: events; bytes: received so far. Each request says the newest beat,
+    as those of the page do; one that a busy machine delays too long is asked again, as by a person.
     """
 
     def __init__(self, port, token='', origin=None, host='127.0.0.1'):
         self.items = {}
+        self.news = []
         self.refusals = []
         self.opened = threading.Event()
         self.closed = threading.Event()
@@ -62,6 +63,7 @@ class WebClient:
                     self.refusals.append(value)
                 else:
                     self.items[name] = value
+                    self.news += [value[1]] if name == 'news' else []
 
     def send_text(self, text):
         self._loop.call_soon_threadsafe(self._write, text)

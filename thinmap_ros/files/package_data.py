@@ -39,6 +39,12 @@ def config_file(node: str) -> Path:
     raise InputError(f'config/{node}.yaml: not installed')
 
 
+def presets() -> dict[str, Path]:
+    """Parameter files of robots by name."""
+    folders = [folder for folder in _folders(_PACKAGE, 'config/robots') if folder.is_dir()]
+    return {file.stem: file for folder in folders[:1] for file in sorted(folder.glob('*.yaml'))}
+
+
 def message_definitions(package: str) -> dict[str, str]:
     """Texts of a package's message definitions by full name, for bags.
 

@@ -116,14 +116,14 @@ class SessionPart(Generic[Value, PartConfig]):
 
         A file that cannot be read, as of another version, holds something.
         """
-        if overwrite or not self.content or self._has_content(value.state()):
+        if overwrite or not self.content or self.has_content(value.state()):
             return
         file = self.file(path)
         if not _exists(file):
             return
         try:
             with open_regular_file(file) as stream:
-                if not self._has_content(read_snapshot(stream, self.name)):
+                if not self.has_content(read_snapshot(stream, self.name)):
                     return
         except (InputError, OSError):
             pass
@@ -132,7 +132,8 @@ class SessionPart(Generic[Value, PartConfig]):
             'overwrite: true'
         )
 
-    def _has_content(self, state: State) -> bool:
+    def has_content(self, state: State) -> bool:
+        """Whether the state of a node holds something."""
         return any(bool(np.any(state[name])) for name in self.content if name in state)
 
     def archive(self, path: str) -> str:

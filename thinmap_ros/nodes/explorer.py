@@ -39,7 +39,7 @@ from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import offer
-from thinmap_ros.ros.session_services import offer_saving
+from thinmap_ros.ros.session_services import offer_saving, save_on_exit
 from thinmap_ros.ros.stop_topic import StopTopic
 
 _CHECK_PERIOD_S = 1.0
@@ -69,7 +69,9 @@ class ExplorerNode(ThinmapNode):
             self, frames.map_frame, self._strategies.is_default, self._progress
         )
         self._session = parameters.declare_session(self)
-        offer_saving(self, SaveDirectory(self), EXPLORATION, self._save)
+        directory = SaveDirectory(self)
+        offer_saving(self, directory, EXPLORATION, self._save)
+        save_on_exit(self, directory, EXPLORATION, self._save_at_end)
         parameters.reject_unknown(self)
         kernels.explorer()
         radius_m = self._strategies.config.robot_radius_m
@@ -237,6 +239,10 @@ class ExplorerNode(ThinmapNode):
 
     def _save(self, path: str, overwrite: bool) -> str:
         return self._strategies.save(path, self._mission.strategy, overwrite)
+
+    def _save_at_end(self, path: str) -> str:
+        strategy = self._mission.strategy
+        return self._save(path, True) if self._strategies.has_learned(strategy) else ''
 
     # Outputs.
 

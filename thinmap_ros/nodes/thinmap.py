@@ -13,19 +13,19 @@ from thinmap_ros.core.errors import did_you_mean, quoted
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-_BY_DEFAULT = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
+BY_DEFAULT = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 _NO_CHOICE = ('demo_monitor', 'thinmap')
 _OTHERS = [
     module.name
     for module in pkgutil.iter_modules(nodes.__path__)
-    if not module.ispkg and module.name not in (*_BY_DEFAULT, *_NO_CHOICE)
+    if not module.ispkg and module.name not in (*BY_DEFAULT, *_NO_CHOICE)
 ]
-NODES = (*_BY_DEFAULT, *_OTHERS)
+NODES = (*BY_DEFAULT, *_OTHERS)
 _WITH_PAGE = 'web:=true'
 _WITHOUT_PAGE = 'web:=false'
 _USAGE = f"""usage: {{program}} [NODE ...] [{_WITH_PAGE}] [--ros-args ...]
 
-Runs nodes in one process. Without names: {', '.join(_BY_DEFAULT)}.
+Runs nodes in one process. Without names: {', '.join(BY_DEFAULT)}.
 {_WITH_PAGE}: with web, the page in the browser, beside them; {_WITHOUT_PAGE}: without.
 There are also: {', '.join(_OTHERS)}.
 A parameter goes to every node that has it; -p localizer:slam:=ekf_ti sets that of one."""
@@ -45,7 +45,7 @@ def node_factories(names: list[str]) -> list['Callable[[], Node]']:
 
 def chosen_nodes(words: list[str]) -> list[str]:
     """Names of the nodes that the words of a command line choose."""
-    names = [word for word in words if word not in (_WITH_PAGE, _WITHOUT_PAGE)] or list(_BY_DEFAULT)
+    names = [word for word in words if word not in (_WITH_PAGE, _WITHOUT_PAGE)] or list(BY_DEFAULT)
     return [*names, 'web'] if _WITH_PAGE in words else names
 
 

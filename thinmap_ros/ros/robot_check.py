@@ -2,11 +2,11 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
@@ -43,13 +43,18 @@ _LISTENING = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 @dataclass(frozen=True)
 class RobotNames:
-    """Topics and frames of a robot, as of the parameters of the nodes."""
+    """Topics and frames of a robot, as of the parameters of the nodes.
 
-    scan_topics: tuple[str, ...]
-    odom_topic: str
-    base_frame: str
-    odom_frame: str
-    map_frame: str
+    odom_topic: '' where the odometry is a transform, or there is none. is_mounted: the pose of the
+    laser is a parameter.
+    """
+
+    scan_topics: tuple[str, ...] = ('scan',)
+    odom_topic: str = 'odom'
+    base_frame: str = 'base_link'
+    odom_frame: str = 'odom'
+    map_frame: str = 'map'
+    is_mounted: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,20 +67,45 @@ class Finding:
     advice: str = ''
 
 
-def check_robot(names: RobotNames, seconds: float) -> list[Finding]:
-    """What a robot publishes within some seconds, compared with what is needed."""
-    with _own_node() as node:
+class Checkup(NamedTuple):
+    """What was found, and whether the robot is in the time of /clock, as a simulated one."""
+
+    findings: list[Finding]
+    is_simulated: bool
+
+    @property
+    def wrong(self) -> list[Finding]:
+        """What is not as needed."""
+        return [finding for finding in self.findings if not finding.is_good]
+
+
+def table(findings: Sequence[Finding]) -> Iterator[str]:
+    """Lines of findings, what to do below those that are wrong."""
+    width = max(len(finding.what) for finding in findings)
+    for finding in findings:
+        mark = '\N{CHECK MARK}' if finding.is_good else '\N{BALLOT X}'
+        yield f'{mark} {finding.what:{width}}  {finding.seen}'
+        if not finding.is_good:
+            yield f'  {"":{width}}  {finding.advice}'
+
+
+def check_robot(names: RobotNames, seconds: float, words: Sequence[str] = ()) -> Checkup:
+    """What a robot publishes within some seconds, compared with what is needed.
+
+    words: arguments for ROS, such as remappings.
+    """
+    with _own_node(words) as node:
         check = RobotCheck(node, names)
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             rclpy.spin_once(node, timeout_sec=_SPIN_S)
-        return list(check.findings())
+        return Checkup(list(check.findings()), check.is_simulated)
 
 
 @contextmanager
-def _own_node() -> Iterator[Node]:
+def _own_node(words: Sequence[str] = ()) -> Iterator[Node]:
     """The node of this program, while it looks. Raises InputError for a name that is no topic's."""
-    rclpy.init()
+    rclpy.init(args=list(words))
     node = rclpy.create_node('doctor')
     try:
         yield node
@@ -98,12 +128,18 @@ class RobotCheck:
         self._transforms: dict[tuple[str, str], bool] = {}
         for topic in names.scan_topics:
             self._listen(LaserScan, topic, self._scans.setdefault(topic, []))
-        self._listen(Odometry, names.odom_topic, self._odometry)
+        if names.odom_topic:
+            self._listen(Odometry, names.odom_topic, self._odometry)
         node.create_subscription(Clock, '/clock', self._clock.append, qos.SENSOR)
         self._localizer: DiagnosticStatus | None = None
         node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         node.create_subscription(TFMessage, 'tf', self._on_moving, _LISTENING)
         node.create_subscription(TFMessage, 'tf_static', self._on_static, qos.STATIC_TRANSFORMS)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether /clock is published."""
+        return bool(self._clock)
 
     def findings(self) -> Iterator[Finding]:
         """All lines, the sensors first."""
@@ -112,9 +148,11 @@ class RobotCheck:
             yield from self._stream(topic, 'sensor_msgs/msg/LaserScan', scans)
             if scans:
                 yield self._laser(scans[-1][0])
-        yield from self._stream(names.odom_topic, 'nav_msgs/msg/Odometry', self._odometry)
+        if names.odom_topic:
+            yield from self._stream(names.odom_topic, 'nav_msgs/msg/Odometry', self._odometry)
         yield self._frame(names.odom_frame, names.base_frame, 'odometry', 'odom_frame, base_frame')
-        frames = [scans[-1][0].header.frame_id for scans in self._scans.values() if scans]
+        heard = [] if names.is_mounted else filter(None, self._scans.values())
+        frames = [scans[-1][0].header.frame_id for scans in heard]
         advice = 'publish it on /tf_static (robot_state_publisher)'
         advice += '' if len(names.scan_topics) > 1 else ', or set laser_pose'
         for frame in dict.fromkeys(frames):

@@ -67,7 +67,7 @@ def save_on_exit(
         'save_on_exit',
         '',
         'Path stem of the session that is saved when the node ends, below save_directory. '
-        'Empty: none. Give it to localizer, grid_mapper and topology_builder.',
+        'Empty: none. Give it to localizer, grid_mapper, topology_builder and explorer.',
     )
     period_s = parameters.declare_parameter(
         node,

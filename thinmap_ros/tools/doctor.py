@@ -23,7 +23,7 @@ def _work(arguments: argparse.Namespace) -> None:
         _confirm(arguments.yes)
     require_ros()
     # Only now: the help needs no ROS.
-    from thinmap_ros.ros.robot_check import RobotNames, check_robot, try_watchdog
+    from thinmap_ros.ros.robot_check import RobotNames, check_robot, table, try_watchdog
 
     names = RobotNames(
         tuple(arguments.scan_topic),
@@ -35,13 +35,8 @@ def _work(arguments: argparse.Namespace) -> None:
     if arguments.try_watchdog:
         findings = [try_watchdog(names.odom_topic, names.base_frame)]
     else:
-        findings = check_robot(names, arguments.seconds)
-    width = max(len(finding.what) for finding in findings)
-    for finding in findings:
-        mark = '\N{CHECK MARK}' if finding.is_good else '\N{BALLOT X}'
-        print(f'{mark} {finding.what:{width}}  {finding.seen}')
-        if not finding.is_good:
-            print(f'  {"":{width}}  {finding.advice}')
+        findings = check_robot(names, arguments.seconds).findings
+    print('\n'.join(table(findings)))
     wrong = sum(not finding.is_good for finding in findings)
     print(f'{wrong} of {len(findings)} are wrong' if wrong else 'all is there')
     sys.exit(1 if wrong else 0)

@@ -317,10 +317,13 @@ class RobotTasks:
         )
 
     def _on_result(self, sent: AnswerFuture, answer: Any, what: str) -> None:
+        if what == 'goal' and sent is not self._newest:
+            return  # the page itself has sent a newer one
         outcome = _OUTCOMES.get(answer.status, 'ended')
         result = answer.result
         reason = result.error_msg if what == 'goal' else result.status.reason
-        self._end(sent, f'{what} {outcome}: {reason}' if reason else f'{what} {outcome}')
+        is_said = reason in ('', outcome)
+        self._end(sent, f'{what} {outcome}' if is_said else f'{what} {outcome}: {reason}')
 
     def _end(self, sent: AnswerFuture, news: str) -> None:
         if sent is self._newest:

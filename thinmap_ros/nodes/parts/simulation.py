@@ -29,6 +29,7 @@ from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.worlds import read_starts
 from thinmap_ros.logs.transforms import parse_pose
+from thinmap_ros.nodes.parts.progress import doing
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
 from thinmap_ros.ros.maps import received_map, received_update, updates_topic
@@ -155,17 +156,7 @@ class RequestedExploration:
     @property
     def doing(self) -> str:
         """What the robot does, in words; '' before the first status."""
-        status = self.status
-        if status is None:
-            return ''
-        if status.state != ExplorationStatus.EXPLORING:
-            return str(status.reason)
-        position = status.target_position
-        return (
-            f'to the end node at {position.x:.1f}, {position.y:.1f}'
-            if status.has_target
-            else 'looking around'
-        )
+        return '' if self.status is None else doing(self.status)
 
     def _on_accepted(self, future: Future) -> None:
         if future is not self._sent:
