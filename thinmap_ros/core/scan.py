@@ -114,6 +114,18 @@ class LaserConfig(Config):
 
 
 @dataclass(frozen=True, eq=False)
+class NearbyRobot:
+    """Another robot, as it was heard when a scan was made.
+
+    T_own_base (3,): its pose in its own map; radius_m: within which it may be.
+    """
+
+    name: str
+    T_own_base: Array
+    radius_m: float
+
+
+@dataclass(frozen=True, eq=False)
 class Scan:
     """Ranges of one scan, and the pose of the laser on the robot.
 
@@ -132,7 +144,8 @@ class Scan:
     in its own frame; body_m (360,): range at which the robot's own body was found at each degree
     from -180, NaN where there is none; delay_s: by how much the stamp is later than the
     measurement, by the clock of the odometry; T_odom_before (3,): odometry of the previous scan,
-    where its delay has turned out to be another one. Use `Scan.create` to make one.
+    where its delay has turned out to be another one; robots: others, whose places in the map may be
+    known only later. Use `Scan.create` to make one.
 
     Each range is one of `hit`, a hit beyond the usable range, `no_return`, `below_range_min`, or
     invalid (`valid` is False).
@@ -161,6 +174,7 @@ class Scan:
     body_m: Array | None = None
     delay_s: float = 0.0
     T_odom_before: Array | None = None
+    robots: tuple[NearbyRobot, ...] = ()
 
     @staticmethod
     def create(
@@ -319,6 +333,41 @@ class Scan:
             return self
         at_body = np.abs(self.ranges_m - body_m[self.degrees]) < BODY_TOLERANCE_M
         return replace(self, ranges_m=np.where(at_body, np.nan, self.ranges_m), body_m=body_m)
+
+    def without_places(self, T_map_base: Array, places: Array, radius_m: float) -> 'Scan':
+        """The scan, made at a pose (3,), with the beams invalid that end near places (M, 2), m.
+
+        Other robots are there: they are no evidence about the map. The beams beside these are
+        invalid as well: their ranges may be mixed with those of walls behind.
+        """
+        hit = np.flatnonzero(self.hit)
+        if not len(places) or not hit.size:
+            return self
+        T_map_laser = se2.compose(T_map_base, self.T_base_laser)
+        angles = self.angles_rad[hit] + T_map_laser[2]
+        directions = np.column_stack([np.cos(angles), np.sin(angles)])
+        ends = T_map_laser[:2] + self.ranges_m[hit, None] * directions
+        away = np.hypot(*(ends[:, None] - places[None]).transpose(2, 0, 1))
+        cut = hit[(away < radius_m).any(axis=1)]
+        if not cut.size:
+            return self
+        beams = np.concatenate([cut - 1, cut, cut + 1])
+        ranges = self.ranges_m.copy()
+        ranges[beams[(beams >= 0) & (beams < ranges.size)]] = np.nan
+        return replace(self, ranges_m=ranges)
+
+    def without_robots(self, T_map_base: Array, T_map_own: Mapping[str, Array]) -> 'Scan':
+        """The scan, made at a pose (3,), without the other robots whose maps have a known place.
+
+        T_map_own: that place (3,), by the name of the robot.
+        """
+        scan = self
+        for robot in self.robots:
+            T = T_map_own.get(robot.name)
+            if T is not None:
+                place = se2.compose(T, robot.T_own_base)[None, :2]
+                scan = scan.without_places(T_map_base, place, robot.radius_m)
+        return scan
 
     def points_laser(self) -> Array:
         """End points of the hits, laser frame, (M, 2)."""

@@ -99,7 +99,8 @@ class GridMapperNode(ThinmapNode):
     tiles that are not complete are shown as they were. correction_stamp of grid and local_grid is
     the stamp of the newest trajectory that all of the map follows.
 
-    With team: true the robots of /team/claims that are joined by /join_status are cut out of scans.
+    With team: true the robots of /team/claims that are joined by /join_status are cut out of scans:
+    once they are, also of the earlier ones.
     """
 
     def __init__(self) -> None:
@@ -220,7 +221,8 @@ class GridMapperNode(ThinmapNode):
             self.reset_state()
         destination = localized.destination if self._settings.mapping else Destination.NOWHERE
         with self.diagnostics.time_step('map update'):
-            scan = self._team.without(localized.scan, localized.T_map_base)
+            self._mapper.grid.place_mates(self._team.places)
+            scan = self._team.noted(localized.scan)
             update = self._mapper.step(
                 replace(localized, scan=scan, destination=destination, trajectory=None)
             )

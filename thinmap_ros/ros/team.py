@@ -269,14 +269,24 @@ class HeardRobots:
 
     def motions(self) -> list[HeardMotion]:
         """Motions of the robots that are joined and were heard lately, in this robot's map."""
+        return [
+            HeardMotion(claim.in_map(self.places.poses[name]).motion, age_s)
+            for name, (claim, age_s) in self._lately().items()
+            if name in self.places.poses
+        ]
+
+    def own_motions(self) -> list[HeardMotion]:
+        """Motions of all robots that were heard lately, joined or not, each in its own map."""
+        return [HeardMotion(claim.motion, age_s) for claim, age_s in self._lately().values()]
+
+    def _lately(self) -> dict[str, tuple[RobotClaim, float]]:
+        """Claims of the robots that were heard lately, with their ages, s."""
         now_ns = self._node.elapsed_time.now_ns()
-        found = []
-        for name, heard in self._heard.items():
-            T = self.places.poses.get(name)
-            age_s = (now_ns - heard.received_ns) / SECOND_NS
-            if T is not None and 0.0 <= age_s <= self._max_age_s:
-                found.append(HeardMotion(heard.claim.in_map(T).motion, age_s))
-        return found
+        ages = {
+            name: (heard.claim, (now_ns - heard.received_ns) / SECOND_NS)
+            for name, heard in self._heard.items()
+        }
+        return {name: each for name, each in ages.items() if 0.0 <= each[1] <= self._max_age_s}
 
     def _on_claim(self, message: TeamClaim) -> None:
         claim = claim_from_msg(message)

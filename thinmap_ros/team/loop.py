@@ -14,7 +14,6 @@ from thinmap_ros.core.planning.navigator import Command
 from thinmap_ros.core.planning.path_follower import NEAR_ROBOT_M, Motion, must_stop
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
-from thinmap_ros.core.sensing.beams import without_robots
 from thinmap_ros.sim.coverage import ObservableCells
 from thinmap_ros.sim.simulation import STEP_NS, SensorReadings
 from thinmap_ros.team.maps import TeamMaps
@@ -149,7 +148,7 @@ class TeamLoop:
         for number, member in self._working():
             places = np.array([m.pose[:2] for m in self._recent_motions(member)]).reshape(-1, 2)
             cut_m = member.radius_m + _CUT_MARGIN_M
-            seen = without_robots(scans[number], member.pose, places, cut_m)
+            seen = scans[number].without_places(member.pose, places, cut_m)
             estimates[number] = self.maps.add_scan(number, seen, member.moment.T_odom_base)
         self.maps.update({i: estimate.T_map_base for i, estimate in estimates.items()}, now_s)
         self._scans += 1

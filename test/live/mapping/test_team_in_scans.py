@@ -43,12 +43,13 @@ class Room:
         """Time of the last scan."""
         return self._ns / 1e9
 
-    def tells(self, x, y):
+    def tells(self, x, y, is_joined=True):
         """The other robot tells its place until the mapper has it."""
         heard = self._doctor.number('grid_mapper', '/team/claims: received')
 
         def is_heard():
-            self.talk.join()
+            if is_joined:
+                self.talk.join()
             self.talk.stands_at(x, y)
             return self._doctor.number('grid_mapper', '/team/claims: received') > heard
 
@@ -91,6 +92,21 @@ def test_a_robot_that_tells_its_place_is_no_wall(graph):
     room.tells(3.5, 1.0)
     room.sees_robot_at(3.5, 1.0, tells=True)
     assert not room.has_wall_at(3.5, 1.0)
+
+
+def test_a_robot_that_is_joined_later_is_no_wall_from_then_on(graph):
+    room = Room(graph, team=True, team_name=ME)
+    room.tells(3.5, 1.0, is_joined=False)
+    room.sees_robot_at(3.5, 1.0, tells=True)
+    assert room.has_wall_at(3.5, 1.0)
+
+    def is_cut_out():
+        room.talk.join()
+        room.sees_robot_at(4.5, 3.0, tells=True)  # it has driven on
+        return not room.has_wall_at(3.5, 1.0)
+
+    graph.until(is_cut_out, 'a map without the robot')
+    assert room.has_wall_at(5.9, 1.0)
 
 
 def test_a_robot_that_is_silent_for_long_is_a_wall(graph):

@@ -22,6 +22,9 @@ from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.stage import Destination
 
 _MAX_PLACE = 1 << 26  # more places than lie within MAX_COORDINATE_M
+# Of the place of another robot's map: less than what is cut out around a robot beside it.
+_CORRECTED_M = 0.1
+_CORRECTED_RAD = 0.02
 _MARGIN_CELLS = 2  # by which the cells of a scan may lie beyond the ends of its beams
 MAX_OPEN = 1000  # scans that wait, the latest; 10 MB of a robot that stands at a start pose
 
@@ -383,6 +386,7 @@ class Rerendering:
         dropping: frozenset[str] = frozenset(),
         erased: Sequence[Array] = (),
         bodies: Mapping[str, Array | None] | None = None,
+        mates: Mapping[str, Array] | None = None,
     ) -> None:
         """Start with the stored scans at their poses (N, 3).
 
@@ -390,9 +394,11 @@ class Rerendering:
         dropping: frames of the lasers that drop out, as is known now, for all their scans, and for
         those of an unknown laser; those that have it, keep it;
         erased: polygons (M, 2), m, of which only scans since show anything; bodies: what each
-        laser, by its frame, is known to see of the robot.
+        laser, by its frame, is known to see of the robot; mates: places (3,) of the maps of other
+        robots, by their names.
         """
         self._bodies = bodies or {}
+        self._mates = mates or {}
         self._dropping = dropping
         self._erased = erased
         self.grid = OccupancyGrid(like.config, like.frame)
@@ -412,7 +418,8 @@ class Rerendering:
     def add_scan(self, kept: StoredScan, T_map_base: Array) -> None:
         """Add a scan that arrived meanwhile, made at a pose (3,) that is already correct."""
         with suppress(InputError):  # it is shown when all is complete
-            self._added.add_scan(kept.scan, T_map_base)
+            seen = kept.scan.without_robots(T_map_base, self._mates)
+            self._added.add_scan(seen, T_map_base)
         box = _tile_boxes([kept.extent], T_map_base[None], self.grid.frame)[0]
         tiles = int(np.prod(box[1] - box[0] + 1))
         self._queue.append(kept, T_map_base, tiles)
@@ -433,6 +440,7 @@ class Rerendering:
             try:
                 scan = task.stored.scan
                 scan = scan.without_body(self._bodies.get(scan.frame))
+                scan = scan.without_robots(task.T_map_base, self._mates)
                 drops_out = scan.frame in self._dropping or bool(self._dropping and not scan.frame)
                 scan = replace(scan, drops_out=drops_out or scan.drops_out)
                 erased = self._erased[task.stored.erasures :]
@@ -479,7 +487,7 @@ class CorrectableGrid:
     """A grid that is re-rendered from stored scans after a loop closure, one slice per scan.
 
     So it is when the beams without return of a laser turn out to show no free space (`drops_out`),
-    or some of its beams to end at the robot (`body_m`).
+    or some of its beams to end at the robot (`body_m`), or at another one (`place_mates`).
     `shown` is the published map. It is always complete: each tile shows the old rendering until its
     new one is complete. `corrected_ns` is the stamp of the newest correction that has been
     applied to the whole map.
@@ -509,6 +517,9 @@ class CorrectableGrid:
         self.erasures = erasures or Erasures()
         self._dropping: frozenset[str] = frozenset()  # frames of the lasers that drop out
         self._bodies: dict[str, Array | None] = {}  # by the frame of the laser
+        self._mates: dict[str, Array] = {}  # place (3,) of the map of each other robot
+        # Where each of them was, in its own map: x, y, radius (m), one for each cell of some size.
+        self._heard: dict[str, dict[tuple[int, int], Array]] = {}
         self._refusals: list[str] = []
         history: PoseHistory[StoredScan] = PoseHistory()
         for scan, T_scan in scans:
@@ -584,6 +595,38 @@ class CorrectableGrid:
             self._open.clear()
             self._store_apart(scan, T_map_base)
 
+    def place_mates(self, places: Mapping[str, Array]) -> None:
+        """Cut other robots out of the scans: their maps have places (3,) in this one, by name.
+
+        Where one was while its place was unknown, it is a wall: these cells then show what the
+        stored scans do without it.
+        """
+        before = self._mates
+        self._mates = {name: _kept_place(before.get(name), T) for name, T in places.items()}
+        for name, T in self._mates.items():
+            if T is not before.get(name) and name in self._heard:
+                heard = np.array(list(self._heard[name].values()))
+                self._cut_again(se2.transform_points(T, heard[:, :2]), heard[:, 2])
+
+    def _cut_again(self, places: Array, radii_m: Array) -> None:
+        """Render the cells around places (N, 2) again, each within a radius (N,), m."""
+        if self._history is None:
+            return
+        bounds, near = _around(places, radii_m, self.shown.frame)
+        kept = self._history.kept()
+        poses = self._history.kept_poses()
+        boxes = _tile_boxes([each.extent for each in kept], poses, self.shown.frame)
+        low = np.array(bounds[:2]) // TILE
+        high = np.array(bounds[2:]) // TILE
+        some = np.flatnonzero(((boxes[:, 0] <= high) & (boxes[:, 1] >= low)).all(axis=1))
+        rendering = self._rendering([kept[k] for k in some.tolist()], poses[some])
+        unseen = OccupancyGrid(self.shown.config, self.shown.frame)
+        while not rendering.is_complete:
+            self._refusals += rendering.render_slice(unseen)
+        odds = np.where(near, rendering.grid.odds(bounds), self.shown.odds(bounds))
+        self.shown.set_odds(bounds, odds)
+        self._rerendering = None  # it has begun without this robot's place
+
     def erase(self, corners: Array, stamp_ns: int) -> None:
         """Set a polygon (M, 2), m, to unknown until later scans show it.
 
@@ -653,7 +696,8 @@ class CorrectableGrid:
 
     def _add_scan(self, scan: Scan, T_map_base: Array) -> None:
         try:
-            self.shown.add_scan(scan, T_map_base)
+            self._note_robots(scan)
+            self.shown.add_scan(scan.without_robots(T_map_base, self._mates), T_map_base)
         except InputError as error:
             self._refusals.append(str(error))
             return
@@ -664,10 +708,31 @@ class CorrectableGrid:
         if self._rerendering is not None:
             self._rerendering.add_scan(kept, T_map_base)
 
+    def _note_robots(self, scan: Scan) -> None:
+        """Remember where other robots were."""
+        for robot in scan.robots:
+            x, y, _ = robot.T_own_base.tolist()
+            place = (math.floor(x / _CORRECTED_M), math.floor(y / _CORRECTED_M))
+            reach_m = robot.radius_m + _CORRECTED_M
+            self._heard.setdefault(robot.name, {})[place] = np.array([x, y, reach_m])
+
     def _stored(self, scan: Scan) -> StoredScan:
         """The scan of a laser of which it is found out later whether it drops out."""
         scan = replace(scan, drops_out=False)
         return StoredScan.of(scan, self.shown.config, len(self.erasures))
+
+    def _rendering(self, kept: Sequence[StoredScan], poses: Array) -> Rerendering:
+        """Stored scans at poses (N, 3), to be rendered."""
+        return Rerendering(
+            self.shown,
+            kept,
+            poses,
+            self._T_map_base,
+            self._dropping,
+            [item.corners for item in self.erasures.items],
+            self._bodies,
+            self._mates,
+        )
 
     def _render_slice(self) -> CorrectedPoses | None:
         if self._history is None or self._pending_ns is None:
@@ -675,15 +740,7 @@ class CorrectableGrid:
         if self._rerendering is None:
             kept = self._history.kept()
             poses = self._history.kept_poses()
-            self._rerendering = Rerendering(
-                self.shown,
-                kept,
-                poses,
-                self._T_map_base,
-                self._dropping,
-                [item.corners for item in self.erasures.items],
-                self._bodies,
-            )
+            self._rerendering = self._rendering(kept, poses)
             # The step that closes a loop is already long: rendering starts with the next one.
             return None
         self._refusals += self._rerendering.render_slice(self.shown)
@@ -694,3 +751,27 @@ class CorrectableGrid:
         self._pending_ns = None
         self._rerendering = None
         return self._history.accept_corrections()
+
+
+def _kept_place(before: Array | None, T: Array) -> Array:
+    """A place (3,) of a map: the former one, where it has only been corrected a little since."""
+    is_same = before is not None and not se2.are_apart(before, T, _CORRECTED_M, _CORRECTED_RAD)
+    return before if before is not None and is_same else T
+
+
+def _around(places: Array, radii_m: Array, frame: GridFrame) -> tuple[Bounds, Mask]:
+    """Cells (H, W) within a radius (N,), m, of one of some places (N, 2), and their bounds."""
+    low = frame.cells_of(places - radii_m[:, None]).min(axis=0)
+    high = frame.cells_of(places + radii_m[:, None]).max(axis=0) + 1
+    row, col = low.tolist()
+    end_row, end_col = high.tolist()
+    near = np.zeros((end_row - row, end_col - col), dtype=np.bool_)
+    for (at_col, at_row), radius_m in zip(frame.in_cells(places), radii_m, strict=True):
+        reach = radius_m / frame.resolution
+        first = np.maximum(np.floor([at_row - reach, at_col - reach]).astype(int) - low, 0)
+        last = np.ceil([at_row + reach, at_col + reach]).astype(int) - low + 1
+        part = near[first[0] : last[0], first[1] : last[1]]
+        rows, cols = np.indices(part.shape)
+        offs = (rows + first[0] + row + 0.5 - at_row, cols + first[1] + col + 0.5 - at_col)
+        part |= np.hypot(*offs) < reach
+    return (row, col, end_row, end_col), near

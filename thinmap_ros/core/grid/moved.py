@@ -103,6 +103,15 @@ def overlaid(base: GridPatch, other: GridPatch, T_base_other: Array) -> GridPatc
 
 def overlaid_bent(base: GridPatch, other: GridPatch, motion: MapMotion) -> GridPatch:
     """As `overlaid`, with the other map moved into the frame of the base part by part."""
+    wide, laid = laid_on(base, other, motion)
+    return GridPatch(wide.frame, np.where(wide.cells == UNKNOWN, laid.cells, wide.cells))
+
+
+def laid_on(base: GridPatch, other: GridPatch, motion: MapMotion) -> tuple[GridPatch, GridPatch]:
+    """A map with room for another one, and that one moved, on the same cells.
+
+    Raises InputError where the map would have more than MAX_CELLS cells.
+    """
     cell_m = base.frame.resolution
     own, shape = _bounds(other, motion)
     rows_cols = base.frame.cells_of(np.array([[own.origin_x, own.origin_y]]))[0]
@@ -114,7 +123,7 @@ def overlaid_bent(base: GridPatch, other: GridPatch, motion: MapMotion) -> GridP
         raise InputError(f'joined map: {rows} x {cols} cells: expected {MAX_CELLS} at most')
     padded = base.padded((int(before[0]), int(before[1]), int(after[0]), int(after[1])))
     laid = _resampled(other, motion, padded.frame, padded.shape)
-    return GridPatch(padded.frame, np.where(padded.cells == UNKNOWN, laid, padded.cells))
+    return padded, GridPatch(padded.frame, laid)
 
 
 def _resampled(

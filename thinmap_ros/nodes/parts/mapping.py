@@ -1,7 +1,7 @@
 """Parts of the grid mapper: scans in, edits, and the map on topics."""
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,9 +21,8 @@ from thinmap_ros.core.errors import ConfigError, InputError, counted
 from thinmap_ros.core.grid.edits import KeepOut
 from thinmap_ros.core.grid.mapper import Mapper, MapUpdate, WholeMap
 from thinmap_ros.core.grid.patch import Bounds, GridFrame, GridPatch, Margins
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import NearbyRobot, Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.sensing.beams import without_robots
 from thinmap_ros.core.stage import Trajectory
 from thinmap_ros.files.keep_out_masks import outlines_of, read_mask
 from thinmap_ros.logs import decode
@@ -504,18 +503,26 @@ class RobotCutConfig(Config):
 
 
 class TeamInScans:
-    """Cuts the other robots out of scans; without a team, nothing."""
+    """Tells a map which other robots are near by, and where their maps lie; without a team, none.
+
+    Robots that are not joined yet are remembered, too, to be cut out of the scans once they are.
+    """
 
     def __init__(self, node: ThinmapNode) -> None:
         """Declare the parameters."""
         self._heard = heard_robots(node)
         self._cut_m = parameters.declare_config(node, RobotCutConfig).robot_cut_radius_m
 
-    def without(self, scan: Scan, T_map_base: Array) -> Scan:
-        """A scan made at a pose (3,) without the beams that end at another robot."""
-        if self._heard is None:
-            return scan
-        for motion, age_s in self._heard.motions():
-            radius_m = self._cut_m + abs(motion.v) * age_s
-            scan = without_robots(scan, T_map_base, motion.pose[None, :2], radius_m)
-        return scan
+    @property
+    def places(self) -> Mapping[str, Array]:
+        """Where the maps of robots that are joined lie (3,), by their names."""
+        return {} if self._heard is None else self._heard.places.poses
+
+    def noted(self, scan: Scan) -> Scan:
+        """A scan with the robots that were heard lately."""
+        motions = [] if self._heard is None else self._heard.own_motions()
+        robots = tuple(
+            NearbyRobot(motion.robot, motion.pose, self._cut_m + abs(motion.v) * age_s)
+            for motion, age_s in motions
+        )
+        return replace(scan, robots=robots) if robots else scan

@@ -12,7 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.moved import MapMotion, overlaid_bent
+from thinmap_ros.core.grid.fused import Layer, fused
+from thinmap_ros.core.grid.moved import MapMotion, laid_on, overlaid_bent
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.places.piece import SAME_M, SAME_RAD
 from thinmap_ros.core.places.recognition import JOIN_ODDS, recognize
@@ -549,23 +550,46 @@ def merged(
     before: TeamMap | None,
     bent: Mapping[str, Array] | None = None,
 ) -> TeamMap:
-    """Merge the maps that have a place (3,) in the world; what the first knows comes first.
+    """Merge the maps that have a place (3,) in the world, on the cells of the first; see `fused`.
 
     before: the map that was merged last, whose ids are continued; None: ids are those of the first
     map, as far as they can be. bent: poses (N, 3) of the keyframes of each map that bends, world
     frame.
     """
     motions = {name: _motion(maps[name], T, (bent or {}).get(name)) for name, T in places.items()}
-    first, *others = places
-    patch = _moved(maps[first].patch, motions[first], places[first])
-    for name in others:
-        patch = overlaid_bent(patch, maps[name].patch, motions[name])
+    first = next(iter(places))
+    patch = _fused(maps, motions, places[first])
     known = before or _begun(first, maps[first].graph, patch, motions[first])
     builder = TopologyBuilder.continued(patch, known.graph, known.next_id)
     for name in places.keys() - known.names:
         graph = _moved_graph(maps[name].graph, motions[name])
         builder, _ = join_topologies(patch, builder.map, graph, builder.next_id)
     return TeamMap(frozenset(places), patch, builder.map, builder.next_id)
+
+
+def _fused(
+    maps: Mapping[str, RobotMap], motions: Mapping[str, MapMotion], T_world_first: Array
+) -> GridPatch:
+    """The cells of maps that are moved by motions; T_world_first (3,): place of the first one."""
+    first, *others = motions
+    patch = _moved(maps[first].patch, motions[first], T_world_first)
+    if not others:
+        return patch
+    moved = [patch]
+    for name in others:
+        patch, own = laid_on(patch, maps[name].patch, motions[name])
+        moved.append(own)
+    layers = [
+        Layer(own.padded(own.overhang_of(patch)), _driven(maps[name], motions[name]))
+        for name, own in zip(motions, moved, strict=True)
+    ]
+    return fused(layers, 2.0 * math.sqrt(_MATCHED[0, 0]))
+
+
+def _driven(robot: RobotMap, motion: MapMotion) -> Array:
+    """Places (N, 2), world frame, where a robot has been, as far as its keyframes tell."""
+    poses = np.zeros((0, 3)) if robot.keyframes is None else robot.keyframes.poses
+    return motion.moved(poses[:, :2])
 
 
 def _motion(robot: RobotMap, T: Array, bent: Array | None) -> MapMotion:
