@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,6 +41,8 @@ _SIM_TIME = ['-p', 'use_sim_time:=true']
 # Subscribers of the scans of a robot: simulated time waits for all of them.
 _SCAN_LISTENERS = 4
 _SLEEP_S = 0.05
+_WORLD = 'room_10x10'
+_TEAM_WORLD = 'lab'  # large enough that robots which do not know each other's starts gain time
 _PORT = 8480
 _MAX_PORT = 65535
 
@@ -243,6 +246,7 @@ def _work(arguments: argparse.Namespace) -> None:
         raise InputError(f'--view: {rerun_sinks.ADVICE}')
     if arguments.web and find_spec('tornado') is None:
         raise InputError('--web: tornado is not installed: pip install tornado')
+    arguments.world = arguments.world or (_WORLD if arguments.robots == 1 else _TEAM_WORLD)
     world = package_data.world_path(arguments.world)
     arguments.out = out_folder(arguments.out, 'demo')
     starts = _starts(arguments, world)
@@ -264,7 +268,18 @@ def _work(arguments: argparse.Namespace) -> None:
     )
     for line in report.get('joins', []):
         print(f'  joined: {line}')
+    if len(starts) > 1:
+        print(f'  {_together(report)}')
     print(_next_steps(arguments.out, len(starts)))
+
+
+def _together(report: dict[str, Any]) -> str:
+    """For how long the robots shared what was left: before their maps are joined, they cannot."""
+    joined = [robot['joined_at'] for robot in report['robots']]
+    if None in joined:
+        return 'not all maps were joined: these robots explored alone'
+    shared_s = max(report['time'] - max(joined), 0.0)
+    return f'explored together for the last {shared_s:.0f} of {report["time"]:.0f} s, alone before'
 
 
 def _next_steps(out: Path, count: int) -> str:
@@ -272,7 +287,8 @@ def _next_steps(out: Path, count: int) -> str:
     folder = out.parent
     after = ' (after `source scripts/env`)' if cli.is_module() else ''
     office = ['explore_world', 'office', '-o', str(folder / 'office')]
-    demo = ['demo', '--world', 'office', '-o', str(folder / 'demo_office')]
+    world = 'office' if count == 1 else _TEAM_WORLD
+    demo = ['demo', '--world', world, '-o', str(folder / f'demo_{world}')]
     robots = [] if count == 1 else ['--robots', str(count)]
     commands = [cli.command_of(*office, *robots), cli.command_of(*demo, *robots)]
     if count == 1:
@@ -291,7 +307,9 @@ def main() -> None:
     """Run the program."""
     parser = Parser('demo', __doc__)
     parser.add_argument(
-        '--world', default='room_10x10', help='world or map YAML file, or a world of the package'
+        '--world',
+        help='world or map YAML file, or a world of the package (default '
+        f'{_WORLD}, of several robots {_TEAM_WORLD})',
     )
     pioneers = [name for name in PRESETS if name not in LASERS]
     parser.add_argument(
