@@ -40,6 +40,7 @@ def test_looks_from_one_place_count_once_and_the_piece_returns_by_those_of_two()
     for number in range(5):
         reckoned.add(at(0.1 * number), edge(number), np.zeros(3), EXACT, SEARCH)
     assert reckoned.log_odds < RETURNS
+    assert reckoned.has_looked_from(at(1.0)) and not reckoned.has_looked_from(at(2.0))
     reckoned.add(at(2.0), edge(5), np.zeros(3), EXACT, SEARCH)
     assert reckoned.log_odds >= RETURNS
     assert [each.b for each in reckoned.edges] == [4, 5]

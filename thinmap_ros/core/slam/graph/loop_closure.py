@@ -422,6 +422,9 @@ EDGE_NOISE = np.diag(np.square([0.05, 0.05, 0.02]))
 # log, and one done at a time, a loop was closed up to 344 scans after its keyframes.
 _LATEST = 20
 
+# Of a scan that is searched for within all of the largest reach: as many again take twice as long.
+_FAR_POINTS = 45
+
 
 @dataclass(frozen=True)
 class LoopClosureConfig(Config):
@@ -518,7 +521,7 @@ class LoopClosure:
         self._matcher = Matcher(own)
         reach_m = config.reach_m(math.inf)
         far = (reach_m, reach_m, own.max_search[2])
-        self._far_matcher = Matcher(replace(own, max_search=far))
+        self._far_matcher = Matcher(replace(own, max_search=far, search_points=_FAR_POINTS))
 
     @property
     def anchor(self) -> Anchor:
@@ -741,6 +744,10 @@ class LoopClosure:
         here = self._frame(k)
         frames = self.keyframes.frames
         is_step = self.keyframes.is_step(j, k)
+        is_ambiguous = not is_step and self._is_ambiguous(job.covariance)
+        reckoned = self._reckoned(frames[j], here)
+        if is_ambiguous and reckoned and reckoned.has_looked_from(here.T_map_base[:2]):
+            return
         if is_step:
             base, submap = self._submaps.before(frames, j)
         else:
@@ -750,10 +757,8 @@ class LoopClosure:
         config = self._config
         prior = se2.between(base, here.T_map_base)
         relative = rotated_covariance(job.covariance, -float(base[2])) + 4.0 * EDGE_NOISE
-        is_ambiguous = not is_step and self._is_ambiguous(job.covariance)
         matcher = self._far_matcher if is_ambiguous else self._matcher
         match = matcher.match(here.points, here.scan.T_base_laser, submap, prior, relative)
-        reckoned = self._reckoned(frames[j], here)
         if match.inlier_ratio < config.min_inlier_ratio:
             if reckoned is not None and match.contradiction_ratio > CONTRARY_RATIO:
                 reckoned.add_contrary(here.T_map_base[:2])

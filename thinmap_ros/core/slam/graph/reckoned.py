@@ -109,6 +109,10 @@ class Reckoned:
         """
         return path_m <= self._begin_m - min(_LATE_M, 0.5 * self._begin_m)
 
+    def has_looked_from(self, place: Array) -> bool:
+        """Whether a look from near a place (2,), m, is counted already."""
+        return bool(self._near(place))
+
     def add_contrary(self, place: Array) -> None:
         """Add a look from a place (2,), m, that finds nothing of the map, and contradicts it."""
         self._count(_Look(place, _CONTRARY, None))
@@ -120,10 +124,13 @@ class Reckoned:
 
     def _count(self, look: _Look) -> None:
         """Keep a look instead of those near it that tell less; none if one of these tells more."""
-        near = [each for each in self._looks if math.dist(each.place, look.place) < _LOOK_M]
+        near = self._near(look.place)
         if all(each.log_ratio <= look.log_ratio for each in near):
             self._looks = [each for each in self._looks if each not in near]
             self._looks.append(look)
+
+    def _near(self, place: Array) -> list[_Look]:
+        return [each for each in self._looks if math.dist(each.place, place) < _LOOK_M]
 
     def _covariance_at(self, place: Array) -> Array:
         """Covariance (3, 3) of the piece at a place (2,), m, that lies away from its beginning.

@@ -118,6 +118,7 @@ class Atlas:
 
     A piece that is apart is looked for in the published map, a little with each scan, by the views
     along its path. Where the odds are high enough, both are joined by matches of its keyframes.
+    What recognition needs of the published map is kept: the next search adds what is new.
     Source: Elvira, Tardos and Montiel, "ORBSLAM-Atlas: a robust and accurate multi-map system",
     2019.
     """
@@ -127,6 +128,7 @@ class Atlas:
         self._loops = loops
         self._join: Join | None = None
         self._search: _PieceSearch | None = None
+        self._known: GrowingPiece | None = None
 
     @property
     def apart(self) -> Apart | None:
@@ -146,14 +148,24 @@ class Atlas:
             return
         if self._loops.graph.is_moving:
             return
-        frames = self._loops.keyframes.frames
-        if self._search is None or self._search.is_outdated(self._loops):
-            published = (k for k, frame in enumerate(frames) if pieces.is_published(frame.submap))
-            self._search = _PieceSearch(pieces.piece, published)
         search = self._search
-        self._search = None  # begun again if this step of it fails
+        if search is None or search.is_outdated(self._loops):
+            search = self._begun()
+        self._search = None  # begun again if this step of it fails, with all of the map
+        self._known = None
         self._join = search.step(self._loops, join_odds) or self._join
         self._search = search
+        self._known = search.known
+
+    def _begun(self) -> '_PieceSearch':
+        """A search for the piece that the robot is in; a map that was bent is made again."""
+        frames = self._loops.keyframes.frames
+        pieces = self._loops.pieces
+        published = [k for k, frame in enumerate(frames) if pieces.is_published(frame.submap)]
+        known = self._known
+        if known is None or known.is_bent(frames) or not {*known.numbers} <= {*published}:
+            known = GrowingPiece()
+        return _PieceSearch(pieces.piece, known, sorted({*published} - {*known.numbers}))
 
     def take_join(self) -> Join | None:
         """The join that a correction has completed; None where it was a loop of its own."""
@@ -165,12 +177,12 @@ class Atlas:
 class _PieceSearch:
     """Looks for a piece in the published map."""
 
-    def __init__(self, piece: int, published: Iterable[int]) -> None:
-        """piece: its number; published: numbers of the keyframes of the published map."""
+    def __init__(self, piece: int, known: GrowingPiece, waiting: Iterable[int]) -> None:
+        """piece: its number; known: of the published map; waiting: its keyframes not yet in it."""
         self._log_odds = -math.inf
         self._piece = piece
-        self._known = GrowingPiece()
-        self._waiting = deque(published)
+        self.known = known
+        self._waiting = deque(waiting)
         self._query = GrowingPiece()
         self._next = 0  # keyframe that is looked at next
         self._recognition: Recognition | None = None
@@ -189,7 +201,7 @@ class _PieceSearch:
         is_corrected = self._revision != loops.keyframes.revision
         self._revision = loops.keyframes.revision
         frames = loops.keyframes.frames
-        return is_corrected and (self._known.is_bent(frames) or self._query.is_bent(frames))
+        return is_corrected and (self.known.is_bent(frames) or self._query.is_bent(frames))
 
     def step(self, loops: LoopClosure, join_odds: float) -> Join | None:
         """Do one of: add keyframes, look for a view, match a keyframe, join both."""
@@ -199,9 +211,9 @@ class _PieceSearch:
         if self._waiting:
             for _ in range(min(_KEYFRAMES_PER_SCAN, len(self._waiting))):
                 number = self._waiting.popleft()
-                self._known.add(number, frames[number])
+                self.known.add(number, frames)
             if not self._waiting:
-                self._known.end_path()
+                self.known.end_path()
         elif self._has_view and not loops.pieces.is_other_storey():
             self._look(loops.pieces, join_odds)
         else:
@@ -220,15 +232,15 @@ class _PieceSearch:
             number = self._next
             self._next += 1
             if loops.pieces.is_here(frames[number].submap):
-                self._query.add(number, frames[number])
+                self._query.add(number, frames)
                 return
 
     def _look(self, pieces: Pieces, join_odds: float) -> None:
         """Look for the next view, and begin to join if the place is sure."""
-        if not len(self._known):
+        if not len(self.known):
             return
         if self._recognition is None:
-            self._recognition = Recognition(self._known.map_piece(pieces.published_tag))
+            self._recognition = Recognition(self.known.map_piece(pieces.published_tag))
         recognition = self._recognition
         view = self._query.views[len(recognition.views)]
         recognition.add(view, self._query.landmarks(view))
@@ -238,7 +250,7 @@ class _PieceSearch:
         if decision.is_joined and decision.placement is not None:
             placement = decision.placement
             priors = placed_keyframes(self._query.frames, self._query.views, placement.hypothesis)
-            matches = match_keyframes(self._known.frames, self._query.frames, priors)
+            matches = match_keyframes(self.known.frames, self._query.frames, priors)
             self._matching = _Matching(placement, decision.log_odds, matches, [])
 
     def _match(self, matching: _Matching, loops: LoopClosure) -> Join | None:
@@ -250,13 +262,13 @@ class _PieceSearch:
             is_linked = len(matching.links) >= loops.min_consistent_matches
             return self._joined(matching, loops) if is_linked else None
         if link is not None:
-            a = self._known.numbers[link.a]
+            a = self.known.numbers[link.a]
             matching.links.append(replace(link, a=a, b=self._query.numbers[link.b]))
         return None
 
     def _joined(self, matching: _Matching, loops: LoopClosure) -> Join:
         frames = loops.keyframes.frames
-        T_map_known = frames[self._known.numbers[0]].T_map_base
+        T_map_known = frames[self.known.numbers[0]].T_map_base
         T_map_query = frames[self._query.numbers[0]].T_map_base
         T_map_joined = se2.compose(T_map_known, matching.placement.T_map_piece)
         T = se2.compose(T_map_joined, se2.invert(T_map_query))

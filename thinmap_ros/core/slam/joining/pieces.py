@@ -28,16 +28,17 @@ _CELL_M = 0.1
 class GrowingPiece:
     """A piece that grows: keyframes in the frame of the first of them, grid, graph and views.
 
-    That is all that recognition needs of it. numbers: of the keyframes in the pose graph.
+    That is all that recognition needs of it. numbers: of the keyframes in the pose graph. The graph
+    follows the grid with each view: this takes hardly longer than with each keyframe.
     """
 
     def __init__(self) -> None:
         self.numbers: list[int] = []
         self.frames: list[Keyframe] = []
         self.views: list[View] = []
-        self._origin = np.zeros(3)
         self._grid = OccupancyGrid(OccupancyConfig(resolution_m=_CELL_M))
         self._topology = TopologyBuilder(TopologyConfig())
+        self._in_graph = 0  # keyframes
         self._views = ViewBuilder()
 
     def __len__(self) -> int:
@@ -48,21 +49,20 @@ class GrowingPiece:
         """Length of the path, m."""
         return self.frames[-1].path_m - self.frames[0].path_m if self.frames else 0.0
 
-    def add(self, number: int, frame: Keyframe) -> None:
-        """Add a keyframe of the pose graph; it is left out where it fits into no map."""
-        if not self.frames:
-            self._origin = frame.T_map_base
-        own = replace(frame, T_map_base=se2.between(self._origin, frame.T_map_base))
+    def add(self, number: int, frames: Sequence[Keyframe]) -> None:
+        """Add a keyframe of those of the pose graph; it is left out where it fits into no map."""
+        frame = frames[number]
+        first = frames[self.numbers[0]] if self.numbers else frame
+        own = replace(frame, T_map_base=se2.between(first.T_map_base, frame.T_map_base))
         try:
             self._grid.add_scan(own.scan, own.T_map_base)
         except InputError:
             return
         self.numbers.append(number)
         self.frames.append(own)
-        changes = self._grid.take_changes()
-        if changes is not None:
-            self._topology.update(changes, own.T_map_base)
-        self.views += self._views.add(own)
+        if views := self._views.add(own):
+            self.views += views
+            self._update_graph()
 
     def end_path(self) -> None:
         """Make the views at the end of the path, after the last keyframe."""
@@ -70,6 +70,7 @@ class GrowingPiece:
 
     def map_piece(self, tag: str = '') -> MapPiece:
         """The piece as it is now; tag: of its storey."""
+        self._update_graph()
         return MapPiece(self.frames, self._grid.known_area(), self._topology.map, self.views, tag)
 
     def landmarks(self, view: View) -> Landmarks:
@@ -87,6 +88,14 @@ class GrowingPiece:
         own = np.array([frame.T_map_base for frame in self.frames])
         moved = np.array([se2.between(poses[0], T) for T in poses])
         return bool(np.hypot(*(moved - own)[:, :2].T).max() > SAME_M)
+
+    def _update_graph(self) -> None:
+        """Let the graph follow the grid."""
+        changes = self._grid.take_changes()
+        if changes is not None:
+            places = [frame.T_map_base for frame in self.frames[self._in_graph :]]
+            self._topology.update(changes, np.array(places))
+            self._in_graph = len(self.frames)
 
 
 @dataclass(frozen=True, eq=False)
