@@ -212,6 +212,7 @@ class StartConfig(Config):
     """Parameters that all localizers have: which one it is, where it starts, whether it maps.
 
     of_slam: the values of `slam` that a configuration is for. Raises ConfigError for another one.
+    has_start: whether the start pose is given, also one that is exactly 0, 0, 0.
     """
 
     of_slam: ClassVar[tuple[str, ...]] = (SCAN_MATCHING, EKF_TI, EKF_FULL)
@@ -238,6 +239,8 @@ class StartConfig(Config):
         choices=(MAPPING, LOCALIZATION),
     )
 
+    has_start: bool = False
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.slam not in self.of_slam:
@@ -248,8 +251,9 @@ class StartConfig(Config):
 
     @property
     def is_start_given(self) -> bool:
-        """Whether a start pose is given: one that is not that of a new map."""
-        return (self.initial_x_m, self.initial_y_m, self.initial_yaw_rad) != (0.0, 0.0, 0.0)
+        """Whether a start pose is given: parameters alone cannot tell 0, 0, 0 from none."""
+        start = (self.initial_x_m, self.initial_y_m, self.initial_yaw_rad)
+        return self.has_start or start != (0.0, 0.0, 0.0)
 
     @property
     def is_mapping(self) -> bool:
@@ -258,6 +262,6 @@ class StartConfig(Config):
 
 
 def config_at(config: StartConfig, T_map_base: Array) -> StartConfig:
-    """The configuration with a start pose (3,)."""
+    """The configuration with a start pose (3,) that is given."""
     x, y, yaw = T_map_base.tolist()
-    return replace(config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
+    return replace(config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw, has_start=True)

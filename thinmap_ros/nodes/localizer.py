@@ -1,7 +1,7 @@
 """The pose of the robot: each scan, with the odometry at its stamp, is a step of the localizer."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any
 
@@ -425,7 +425,8 @@ class LocalizerNode(ThinmapNode):
 
     def _read(self, path: str) -> AnyLocalizer | None:
         """Localizer in a saved map, at the present pose; None where there is no such map."""
-        config = config_at(self._localizer.config, self._localizer.pose)
+        here = config_at(self._localizer.config, self._localizer.pose)
+        config = replace(here, has_start=False)  # nobody has said that it is the pose in that map
         folder = self._save_directory
         return load_localizer(folder.resolve(path), config, folder.path, self.get_logger().warning)
 

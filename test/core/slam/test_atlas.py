@@ -117,6 +117,51 @@ def test_a_start_that_was_given_wrong_is_not_drawn(session, off, is_right):
         assert all(drawn[5:])
 
 
+@pytest.mark.parametrize('is_given', [False, True])
+def test_a_start_at_the_origin_that_is_given_is_mapped_at_once(session, is_given):
+    """One that is not given waits until scans fit along the path of a view."""
+    state, keyframes, _ = session
+    config = config_at(LocalizerConfig(), np.zeros(3)) if is_given else LocalizerConfig()
+    localizer = Localizer.from_state(state, config, keyframes=keyframes)
+    moments = islice(carried((2, 0, 30.0)), 40)
+    estimates = [localizer.step(moment.scan, moment.T_odom_base) for moment in moments]
+    assert any(is_mapped(estimate) for estimate in estimates) == is_given
+
+
+_GIVEN = np.diag([0.25, 0.25, 0.07])
+
+
+@pytest.mark.parametrize(('turn', 'is_right'), [(0.0, True), (np.pi, False)])
+def test_a_pose_that_is_set_wrong_by_half_a_turn_is_not_drawn(session, turn, is_right):
+    """While mapping, the robot is in the map, or in a piece of its own."""
+    state, keyframes, T_world_map = session
+    moments = list(islice(carried((2, 1, 30.0)), 150))
+    localizer = Localizer.from_state(state, keyframes=keyframes)
+    start = se2.between(T_world_map, moments[0].T_world_base)
+    localizer.set_pose(start + [0.0, 0.0, turn], _GIVEN)
+    estimates = [localizer.step(moment.scan, moment.T_odom_base) for moment in moments]
+    assert any(is_mapped(estimate) for estimate in estimates) == is_right
+    assert estimates[-1].is_mapping_apart != is_right
+
+
+@pytest.mark.parametrize(('turn', 'is_right'), [(0.0, True), (np.pi, False)])
+@pytest.mark.parametrize('is_set', [False, True])
+def test_in_a_given_map_a_robot_whose_pose_is_given_wrong_by_half_a_turn_is_lost(
+    session, turn, is_right, is_set
+):
+    """At its start, or by a service, as AMCL has it."""
+    state, _, T_world_map = session
+    moments = list(islice(carried((2, 1, 30.0)), 150))
+    start = se2.between(T_world_map, moments[0].T_world_base) + [0.0, 0.0, turn]
+    config = LocalizerConfig(mode=LOCALIZATION)
+    localizer = Localizer.from_state(state, config if is_set else config_at(config, start))
+    if is_set:
+        localizer.set_pose(start, _GIVEN)
+    lost = [localizer.step(moment.scan, moment.T_odom_base).is_lost for moment in moments]
+    assert lost[-1] != is_right
+    assert any(lost[5:]) != is_right
+
+
 @pytest.mark.parametrize('drives', [((3, 0, 30.0), (4, 1, 5.0)), ((2, 0, 25.0), (5, 1, 5.0))])
 def test_scans_of_another_place_do_not_change_the_map_until_it_agrees_with_them(drives):
     """Neither those that contradict it, nor, once there is much evidence, those that fit badly."""

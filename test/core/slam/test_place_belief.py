@@ -90,6 +90,7 @@ def test_a_robot_that_was_kidnapped_in_a_given_map_is_lost_until_scans_fit():
 def test_a_given_pose_ends_a_guess():
     evidence = tried((0.0, 1.0), is_guess=True)
     evidence.place()
+    evidence.judge_start(0.0)
     evidence.update(match(1.0, 0.0))
     assert not evidence.is_lost and evidence.permits_mapping
 

@@ -313,9 +313,9 @@ class Localizer:
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Set the pose (3,) with covariance (3, 3) in the current map.
 
-        The map is not updated until scans confirm the pose. In a map that does not change, the
-        robot is lost until then. A piece of map that is apart is left: the pose is in the published
-        map.
+        The map is not updated until scans confirm the pose: looks on the way may speak against it.
+        In a map that does not change, the robot is lost until then. A piece of map that is apart is
+        left: the pose is in the published map.
         """
         if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
             self._rejected += 1
@@ -515,10 +515,9 @@ class Localizer:
         else:
             self._local.load(given, len(self.keyframes))
         self._place(start, self._tracker.slip_covariance())
-        is_mapping = self.config.is_mapping
         is_given = self.config.is_start_given
         self._tracker.belief.start_delocalized(
-            is_given or not is_mapping, is_guess, is_tried=is_given and is_mapping and not is_guess
+            is_given or not self.config.is_mapping, is_guess, is_tried=is_given and not is_guess
         )
 
     def _detect_loss(self) -> None:

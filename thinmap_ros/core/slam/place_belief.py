@@ -61,6 +61,7 @@ class _Trial:
         log_odds: of the pose; 0 where nobody gave it.
         """
         self.is_guess = is_guess
+        self.is_given = log_odds > 0.0
         self.log_odds = log_odds
         self.is_judged = False
         self._path_m = 0.0
@@ -181,8 +182,9 @@ class PlaceBelief:
     @property
     def is_lost(self) -> bool:
         """Whether scans have not confirmed the pose at which the robot was placed in the map."""
-        is_guess = self._trial is not None and self._trial.is_guess
-        return self.is_delocalized and (is_guess or not self.agrees)
+        trial = self._trial
+        is_doubtful = trial is not None and (trial.is_guess or trial.log_odds < 0.0)
+        return self.is_delocalized and (is_doubtful or not self.agrees)
 
     @property
     def needs_submap(self) -> bool:
@@ -279,7 +281,7 @@ class PlaceBelief:
             self._opening = _Opening()
 
     def place(self, is_map_given: bool = False) -> None:
-        """The pose was given: the robot is delocalized until scans fit.
+        """The pose was given: the robot is delocalized until scans fit, and looks do not deny it.
 
         is_map_given: the map does not change: the robot is also lost until the first scan that
         fits. Outside of the map no scan contradicts it.
@@ -287,18 +289,18 @@ class PlaceBelief:
         self.is_delocalized = True
         self._carried = 0.0
         self._is_elsewhere = False
-        self._trial = None
+        self._trial = _Trial(is_guess=False, log_odds=_GIVEN)
         self.is_unconfirmed = False
         self.level = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
         self._end_look(0.0)
 
     @property
     def is_start_judged(self) -> bool:
-        """Whether a start pose that was given waits for looks that speak for it."""
-        return self._trial is not None and self._trial.log_odds > 0.0
+        """Whether a pose that was given waits for looks that speak for it."""
+        return self._trial is not None and self._trial.is_given
 
     def judge_start(self, log_ratio: float) -> None:
-        """Add the log likelihood ratio of a look from another place to a given start pose.
+        """Add the log likelihood ratio of a look from another place to a given pose.
 
         One place alone, with people around, does not outweigh the pose.
         """

@@ -92,7 +92,7 @@ LIVE_PARAMETERS = (
 _NO_RETURNS = 'no returns from walls of the map'
 
 # Of the walls of the local map that beams would hit, or have passed through.
-_START_LOOK_M = 1.0  # between two looks that judge a start pose
+_START_LOOK_M = 1.0  # between two looks that judge a given pose
 
 _REACH = 0.9  # of range_max: a farther wall may be out of range
 
@@ -300,7 +300,7 @@ class Tracker:
         self.reckoned = DeadReckoning(start, np.zeros((3, 3)))
         self.T_anchor_update: Array | None = None
         self._looks: dict[str, LastLook] = {}  # by the frame of the laser
-        # Of a start that is judged: its pose (3,), and that of the last look, map frame.
+        # Of a given pose that is judged: it (3,), and that of the last look, map frame.
         self._start: tuple[Array, Array] | None = None
 
     def adjust(self, config: LocalizerConfig) -> None:
@@ -449,10 +449,11 @@ class Tracker:
         self.belief.move(continuity(look.scan, scan, motions), is_again)
 
     def _judge_start(self, scan: Scan, points: Array, match: Match, there: Surroundings) -> None:
-        """Judge a start pose by how a scan fits on the way from there, and at other headings.
+        """Judge a given pose by how a scan fits on the way from there, and at other headings.
 
         Each place counts once: the robot may be elsewhere, or it stands turned by a right angle, as
-        walls do.
+        walls do. Furniture may have changed since a map was made that stays as it is: there the
+        headings alone are compared.
         """
         here = match.pose
         start, last = self._start or (here, None)
@@ -472,7 +473,7 @@ class Tracker:
             for turn in (0.5 * math.pi, math.pi, -0.5 * math.pi)
         ]
         turned = there_fits - log_ratio(max(others), 0.0)
-        self.belief.judge_start(min(there_fits, turned))
+        self.belief.judge_start(min(there_fits, turned) if self._config.is_mapping else turned)
 
     def _is_at_rest(self, look: LastLook) -> bool:
         """Whether the robot has not moved since a look, but for the noise of the odometry."""
