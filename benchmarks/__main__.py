@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import days
+from benchmarks import days, place_belief
 from benchmarks.graphs import compactness, doors, map_to_graph, real_maps, voronoi
 from benchmarks.release import command as release
 from benchmarks.rows import Row, show
@@ -51,6 +51,7 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'pose_graph': pose_graph.run,
     'growth': growth.run,
     'days': days.run,
+    'place_belief': place_belief.run,
 }
 
 

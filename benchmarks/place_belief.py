@@ -1,0 +1,264 @@
+"""What each constant of the belief of place is worth: halved and doubled, on kidnaps and starts."""
+
+import math
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from benchmarks.kidnapped.trials import along
+from benchmarks.rows import Row
+from thinmap_ros.core import se2
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.slam import localizer as localizing
+from thinmap_ros.core.slam import place_belief, track
+from thinmap_ros.core.slam.graph import loop_closure, reckoned
+from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.track import LocalizerConfig
+from thinmap_ros.core.stage import Estimate
+from thinmap_ros.sim.buildings import BuildingConfig, generate_building
+from thinmap_ros.sim.drives import DriveSample, random_drive, random_start
+from thinmap_ros.sim.world import World
+
+# Where each constant is read: a module that imports it has a name of its own for it.
+CONSTANTS: dict[str, tuple[ModuleType, ...]] = {
+    'SURE': (place_belief, localizing),
+    '_GIVEN': (place_belief,),
+    '_LEAST_ODDS': (place_belief,),
+    'INLIERS_PER_CONTRADICTION': (place_belief, track),
+    '_SEEN_THROUGH': (place_belief,),
+    '_OPENING_RADIUS_M': (place_belief,),
+    '_OPENING_PATH_M': (place_belief,),
+    'RETURNS': (reckoned, loop_closure),
+    'CONTRARY_RATIO': (reckoned, loop_closure),
+    '_FITS_HERE': (reckoned,),
+    '_FITS_ELSEWHERE': (reckoned,),
+    '_ALIGNED': (reckoned,),
+    '_CAREFUL': (reckoned,),
+    '_MOST_OF_A_LOOK': (reckoned,),
+    '_LATE_M': (reckoned,),
+    '_LOOK_M': (reckoned,),
+    '_CONTRARY': (reckoned,),
+    '_GROWN': (reckoned,),
+    '_GROWN_PER_M': (reckoned,),
+}
+_FACTORS = (0.5, 2.0)
+
+_AREA_M2 = 350.0
+_WRONG_M = 0.5
+_MAPPED_M = 60.0
+_DRIVEN_M = 20.0  # less than recognition needs: what comes back is where dead reckoning has it
+_START_M = 12.0
+_BLINDED_M = (3.0, 12.0)  # path with scans of another place, and then to the end
+_KIDNAPS = ((3, 1), (5, 3), (6, 3))  # building and drive
+_STARTS = (2,)  # buildings
+_OFF = {
+    'right': (0.0, 0.0, 0.0),
+    '1 m': (0.8, 0.6, 0.0),
+    '20 degrees': (0.0, 0.0, 0.35),
+    'half a turn': (0.0, 0.0, math.pi),
+    'another room': (5.0, 3.0, 1.0),
+}
+_PERIOD_NS = SECOND_NS // 5
+
+
+@dataclass(frozen=True, eq=False)
+class _Moment:
+    """A scan, the odometry (3,) at it, the true pose (3,), map frame, and the path to it, m."""
+
+    scan: Scan
+    T_odom_base: Array
+    T_map_base: Array
+    path_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """A localizer that is about to be wrong, and what it then sees; kind: for which sum."""
+
+    kind: str
+    localizer: Localizer
+    moments: list[_Moment]
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """Scans drawn wrong, of kidnaps and of starts; paths, m, until a robot is in its map.
+
+    returned_m: after its laser was covered; begun_m: after a start that is right.
+    """
+
+    kidnapped: int = 0
+    starts: int = 0
+    returned_m: float = 0.0
+    begun_m: float = 0.0
+
+    def __str__(self) -> str:
+        wrong = f'{self.kidnapped} + {self.starts} wrong'
+        return f'{wrong}; {self.returned_m:.1f}, {self.begun_m:.1f} m'
+
+
+def run(worlds: Path, quick: bool) -> Iterator[Row]:
+    """Rows: scans drawn wrong, kidnaps + starts; paths to return and to begin."""
+    names = ['', *CONSTANTS]
+    changes = [(name, factor) for name in names for factor in _FACTORS if name or factor < 1.0]
+    if quick:
+        changes = changes[:5]
+    workers = min(2, os.cpu_count() or 1)
+    with ProcessPoolExecutor(workers, get_context('forkserver')) as pool:
+        for (name, factor), found in zip(changes, pool.map(_tried, changes), strict=True):
+            yield Row(f'{name.strip("_")} x {factor}' if name else 'as it is', str(found))
+
+
+def _tried(change: tuple[str, float]) -> _Outcome:
+    """The outcome of all cases with a constant times a factor."""
+    cases = _cases()
+    with changed(*change):
+        outcome = _Outcome()
+        for case in cases:
+            outcome = _added(outcome, case)
+    return outcome
+
+
+@contextmanager
+def changed(name: str, factor: float) -> Iterator[None]:
+    """Multiply a constant of the belief, by its name, while it lasts; '' for none."""
+    modules = CONSTANTS.get(name, ())
+    before: Any = getattr(modules[0], name) if modules else None
+    for module in modules:
+        setattr(module, name, before * factor)
+    try:
+        yield
+    finally:
+        for module in modules:
+            setattr(module, name, before)
+
+
+def _added(outcome: _Outcome, case: _Case) -> _Outcome:
+    """The outcome with that of a case."""
+    localizer = deepcopy(case.localizer)
+    wrong = 0
+    apart_m = case.moments[0].path_m if case.kind == 'right' else None
+    way_m = 0.0  # in which it was not in the map
+    for moment in case.moments:
+        estimate = localizer.step(moment.scan, moment.T_odom_base)
+        off = se2.between(estimate.T_map_base, moment.T_map_base)
+        is_drawn = _is_drawn(estimate)
+        wrong += int(is_drawn and math.hypot(off[0], off[1]) > _WRONG_M)
+        if not is_drawn and apart_m is None:
+            apart_m = moment.path_m
+        if is_drawn and apart_m is not None:
+            way_m += moment.path_m - apart_m
+            apart_m = None
+        if case.kind == 'start' and estimate.is_mapping_apart:
+            break  # it is doubted
+    if apart_m is not None:
+        way_m += case.moments[-1].path_m - apart_m
+    if case.kind == 'kidnap':
+        return replace(outcome, kidnapped=outcome.kidnapped + wrong)
+    if case.kind == 'blinded':
+        return replace(outcome, returned_m=outcome.returned_m + way_m)
+    if case.kind == 'right':
+        return replace(outcome, begun_m=outcome.begun_m + way_m, starts=outcome.starts + wrong)
+    return replace(outcome, starts=outcome.starts + wrong)
+
+
+def _is_drawn(estimate: Estimate) -> bool:
+    return not (estimate.is_lost or estimate.is_contradicted)
+
+
+@cache
+def _cases() -> list[_Case]:
+    """All cases, up to where constants matter."""
+    return [*_kidnaps(), *_starts()]
+
+
+def _kidnaps() -> Iterator[_Case]:
+    """Robots that are put elsewhere, and robots whose laser is covered for a while."""
+    for building, drive in _KIDNAPS:
+        world = _world(building)
+        first = _drive(world, building, 0, _MAPPED_M + sum(_BLINDED_M))
+        second = _drive(world, building, drive, _DRIVEN_M)
+        T_map_world = se2.invert(first[0].T_world_base)
+        moments = _moments(T_map_world, first)
+        mapped = [moment for moment in moments if moment.path_m <= _MAPPED_M]
+        rest = moments[len(mapped) :]
+        localizer = Localizer()
+        for moment in mapped:
+            localizer.step(moment.scan, moment.T_odom_base)
+        yield _Case('kidnap', localizer, _moments(T_map_world, second, mapped[-1]))
+        yield _Case('blinded', localizer, list(_blinded(rest, second)))
+
+
+def _blinded(moments: list[_Moment], others: list[DriveSample]) -> Iterator[_Moment]:
+    """The moments, the first of them with scans of another place."""
+    for moment, other in zip(moments, others, strict=False):
+        is_blinded = moment.path_m < moments[0].path_m + _BLINDED_M[0]
+        scan = replace(other.scan, stamp_ns=moment.scan.stamp_ns) if is_blinded else moment.scan
+        yield replace(moment, scan=scan)
+
+
+def _starts() -> Iterator[_Case]:
+    """Robots in a session, whose start pose is given, right or wrong."""
+    for building in _STARTS:
+        world = _world(building)
+        first = _drive(world, building, 0, _MAPPED_M)
+        T_map_world = se2.invert(first[0].T_world_base)
+        session = Localizer()
+        for moment in _moments(T_map_world, first):
+            session.step(moment.scan, moment.T_odom_base)
+        moments = _moments(T_map_world, _drive(world, building, 1, _START_M))
+        for name, off in _OFF.items():
+            x, y, yaw = (moments[0].T_map_base + np.array(off)).tolist()
+            config = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
+            keyframes = session.saved_keyframes()
+            localizer = Localizer.from_state(session.state(), config, keyframes=keyframes)
+            yield _Case('right' if name == 'right' else 'start', localizer, moments)
+
+
+@cache
+def _world(seed: int) -> World:
+    config = BuildingConfig(
+        area_m2=_AREA_M2,
+        hall_share=0.0,
+        clutter=0.0,
+        glass_share=0.0,
+        wings=1,
+        people_per_1000_m2=0.0,
+        moving_doors=0.0,
+    )
+    return generate_building(seed, config).world
+
+
+def _drive(world: World, building: int, drive: int, path_m: float) -> list[DriveSample]:
+    start = random_start(world, np.random.default_rng([building, drive]))
+    return [sample for sample, _ in along(random_drive(world, start, drive), path_m)]
+
+
+def _moments(
+    T_map_world: Array, samples: list[DriveSample], after: _Moment | None = None
+) -> list[_Moment]:
+    """The samples as moments; after: the last one, from which the robot was carried here."""
+    stamp_ns = 0 if after is None else after.scan.stamp_ns
+    T_odom = np.zeros(3) if after is None else after.T_odom_base
+    path_m = 0.0 if after is None else after.path_m
+    before = samples[0]
+    found = []
+    for sample in samples:
+        T_odom = se2.compose(T_odom, se2.between(before.T_odom_base, sample.T_odom_base))
+        path_m += math.dist(before.T_world_base[:2], sample.T_world_base[:2])
+        before = sample
+        stamp_ns += _PERIOD_NS
+        scan = replace(sample.scan, stamp_ns=stamp_ns)
+        found.append(_Moment(scan, T_odom, se2.compose(T_map_world, sample.T_world_base), path_m))
+    return found
