@@ -326,9 +326,15 @@ def make_loop(
     grid = replace(PAPER_GRID, no_return_clear_range_m=options.laser.range_max_m)
     topology = TopologyConfig(robot_radius_m=radius_m)
     pipeline = Pipeline(PipelineConfig(localizer, grid, topology, SCANS_PER_GRAPH), source)
-    strategy = make_strategy(options.strategy, ExplorerConfig(robot_radius_m=radius_m))
+    strategy = make_strategy(options.strategy, explorer_config(robot, options.speed_m_s))
     navigator = Navigator(_navigator_config(robot, options.speed_m_s))
     return ClosedLoop(simulation, pipeline, strategy, navigator, mishap, watch)
+
+
+def explorer_config(robot: RobotConfig, speed_m_s: float) -> ExplorerConfig:
+    """The default for a body and a speed, as of its navigator."""
+    navigator = _navigator_config(robot, speed_m_s)
+    return ExplorerConfig(planner=navigator.planner, controller=navigator.controller)
 
 
 def _navigator_config(robot: RobotConfig, speed_m_s: float) -> NavigatorConfig:

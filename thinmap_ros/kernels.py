@@ -348,7 +348,7 @@ def explorer() -> None:
     # Of other strategies, and of a frontier that no viewpoint sees into.
     path_lengths_from(patch.free, (20, 20), np.array([[30, 30]]))
     line_is_clear(patch.free, *np.array([20, 20, 30, 30]))
-    search_beside(patch.free, np.array([[20, 20]]), patch.free, patch.free, 5, (30, 30))
+    search_beside(patch.free, np.array([[20, 20]]), patch.free, 5, (30, 30))
     rehearsed = Explorer()
     topology = _graph(patch)
     for scan, T_map_base in _drive():

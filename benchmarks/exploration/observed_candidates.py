@@ -88,11 +88,11 @@ def _rows(explorer: Explorer, patch: GridPatch, observable: ObservableCells) -> 
         [
             c.evidence.id,
             c.length_m,
-            c.hidden_m2,
-            c.depth_m,
+            c.view.hidden_m2,
+            c.view.depth_m,
             c.evidence.visits,
             c.probability,
-            (1.0 - c.probability) * c.mean_area_m2,
+            c.expected_area_m2,
             area,
         ]
         for c, area in zip(candidates, areas.tolist(), strict=True)

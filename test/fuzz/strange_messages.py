@@ -264,7 +264,7 @@ def local_grids(draw, ns=10**9):
 
 @st.composite
 def claims(draw, ns=10**9):
-    message = stamped(draw, TeamClaim(robot='/a', session=1, state=1, remaining_m=2.0), ns)
+    message = stamped(draw, TeamClaim(robot='/a', session=1, state=1, remaining_s=2.0), ns)
     message.settled = [SettledPlace(x=1.0, y=2.0, visits=1)] * 2
 
     def number(part, name):
@@ -288,7 +288,7 @@ def claims(draw, ns=10**9):
 
     points = [number(part, axis) for part in ('goal', 'frontier') for axis in 'xy']
     points += pose_setters(draw, message.pose)
-    changed(draw, [*points, *map(own, ('v', 'w', 'remaining_m')), place, count, name, state])
+    changed(draw, [*points, *map(own, ('v', 'w', 'remaining_s')), place, count, name, state])
     return message
 
 
@@ -387,7 +387,7 @@ def check_topology(message):
 
 def check_claim(message):
     found = claim_from_msg(message)
-    assert np.isfinite(found.claim.pose).all() and np.isfinite(found.claim.remaining_m)
+    assert np.isfinite(found.claim.pose).all() and np.isfinite(found.claim.remaining_s)
     assert found.claim.place is None or np.isfinite(found.claim.place).all()
     assert len(found.claim.settled) <= MAX_SETTLED and found.claim.robot
 

@@ -40,7 +40,7 @@ def test_a_claim_arrives_as_it_was(state):
     sent = claimed(state)
     found = claim_from_msg(claim_msg(sent, 'map'))
     assert found.claim.pose == pytest.approx(POSE, abs=1e-12)
-    for name in ('robot', 'stamp_ns', 'place', 'remaining_m', 'settled', 'explores'):
+    for name in ('robot', 'stamp_ns', 'place', 'remaining_s', 'settled', 'explores'):
         assert getattr(found.claim, name) == getattr(sent.claim, name), name
     assert (found.motion.v, found.motion.w) == (0.5, -0.25)
     assert (found.state, found.session, found.goal) == (state, 9, sent.goal)
@@ -84,7 +84,7 @@ def damaged(**values):
         ({'frontier__x': 1e30}, 'place: 1'),
         ({'v': math.inf}, 'speed: inf'),
         ({'w': math.nan}, 'speed: nan'),
-        ({'remaining_m': math.nan}, 'path: nan'),
+        ({'remaining_s': math.nan}, 'time: nan'),
     ],
 )
 def test_a_claim_with_a_wrong_value_is_refused_in_one_line(values, named):

@@ -140,4 +140,5 @@ def test_the_graph_holds_what_each_robot_can_reach():
 def test_claims_may_be_late():
     _, report = run(2, claim_delay_s=5.0)
     assert report['finished']
-    assert report['time'] < 1.3 * run(2)[1]['time']
+    # Both may drive to one place until each has heard of the other.
+    assert report['time'] < 0.8 * run(1)[1]['time']

@@ -44,7 +44,8 @@ _COARSE = 2
 _PART_M = 1.0
 # The same robot and the same frontiers as for the exploration of the paper.
 _EXPLORER = ExplorerConfig()
-_ESCAPE_M = start_escape_m(_EXPLORER.robot_radius_m)
+_MIN_FRONTIER_M = 0.5  # as of explore_lite
+_ESCAPE_M = start_escape_m(_EXPLORER.planner.robot_radius_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +87,16 @@ class FrontierFinder:
 
     def is_open(self, frontier: Frontier) -> bool:
         """Whether enough of a frontier remains; its cells must be of the present frame."""
-        return self.map.is_long(self.map.remaining(frontier.cells), _EXPLORER.min_frontier_size)
+        return self.map.is_long(self.map.remaining(frontier.cells), _MIN_FRONTIER_M)
 
     def find(self, T_map_base: Array) -> list[Frontier]:
         """All frontiers with a viewpoint that is reachable from a pose (3,)."""
         frame = self.map.frame
         clusters = self._clusters()
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        standing = traversable_cells(self.map.free, _EXPLORER.robot_radius_m, frame.resolution)
+        standing = traversable_cells(
+            self.map.free, _EXPLORER.planner.robot_radius_m, frame.resolution
+        )
         reach = self._reach_from(standing, xy)
         if not clusters:
             return []
@@ -117,7 +120,7 @@ class FrontierFinder:
 
     def _clusters(self) -> list[Cells]:
         """Frontier cells of each cluster, without those that were given up."""
-        min_length_m = _EXPLORER.min_frontier_size
+        min_length_m = _MIN_FRONTIER_M
         clusters = []
         for cells in self.map.clusters(min_length_m):
             keys = self._lattice_cells(cells)
@@ -160,7 +163,7 @@ class FrontierFinder:
         frame = self.map.frame
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
         max_steps = int(ASSIGNMENT_RADIUS_M / frame.resolution)
-        cell, _ = search_beside(self.map.free, cells, allowed, allowed, max_steps, (row, col))
+        cell = search_beside(self.map.free, cells, allowed, max_steps, (row, col))
         return None if cell is None else np.asarray(frame.centres_of(np.array([cell]))[0])
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
-from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.closed_loop import ClosedLoop, Options, explorer_config, make_loop, no_progress
+from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.team import Team, TeamConfig
 from thinmap_ros.core.se2 import Array, path_length_m
 from thinmap_ros.evaluation.exploration_metrics import MILESTONES, first_time
@@ -48,7 +48,7 @@ def make_team(
             own_world.others.append(other.simulation.robot)
         own_options = Options(**{**vars(options), 'seed': options.seed + number})
         loop = make_loop(own_world, start, own_options)
-        config = ExplorerConfig(robot_radius_m=PRESETS[options.robot].planned_radius_m)
+        config = explorer_config(PRESETS[options.robot], options.speed_m_s)
         loop.strategy = Explorer(config, team=Team(f'robot{number + 1}', team.config))
         for other in loops:
             other_world = other.simulation.world

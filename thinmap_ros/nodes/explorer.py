@@ -74,7 +74,7 @@ class ExplorerNode(ThinmapNode):
         save_on_exit(self, directory, EXPLORATION, self._save_at_end)
         parameters.reject_unknown(self)
         kernels.explorer()
-        radius_m = self._strategies.config.robot_radius_m
+        radius_m = self._strategies.config.planner.robot_radius_m
         self._source = ObservationSource(
             self, self._settings, frames, radius_m, self._on_observation
         )
@@ -270,7 +270,7 @@ class ExplorerNode(ThinmapNode):
         """The report to the other robots of a team after an observation."""
         driver = self._driver
         located = self._source.located(last)
-        return Progress(self._mission, located, driver.goal, driver.remaining_m)
+        return Progress(self._mission, located, driver.goal)
 
     def _publish_progress(self) -> None:
         self._output.lite.publish_status(self._mission, self._driver.is_yielding)

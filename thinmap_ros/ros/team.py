@@ -130,7 +130,7 @@ def claim_msg(sent: RobotClaim, frame_id: str) -> TeamClaim:
         state=int(sent.state),
         goal=_point_msg(sent.goal),
         frontier=_point_msg(claim.place),
-        remaining_m=claim.remaining_m,
+        remaining_s=claim.remaining_s,
         settled=[
             SettledPlaceMsg(
                 x=place.x,
@@ -159,7 +159,7 @@ def claim_from_msg(message: TeamClaim) -> RobotClaim:
     points = [(message.goal.x, message.goal.y), (message.frontier.x, message.frontier.y)]
     numbers = np.ravel([*places, *points]).tolist()
     errors.require_bounded(f'claim of robot {quoted(name)}: place', numbers)
-    errors.require_bounded(f'claim of robot {quoted(name)}: path', [message.remaining_m])
+    errors.require_bounded(f'claim of robot {quoted(name)}: time', [message.remaining_s])
     speeds = [message.v, message.w]
     errors.require_bounded(f'claim of robot {quoted(name)}: speed', speeds, _MAX_SPEED)
     if message.state not in list(RobotState):
@@ -174,7 +174,7 @@ def claim_from_msg(message: TeamClaim) -> RobotClaim:
         messages.stamp_ns(message.header.stamp),
         T,
         points[1] if is_driving else None,
-        max(float(message.remaining_m), 0.0),
+        max(float(message.remaining_s), 0.0),
         tuple(SettledPlace(p.x, p.y, p.visits, p.failures) for p in message.settled),
         state in (RobotState.DRIVING, RobotState.WAITING),
     )

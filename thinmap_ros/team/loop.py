@@ -67,8 +67,7 @@ class Member:
 
     def claim(self) -> Claim:
         """The claim that it sends."""
-        remaining_m = self.loop.navigator.distance_remaining_m
-        return self.explorer.claim(self.moment.stamp_ns, self.pose, remaining_m)
+        return self.explorer.claim(self.moment.stamp_ns, self.pose)
 
 
 class TeamLoop:

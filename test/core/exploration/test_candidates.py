@@ -7,13 +7,17 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.candidates import CandidateConfig, CandidateFinder
+from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.fitted import FITTED
-from thinmap_ros.core.exploration.space import FrontierMap, ReachableSpace, search_beside
+from thinmap_ros.core.exploration.space import FrontierMap, is_enclosed, search_beside
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
+from thinmap_ros.core.exploration.views import Sight
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.planning.path_follower import SpeedConfig
+from thinmap_ros.core.planning.travel_times import TravelTimes
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
-from thinmap_ros.core.se2 import SECOND_NS
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
 FRAME = GridFrame(0.0, 0.0, 0.1)
@@ -25,7 +29,9 @@ class Room:
 
     def __init__(self, cells, ends=()):
         self.frontiers = FrontierMap()
-        self.space = ReachableSpace(CandidateConfig().robot_radius_m)
+        self.travel = TravelTimes(WavefrontConfig(), SpeedConfig(max_speed_m_s=0.5))
+        self.sight = Sight()
+        self.sight.add_scan(Scan.create(0, np.full(181, 4.0), -1.57, 0.0174, 0.05, 8.0))
         self.finder = CandidateFinder(CandidateConfig(), FITTED)
         self.nodes = [Node(5 + i, NodeKind.END, x, y, 1.0) for i, (x, y) in enumerate(ends)]
         self.set_cells(cells)
@@ -34,11 +40,10 @@ class Room:
         patch = GridPatch(FRAME, cells.astype(np.int8))
         self.frontiers.update(patch, np.array([[0.0, 0.0], [50.0, 50.0]]))
 
-    def find(self, at=AT, seconds=0.0):
-        self.space.update(self.frontiers, at)
-        topology = TopologicalMap(self.nodes)
-        stamp_ns = int(seconds * SECOND_NS)
-        self.finder.update(topology, self.frontiers, self.space.now, at, 8.0, stamp_ns)
+    def find(self, at=AT):
+        frontiers = self.frontiers
+        self.travel.update(frontiers.free, frontiers.passable, frontiers.frame, at)
+        self.finder.update(TopologicalMap(self.nodes), frontiers, self.travel, self.sight)
         return self.finder.candidates
 
 
@@ -84,17 +89,16 @@ def test_a_frontier_at_the_end_of_the_range_is_observed_from_a_little_nearer():
     assert abs(candidate.goal[2]) < 0.3
 
 
-def test_after_a_visit_without_success_a_frontier_is_observed_from_nearby():
+def test_after_a_visit_without_success_a_frontier_is_observed_from_elsewhere():
     room = Room(corridor(), [(8.0, 2.0)])
     (far,) = room.find()
     assert far.node_id == 5
     assert far.goal[0] < 5.0
-    far.evidence.visits += 1
-    far.examined_ns = -1
-    (near,) = room.find()
-    assert near.evidence is far.evidence
-    assert near.goal[0] > 7.0
-    assert near.probability > far.probability
+    far.evidence.add_visit((float(far.goal[0]), float(far.goal[1])))
+    (other,) = room.find()
+    assert other.evidence is far.evidence
+    assert math.dist(other.goal[:2], far.goal[:2]) > 0.5
+    assert other.probability > far.probability
 
 
 def test_a_frontier_belongs_to_the_nearest_end_node_that_sees_it():
@@ -110,7 +114,7 @@ def test_a_frontier_belongs_to_the_nearest_end_node_that_sees_it():
     cells = corridor()
     cells[1:38, 85] = 100
     room.set_cells(cells)
-    own = [c for c in room.find(seconds=1.0) if c.node_id >= FIRST_FRONTIER_ID]
+    own = [c for c in room.find() if c.node_id >= FIRST_FRONTIER_ID]
     assert sum(len(candidate.cells) for candidate in own) == 38
     assert [node.node_id for node in room.finder.settled] == [5, 6, 7]
 
@@ -123,18 +127,18 @@ def test_free_specks_behind_a_wall_are_no_candidates():
     # Beams that noise moved across the wall have left a line of free cells behind it.
     cells[5:25, 61] = 0
     room = Room(cells)
-    for seconds in (0.0, 1.0):
-        assert room.find(seconds=seconds) == []
+    for _ in range(2):
+        assert room.find() == []
     # A hole in the wall: it may be worth a look.
     cells[10, 60] = 0
     room.set_cells(cells)
-    (candidate,) = room.find(seconds=10.0)
+    (candidate,) = room.find()
     assert len(candidate.cells) == 20
     # So may a place that is cut off, but large enough for the robot.
     cells[10, 60] = 100
     cells[5:25, 61:71] = 0
     room.set_cells(cells)
-    (candidate,) = room.find(seconds=20.0)
+    (candidate,) = room.find()
     assert candidate.goal is None
 
 
@@ -145,7 +149,7 @@ def test_most_of_what_is_hidden_is_in_line_of_sight_of_the_viewpoint():
     frontiers = room.frontiers
     for candidate in candidates:
         row, col = (int(v) for v in frontiers.frame.cells_of(candidate.goal[None, :2])[0])
-        assert room.space.now.cells[row, col]
+        assert np.isfinite(room.travel.seconds[row, col])
         seen = [
             line_is_clear(frontiers.passable, row, col, int(r), int(c)) for r, c in candidate.cells
         ]
@@ -154,29 +158,59 @@ def test_most_of_what_is_hidden_is_in_line_of_sight_of_the_viewpoint():
 
 def test_a_frontier_longer_than_the_range_is_observed_in_part_from_the_nearest_place():
     room = Room(open_hall(12.0))
-    for seconds, y in ((0.0, 4.0), (10.0, 16.0)):
-        (candidate,) = room.find(se2.pose(2.0, y, 0.0), seconds)
+    for y in (4.0, 16.0):
+        (candidate,) = room.find(se2.pose(2.0, y, 0.0))
         assert len(candidate.cells) == 198
-        assert candidate.goal[0] < 9.0
+        assert candidate.goal[0] < 9.5
         assert abs(candidate.goal[1] - y) < 2.5
 
 
-def test_an_unchanged_frontier_keeps_its_viewpoint_for_some_seconds():
-    room = Room(open_hall(12.0))
-    (first,) = room.find(se2.pose(2.0, 4.0, 0.0))
-    (kept,) = room.find(se2.pose(2.0, 16.0, 0.0), 4.0)
-    assert kept.goal is first.goal and kept.examined_ns == 0
-    (renewed,) = room.find(se2.pose(2.0, 16.0, 0.0), 6.0)
-    assert renewed.goal is not first.goal
+def test_a_frontier_that_changes_is_examined_at_once_and_the_others_in_turn():
+    cells = open_hall(12.0)
+    cells[95:105, 118:120] = 100
+    room = Room(cells)
+    first = [candidate.view for candidate in room.find()]
+    assert len(first) == 2
+    second = [candidate.view for candidate in room.find()]
+    third = [candidate.view for candidate in room.find()]
+    assert [new is old for new, old in zip(second, first, strict=True)] == [False, True]
+    assert [new is old for new, old in zip(third, second, strict=True)] == [True, False]
+    cells[105:, 120] = 0
+    room.set_cells(cells)
+    changed = room.find()[-1].view
+    assert changed is not third[-1]
 
 
-def test_path_lengths_are_those_on_the_grid_or_a_detour():
-    room = Room(corridor())
+def test_a_short_frontier_counts_as_its_probability_says():
+    """A gap of 0.3 m hides a room; one of 0.3 m in which a wall is seen hides nothing."""
+    cells = np.full((60, 60), -1)
+    cells[:40, :40] = 0
+    cells[[0, 40], :41] = 100
+    cells[:41, [0, 40]] = 100
+    cells[40, 8:11] = -1
+    cells[40, 28:31] = -1
+    cells[41, 27:32] = 100
+    wide, blind = sorted(Room(cells).find(), key=lambda candidate: candidate.probability)
+    assert wide.length_m == pytest.approx(0.3)
+    assert wide.middle[0] == pytest.approx(0.95)
+    assert wide.probability < ExplorerConfig().probability_threshold < blind.probability
+
+
+def test_a_gap_into_which_no_place_sees_hides_no_area():
+    """Behind a pillar, close to a wall, nothing is seen: expected there is nothing."""
+    cells = corridor()
+    cells[1:39, 60] = 100
+    cells[1:39, 61:] = -1
+    room = Room(cells)
+    assert room.find() == [] and room.finder.hidden == []
+    cells[10, 60] = 0
+    cells[8:13, 61] = 0
+    cells[7:14, 62] = 100
+    cells[[7, 13], 61] = -1
+    room.set_cells(cells)
     room.find()
-    goals = np.array([[8.0, 2.0], [11.0, 2.0], [-50.0, 2.0]])
-    reached, *others = room.space.path_lengths(AT, goals)
-    assert reached == pytest.approx(7.0, rel=0.1, abs=0.2)
-    assert others == pytest.approx([30.0, 153.0])
+    assert room.finder.hidden
+    assert sum(area_m2 for _, area_m2 in room.finder.hidden) < 0.5
 
 
 def test_a_frontier_behind_a_passage_that_looks_too_narrow_is_observed_from_before_it():
@@ -195,9 +229,7 @@ def test_a_frontier_behind_a_passage_that_looks_too_narrow_is_observed_from_befo
         for candidate in candidates:
             assert candidate.goal is not None
             assert candidate.goal[0] < 4.0
-            assert math.dist(candidate.goal[:2], candidate.middle) < 3.0
-            candidate.evidence.visits += 1
-            candidate.examined_ns = -1
+            candidate.evidence.add_visit((float(candidate.goal[0]), float(candidate.goal[1])))
 
 
 def cluttered(seed):
@@ -221,11 +253,10 @@ def test_what_can_be_reached_is_what_the_navigator_finds_a_way_to():
         room = Room(cells)
         room.find()
         patch = GridPatch(FRAME, cells.astype(np.int8))
-        now = room.space.now
-        rows, cols = np.nonzero(now.standing)
+        rows, cols = np.nonzero(room.travel.traversable)
         for k in range(0, len(rows), 40):
             goal = FRAME.centres_of(np.array([[rows[k], cols[k]]]))[0].tolist()
-            is_reachable = bool(now.cells[rows[k], cols[k]])
+            is_reachable = bool(room.travel.reachable[rows[k], cols[k]])
             assert is_reachable == (plan(patch, here, goal, config) is not None), (seed, goal)
             answers.add(is_reachable)
     assert answers == {True, False}
@@ -243,20 +274,20 @@ def test_no_place_is_visited_twice_and_a_place_that_can_be_reached_later_is_visi
     cells[4, 61:] = cells[35, 61:] = 100
     room = Room(cells)
     seen_from = []
-    for second in range(10):
-        (candidate,) = (c for c in room.find(seconds=10.0 * second) if c.length_m > 2.0)
+    for _ in range(200):
+        (candidate,) = (c for c in room.find() if c.length_m > 2.0)
         if candidate.goal is None:
             break
         assert all(math.dist(candidate.goal[:2], place) > 0.5 for place in seen_from)
         seen_from.append((float(candidate.goal[0]), float(candidate.goal[1])))
         candidate.evidence.add_visit(seen_from[-1])
-    assert candidate.goal is None and not candidate.is_enclosed
+    assert candidate.goal is None and not candidate.view.is_enclosed
     assert seen_from and all(x < 6.0 for x, _ in seen_from)
     cells[24:32, 60] = 0
     room.set_cells(cells)
-    (candidate,) = (c for c in room.find(seconds=200.0) if c.length_m > 2.0)
+    (candidate,) = (c for c in room.find() if c.length_m > 2.0)
     assert candidate.evidence.visits == len(seen_from)
-    assert candidate.goal[0] > 6.0
+    assert candidate.goal is not None
 
 
 def test_no_place_is_beside_a_frontier_across_a_wall():
@@ -266,9 +297,11 @@ def test_no_place_is_beside_a_frontier_across_a_wall():
     frontier = np.array([[20, 33], [21, 33]])
     allowed = free.copy()
     allowed[:, 31:] = False
-    assert search_beside(free, frontier, allowed, allowed, 30, (20, 33)) == (None, True)
+    assert search_beside(free, frontier, allowed, 30, (20, 33)) is None
+    assert is_enclosed(free, frontier, allowed)
     free[5, 30] = True
-    place, is_enclosed = search_beside(free, frontier, allowed, allowed, 30, (20, 33))
-    assert place[1] < 30 and not is_enclosed
+    place = search_beside(free, frontier, allowed, 30, (20, 33))
+    assert place[1] < 30 and not is_enclosed(free, frontier, allowed)
     allowed[:, 25:] = False
-    assert search_beside(free, frontier, allowed, allowed, 10, (20, 33)) == (None, False)
+    assert search_beside(free, frontier, allowed, 10, (20, 33)) is None
+    assert not is_enclosed(free, frontier, allowed)

@@ -1,15 +1,13 @@
 """Claims of other robots, and when they end."""
 
-import math
-
 import numpy as np
 
 from thinmap_ros.core.exploration.team import Claim, Claims
 from thinmap_ros.core.se2 import SECOND_NS
 
 
-def claim(robot, second, remaining_m=5.0, place=(1.0, 2.0)):
-    return Claim(robot, second * SECOND_NS, np.zeros(3), place, remaining_m)
+def claim(robot, second, remaining_s=5.0, place=(1.0, 2.0)):
+    return Claim(robot, second * SECOND_NS, np.zeros(3), place, remaining_s)
 
 
 def place_of(claims, robot, second):
@@ -37,15 +35,13 @@ def test_a_claim_ends_without_progress():
     assert place_of(claims, 'stands', 29) is None
 
 
-def test_a_path_that_is_not_planned_yet_is_no_nearest_one():
+def test_a_time_that_is_not_known_yet_is_no_least_one():
     claims = Claims()
     for second in range(30):
         claims.add(claim('drives', second, second and 20.0 - 0.5 * second), second * SECOND_NS)
-        claims.add(claim('has no path', second, 0.0), second * SECOND_NS)
+        claims.add(claim('knows no time', second, 0.0), second * SECOND_NS)
     assert place_of(claims, 'drives', 29) == (1.0, 2.0)
-    assert place_of(claims, 'has no path', 29) is None
-    assert math.isclose(claim('a', 0, 0.0).path_m, math.sqrt(5.0))
-    assert math.isclose(claim('a', 0, 9.0).path_m, 9.0)
+    assert place_of(claims, 'knows no time', 29) is None
 
 
 def test_another_place_is_a_new_claim():

@@ -7,7 +7,6 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.space import (
-    NOTHING,
     FrontierMap,
     box_of_scan,
     depth_behind_m,
@@ -129,15 +128,6 @@ def test_a_map_that_grows_on_all_sides_keeps_its_frontiers():
     centres = frontiers.frame.centres_of(np.argwhere(frontiers.mask))
     assert np.allclose(centres, FRAME.centres_of(np.argwhere(expected.mask)))
     assert frontiers.free_cells == expected.free_cells
-
-
-def test_changes_are_taken_once():
-    frontiers = frontiers_of(half_known())
-    assert frontiers.take_changes() is None
-    assert frontiers.take_changes() == NOTHING
-    frontiers.update(patch_of(half_known()), np.array([[0.5, 0.5], [1.0, 1.0]]))
-    frontiers.update(patch_of(half_known()), np.array([[2.0, 0.2], [2.5, 0.3]]))
-    assert frontiers.take_changes() == (2, 5, 11, 26)
 
 
 def test_the_hidden_area_is_what_is_unknown_in_line_of_sight():

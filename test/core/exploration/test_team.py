@@ -1,6 +1,7 @@
 """A robot's share of the candidates, what it tells the others, and what it hears from them."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,11 +15,14 @@ from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.exploration.team import Claim, SettledPlace, Team, TeamConfig
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.navigator import NO_PATH
+from thinmap_ros.core.planning.path_follower import SpeedConfig
+from thinmap_ros.core.planning.travel_times import TravelTimes
+from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.topology.topology import TopologyBuilder
 
-MARGIN_M = 2.0
+MARGIN_S = 2.0
 
 
 def candidate(x, y=0.0):
@@ -27,13 +31,19 @@ def candidate(x, y=0.0):
     return Candidate(evidence, cells, (x, y), goal=se2.pose(x, y, 0.0))
 
 
-def straight(T_map_base, goals):
-    return np.hypot(*(goals - T_map_base[:2]).T)
+@cache
+def travel():
+    """A hall of 60 x 10 m, in which a metre takes a second."""
+    frame = GridFrame(-30.0, -5.0, 0.1)
+    free = np.ones((100, 600), dtype=np.bool_)
+    times = TravelTimes(WavefrontConfig(), SpeedConfig(max_speed_m_s=1.0))
+    times.update(free, free, frame, np.zeros(3))
+    return times
 
 
-def claim(robot, x, place=(99.0, 99.0), remaining_m=0.0, stamp_ns=0, settled=()):
+def claim(robot, x, place=(99.0, 99.0), remaining_s=0.0, stamp_ns=0, settled=()):
     """A claim of a place that no candidate is near to, unless one is given."""
-    return Claim(robot, stamp_ns, se2.pose(x, 0.0, 0.0), place, remaining_m, settled)
+    return Claim(robot, stamp_ns, se2.pose(x, 0.0, 0.0), place, remaining_s, settled)
 
 
 def shares(candidates, claims, **config):
@@ -45,13 +55,13 @@ def shares(candidates, claims, **config):
         for other in claims:
             if other is not own:
                 team.add_claim(other, 0)
-        found.append([c.middle[0] for c in team.share(candidates, own, straight, MARGIN_M)])
+        found.append([c.middle[0] for c in team.share(candidates, own, travel(), MARGIN_S)])
     return found
 
 
 def test_a_robot_alone_has_everything_in_its_order():
     candidates = [candidate(3.0), candidate(1.0)]
-    assert Team('a').share(candidates, claim('a', 0.0), straight, MARGIN_M) is candidates
+    assert Team('a').share(candidates, claim('a', 0.0), travel(), MARGIN_S) is candidates
 
 
 def test_a_robot_that_does_not_explore_takes_nothing():
@@ -59,7 +69,7 @@ def test_a_robot_that_does_not_explore_takes_nothing():
     idle = Claim('a', 0, se2.pose(0.0, 0.0, 0.0), explores=False)
     team = Team('b')
     team.add_claim(idle, 0)
-    assert team.share(candidates, claim('b', 0.5), straight, MARGIN_M) is candidates
+    assert team.share(candidates, claim('b', 0.5), travel(), MARGIN_S) is candidates
 
 
 def test_two_robots_agree_who_goes_where():
@@ -92,14 +102,14 @@ def test_two_robots_side_by_side_do_not_drive_to_one_place():
         now_ns = second * SECOND_NS
         for name, team in teams.items():
             target = targets[name]
-            remaining_m = abs(target.middle[0] - x[name])
-            team.sent = claim(name, x[name], target.middle, remaining_m, now_ns + 1)
+            remaining_s = abs(target.middle[0] - x[name])
+            team.sent = claim(name, x[name], target.middle, remaining_s, now_ns + 1)
         for name, team in teams.items():
             team.add_claim(teams['ba'['ab'.index(name)]].sent, now_ns)
         for name, team in teams.items():
             x[name] += math.copysign(0.5, targets[name].middle[0])
             own = claim(name, x[name], targets[name].middle, stamp_ns=now_ns)
-            targets[name] = team.share(candidates, own, straight, MARGIN_M)[0]
+            targets[name] = team.share(candidates, own, travel(), MARGIN_S)[0]
     assert [target.middle[0] for target in targets.values()] == [10.0, -14.0]
 
 
@@ -118,7 +128,7 @@ def test_robots_that_stand_or_claim_nothing_do_not_bid():
         team.add_claim(claim('b', 9.0, (8.0, 0.0), 5.0, now_ns), now_ns)
         team.add_claim(claim('c', 7.9, None, 0.0, now_ns), now_ns)
     own = claim('a', 3.0, None, stamp_ns=29 * SECOND_NS)
-    assert team.share([candidate(8.0)], own, straight, MARGIN_M)
+    assert team.share([candidate(8.0)], own, travel(), MARGIN_S)
     now_ns = 29 * SECOND_NS
     team.add_claim(claim('c', 7.9, (8.0, 0.0), 0.0, now_ns + 1), now_ns)
     assert not Team('a', TeamConfig(follow_m=0.0)).claims.held(now_ns)
@@ -160,7 +170,6 @@ def test_no_path_is_told_and_a_blocked_robot_is_not(reason, is_told):
     explorer.target_failed(reason)
     told = explorer.claim(0, np.zeros(3)).settled
     assert told == ((SettledPlace(4.0, 0.0, 0, 1),) if is_told else ())
-    assert math.isclose(explorer.claim(0, np.zeros(3), 3.5).remaining_m, 3.5)
 
 
 def test_two_robots_of_one_name_are_refused():
@@ -184,7 +193,9 @@ def test_a_frontier_to_which_another_robot_found_no_path_is_given_up():
         return explorer.step(builder.map, patch, scan, pose)
 
     step(0)
-    assert explorer.claim(0, pose).place is not None
+    claimed = explorer.claim(0, pose)
+    assert claimed.place is not None
+    assert claimed.remaining_s > 0.0
     places = (SettledPlace(c.middle[0], c.middle[1], 0, 3) for c in explorer.candidates)
     explorer.team.add_claim(claim('b', 9.0, settled=tuple(places)), 0)
     step(2)

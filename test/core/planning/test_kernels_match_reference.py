@@ -14,8 +14,6 @@ from thinmap_ros.core.planning.grid_search import (
     downsample_mask,
     path_collides,
     reachable_cells,
-    traversable_cells,
-    update_traversable_cells,
 )
 from thinmap_ros.core.planning.obstacles import _arc, _clear_steps, _points_around
 from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
@@ -123,23 +121,6 @@ def test_hair_by_hair_a_disc_that_is_too_near_comes_no_nearer():
     for _ in range(100):
         x += 0.004 * _clear_steps(np.array([[x, 0.0], [x + 0.004, 0.0]]), wall, 0.24)
     assert x == 0.0
-
-
-@pytest.mark.parametrize('seed', SEEDS)
-def test_standing_places_are_renewed_where_something_changed(seed):
-    rng = np.random.default_rng(seed)
-    free = rng.random((60, 70)) < 0.97
-    standing = traversable_cells(free, 0.25, 0.1)
-    for _ in range(10):
-        top = int(rng.integers(0, 55))
-        left = int(rng.integers(0, 65))
-        bottom = min(top + int(rng.integers(1, 20)), 60)
-        right = min(left + int(rng.integers(1, 20)), 70)
-        part = (top, left, bottom, right)
-        where = (slice(part[0], part[2]), slice(part[1], part[3]))
-        free[where] = rng.random(free[where].shape) < 0.97
-        update_traversable_cells(standing, free, part, 0.25, 0.1)
-        assert (standing == traversable_cells(free, 0.25, 0.1)).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)

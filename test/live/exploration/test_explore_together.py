@@ -24,6 +24,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.moved import overlaid
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
+from thinmap_ros.core.planning.path_follower import SpeedConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import build
@@ -185,7 +186,10 @@ def test_claims_keep_the_other_robot_away_until_their_robot_is_silent(graph):
     last = next(claim for claim in reversed(hall.claims) if claim.robot == ONE)
     assert messages.stamp_ns(last.header.stamp) > 0
     assert (last.pose.position.x, last.pose.position.y) == pytest.approx((7.0, 2.0))
-    assert last.remaining_m == pytest.approx(math.dist((7.0, 2.0), (last.goal.x, last.goal.y)))
+    assert (
+        last.remaining_s
+        > math.dist((7.0, 2.0), (last.goal.x, last.goal.y)) / SpeedConfig().max_speed_m_s
+    )
 
     stranger = TeamClaim(robot=TWO, session=1, header=messages.header('map', 1))
     speaker = graph.node.create_publisher(TeamClaim, '/team/claims', qos.SENSOR)

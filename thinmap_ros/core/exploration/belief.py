@@ -21,7 +21,7 @@ _MIN_M2 = 0.05
 _MIN_DEPTH_M = 0.05
 _DEVIATIONS = 1.645  # of a normal distribution at 95 %
 
-_SAME_M = 0.5  # cells of a frontier so far apart are the same: corrections of the map move them
+SAME_M = 0.5  # cells of a frontier so far apart are the same: corrections of the map move them
 _SHARE = 0.5  # of its cells with which a frontier continues an earlier one
 
 FIELDS = {
@@ -156,7 +156,7 @@ class Evidence:
 
     def was_seen_from(self, place: Place) -> bool:
         """Whether a visit to a place, m, or beside it, showed nothing."""
-        return any(math.dist(place, earlier) <= _SAME_M for earlier in self.seen_from)
+        return any(math.dist(place, earlier) <= SAME_M for earlier in self.seen_from)
 
 
 class EvidenceStore:
@@ -176,7 +176,7 @@ class EvidenceStore:
         """Evidence of each frontier (N, 2) now, on the lattice of the map, with its place, m."""
         # Of two that a frontier continues equally, what was tried counts.
         earlier = sorted(self.items, key=lambda item: not item.is_tried)
-        reach = round(_SAME_M / resolution)
+        reach = round(SAME_M / resolution)
         indices = _continued(*_joined([i.cells for i in earlier]), *_joined(frontiers), reach)
         found: list[Evidence] = []
         continued: set[int] = set()

@@ -8,53 +8,46 @@ frontiers, too: they are no candidates.
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.config import Config, parameter, robot_radius
-from thinmap_ros.core.exploration.belief import BeliefModel, Evidence, EvidenceStore
-from thinmap_ros.core.exploration.space import (
-    FrontierMap,
-    Reachable,
-    depth_behind_m,
-    hidden_area_m2,
-    place_for,
-    search_beside,
-)
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.exploration.belief import SAME_M, BeliefModel, Evidence, EvidenceStore
+from thinmap_ros.core.exploration.space import FrontierMap, search_beside
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode, unobserved
+from thinmap_ros.core.exploration.views import NO_VIEW, Sight, View, ViewFinder
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.se2 import SECOND_NS, Array, Cell, Cells, Place
+from thinmap_ros.core.planning.travel_times import TravelTimes
+from thinmap_ros.core.se2 import Array, Cells, Place
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
 SETTLED = 0.999  # probability of an end node without a frontier
-_RIM_M = 0.5  # at the end of its range the laser sees little
-_NEAR_M = 1.5
 # A frontier belongs to the nearest end node in sight within this distance; without
 # one it is a candidate of its own.
 ASSIGNMENT_RADIUS_M = 3.0
-# Depth behind a frontier that a viewpoint must be able to see: more leads closer to the middle of
-# openings.
-_VIEW_DEPTH_M = 2.0
-_RENEW_S = 5.0
-_RENEW_S_M = 0.5  # of a candidate far away: so much per metre, as its surroundings do not change
 
 
 @dataclass(frozen=True)
 class CandidateConfig(Config):
-    """Which frontiers count, and from where they are observed."""
+    """Which frontiers count, and which are worth a visit."""
 
-    robot_radius_m: float = robot_radius()
     # The name of explore_lite's parameter.
     min_frontier_size: float = parameter(
-        0.5,
+        0.2,
         'Shorter frontiers are ignored (m). Raise it for shorter paths, lower it for higher '
         'coverage.',
         low=0.0,
         high=5.0,
+    )
+    probability_threshold: float = parameter(
+        0.9,
+        'An end node with at least this position probability is not visited. Raise it for higher '
+        'coverage, lower it for shorter paths.',
+        low=0.5,
+        high=0.999,
     )
 
 
@@ -64,10 +57,9 @@ class Candidate:
 
     cells (N, 2): of the frontier; middle (x, y), m: of these cells; end_node: of the topological
     map, to which the frontier belongs; goal (3,): viewpoint, None
-    where none can be reached; hidden_m2: unknown area in line of sight; depth_m: of the unknown
-    behind it; probability: that nothing worth seeing is behind; mean_area_m2: if there is;
-    examined_ns: when viewpoint, hidden area and depth were determined; is_enclosed: whether its
-    free cells connect to nowhere that the robot fits.
+    where none can be reached, or none is needed; seconds: until the robot is there; view: from
+    where what it hides is seen; probability: that nothing worth seeing is behind; area_m2: if there
+    is.
     """
 
     evidence: Evidence
@@ -76,12 +68,10 @@ class Candidate:
     end_node: Node | None = None
     length_m: float = 0.0
     goal: Array | None = None
-    hidden_m2: float = 0.0
-    depth_m: float = 0.0
+    seconds: float = math.inf
+    view: View = NO_VIEW
     probability: float = 0.5
-    mean_area_m2: float = 0.0
-    examined_ns: int = -1
-    is_enclosed: bool = False
+    area_m2: float = 0.0
 
     @property
     def node_id(self) -> int:
@@ -91,7 +81,7 @@ class Candidate:
     @property
     def expected_area_m2(self) -> float:
         """Area that is hidden behind it, as a mean over both cases."""
-        return (1.0 - self.probability) * self.mean_area_m2
+        return (1.0 - self.probability) * self.area_m2
 
     def published(self, target_goal: Array | None) -> EndNode:
         """End node of a decision; target_goal (3,): where the robot drives if it is the target."""
@@ -111,56 +101,51 @@ class Candidate:
 class CandidateFinder:
     """Finds the candidates of a growing map, each with the evidence that it had before.
 
-    settled: end nodes without a frontier.
+    settled: end nodes without a frontier; hidden: of each frontier, also of those that are too
+    short to be candidates, the probability that it hides nothing, and the area, m2, if not.
     """
 
     def __init__(self, config: CandidateConfig, model: BeliefModel) -> None:
         self._config = config
         self._model = model
+        self._views = ViewFinder()
         self.store = EvidenceStore(FIRST_FRONTIER_ID)
         self.candidates: list[Candidate] = []
         self.settled: list[EndNode] = []
-        self._found: list[Candidate] = []
+        self.hidden: list[tuple[float, float]] = []
 
     def update(
-        self,
-        topology: TopologicalMap,
-        frontiers: FrontierMap,
-        reachable: Reachable,
-        T_map_base: Array,
-        range_max_m: float,
-        stamp_ns: int,
+        self, topology: TopologicalMap, frontiers: FrontierMap, travel: TravelTimes, sight: Sight
     ) -> None:
-        """Find the candidates of a graph and a map, and update the belief about each.
-
-        T_map_base (3,): pose of the robot; range_max_m: of the laser.
-        """
-        before = {id(c.evidence): c for c in self._found}
-        found = []
-        for new in self._find(topology, frontiers):
-            known = before.get(id(new.evidence))
-            if known is not None and _is_as_it_was(new, known, stamp_ns, T_map_base):
-                known.cells = new.cells
-                known.end_node = new.end_node
-                found.append(known)
-            else:
-                self._examine(new, frontiers, reachable, range_max_m)
-                new.examined_ns = stamp_ns
-                found.append(new)
-        for candidate in found:
-            candidate.probability = self._model.probability(
-                candidate.length_m,
-                candidate.hidden_m2,
-                candidate.depth_m,
-                candidate.evidence.visits,
+        """Find the candidates of a graph and a map, and update the belief about each."""
+        clusters = frontiers.clusters(0.0)
+        min_length_m = self._config.min_frontier_size
+        found = self._find(
+            topology, frontiers, [c for c in clusters if frontiers.is_long(len(c), min_length_m)]
+        )
+        short = [c for c in clusters if not frontiers.is_long(len(c), min_length_m)]
+        views = self._views.update(frontiers, travel, [*(c.cells for c in found), *short], sight)
+        for candidate, view in zip(found, views[: len(found)], strict=True):
+            self._believe(candidate, view)
+        fragments = [
+            Candidate(
+                Evidence(0, middle), cells, middle, None, len(cells) * frontiers.frame.resolution
             )
-            candidate.mean_area_m2 = self._model.mean_area(candidate.hidden_m2)
-        self._found = found
-        self.candidates = [c for c in found if not c.is_enclosed]
+            for cells, middle in zip(short, map(frontiers.middle_of, short), strict=True)
+        ]
+        for fragment, view in zip(fragments, views[len(found) :], strict=True):
+            self._believe(fragment, view)
+        self.candidates = [c for c in found if not c.view.is_enclosed]
+        threshold = self._config.probability_threshold
+        below = [c for c in self.candidates if c.probability < threshold]
+        for candidate in below or self.candidates:
+            _choose_viewpoint(candidate, frontiers, travel, sight.slack_rad)
+        self.hidden = [(c.probability, c.area_m2) for c in (*found, *fragments)]
 
-    def _find(self, topology: TopologicalMap, frontiers: FrontierMap) -> list[Candidate]:
+    def _find(
+        self, topology: TopologicalMap, frontiers: FrontierMap, clusters: list[Cells]
+    ) -> list[Candidate]:
         nodes = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
-        clusters = frontiers.clusters(self._config.min_frontier_size)
         middles = [frontiers.middle_of(cells) for cells in clusters]
         owners = self._owners(frontiers, middles, nodes)
         self.settled = [
@@ -197,76 +182,53 @@ class CandidateFinder:
                 owners[i] = k
         return owners
 
-    def _examine(
-        self, candidate: Candidate, frontiers: FrontierMap, reachable: Reachable, range_max_m: float
-    ) -> None:
-        """Determine the hidden area and the viewpoint.
+    def _believe(self, candidate: Candidate, view: View) -> None:
+        """Determine how likely a candidate hides nothing, and how much if it hides something.
 
-        The viewpoint is as far away as the laser allows, unless a visit there showed nothing. Where
-        no reachable place sees the frontier, it is the nearest one on the way: from there a passage
-        that looks too narrow may turn out to be wide enough.
+        At most what the best place would see: a gap into which no place sees hides no more.
         """
-        candidate.hidden_m2 = hidden_area_m2(frontiers, candidate.middle)
-        candidate.depth_m = depth_behind_m(frontiers, candidate.cells)
-        candidate.goal = None
-        candidate.is_enclosed = False
-        has_view = False
-        for cell in self._views(candidate, frontiers, reachable, range_max_m):
-            has_view = True
-            if _drives_to(candidate, cell, frontiers):
-                return
-        beside, is_enclosed = self._beside(candidate, frontiers, reachable)
-        if beside is None or not _drives_to(candidate, beside, frontiers):
-            candidate.is_enclosed = is_enclosed and not has_view
-
-    def _views(
-        self, candidate: Candidate, frontiers: FrontierMap, reachable: Reachable, range_max_m: float
-    ) -> Iterator[Cell]:
-        """Cells that see behind a frontier, the best one first."""
-        resolution = frontiers.frame.resolution
-        views = [(range_max_m - _RIM_M, _VIEW_DEPTH_M), (_NEAR_M, 0.0)]
-        for reach_m, depth_m in views[min(candidate.evidence.visits, 1) :]:
-            cell = place_for(
-                frontiers.free,
-                frontiers.passable,
-                candidate.cells,
-                reachable.cells,
-                reachable.path_lengths,
-                round(depth_m / resolution),
-                reach_m / resolution,
-            )
-            if cell is not None:
-                yield cell
-
-    def _beside(
-        self, candidate: Candidate, frontiers: FrontierMap, reachable: Reachable
-    ) -> tuple[Cell | None, bool]:
-        """The nearest cell on the way to a frontier, None without one; whether it is enclosed."""
-        steps = int(ASSIGNMENT_RADIUS_M / frontiers.frame.resolution)
-        row, col = frontiers.frame.cells_of(np.array([candidate.middle]))[0]
-        return search_beside(
-            frontiers.free,
-            candidate.cells,
-            reachable.cells,
-            reachable.standing,
-            steps,
-            (int(row), int(col)),
+        candidate.view = view
+        candidate.probability = self._model.probability(
+            candidate.length_m, view.hidden_m2, view.depth_m, candidate.evidence.visits
         )
+        candidate.area_m2 = min(view.most_m2, self._model.mean_area(view.hidden_m2))
 
 
-def _drives_to(candidate: Candidate, cell: Cell, frontiers: FrontierMap) -> bool:
-    """Make a cell the viewpoint, unless a visit there showed nothing; returns whether it is."""
-    x, y = frontiers.frame.centres_of(np.array([cell]))[0].tolist()
-    if candidate.evidence.was_seen_from((x, y)):
-        return False
-    candidate.goal = se2.pose(x, y, se2.bearing((x, y), candidate.middle))
-    return True
+def _choose_viewpoint(
+    candidate: Candidate, frontiers: FrontierMap, travel: TravelTimes, slack_rad: float
+) -> None:
+    """Choose the place that sees most of a frontier for each second that it costs.
+
+    Not one from where a visit showed nothing. Without such a place, it is the nearest one beside
+    the frontier: from there a passage that looks too narrow may turn out to be wide enough.
+    slack_rad: angle by which the robot need not turn to what it observes.
+    """
+    view = candidate.view
+    centres = frontiers.frame.centres_of(view.cells)
+    arrivals = travel.arrivals(view.cells)
+    is_new = np.isfinite(arrivals.seconds)
+    for place in candidate.evidence.seen_from:
+        is_new &= np.hypot(*(centres - place).T) > SAME_M
+    if not is_new.any():
+        _choose_beside(candidate, frontiers, travel)
+        return
+    off = se2.wrap(view.directions - arrivals.headings)
+    turns = off - np.clip(off, -slack_rad, slack_rad)
+    seconds = arrivals.seconds + travel.turn_s(turns)
+    best = int(np.argmax(np.where(is_new, view.areas_m2 / seconds, 0.0)))
+    heading = float(arrivals.headings[best] + turns[best])
+    x, y = centres[best].tolist()
+    candidate.goal = se2.pose(x, y, heading)
+    candidate.seconds = float(seconds[best])
 
 
-def _is_as_it_was(new: Candidate, known: Candidate, stamp_ns: int, T_map_base: Array) -> bool:
-    """Whether a frontier is the same, and was examined so lately that nothing has changed."""
-    age_s = (stamp_ns - known.examined_ns) / SECOND_NS
-    is_same = len(known.cells) == len(new.cells) and known.middle == new.middle
-    away_m = math.dist(new.middle, T_map_base[:2])
-    is_recent = 0.0 <= age_s < max(_RENEW_S, _RENEW_S_M * away_m)
-    return is_same and is_recent and known.examined_ns >= 0
+def _choose_beside(candidate: Candidate, frontiers: FrontierMap, travel: TravelTimes) -> None:
+    """Choose the nearest place beside a frontier, unless a visit there showed nothing."""
+    row, col = frontiers.frame.cells_of(np.array([candidate.middle]))[0].tolist()
+    steps = int(ASSIGNMENT_RADIUS_M / frontiers.frame.resolution)
+    cell = search_beside(frontiers.free, candidate.cells, travel.reachable, steps, (row, col))
+    if cell is not None:
+        x, y = frontiers.frame.centres_of(np.array([cell]))[0].tolist()
+        if not candidate.evidence.was_seen_from((x, y)):
+            candidate.goal = se2.pose(x, y, se2.bearing((x, y), candidate.middle))
+            candidate.seconds = float(travel.seconds_to(candidate.goal[None])[0])

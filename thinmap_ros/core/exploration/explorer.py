@@ -4,8 +4,8 @@
   paper. A candidate is dropped as soon as its probability passes the threshold on the way.
 - Many small chances are one large one: an exploration does not end as long as all candidates above
   the threshold together are expected to hide more than 2 m2.
-- The next one is that with the shortest path, the turn at its beginning included. A tour through
-  all of them saves nothing: what comes to light on the way changes it.
+- The next one is that which is reached first, turns included. A tour through all of them saves
+  nothing: what comes to light on the way changes it.
 - The target is kept unless another one saves a clear margin, so that the robot does not oscillate.
 - A target that stays as it is although the robot observes it is evidence that nothing is hidden.
 - What was tried is tried again when its frontier has changed, or once before the end.
@@ -17,7 +17,7 @@ Source: exploration paper sections 3.2 and 4.
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from typing import Any
 
@@ -25,21 +25,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.config import config_or_default, parameter
+from thinmap_ros.core.config import config_or_default, part
 from thinmap_ros.core.exploration import belief
 from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel, Evidence
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.fitted import FITTED
-from thinmap_ros.core.exploration.space import (
-    FrontierMap,
-    ReachableSpace,
-    box_of_scan,
-    hidden_area_m2,
-)
+from thinmap_ros.core.exploration.space import FrontierMap, box_of_scan, hidden_area_m2
 from thinmap_ros.core.exploration.strategy import Decision, Start, Streak, decide, is_at, is_near
 from thinmap_ros.core.exploration.team import SAME_PLACE_M, Claim, Team
+from thinmap_ros.core.exploration.views import Sight
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import NO_PATH
+from thinmap_ros.core.planning.path_follower import SpeedConfig
+from thinmap_ros.core.planning.travel_times import TravelTimes
+from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -49,11 +48,9 @@ TURN_ID = 2**32 - 1  # of the place where the robot turns; the end nodes' ids ar
 _PARTS = 3
 _IS_THERE_RAD = 0.35
 
-_TURN_FROM_M = 0.3  # paths that are shorter begin with no turn
 _SAME_PLACE_M = 1.5  # a target or viewpoint that moves less is the same one
-_TURN_COST_M_RAD = 0.2  # driven in the time of a turn by one radian, at 0.2 m/s and 1 rad/s
 # Saving for which the target is changed, so that the robot does not oscillate.
-_SWITCH_MARGIN_M = 2.0
+_SWITCH_MARGIN_S = 4.0
 _FIND_PERIOD_S = 1.0  # between two searches for candidates, which take time in large maps
 _MAX_VISITS = 3  # until a candidate is given up
 _MAX_FAILURES = 2
@@ -111,28 +108,29 @@ def _has_heading(T_map_base: Array, goal: Array) -> bool:
 
 @dataclass(frozen=True)
 class ExplorerConfig(CandidateConfig):
-    """What is worth a visit, and how the next target is chosen."""
+    """What is worth a visit, and how long it takes to get there.
 
-    probability_threshold: float = parameter(
-        0.9,
-        'An end node with at least this position probability is not visited. Raise it for higher '
-        'coverage, lower it for shorter paths.',
-        low=0.5,
-        high=0.999,
-    )
+    planner, controller: of the navigator that drives to the targets.
+    """
+
+    planner: WavefrontConfig = part(WavefrontConfig)
+    controller: SpeedConfig = part(SpeedConfig)
 
 
 @dataclass
 class _Target:
     """Where the robot drives: the candidate, the goal (3,), and the scans made there.
 
-    is_turn: whether the goal is a part of a turn in place.
+    is_turn: whether the goal is a part of a turn in place; known_area_m2: when the goal was set;
+    seconds: until the robot is there, as found last, 0 where that is not known.
     """
 
     candidate: Candidate | None = None
     goal: Array | None = None
     visit: Streak = field(default_factory=Streak)
     is_turn: bool = False
+    known_area_m2: float = 0.0
+    seconds: float = 0.0
 
 
 class Explorer:
@@ -149,7 +147,8 @@ class Explorer:
         self.team = team or Team()
         self.frontier_map = FrontierMap()
         self._finder = CandidateFinder(self.config, model)
-        self._space = ReachableSpace(self.config.robot_radius_m)
+        self._travel = TravelTimes(self.config.planner, self.config.controller)
+        self._sight = Sight()
         self._target = _Target()
         self._look = LookAround()
         self._now_ns = 0  # stamp of this scan
@@ -188,22 +187,17 @@ class Explorer:
         patch: the whole map, on one lattice from step to step. Deterministic; call it once a scan.
         """
         self._now_ns = scan.stamp_ns
-        self._space.add_pose(T_map_base)
+        self._travel.add_pose(T_map_base)
+        self._sight.add_scan(scan)
         self.frontier_map.update(patch, box_of_scan(scan, T_map_base), *self.team.take_changes())
         self._add_visit(T_map_base)
         if self._is_due():
             self._found_ns = scan.stamp_ns
             self.team.apply_settled(self._finder.store.items, SAME_PLACE_M, scan.stamp_ns)
             self._frame = self.frontier_map.frame
-            self._space.update(self.frontier_map, T_map_base)
-            self._finder.update(
-                topology,
-                self.frontier_map,
-                self._space.now,
-                T_map_base,
-                scan.range_max_m,
-                scan.stamp_ns,
-            )
+            frontiers = self.frontier_map
+            self._travel.update(frontiers.free, frontiers.passable, frontiers.frame, T_map_base)
+            self._finder.update(topology, frontiers, self._travel, self._sight)
             self._choose(topology, T_map_base)
         return self._decision()
 
@@ -220,12 +214,13 @@ class Explorer:
                 self.team.add_settled(candidate.evidence)
         self._target = _Target()
 
-    def claim(self, stamp_ns: int, T_map_base: Array, remaining_m: float = 0.0) -> Claim:
-        """What to send the other robots of the team, at a pose (3,); remaining_m: of the path."""
-        candidate = self._target.candidate
-        place = None if candidate is None or self._target.is_turn else candidate.middle
+    def claim(self, stamp_ns: int, T_map_base: Array) -> Claim:
+        """What to send the other robots of the team, at a pose (3,)."""
+        target = self._target
+        is_claimed = target.candidate is not None and not target.is_turn
+        place = target.candidate.middle if target.candidate is not None and is_claimed else None
         team = self.team
-        return Claim(team.name, stamp_ns, T_map_base, place, remaining_m, team.settled)
+        return Claim(team.name, stamp_ns, T_map_base, place, target.seconds, team.settled)
 
     def frontiers(self) -> list[Array]:
         """Cells of each candidate, (N, 2), m, map frame."""
@@ -234,16 +229,18 @@ class Explorer:
     def _add_visit(self, T_map_base: Array) -> None:
         """A target that stays although the robot is there and observes it hides nothing, probably.
 
-        It is observed from somewhere else the next time, and is reachable, whatever failed before.
+        Unless the visit has shown something: what it shows is often a part of what is hidden. It is
+        observed from somewhere else the next time, and is reachable, whatever failed before.
         """
         target = self._target
         if target.candidate is None or target.goal is None or target.is_turn:
             return
         if target.visit.add(is_at(T_map_base, target.goal)):
+            self._target = _Target()
+            if self.frontier_map.known_area_m2 >= target.known_area_m2 + WORTH_SEEING_M2:
+                return
             target.candidate.evidence.add_visit((float(target.goal[0]), float(target.goal[1])))
             self.team.add_settled(target.candidate.evidence)
-            target.candidate.examined_ns = -1
-            self._target = _Target()
 
     def _is_due(self) -> bool:
         """Whether candidates are found again: once in a while, and when the target is gone."""
@@ -272,27 +269,25 @@ class Explorer:
         self._end = Streak()
         self._look.stop()
         own = self.claim(self._now_ns, T_map_base)
-        ready = self.team.share(
-            self._ready(worth), own, self._space.path_lengths_from, _SWITCH_MARGIN_M
-        )
+        ready = self.team.share(self._ready(worth), own, self._travel, _SWITCH_MARGIN_S)
         if ready:
-            self._drive_to(self._best(self._costs(ready, T_map_base)), T_map_base)
+            self._drive_to(self._best(ready), T_map_base)
         else:
             self._target = _Target()
 
-    def _best(self, costs: dict[Candidate, float]) -> Candidate:
-        """The target, unless another candidate saves the margin; else the cheapest one.
+    def _best(self, ready: list[Candidate]) -> Candidate:
+        """The target, unless another candidate saves the margin; else that which is reached first.
 
         The margin is twice as large for each time that the other one was left, so that the robot
         never oscillates without end, whatever the costs are.
         """
-        best = min(costs, key=lambda candidate: costs[candidate])
-        kept = self._kept(costs)
+        best = min(ready, key=lambda candidate: candidate.seconds)
+        kept = self._kept(ready)
         if kept is None or kept is best:
             return best
         known_area_m2 = self.frontier_map.known_area_m2
-        margin_m = _SWITCH_MARGIN_M * 2.0 ** best.evidence.times_left(known_area_m2)
-        if costs[best] >= costs[kept] - margin_m:
+        margin_s = _SWITCH_MARGIN_S * 2.0 ** best.evidence.times_left(known_area_m2)
+        if best.seconds >= kept.seconds - margin_s:
             return kept
         kept.evidence.leave(known_area_m2)
         return best
@@ -341,13 +336,19 @@ class Explorer:
         return min(near, key=lambda c: _moved_m(c, target), default=None)
 
     def _drive_to(self, candidate: Candidate, T_map_base: Array) -> None:
-        """Make a candidate the target; the goal stays while its frontier does."""
-        goal = candidate.goal
-        if goal is None:
+        """Make a candidate the target; the goal stays while its frontier and the path to it do."""
+        if candidate.goal is None:
             return
-        if self._goal_stays(candidate, goal, T_map_base):
-            goal = self._target.goal
-        self._target = _Target(candidate, goal, self._target.visit)
+        before = self._target
+        if before.goal is not None and self._goal_stays(candidate, candidate.goal, T_map_base):
+            seconds = float(self._travel.seconds_to(before.goal[None])[0])
+            if seconds <= candidate.seconds + _SWITCH_MARGIN_S:
+                self._target = replace(before, candidate=candidate, is_turn=False, seconds=seconds)
+                return
+        known_m2 = self.frontier_map.known_area_m2
+        self._target = _Target(
+            candidate, candidate.goal, before.visit, False, known_m2, candidate.seconds
+        )
 
     def _goal_stays(self, candidate: Candidate, goal: Array, T_map_base: Array) -> bool:
         """Whether the goal stays although another viewpoint of the same frontier is nearer now.
@@ -363,13 +364,6 @@ class Explorer:
         is_same = max(moved_m, gap_m) <= _SAME_PLACE_M
         return is_same and (moved_m == 0.0 or not is_near(T_map_base, target.goal))
 
-    def _costs(self, candidates: list[Candidate], T_map_base: Array) -> dict[Candidate, float]:
-        """Cost, m, of driving to each candidate: the path, and the turn with which it begins."""
-        goals = np.array([candidate.goal for candidate in candidates])
-        lengths = self._space.path_lengths(T_map_base, goals[:, :2])
-        costs = lengths + _TURN_COST_M_RAD * _turns(T_map_base, goals)
-        return dict(zip(candidates, costs.tolist(), strict=True))
-
     def _decision(self) -> Decision:
         target = self._target
         places = self.candidates
@@ -383,7 +377,7 @@ class Explorer:
             len(doubtful) or int(self._look.is_in_the_dark),
             (c.node_id for c in doubtful if c.evidence.failures or _is_given_up(c)),
             self.frontier_map.known_area_m2,
-            [(c.probability, c.mean_area_m2) for c in self.candidates],
+            self._finder.hidden,
         )
 
 
@@ -397,10 +391,3 @@ def _is_given_up(candidate: Candidate) -> bool:
 def _moved_m(candidate: Candidate, target: Candidate) -> float:
     """Distance from the middle of a target to that of a candidate."""
     return math.dist(candidate.middle, target.middle)
-
-
-def _turns(T_map_base: Array, goals: Array) -> Array:
-    """Size of the turns (N,), rad, with which the paths to goals (N, 3) begin; 0 at the goal."""
-    offsets = goals[:, :2] - T_map_base[:2]
-    turns = np.abs(se2.wrap(np.arctan2(offsets[:, 1], offsets[:, 0]) - T_map_base[2]))
-    return np.where(np.hypot(*offsets.T) > _TURN_FROM_M, turns, 0.0)

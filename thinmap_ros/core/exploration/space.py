@@ -1,31 +1,18 @@
-"""Where the known space ends: frontiers, what may be behind them, and from where it is seen."""
+"""Where the known space ends: frontiers, and what may be behind them."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.patch import Bounds, GridFrame, GridPatch, union
+from thinmap_ros.core.grid.patch import Bounds, GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup, line_is_clear
-from thinmap_ros.core.planning.grid_search import (
-    distance_field_from,
-    downsample_mask,
-    escape_cells,
-    reachable_cells,
-    traversable_cells,
-    update_traversable_cells,
-)
-from thinmap_ros.core.planning.obstacles import RecentPath
-from thinmap_ros.core.planning.wavefront import start_escape_m
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, Cell, Cells, Mask, Place
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import known_free, true_cells
 from thinmap_ros.jit import inlined, kernel
-
-NOTHING: Bounds = (0, 0, 0, 0)
 
 # Of frontiers.
 _GAPS = TopologyConfig()
@@ -44,19 +31,7 @@ _SKIPPED = 2  # free cells with which a ray at an angle may begin
 
 _RIM_M = 0.5  # beyond the beams of a scan, in which it may have changed the map
 
-# Of viewpoints. Not more: across a wall one cell thick places where a robot can stand are six cells
-# apart, and stay apart in squares.
-SQUARE = 3
-# Most of what a border hides: so much of so many points. Of a long one, with a point every so many
-# cells, as many.
-_POINTS = 8
-_SHARE = 0.7
-_SPACING = 10
-_STRIDE = 4
-_SLACK_CELLS = 5
-
-# Of what can be reached.
-_DETOUR = 3.0  # of the straight line, where no path is known
+_SLACK_CELLS = 5  # of a search beside a frontier, beyond the first find
 
 
 class FrontierMap:
@@ -73,7 +48,6 @@ class FrontierMap:
 
     def __init__(self) -> None:
         self._updates = 0
-        self._changed: Bounds | None = None
         self._begin(GridPatch(GridFrame(0.0, 0.0, 1.0), np.zeros((0, 0), dtype=np.int8)), 0)
 
     @property
@@ -97,12 +71,6 @@ class FrontierMap:
         for part in [(0, 0, *patch.shape)] if is_whole else [_part(patch, box) for box in boxes]:
             self._update_part(patch, part)
 
-    def take_changes(self) -> Bounds | None:
-        """Part in which cells may have changed since the last call; None: everywhere."""
-        changed = self._changed
-        self._changed = NOTHING
-        return changed
-
     def _begin(self, patch: GridPatch, spare: int) -> None:
         """Forget all cells; the next ones are those of a map, and spare ones on each side."""
         rows, cols = (size + 2 * spare for size in patch.shape)
@@ -112,7 +80,6 @@ class FrontierMap:
         self.passable: Mask = np.ones((rows, cols), dtype=np.bool_)
         self.free_cells = 0
         self._room = GridPatch(self.frame, self.mask.view(np.int8))
-        self._changed = None
         # For each cell and a margin of one cell, kept: a map has few frontier cells.
         self._zeros = np.zeros((rows + 2) * (cols + 2), dtype=np.int32)
 
@@ -130,7 +97,6 @@ class FrontierMap:
         first_row, first_col = self._room.offset_of(patch)
         to = (top + first_row, left + first_col, bottom + first_row, right + first_col)
         at = np.s_[to[0] : to[2], to[1] : to[3]]
-        self._mark_changed(to)
         known = known_free(cut, _GAPS)
         # Cells outside of the map are unknown.
         unknown = np.ones((known.shape[0] + 2, known.shape[1] + 2), dtype=np.bool_)
@@ -141,12 +107,6 @@ class FrontierMap:
         self.free[at] = known[inner]
         self.mask[at] = (known & beside)[inner]
         self.passable[at] = ~cut.occupied[inner]
-
-    def _mark_changed(self, part: Bounds) -> None:
-        if self._changed == NOTHING:
-            self._changed = part
-        elif self._changed is not None:
-            self._changed = union(self._changed, part)
 
     def clusters(self, min_length_m: float) -> list[Cells]:
         """Frontier cells (N, 2) of each cluster that is long enough, in the order of first cells.
@@ -262,8 +222,7 @@ def depth_behind_m(frontiers: FrontierMap, cells: Cells) -> float:
     """
     resolution = frontiers.frame.resolution
     reach = round(DEPTH_REACH_M / resolution)
-    depths = _depths(frontiers.free, frontiers.passable, cells, reach)
-    return float(np.quantile(depths, _DEPTH_QUANTILE)) * resolution
+    return float(_depth_behind(frontiers.free, frontiers.passable, cells, reach)) * resolution
 
 
 @kernel
@@ -297,14 +256,14 @@ def _hidden_cells(free: Mask, passable: Mask, row: int, col: int, reach: float) 
 
 
 @kernel
-def _depths(free: Mask, passable: Mask, cells: Cells, reach: int) -> Array:
-    """Unknown cells in a row, at most `reach`, behind some of a cluster's cells (N, 2)."""
+def _depth_behind(free: Mask, passable: Mask, cells: Cells, reach: int) -> float:
+    """Unknown cells in a row, at most `reach`, behind most of some of a cluster's cells (N, 2)."""
     count = min(cells.shape[0], _DEPTH_RAYS)
     depths = np.empty(count)
     for i in range(count):
         k = (2 * i + 1) * cells.shape[0] // (2 * count)
         depths[i] = _depth(free, passable, cells[k, 0], cells[k, 1], reach)
-    return depths
+    return float(np.quantile(depths, _DEPTH_QUANTILE))
 
 
 @inlined
@@ -400,129 +359,31 @@ def _box(
     return box
 
 
-def place_for(
-    free: Mask, passable: Mask, cells: Cells, allowed: Mask, ways: Array, depth: int, reach: float
+def search_beside(
+    free: Mask, cells: Cells, allowed: Mask, max_steps: int, towards: Cell
 ) -> Cell | None:
-    """Allowed cell with the shortest path that observes most of the space behind a frontier (N, 2).
+    """The allowed cell beside a frontier (N, 2) that is nearest to another cell; None: none.
 
-    Some points straight behind the frontier's cells stand for the unknown. Most of these could be
-    seen from there if nothing stands in the unknown. A robot on the known side of a corner sees
-    along the frontier, but nothing that the corner hides; one at the end of its laser's range has
-    to come only a little nearer.
-    free, passable (all cells that are not occupied), allowed (H, W);
-    ways (ceil(H / SQUARE), ceil(W / SQUARE)): path length to each square of SQUARE x SQUARE cells;
-    the robot would stand in its middle; depth: of the space behind the frontier, in cells;
-    reach: range of the laser, in cells.
+    Of the allowed cells (H, W) whose path to the frontier over free cells (H, W) has at most
+    max_steps cells, and is nearly the shortest: around a pillar all sides are equally near.
     """
-    most = max(_POINTS, len(cells) // _SPACING)
-    points = _hidden_points(free, passable, cells, depth, most)
-    need = math.ceil(_SHARE * min(len(points), _POINTS))
-    row, col = _view_place(ways, SQUARE, allowed, passable, points, reach, need)
+    row, col, _ = _search_beside(free, cells, allowed, allowed, max_steps, towards)
     return None if row < 0 else (int(row), int(col))
 
 
-def search_beside(
-    free: Mask, cells: Cells, allowed: Mask, standing: Mask, max_steps: int, towards: Cell
-) -> tuple[Cell | None, bool]:
-    """The allowed cell beside a frontier (N, 2) that is nearest to another cell; None: none.
+def is_enclosed(free: Mask, cells: Cells, standing: Mask) -> bool:
+    """Whether no path over free cells leads from a frontier (N, 2) to where a robot could stand.
 
-    Of the allowed cells whose path to the frontier over free cells has at most max_steps cells, and
-    is nearly the shortest: around a pillar all sides are equally near. Also whether the frontier is
-    enclosed: no path leads from it to a cell where the robot could stand. free, standing (H, W).
+    free, standing (H, W).
     """
-    row, col, is_enclosed = _search_beside(free, cells, allowed, standing, max_steps, towards)
-    return (None if row < 0 else (int(row), int(col))), bool(is_enclosed)
-
-
-@kernel
-def _hidden_points(free: Mask, passable: Mask, cells: Cells, depth: int, most: int) -> Cells:
-    """Cells behind some of a border's cells (N, 2).
-
-    They lie straight on into the unknown, up to a depth or something known.
-    """
-    rows, cols = free.shape
-    count = min(cells.shape[0], most)
-    points = np.empty((count, 2), dtype=np.int64)
-    for i in range(count):
-        k = (2 * i + 1) * cells.shape[0] // (2 * count)
-        row = cells[k, 0]
-        col = cells[k, 1]
-        # Which way the unknown lies, from the cells around.
-        down = 0.0
-        right = 0.0
-        for r in range(max(row - 3, 0), min(row + 4, rows)):
-            for c in range(max(col - 3, 0), min(col + 4, cols)):
-                if not free[r, c] and passable[r, c]:
-                    down += r - row
-                    right += c - col
-        length = max(math.hypot(down, right), 1e-9)
-        points[i, 0] = row
-        points[i, 1] = col
-        for step in range(1, depth + 1):
-            r = int(round(row + step * down / length))
-            c = int(round(col + step * right / length))
-            if r < 0 or r >= rows or c < 0 or c >= cols or not passable[r, c]:
-                break
-            points[i, 0] = r
-            points[i, 1] = c
-    return points
-
-
-@kernel
-def _view_place(
-    ways: Array, factor: int, allowed: Mask, passable: Mask, points: Cells, reach: float, need: int
-) -> tuple[int, int]:
-    """Middle of the square with the shortest path that sees at least `need` points, or -1.
-
-    A line of sight runs over passable cells, and is shorter than reach.
-    """
-    rows, cols = allowed.shape
-    low_r = points[:, 0].min() - reach
-    high_r = points[:, 0].max() + reach
-    low_c = points[:, 1].min() - reach
-    high_c = points[:, 1].max() + reach
-    top = max(int(low_r) // factor, 0)
-    bottom = min(int(high_r) // factor + 1, ways.shape[0])
-    left = max(int(low_c) // factor, 0)
-    right = min(int(high_c) // factor + 1, ways.shape[1])
-    best = np.inf
-    best_row = -1
-    best_col = -1
-    # First a few squares here and there: with a good place in hand most others need no look.
-    for stride in (_STRIDE, 1):
-        for r in range(top, bottom, stride):
-            for c in range(left, right, stride):
-                row = r * factor + factor // 2
-                col = c * factor + factor // 2
-                if ways[r, c] >= best or row >= rows or col >= cols or not allowed[row, col]:
-                    continue
-                if _sees_enough(passable, row, col, points, reach, need):
-                    best = ways[r, c]
-                    best_row = row
-                    best_col = col
-    return best_row, best_col
-
-
-@inlined
-def _sees_enough(
-    passable: Mask, row: int, col: int, points: Cells, reach: float, need: int
-) -> bool:
-    """Whether so many of the points (N, 2) are in sight of a cell."""
-    seen = 0
-    for i in range(points.shape[0]):
-        if seen + points.shape[0] - i < need:
-            break
-        away = math.hypot(points[i, 0] - row, points[i, 1] - col)
-        if away < reach and line_is_clear(passable, points[i, 0], points[i, 1], row, col):
-            seen += 1
-    return seen >= need
+    return bool(_search_beside(free, cells, standing, standing, -1, (0, 0))[2])
 
 
 @kernel
 def _search_beside(
     free: Mask, cells: Cells, allowed: Mask, standing: Mask, most_steps: int, towards: Cell
 ) -> tuple[int, int, bool]:
-    """Breadth first over free cells, from all frontier cells at once; see search_beside.
+    """Breadth first over free cells, from all frontier cells at once, to a place and at all.
 
     It goes _SLACK_CELLS steps on after the first find.
     """
@@ -554,84 +415,3 @@ def _search_beside(
                 queue[tail] = r, c, steps + 1
                 tail += 1
     return place[0], place[1], is_enclosed
-
-
-class Reachable(NamedTuple):
-    """Reachable cells (H, W), and the path length, in squares, to each of their squares.
-
-    standing (H, W): cells where the robot fits, reachable or not.
-    """
-
-    cells: Mask
-    standing: Mask
-    path_lengths: Array
-    frame: GridFrame
-
-    def lengths_to(self, T_map_base: Array, goals: Array) -> Array:
-        """Path lengths (N,), m, to goals (N, 2) from where the robot is, at (3,).
-
-        At least the straight line; a detour where there is no path.
-        """
-        rows, cols = (self.frame.cells_of(goals) // SQUARE).T
-        height, width = self.path_lengths.shape
-        inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
-        squares = np.full(len(goals), np.inf)
-        squares[inside] = self.path_lengths[rows[inside], cols[inside]]
-        straight_m = np.hypot(*(goals - T_map_base[:2]).T)
-        known = np.isfinite(squares)
-        lengths_m = np.where(known, squares * SQUARE * self.frame.resolution, _DETOUR * straight_m)
-        return np.asarray(np.maximum(lengths_m, straight_m))
-
-
-class ReachableSpace:
-    """Reachable space of a robot of a radius, updated where the map has changed."""
-
-    def __init__(self, robot_radius_m: float) -> None:
-        self._radius_m = robot_radius_m
-        self._escape_m = start_escape_m(robot_radius_m)
-        self._recent_path = RecentPath()
-        self._standing: Mask = np.zeros((0, 0), dtype=np.bool_)
-        self._passable = self._standing
-        nowhere = np.zeros((0, 0))
-        self.now = Reachable(self._standing, self._standing, nowhere, GridFrame(0.0, 0.0, 1.0))
-
-    def add_pose(self, T_map_base: Array) -> None:
-        """Add a pose (3,): the robot can return over its recent path."""
-        self._recent_path.add_pose(T_map_base)
-
-    def update(self, frontiers: FrontierMap, T_map_base: Array) -> None:
-        """Find what can be reached from a pose (3,) in the map of the frontiers."""
-        self._update_standing(frontiers)
-        self._passable = frontiers.passable
-        recent = self._recent_path.cells(frontiers.frame, frontiers.free.shape)
-        self.now = self._reach(T_map_base, frontiers.frame, recent)
-
-    def path_lengths(self, T_map_base: Array, goals: Array) -> Array:
-        """Path lengths (N,), m, to goals (N, 2); estimated where there is no path."""
-        return self.now.lengths_to(T_map_base, goals)
-
-    def path_lengths_from(self, T_map_base: Array, goals: Array) -> Array:
-        """Path lengths (N,), m, to goals (N, 2) from a pose (3,) of another robot."""
-        return self._reach(T_map_base, self.now.frame).lengths_to(T_map_base, goals)
-
-    def _reach(self, T_map_base: Array, frame: GridFrame, recent: Cells | None = None) -> Reachable:
-        """What can be reached from a pose (3,); recent (N, 2): cells where the robot was."""
-        xy = (float(T_map_base[0]), float(T_map_base[1]))
-        allowed = escape_cells(self._standing, self._passable, frame, xy, self._escape_m, recent)
-        row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
-        # Cells say whether there is a way, as the navigator does; squares, which join what a narrow
-        # gap separates, say how long it is.
-        reached = reachable_cells(allowed, (row, col))
-        lengths = distance_field_from(
-            downsample_mask(reached, SQUARE), (row // SQUARE, col // SQUARE)
-        )
-        return Reachable(reached & self._standing, allowed, lengths, frame)
-
-    def _update_standing(self, frontiers: FrontierMap) -> None:
-        radius_m = self._radius_m
-        resolution = frontiers.frame.resolution
-        part = frontiers.take_changes()
-        if part is None:
-            self._standing = traversable_cells(frontiers.free, radius_m, resolution)
-        elif part != NOTHING:
-            update_traversable_cells(self._standing, frontiers.free, part, radius_m, resolution)

@@ -1,7 +1,7 @@
 """A robot's view of its team: what others claim and change, and which candidates are its own."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,39 +12,38 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.exploration.belief import Evidence
 from thinmap_ros.core.exploration.candidates import Candidate
+from thinmap_ros.core.planning.travel_times import TravelTimes
 from thinmap_ros.core.se2 import SECOND_NS, Array, Place
 
 NOTHING = -1
-_TIE_M = 0.1  # paths that differ less are equally long
+_TIE_S = 0.2  # times that differ less are equal
 _CLAIM_RADIUS_M = 2.0  # a candidate belongs to a claim of a place within this distance
 _MAX_CANDIDATES = 40  # in an auction; the nearest ones
 
 SAME_PLACE_M = 0.5  # a claimed place that moves less is the same one
 MAX_SETTLED = 8  # places in a claim
-_PROGRESS_M = 0.5
-
-LengthsFrom = Callable[[Array, Array], Array]  # path lengths (N,), m, from a pose to goals (N, 2)
+_PROGRESS_S = 1.0
 
 
 def auction(
-    lengths_m: Array, claimed: NDArray[np.int64], told_m: Array, margin_m: float
+    seconds: Array, claimed: NDArray[np.int64], told_s: Array, margin_s: float
 ) -> NDArray[np.int64]:
     """Candidate (R,) that each robot explores, NOTHING where there are fewer candidates.
 
     Each robot decides this alone from the claims of all. Pairs of robot and candidate are formed,
-    the shortest path first, one candidate for each robot. A robot keeps what it has claimed unless
-    another one is clearly nearer.
-    lengths_m (R, N): path length from each robot to each candidate, robots in the order in which
-    ties are decided; claimed (R,): the candidate that each has claimed, or NOTHING; told_m (R,):
-    path length to it of which each has told the others; margin_m: a claimed candidate counts as so
-    much nearer.
+    the shortest time first, one candidate for each robot. A robot keeps what it has claimed unless
+    another one is clearly sooner there.
+    seconds (R, N): time from each robot to each candidate, robots in the order in which ties are
+    decided; claimed (R,): the candidate that each has claimed, or NOTHING; told_s (R,): time to it
+    that each has sent to the others; margin_s: a claimed candidate counts as reached so much
+    sooner.
     Sources: Zlot et al., "Multi-robot exploration controlled by a market economy", 2002; Werger and
     Mataric, "Broadcast of local eligibility", 2000.
     """
-    robots, count = lengths_m.shape
-    bids = np.round(lengths_m / _TIE_M)
-    holders = [r for r in range(robots) if _holds(r, claimed, told_m)]
-    bids[holders, claimed[holders]] -= margin_m / _TIE_M
+    robots, count = seconds.shape
+    bids = np.round(seconds / _TIE_S)
+    holders = [r for r in range(robots) if _holds(r, claimed, told_s, margin_s)]
+    bids[holders, claimed[holders]] -= margin_s / _TIE_S
     won = np.full(robots, NOTHING, dtype=np.int64)
     for _ in range(min(robots, count)):
         # Of equal bids the first robot's.
@@ -55,17 +54,18 @@ def auction(
     return won
 
 
-def _holds(robot: int, claimed: NDArray[np.int64], told_m: Array) -> bool:
-    """Whether a robot's claim counts: of several on one candidate only that of the nearest robot.
+def _holds(robot: int, claimed: NDArray[np.int64], told_s: Array, margin_s: float) -> bool:
+    """Whether a robot's claim counts: of several on one candidate only that of the first there.
 
-    The nearest by what they have told: each knows its own pose sooner than those of the others, and
-    would take itself for the nearest.
+    The first by what they have sent: each knows its own pose sooner than those of the others, and
+    would take itself for the first. What they have sent is some seconds old: of two that differ by
+    less than the margin the first robot's counts.
     """
     candidate = int(claimed[robot])
     if candidate == NOTHING:
         return False
     rivals = np.flatnonzero(claimed == candidate)
-    return int(rivals[told_m[rivals].argmin()]) == robot
+    return int(rivals[told_s[rivals] <= told_s[rivals].min() + margin_s][0]) == robot
 
 
 @dataclass(frozen=True)
@@ -110,37 +110,30 @@ class Claim:
     It names the place of a frontier and no id of a node, so that each robot can have a graph of its
     own. It holds as long as its robot is received and comes nearer to the place.
     robot: its name; stamp_ns: by its own clock; pose (3,); place: of the frontier that it drives
-    to, m, None without a target; remaining_m: rest of its path, 0 before it is planned; settled:
-    its latest places; explores: False for one that takes no candidate, whatever is left.
+    to, m, None without a target; remaining_s: time until it is there, 0 where that is not known;
+    settled: its latest places; explores: False for one that takes no candidate, whatever is left.
     """
 
     robot: str
     stamp_ns: int
     pose: Array
     place: Place | None = None
-    remaining_m: float = 0.0
+    remaining_s: float = 0.0
     settled: tuple[SettledPlace, ...] = ()
     explores: bool = True
-
-    @property
-    def path_m(self) -> float:
-        """Rest of the path to the claimed place; the straight line before a path is planned."""
-        if self.place is None or self.remaining_m > 0.0:
-            return self.remaining_m
-        return math.dist(self.pose[:2], self.place)
 
 
 @dataclass
 class _Received:
     """A claim, when it came and when its robot made progress, by this robot's clock, ns.
 
-    nearest_m: smallest remaining path to the claimed place.
+    least_s: smallest remaining time to the claimed place.
     """
 
     claim: Claim
     received_ns: int
     progress_ns: int
-    nearest_m: float
+    least_s: float
 
 
 class Claims:
@@ -157,14 +150,14 @@ class Claims:
         """
         last = self._received.get(claim.robot)
         if last is None or not self._is_recent(last, now_ns):
-            self._received[claim.robot] = _Received(claim, now_ns, now_ns, _planned_m(claim))
+            self._received[claim.robot] = _Received(claim, now_ns, now_ns, _known_s(claim))
             return
         if claim.stamp_ns <= last.claim.stamp_ns:
             return
-        is_nearer = _planned_m(claim) < last.nearest_m - _PROGRESS_M
+        is_nearer = _known_s(claim) < last.least_s - _PROGRESS_S
         if is_nearer or not is_same_place(claim.place, last.claim.place):
             last.progress_ns = now_ns
-            last.nearest_m = _planned_m(claim)
+            last.least_s = _known_s(claim)
         last.claim = claim
         last.received_ns = now_ns
 
@@ -187,9 +180,9 @@ class Claims:
         return now_ns - received.received_ns <= self.config.claim_timeout_s * SECOND_NS
 
 
-def _planned_m(claim: Claim) -> float:
-    """Rest of the path, infinite before it is planned: the first plan is progress."""
-    return claim.remaining_m or math.inf
+def _known_s(claim: Claim) -> float:
+    """Remaining time, infinite before it is known: the first one is progress."""
+    return claim.remaining_s or math.inf
 
 
 def is_same_place(a: Place | None, b: Place | None) -> bool:
@@ -276,37 +269,38 @@ class Team:
                     item.failed_ns = now_ns
 
     def share(
-        self, candidates: list[Candidate], own: Claim, lengths_from: LengthsFrom, margin_m: float
+        self, candidates: list[Candidate], own: Claim, travel: TravelTimes, margin_s: float
     ) -> list[Candidate]:
         """The candidates that are this robot's: one by auction, or the nearest one to follow.
 
-        own: what this robot claims now; margin_m: saving for which a claim is given up. A robot
-        that claims nothing, or makes no progress, does not bid: it has put aside what is left.
+        own: what this robot claims now; travel: in the map of all; margin_s: saving for which a
+        claim is given up. A robot that claims nothing, or makes no progress, does not bid: it has
+        put aside what is left.
         """
         others = self.claims.held(own.stamp_ns)
         if not others or not candidates:
             return candidates
         bidders = sorted([own, *others], key=lambda claim: claim.robot)
         me = bidders.index(own)
-        goals = np.array([candidate.goal for candidate in candidates])[:, :2]
-        lengths = np.array([lengths_from(claim.pose, goals) for claim in bidders])
-        near = np.argsort(lengths.min(axis=0), kind='stable')[:_MAX_CANDIDATES]
+        goals = np.array([candidate.goal for candidate in candidates])
+        seconds = np.array([travel.seconds_from(claim.pose, goals) for claim in bidders])
+        near = np.argsort(seconds.min(axis=0), kind='stable')[:_MAX_CANDIDATES]
         middles = np.array([candidates[i].middle for i in near])
         claimed = _claimed(middles, [claim.place for claim in bidders])
-        told_m = np.array([claim.path_m for claim in bidders])
-        told_m[me] = self._told_m(own)
-        won = int(auction(lengths[:, near], claimed, told_m, margin_m)[me])
+        told_s = np.array([claim.remaining_s for claim in bidders])
+        told_s[me] = self._told_s(own)
+        won = int(auction(seconds[:, near], claimed, told_s, margin_s)[me])
         if won != NOTHING:
             return [candidates[near[won]]]
-        nearest = int(lengths[me].argmin())
-        follows = 0.0 < self.config.follow_m < lengths[me, nearest]
+        nearest = int(seconds[me].argmin())
+        follows = 0.0 < self.config.follow_m < seconds[me, nearest] * travel.speed_m_s
         return [candidates[nearest]] if follows else []
 
-    def _told_m(self, own: Claim) -> float:
-        """Path length to the claimed place that the others know; infinite: they know of none."""
+    def _told_s(self, own: Claim) -> float:
+        """Time to the claimed place that the others know; infinite: they know of none."""
         sent = self.sent
         is_sent = sent is not None and is_same_place(sent.place, own.place)
-        return sent.path_m if sent is not None and is_sent else math.inf
+        return sent.remaining_s if sent is not None and is_sent else math.inf
 
 
 def _nearest(items: Iterable[Evidence], place: Place, reach_m: float) -> Evidence | None:

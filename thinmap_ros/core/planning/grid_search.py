@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.fields import reachable
-from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, Bounds, GridFrame, GridPatch
-from thinmap_ros.core.se2 import Array, Cells, Mask
+from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridFrame, GridPatch
+from thinmap_ros.core.se2 import Array, Cell, Cells, Mask
 from thinmap_ros.core.topology.thinning import column_distance, standing_room
 from thinmap_ros.jit import kernel
 
 _STRAIGHT = 5
 _DIAGONAL = 7
-_BUCKETS = 32  # enough for steps of up to four times the diagonal one
+_BUCKETS = 32  # enough for steps of up to MAX_WEIGHT times the diagonal one
+MAX_WEIGHT = 4
 _FAR = 2**31 - 1
 
 
@@ -36,13 +37,21 @@ def path_lengths_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Ar
     return _cells(steps)
 
 
-def distance_field_from(allowed: Mask, start: tuple[int, int]) -> Array:
+def distance_field_from(allowed: Mask, start: Cell) -> Array:
     """Path length, cells, over allowed cells from a start (row, col) to each cell (H, W).
 
     inf if there is no path, or if the start is outside the grid.
     """
-    nothing = np.zeros((allowed.shape[0] + 2, allowed.shape[1] + 2), dtype=np.bool_)
-    return _cells(_field(allowed.astype(np.uint8), start[0], start[1], nothing, -1)[1:-1, 1:-1])
+    return weighted_distance_field_from(allowed.astype(np.uint8), start)
+
+
+def weighted_distance_field_from(weights: NDArray[np.uint8], start: Cell) -> Array:
+    """As `distance_field_from`; the length of a step is multiplied by the weight of its end.
+
+    weights (H, W): 0 where there is no path, at most MAX_WEIGHT.
+    """
+    nothing = np.zeros((weights.shape[0] + 2, weights.shape[1] + 2), dtype=np.bool_)
+    return _cells(_field(weights, start[0], start[1], nothing, -1)[1:-1, 1:-1])
 
 
 @kernel
@@ -176,24 +185,6 @@ def traversable_cells(free: Mask, radius_m: float, resolution: float) -> Mask:
     All cells that are not free count as obstacles.
     """
     return standing_room(column_distance(free), radius_m / resolution)
-
-
-def update_traversable_cells(
-    standing: Mask, free: Mask, part: Bounds, radius_m: float, resolution: float
-) -> None:
-    """Update traversable cells (H, W), in place, where free cells have changed within a part."""
-    reach = math.ceil(radius_m / resolution) + 1
-    top = max(part[0] - reach, 0)
-    left = max(part[1] - reach, 0)
-    bottom = part[2] + reach
-    right = part[3] + reach
-    # A margin is read as well, so that the edge of the part does not act as a wall.
-    wide = free[max(top - reach, 0) : bottom + reach, max(left - reach, 0) : right + reach]
-    found = traversable_cells(np.ascontiguousarray(wide), radius_m, resolution)
-    row = top - max(top - reach, 0)
-    col = left - max(left - reach, 0)
-    renewed = standing[top:bottom, left:right]
-    renewed[:] = found[row : row + renewed.shape[0], col : col + renewed.shape[1]]
 
 
 def escape_cells(

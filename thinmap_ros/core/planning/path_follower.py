@@ -21,8 +21,8 @@ _APPROACH_M = 1e-3  # two robots that are too close already may not come closer 
 
 
 @dataclass(frozen=True)
-class PathFollowerConfig(Config):
-    """Limits of the drive, and how closely a path is followed."""
+class SpeedConfig(Config):
+    """What decides how long a drive takes."""
 
     max_speed_m_s: float = parameter(
         0.2, 'Maximum speed (m/s).', low=0.01, high=5.0, safe=SAFE_LOWER
@@ -37,6 +37,12 @@ class PathFollowerConfig(Config):
         high=10.0,
         safe=SAFE_LOWER,
     )
+
+
+@dataclass(frozen=True)
+class PathFollowerConfig(SpeedConfig):
+    """Limits of the drive, and how closely a path is followed."""
+
     max_angular_acceleration_rad_s2: float = parameter(
         2.5,
         'Maximum angular acceleration (rad/s^2). Lower: smoother turns.',

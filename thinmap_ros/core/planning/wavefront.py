@@ -18,7 +18,7 @@ from thinmap_ros.core.config import Config, parameter, robot_radius
 from thinmap_ros.core.grid.fields import nearest_true
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import disc, reachable_cells
-from thinmap_ros.core.se2 import Array, Cells, Mask
+from thinmap_ros.core.se2 import Array, Cell, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import column_distance, known_free
 from thinmap_ros.jit import inlined, kernel
@@ -147,12 +147,7 @@ def find_path(
         )
     start = (int(cells[0, 0]), int(cells[0, 1]))
     wished = (int(cells[1, 0]), int(cells[1, 1]))
-    if not math.isfinite(cost[start]):
-        _open_escape_cells(cost, occupied, start, patch.frame.resolution, config)
-    if trail is not None:
-        back = trail[~occupied[trail[:, 0], trail[:, 1]]]
-        back = back[~_beside_thin_wall(occupied, back)]
-        cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], config.escape_cost)
+    open_escape_cells(cost, occupied, start, patch.frame.resolution, config, trail)
     if band is not None:
         cost[~band] = np.inf
     goal = nearest_true(
@@ -177,18 +172,21 @@ def find_path(
 
 def cost_of_cells(patch: GridPatch, config: WavefrontConfig) -> Array:
     """Cost per unit of distance in each cell (H, W): 1 + I; inf if the robot would collide."""
-    resolution = patch.frame.resolution
     # With the gaps between beams that the graph closes: without them, a tenth of the reachable
     # cells is lost while a robot maps. Scans show an obstacle in a gap before it gets there.
     free = known_free(patch, _TOPOLOGY)
-    passable = ~patch.occupied if config.allow_unknown else free
+    return cost_of_free(free, ~patch.occupied, patch.frame.resolution, config)
+
+
+def cost_of_free(free: Mask, passable: Mask, resolution: float, config: WavefrontConfig) -> Array:
+    """As `cost_of_cells`, where free cells (H, W), and those that are not occupied, are known."""
     reach = max(math.ceil(max(config.inflation_radius_m, config.robot_radius_m) / resolution), 1)
     distance_m = np.sqrt(np.arange(2 * (reach + 1) ** 2 + 1)) * resolution
     spread = max(config.inflation_radius_m - config.robot_radius_m, 1e-6)
     nearness = np.clip((config.inflation_radius_m - distance_m) / spread, 0.0, 1.0)
     allowed = distance_m >= config.robot_radius_m - _HAIR_M
     table = np.where(allowed, 1.0 + config.inflation_cost * nearness * nearness, np.inf)
-    cost = _look_up(column_distance(passable), reach, table)
+    cost = _look_up(column_distance(passable if config.allow_unknown else free), reach, table)
     if config.allow_unknown:
         cost += np.where(free, 0.0, config.unknown_cost)
     return cost
@@ -207,18 +205,31 @@ def navigation_function(
     return np.asarray(_march(cost, goal[0], goal[1], row, col))
 
 
-def _open_escape_cells(
+def open_escape_cells(
     cost: Array,
     occupied: Mask,
-    start: tuple[int, int],
+    start: Cell,
     resolution: float,
     config: WavefrontConfig,
+    trail: Cells | None = None,
 ) -> None:
-    """Allow the inflated cells around a start, at a high cost, so that the robot can escape.
+    """Allow what a robot needs to leave its place, at a high cost, in the costs of cells (H, W).
 
-    Occupied cells stay forbidden, except the cell of the robot itself. So do cells
-    from which a step over a corner leads through a wall.
+    The inflated cells around a start in collision, and those of its recent path (N, 2). Occupied
+    cells stay forbidden, except the cell of the robot itself. So do cells from which a step over a
+    corner leads through a wall.
     """
+    if not math.isfinite(cost[start]):
+        _open_around(cost, occupied, start, resolution, config)
+    if trail is not None:
+        back = trail[~occupied[trail[:, 0], trail[:, 1]]]
+        back = back[~_beside_thin_wall(occupied, back)]
+        cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], config.escape_cost)
+
+
+def _open_around(
+    cost: Array, occupied: Mask, start: Cell, resolution: float, config: WavefrontConfig
+) -> None:
     where, within = disc(cost, start, start_escape_m(config.robot_radius_m) / resolution)
     opened = np.argwhere(within & ~np.isfinite(cost[where]) & ~occupied[where])
     opened += (where[0].start, where[1].start)

@@ -77,11 +77,6 @@ class NavigationClient(Driver):
         self._timer.cancel()
 
     @property
-    def remaining_m(self) -> float | None:
-        """Rest of the path to the goal, as the server reports it; None where it is unknown."""
-        return None if self._drive is None else self._drive.request.remaining_m
-
-    @property
     def is_yielding(self) -> bool:
         """Whether the goal waits for the end of somebody else's."""
         return self.goal is not None and self._drive is None and self._others.is_taken()

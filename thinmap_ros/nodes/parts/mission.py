@@ -132,11 +132,6 @@ class Driver:
         return False
 
     @property
-    def remaining_m(self) -> float | None:
-        """Rest of the path to the goal; None where it is unknown."""
-        return None
-
-    @property
     def goal_prefix(self) -> bytes:
         """PREFIX_BYTES with which the ids of its goals begin."""
         return bytes(PREFIX_BYTES)

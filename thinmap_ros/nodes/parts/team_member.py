@@ -91,13 +91,12 @@ class Progress(NamedTuple):
     """The part of an exploration that a robot reports.
 
     located: stamp and pose (3,), None where it does not know its place; goal (3,): where it drives,
-    and remaining_m: rest of the path, None where they are unknown.
+    None where that is unknown.
     """
 
     mission: Mission
     located: tuple[int, Array] | None
     goal: Array | None
-    remaining_m: float | None
 
 
 # Progress after the newest observation.
@@ -286,11 +285,8 @@ class _ClaimOutput:
         strategy = mission.strategy
         assert isinstance(strategy, Explorer)
         goal = progress.goal
-        remaining_m = progress.remaining_m or 0.0
-        if goal is not None and progress.remaining_m is None:
-            remaining_m = math.dist(goal[:2], T_map_base[:2])
         now_ns = self._node.now_ns
-        claim = strategy.claim(now_ns, T_map_base, remaining_m)
+        claim = strategy.claim(now_ns, T_map_base)
         if not explores:
             claim = Claim(self.name, now_ns, T_map_base, settled=claim.settled, explores=False)
         v, w = self._track.speeds
