@@ -136,7 +136,9 @@ class ExplorerNode(ThinmapNode):
 
     def _make_driver(self, map_frame: str) -> Driver:
         if self._settings.drive:
-            return NavigationClient(self, self._settings, map_frame, self._on_drive_ended)
+            return NavigationClient(
+                self, self._settings, map_frame, self._on_drive_ended, self._on_path_longer
+            )
         return ForeignDriver(self._on_drive_ended)
 
     # Goals of the action, stops, and explore/resume.
@@ -217,6 +219,9 @@ class ExplorerNode(ThinmapNode):
         if is_exploring:
             self._output.end_nodes(self._mission, observation.scan.stamp_ns)
         self._execute(action)
+
+    def _on_path_longer(self, remaining_m: float) -> None:
+        self._mission.path_grew(remaining_m)
 
     def _on_drive_ended(self, success: bool, reason: str) -> None:
         self._output.target.clear()

@@ -35,11 +35,14 @@ def test_on_a_way_round_an_obstacle_the_remaining_path_counts():
 def test_a_detour_is_measured_anew_but_not_again_and_again():
     progress = DriveProgress(GOAL)
     now_s = 0.0
+    longer_m = []
     for detour in range(10):
         for remaining_m in np.arange(5.0 + detour, 3.0 + detour, -0.2):
             now_s += 1.0
-            progress.update(pose(-1.0, 0.0, 0.0), float(remaining_m), now_s)
+            if progress.update(pose(-1.0, 0.0, 0.0), float(remaining_m), now_s):
+                longer_m.append(float(remaining_m))
     assert progress.idle_s == 60.0
+    assert longer_m == [6.0, 7.0, 8.0]
 
 
 def test_missing_inputs_are_no_standstill():

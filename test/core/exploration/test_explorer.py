@@ -19,6 +19,7 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.topology import TopologyBuilder
 from thinmap_ros.sim.coverage import observable_cells
@@ -400,6 +401,50 @@ def test_of_two_viewpoints_that_take_turns_with_the_robot_one_is_reached():
     assert goal_after(viewpoints[1], se2.pose(0.0, 0.2, 0.0)) is viewpoints[0]
     # A frontier that has moved is observed from where it can be seen now.
     assert goal_after(viewpoints[1], se2.pose(0.0, 0.2, 0.0), (2.1, 2.0)) is viewpoints[1]
+
+
+def test_a_path_that_has_become_longer_is_a_new_decision():
+    explorer = Explorer()
+    near, far = (
+        Candidate(
+            Evidence(FIRST_FRONTIER_ID + i, (x, 0.0)),
+            np.zeros((15, 2), dtype=np.int64),
+            (x, 0.0),
+            goal=se2.pose(x, 0.0, 0.0),
+        )
+        for i, x in enumerate((5.0, -20.0))
+    )
+    explorer._finder.candidates = [near, far]
+
+    def choose():
+        near.seconds = 10.0
+        far.seconds = 40.0
+        explorer._choose(TopologicalMap(), START)
+        return explorer._target.candidate
+
+    assert choose() is near
+    explorer.path_grew(4.0)  # 20 s at 0.2 m/s
+    assert choose() is near
+    explorer.path_grew(20.0)
+    assert choose() is far
+
+
+def test_a_drive_that_failed_is_made_again_only_for_an_area_worth_seeing():
+    explorer = Explorer()
+    candidate = Candidate(
+        Evidence(FIRST_FRONTIER_ID, (5.0, 0.0), failures=1),
+        np.zeros((15, 2), dtype=np.int64),
+        (5.0, 0.0),
+        goal=se2.pose(5.0, 0.0, 0.0),
+        seconds=10.0,
+        probability=0.5,
+    )
+    explorer._finder.candidates = [candidate]
+    explorer._now_ns = 100 * SECOND_NS
+    for area_m2, is_target in ((0.8, False), (1.2, True)):
+        candidate.area_m2 = area_m2
+        explorer._choose(TopologicalMap(), START)
+        assert (explorer._target.candidate is candidate) == is_target
 
 
 def test_a_target_that_was_left_is_taken_again_for_a_larger_saving_only():

@@ -122,7 +122,8 @@ class _Target:
     """Where the robot drives: the candidate, the goal (3,), and the scans made there.
 
     is_turn: whether the goal is a part of a turn in place; known_area_m2: when the goal was set;
-    seconds: until the robot is there, as found last, 0 where that is not known.
+    seconds: until the robot is there, as found last, 0 where that is not known; reported_s: by the
+    path that the navigator drives, where that has become longer since the last decision, else 0.
     """
 
     candidate: Candidate | None = None
@@ -131,6 +132,7 @@ class _Target:
     is_turn: bool = False
     known_area_m2: float = 0.0
     seconds: float = 0.0
+    reported_s: float = 0.0
 
 
 class Explorer:
@@ -214,6 +216,11 @@ class Explorer:
                 self.team.add_settled(candidate.evidence)
         self._target = _Target()
 
+    def path_grew(self, remaining_m: float) -> None:
+        """Decide again: the path to the present target has become longer, to remaining_m."""
+        self._target.reported_s = remaining_m / self._travel.speed_m_s
+        self._found_ns = -(10**18)
+
     def claim(self, stamp_ns: int, T_map_base: Array) -> Claim:
         """What to send the other robots of the team, at a pose (3,)."""
         target = self._target
@@ -281,8 +288,10 @@ class Explorer:
         The margin is twice as large for each time that the other one was left, so that the robot
         never oscillates without end, whatever the costs are.
         """
-        best = min(ready, key=lambda candidate: candidate.seconds)
         kept = self._kept(ready)
+        if kept is not None:
+            kept.seconds = max(kept.seconds, self._target.reported_s)
+        best = min(ready, key=lambda candidate: candidate.seconds)
         if kept is None or kept is best:
             return best
         known_area_m2 = self.frontier_map.known_area_m2
@@ -343,7 +352,9 @@ class Explorer:
         if before.goal is not None and self._goal_stays(candidate, candidate.goal, T_map_base):
             seconds = float(self._travel.seconds_to(before.goal[None])[0])
             if seconds <= candidate.seconds + _SWITCH_MARGIN_S:
-                self._target = replace(before, candidate=candidate, is_turn=False, seconds=seconds)
+                self._target = replace(
+                    before, candidate=candidate, is_turn=False, seconds=seconds, reported_s=0.0
+                )
                 return
         known_m2 = self.frontier_map.known_area_m2
         self._target = _Target(
@@ -382,9 +393,14 @@ class Explorer:
 
 
 def _is_given_up(candidate: Candidate) -> bool:
-    """Whether there is no way to a candidate, or it was tried as often as it is worth."""
+    """Whether there is no way to a candidate, or it was tried as often as it is worth.
+
+    A drive that failed is made again only for an area worth seeing.
+    """
     tried = candidate.evidence
-    is_tried = tried.visits >= _MAX_VISITS or tried.failures >= _MAX_FAILURES
+    is_small = candidate.expected_area_m2 < WORTH_SEEING_M2
+    max_failures = 1 if is_small else _MAX_FAILURES
+    is_tried = tried.visits >= _MAX_VISITS or tried.failures >= max_failures
     return candidate.goal is None or is_tried
 
 

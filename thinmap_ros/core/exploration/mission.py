@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import errors, snapshot
 from thinmap_ros.core.exploration.strategy import (
+    CountsSeconds,
     Decision,
     EndNode,
     FinishCode,
@@ -76,8 +77,8 @@ class DriveProgress:
     """Time without progress of a drive to a goal (3,).
 
     Progress is a smaller distance to the goal than ever, straight or along the remaining path. A
-    new path that is longer by a metre is a detour, and its progress is measured anew, up to three
-    times.
+    new path that is longer by a metre is a detour: the strategy decides again, and the progress on
+    it is measured anew, up to three times.
     """
 
     goal: Array
@@ -87,22 +88,25 @@ class DriveProgress:
     _detours: int = 0
     _last_s: float = math.nan
 
-    def update(self, T_map_base: Array, remaining_m: float | None, now_s: float) -> None:
-        """Process the present pose (3,) and the remaining path, m; None where it is unknown."""
+    def update(self, T_map_base: Array, remaining_m: float | None, now_s: float) -> bool:
+        """Process the present pose (3,) and the remaining path, m; None where it is unknown.
+
+        Returns whether the path has become a detour.
+        """
         gap_s = 0.0 if math.isnan(self._last_s) else now_s - self._last_s
         self._last_s = now_s
         self.idle_s += min(max(gap_s, 0.0), _MAX_GAP_S)
+        is_detour = False
         is_closer = self._straight.is_closer(math.dist(T_map_base[:2], self.goal[:2]))
         if remaining_m is not None:
-            self._check_detour(remaining_m)
+            is_detour = remaining_m > self._path.nearest_m + _DETOUR_M
+            if is_detour and self._detours < _MAX_DETOURS:
+                self._detours += 1
+                self._path = _Approach()
             is_closer |= self._path.is_closer(remaining_m)
         if is_closer:
             self.idle_s = 0.0
-
-    def _check_detour(self, remaining_m: float) -> None:
-        if remaining_m > self._path.nearest_m + _DETOUR_M and self._detours < _MAX_DETOURS:
-            self._detours += 1
-            self._path = _Approach()
+        return is_detour and self._path.nearest_m == remaining_m
 
 
 @dataclass
@@ -471,6 +475,11 @@ class Mission:
         if exhausted and self.state == MissionState.EXPLORING:
             return self._finish_exploring(Finish(FinishCode.BUDGET_EXHAUSTED, exhausted))
         return None
+
+    def path_grew(self, remaining_m: float) -> None:
+        """Process that the path to the last goal has become longer, to remaining_m."""
+        if self.state == MissionState.EXPLORING and isinstance(self.strategy, CountsSeconds):
+            self.strategy.path_grew(remaining_m)
 
     def drive_ended(self, success: bool, reason: str) -> Action:
         """Process the navigator's result for the goal that it was given last."""

@@ -143,6 +143,14 @@ class ShowsFrontiers(Protocol):
         """Cells of each frontier, (N, 2), m, map frame."""
 
 
+@runtime_checkable
+class CountsSeconds(Protocol):
+    """A strategy that decides by the time to its targets."""
+
+    def path_grew(self, remaining_m: float) -> None:
+        """Process that the path to the present target has become longer, to remaining_m."""
+
+
 @dataclass
 class Streak:
     """How many scans in a row something was so: what one scan shows may be noise."""

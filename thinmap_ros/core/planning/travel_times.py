@@ -102,7 +102,7 @@ class TravelTimes:
     def seconds_from(self, T_map_base: Array, goals: Array) -> Array:
         """Time (N,), s, to drive to goals (N, 3) from the pose (3,) of another robot.
 
-        Where this robot knows no path, that of a straight line: the other one may know one.
+        Where the map shows no path, that of a straight line: the other one may have one.
         """
         field = self._search(self._weights(T_map_base), T_map_base)
         found = self._at(field, self.frame.cells_of(goals[:, :2]))

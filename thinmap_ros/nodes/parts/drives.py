@@ -1,5 +1,6 @@
 """Client of a navigator: of ours, of Nav2, or of any server of nav2_msgs/NavigateToPose."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic
 
@@ -62,9 +63,14 @@ class NavigationClient(Driver):
         settings: ExplorationSettings,
         frame_id: str,
         on_result: OnResult,
+        on_longer: Callable[[float], None],
     ) -> None:
-        """frame_id: frame of the goals; on_result: receives success and reason of the last one."""
+        """frame_id: frame of the goals; on_result: receives success and reason of the last one.
+
+        on_longer: receives the rest of the path, m, when that has become longer.
+        """
         super().__init__(on_result)
+        self._on_longer = on_longer
         self._node = node
         self._settings = settings
         self._frame_id = frame_id
@@ -106,7 +112,10 @@ class NavigationClient(Driver):
         drive = self._drive
         if drive is None or not drive.request.is_accepted:
             return
-        drive.progress.update(T_map_base, drive.request.remaining_m, self._now_s())
+        remaining_m = drive.request.remaining_m
+        is_longer = drive.progress.update(T_map_base, remaining_m, self._now_s())
+        if is_longer and remaining_m is not None:
+            self._on_longer(remaining_m)
         timeout_s = self._settings.progress_timeout
         if 0.0 < timeout_s <= drive.progress.idle_s:
             self._withdraw()
