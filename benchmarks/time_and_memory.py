@@ -8,12 +8,10 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.rows import Row
-from thinmap_ros.pipeline import Pipeline
 
 
 def machine() -> Iterator[Row]:
@@ -21,16 +19,6 @@ def machine() -> Iterator[Row]:
     yield Row('load average', f'{os.getloadavg()[2]:.0f}')
     for package in ('numpy', 'scipy', 'numba'):
         yield Row(package, version(package))
-
-
-class CpuTimedPipeline(Pipeline):
-    """A pipeline that measures its stages in CPU time, which depends little on other load."""
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        started = time.process_time()
-        yield
-        self.stage_seconds.setdefault(stage, []).append(time.process_time() - started)
 
 
 def best_seconds(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 
 from thinmap_ros.core.config import Config, config_or_default, parameter, part
 from thinmap_ros.core.errors import InputError, pose_of, require_type
@@ -24,7 +24,7 @@ from thinmap_ros.core.stage import (
     StartConfig,
     Trajectory,
 )
-from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.segmentation import RegionConfig, RegionTracker
 from thinmap_ros.core.topology.topology import Topology, TopologyBuilder, build
 from thinmap_ros.files import sessions
@@ -42,8 +42,9 @@ class PipelineConfig(Config):
     topology: TopologyConfig = part(TopologyConfig)
     scans_per_graph: int = parameter(
         1,
-        'Scans from one update of the graph to the next. Higher: less computing time, and a graph '
-        'that follows the map later.',
+        'Scans from one update of the graph to the next, made when the graph is asked for (with '
+        'slam: ekf_ti or ekf_full, which need it, at once). Higher: less computing time, and a '
+        'graph that follows the map later.',
         low=1,
         high=1_000_000,
     )
@@ -57,8 +58,10 @@ class PipelineResult:
 
 
 class Pipeline:
-    """Localizer, grid and topology, for every scan, as in three live nodes.
+    """Localizer and grid for every scan, and the graph of the map, as in three live nodes.
 
+    The graph is made when it is asked for: `topology`, `save_session`.
+    `stage_seconds`: CPU time of each stage, s, a number for each time that it ran.
     `pose_source` replaces the localizer if poses are known (true poses of a simulator).
     `resolution_m` (m a cell) is short for that of `config.grid`. `max_range_m` is the usable range
     of the laser (m), instead of that of the scans. Raises ConfigError for a value out of range.
@@ -107,7 +110,13 @@ class Pipeline:
 
     @property
     def topology(self) -> TopologyBuilder:
-        """The graph of the map; another object after a correction."""
+        """The graph of the map, updated now; another object after a correction.
+
+        What has changed since it was last asked for is added. A correction of the map in progress
+        is completed first where the graph lacks scans from before it.
+        """
+        if self._mapper.has_changed:
+            self._update_topology()
         return self._topology.builder
 
     @property
@@ -143,23 +152,27 @@ class Pipeline:
             estimate = locate(scan, T_odom_base)
             estimate = self._consistency.checked(scan, T_odom_base, estimate)
         with self._timed('grid'):
-            update = self._mapper.step(self._localized(scan, estimate))
+            is_due = self._mapper.add(self._localized(scan, estimate))
         self.refusals += self._mapper.refusals
-        if update is not None:
-            if update.whole is not None:
-                self._regions.follow(update.whole)
-            with self._timed('rebuild' if update.whole else 'topology'):
-                self._set_topology(self._topology.step(update))
+        if is_due and self.localizer.follows_topology:
+            self._update_topology()
         return PipelineResult(estimate)
 
     def finish(self) -> None:
         """Complete a pending correction after the last scan."""
-        whole = self._mapper.finish()
+        self._mapper.complete()
         self.refusals += self._mapper.refusals
-        if whole is not None:
-            self._regions.follow(whole)
-            with self._timed('rebuild'):
-                self._set_topology(self._topology.add_map(whole))
+
+    def _update_topology(self) -> None:
+        if self._mapper.grid.is_rerendering:
+            self.finish()
+        update = self._mapper.update()
+        if update.whole is not None:
+            self._regions.follow(update.whole)
+        with self._timed('rebuild' if update.whole else 'topology'):
+            topology = self._topology.step(update)
+        if topology is not None:
+            self.localizer.set_topology(topology)
 
     def load_session(self, path: str | Path) -> None:
         """Continue in a session, or a map_server map (YAML file), as live nodes do.
@@ -212,15 +225,11 @@ class Pipeline:
         destination = estimate.destination if is_mapping else Destination.NOWHERE
         return LocalizedScan(scan, estimate.T_map_base, destination, trajectory=trajectory)
 
-    def _set_topology(self, topology: TopologicalMap | None) -> None:
-        if topology is not None:
-            self.localizer.set_topology(topology)
-
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:
-        started = perf_counter()
+        started = process_time()
         yield
-        self.stage_seconds.setdefault(stage, []).append(perf_counter() - started)
+        self.stage_seconds.setdefault(stage, []).append(process_time() - started)
 
 
 def _graph_of(path: str, patch: GridPatch, config: TopologyConfig) -> TopologyBuilder:

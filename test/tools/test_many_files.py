@@ -70,7 +70,7 @@ def test_many_logs_give_what_each_gives_alone(logs: list[Path], tmp_path: Path) 
     assert [row['scans'] for row in rows] == ['12', '20', '']
     assert 'no scan: expected FLASER' in rows[2]['reason']
     assert list(rows[0]) == [
-        *('file', 'scans', 'distance_m', 'ms_per_scan', 'loops', 'lost', 'apart', 'reason')
+        *('file', 'scans', 'distance_m', 'cpu_ms_per_scan', 'loops', 'lost', 'apart', 'reason')
     ]
     page = (out / 'report.html').read_text()
     assert 'href="monday-log/report.html"' in page and 'src="tuesday-log/summary.png"' in page

@@ -70,7 +70,10 @@ def test_files_and_figures(log, tmp_path, form):
     report = json.loads((out / 'report.json').read_text())
     assert (report['scans'], report['skipped']) == (30, 0)
     assert report['distance'] == pytest.approx(0.87, abs=0.05)
-    assert set(report['ms_per_scan']) == {'localizer', 'grid', 'topology', 'all'}
+    assert set(report['ms_per_scan']) == {'localizer', 'grid', 'all'}
+    assert 0.0 < report['graph_ms'] < 1000.0 * report['cpu_s']
+    assert report['cpu_ms_per_scan'] == pytest.approx(1000.0 * report['cpu_s'] / 30, abs=0.1)
+    assert f'{report["cpu_ms_per_scan"]:.1f} ms of CPU a scan' in done.stdout
     trajectory = np.loadtxt(out / 'trajectory.tum')
     assert trajectory.shape == (30, 8)
     assert np.abs(trajectory[:, 1] - 0.03 * np.arange(30)).max() < 0.03
@@ -353,7 +356,15 @@ def test_a_clock_that_is_set_back_while_the_robot_drives_on_loses_nothing(tmp_pa
 
 @pytest.mark.programs
 @pytest.mark.parametrize(
-    'arguments', [['--slam', 'magic'], ['--resolution-m', '0'], ['--offset-m', 'nan'], ['-x']]
+    'arguments',
+    [
+        ['--slam', 'magic'],
+        ['--resolution-m', '0'],
+        ['--offset-m', 'nan'],
+        ['-x'],
+        ['--graph-period-s', '-1'],
+        ['--graph-period-s', 'nan'],
+    ],
 )
 def test_wrong_options_end_with_two(log, tmp_path, arguments):
     done = run(log, '-o', tmp_path / 'out', *arguments)
@@ -398,6 +409,9 @@ class Diary(NullView):
         self.told['grid'] += 1
         self.map_shown = patch
 
+    def topology(self, ns, topology):
+        self.told['graph'] += 1
+
     def scalar(self, ns, plot, curve, value):
         self.told[plot, curve] += np.isfinite(value)
 
@@ -411,10 +425,20 @@ def test_a_view_receives_each_scan_and_the_final_map(log):
     for curve in (
         ('step', 'localizer'),
         ('step', 'map update'),
-        ('step', 'graph update'),
         ('count', 'features'),
     ):
         assert diary.told[curve] == 30
+
+
+@pytest.mark.parametrize(('period_s', 'graphs'), [(0.0, 1), (2.0, 4)])
+def test_a_view_receives_the_graph_at_the_end_or_as_it_grows(log, period_s, graphs):
+    diary = Diary()
+    watcher = ReplayView(diary, period_s)
+    result = replay(CarmenLog(log, LaserOptions()), PipelineConfig(), watcher=watcher)
+    assert diary.told['count', 'nodes'] == graphs
+    assert diary.told['graph'] == graphs
+    taken = result.pipeline.stage_seconds
+    assert len(taken['topology']) <= graphs < len(taken['grid'])
 
 
 @pytest.mark.programs
@@ -532,14 +556,14 @@ class FullDisk(Diary):
 
 
 def test_an_error_that_nobody_expects_ends_a_replay_with_the_stamp_of_its_scan(log, monkeypatch):
-    work = Mapper.step
+    work = Mapper.add
 
-    def step(mapper, localized):
+    def add(mapper, localized):
         if localized.scan.stamp_ns == 2_000_000_000:
             raise ZeroDivisionError('planted')
         return work(mapper, localized)
 
-    monkeypatch.setattr(Mapper, 'step', step)
+    monkeypatch.setattr(Mapper, 'add', add)
     carmen = CarmenLog(log, LaserOptions())
     result = replay(carmen, PipelineConfig(), keep_partial=True)
     assert one_line_reason(result.ended_by) == 'scan at 2000000000 ns: planted'

@@ -79,13 +79,15 @@ def test_figures_of_a_replay(tmp_path):
     report = {
         'scans': 30,
         'first_skipped': '',
+        'cpu_ms_per_scan': 5.24,
         'ms_per_scan': {'all': {'median': 1.26, 'p95': 3.0, 'max': 9.0}},
     }
     page = page_of(tmp_path, report)
     assert page.rows == [
         ['Scans', '30'],
-        ['Computing time per scan, median', '1.3 ms'],
-        ['Computing time per scan, 95th percentile', '3.0 ms'],
+        ['CPU time per scan, whole program', '5.2 ms'],
+        ['CPU time of pose and map, median', '1.3 ms'],
+        ['CPU time of pose and map, 95th percentile', '3.0 ms'],
     ]
     assert 'What is missing' not in page.text
 

@@ -16,7 +16,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.slam.localizer import default_config
 from thinmap_ros.core.stage import Estimate, StartConfig, config_at
 from thinmap_ros.core.topology.graph import TopologyConfig
@@ -38,8 +38,8 @@ from thinmap_ros.view.rerun_view import View
 _NODES = ('localizer', 'grid_mapper', 'topology_builder')
 _OF_ONE = ('view', 'recording', 'session', 'continued', 'start')  # expect one log
 # Arguments that do not decide about the result.
-_ASIDE = ('logs', 'out', 'jobs', 'dask', 'quiet', *_OF_ONE, 'command')
-_COLUMNS = ('scans', 'distance_m', 'ms_per_scan', 'loops', 'lost', 'apart')
+_ASIDE = ('logs', 'out', 'jobs', 'dask', 'quiet', 'graph_period_s', *_OF_ONE, 'command')
+_COLUMNS = ('scans', 'distance_m', 'cpu_ms_per_scan', 'loops', 'lost', 'apart')
 Opened = Callable[[Log], AbstractContextManager[Any]]
 
 
@@ -96,7 +96,7 @@ def run_job(job: FileJob) -> Report:
         {
             'scans': report['scans'],
             'distance_m': round(report['distance'], 1),
-            'ms_per_scan': report['ms_per_scan']['all']['median'],
+            'cpu_ms_per_scan': report['cpu_ms_per_scan'],
             'loops': report['loops_closed'],
             'lost': report['lost'],
             'apart': report['apart'],
@@ -133,17 +133,19 @@ def _config(arguments: argparse.Namespace, parameters: NodeParameters) -> Pipeli
 
 # Large data are converted once a second: a view does not draw them more often.
 _PERIOD_NS = 1_000_000_000
-_STAGES = {'localizer': 'localizer', 'grid': 'map update', 'topology': 'graph update'}
+_STAGES = {'localizer': 'localizer', 'grid': 'map update'}
 
 
 class ReplayView:
     """Shows the results of a pipeline in a view, as of live nodes; `finish` shows the final map."""
 
-    def __init__(self, view: NullView) -> None:
-        """Start with an empty view."""
+    def __init__(self, view: NullView, graph_period_s: float = 0.0) -> None:
+        """Start with an empty view; graph_period_s: from one graph to the next, 0: at the end."""
         self._view = view
         self._T_map_odom: Array | None = None
         self._drawn_ns: int | None = None
+        self._graph_period_ns = graph_period_s * SECOND_NS
+        self._graph_ns: int | None = None
 
     def step(self, scan: Scan, T_odom_base: Array, estimate: Estimate, pipeline: Pipeline) -> None:
         """Show the result of a scan with the odometry pose (3,) at its stamp."""
@@ -166,18 +168,33 @@ class ReplayView:
         for stage, curve in _STAGES.items():
             view.scalar(ns, 'step', curve, 1000.0 * pipeline.stage_seconds[stage][-1])
         if self._drawn_ns is None or abs(ns - self._drawn_ns) >= _PERIOD_NS:
-            self.finish(ns, pipeline)
+            self._show_map(ns, pipeline)
+        last_ns = self._graph_ns
+        if self._graph_period_ns and (
+            last_ns is None or abs(ns - last_ns) >= self._graph_period_ns
+        ):
+            self._show_graph(ns, pipeline)
 
     def finish(self, ns: int, pipeline: Pipeline) -> None:
         """Show map, graph and features as they are now."""
+        self._show_map(ns, pipeline)
+        self._show_graph(ns, pipeline)
+
+    def _show_graph(self, ns: int, pipeline: Pipeline) -> None:
+        self._graph_ns = ns
+        topology = pipeline.topology.map
+        self._view.topology(ns, topology)
+        self._view.scalar(ns, 'count', 'nodes', float(len(topology.nodes)))
+
+    def _show_map(self, ns: int, pipeline: Pipeline) -> None:
         self._drawn_ns = ns
         view = self._view
-        topology = pipeline.topology.map
         view.grid(ns, pipeline.grid.known_area())
         view.apart(ns, pipeline.localizer.apart_points())
-        view.topology(ns, topology)
-        view.scalar(ns, 'count', 'nodes', float(len(topology.nodes)))
         features = pipeline.localizer.features
+        if not features:
+            return  # only a filter has them, and the graph at every scan
+        topology = pipeline.topology.map
         ends = np.array([[feature.start, feature.end] for feature in features]).reshape(-1, 2, 2)
         view.lines(ns, ends, np.array([feature.local for feature in features], dtype=bool))
         near = {node for feature in features if feature.local for node in feature.nodes}
@@ -196,6 +213,8 @@ def _work(arguments: argparse.Namespace) -> None:
         require_own_files(arguments.session, GRID)  # report a wrong name before the work
     if arguments.start and not arguments.continued:
         raise InputError(f'--start {arguments.start}: expected --continue, in whose map it is')
+    if not arguments.graph_period_s >= 0.0:
+        raise InputError(f'--graph-period-s {arguments.graph_period_s:g}: expected 0 or more')
     if len(arguments.logs) > 1:
         _replay_many(arguments)
     else:
@@ -204,7 +223,8 @@ def _work(arguments: argparse.Namespace) -> None:
 
 def _replay_one(arguments: argparse.Namespace) -> None:
     with _view(arguments) as view:
-        result = _play(arguments, None if view is None else ReplayView(view))
+        shown = None if view is None else ReplayView(view, arguments.graph_period_s)
+        result = _play(arguments, shown)
         if view is not None and arguments.view and result.ended_by is None:
             print('close the viewer to end', file=sys.stderr)
             view.wait_until_closed()
@@ -309,7 +329,7 @@ def _summary(result: Replay, report: dict[str, Any]) -> str:
         parts.append(f'{report["refused"]} not mapped (first: {report["first_refused"]})')
     parts += [
         f'{report["distance"]:.1f} m',
-        f'{report["ms_per_scan"]["all"]["median"]:.1f} ms a scan',
+        f'{report["cpu_ms_per_scan"]:.1f} ms of CPU a scan',
     ]
     return ', '.join(parts)
 
@@ -361,6 +381,14 @@ def main() -> None:
         '--view', action='store_true', help='show it in rerun, until the viewer is closed'
     )
     parser.add_argument('--recording', type=Path, help="file for rerun's recording (.rrd)")
+    parser.add_argument(
+        '--graph-period-s',
+        type=float,
+        default=0.0,
+        metavar='S',
+        help='with --view or --recording: show the graph as it grows, once in so many seconds of '
+        'the log (default 0: at the end, which takes much less time)',
+    )
     parser.add_argument(
         '--session',
         default='',

@@ -55,6 +55,39 @@ def test_updates_come_with_every_nth_scan_and_show_what_has_changed_since_the_la
     assert Mapper(PAPER_GRID, window_m=4.0).step(localized(0, POSES[0])).changes.shape == (40, 40)
 
 
+def added_only(mapper, other):
+    """Map four scans off, correct them and four more, twice; update the other with each scan."""
+    off = [0.5, 0.0, 0.0]
+    corrections = {4: (POSES, 5), 6: ([T + [0.0, 0.2, 0.0] for T in POSES], 7)}
+    place = [T + off for T in POSES]
+    for k in range(8):
+        trajectory = None
+        if k in corrections:
+            place, since_ns = corrections[k]
+            trajectory = Trajectory(np.arange(1, k + 1), np.array(place[:k]), since_ns)
+        assert mapper.add(localized(k, place[k], trajectory))
+        yield other.step(localized(k, place[k], trajectory))
+
+
+def test_an_update_that_is_made_later_tells_all_corrections_since_the_last_as_one():
+    mapper = Mapper(PAPER_GRID)
+    other = Mapper(PAPER_GRID)
+    assert not mapper.has_changed
+    updates = list(added_only(mapper, other))
+    assert mapper.has_changed
+    late = mapper.update()
+    assert not mapper.has_changed
+    assert (late.whole.previous_ns, late.whole.corrected_ns) == (0, 7)
+    assert [update.whole.corrected_ns for update in updates if update.whole] == [5, 7]
+    by = late.whole.moved.after - late.whole.moved.before
+    np.testing.assert_allclose(by, [[-0.5, 0.2, 0.0]] * len(by), atol=1e-9)
+    # Every place where the map was not being corrected, in the corrected map.
+    by_x = [T[0] for T in POSES[:4]]
+    np.testing.assert_allclose(late.places[:4, 0], by_x, atol=1e-9)
+    np.testing.assert_allclose(late.places[:4, 1], 2.2, atol=1e-9)
+    np.testing.assert_array_equal(late.changes.cells, other.whole_map().patch.cells)
+
+
 def test_a_saved_map_is_continued_and_not_corrected():
     mapper = Mapper(PAPER_GRID)
     mapper.step(localized(0, POSES[0]))

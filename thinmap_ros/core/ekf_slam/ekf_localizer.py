@@ -60,6 +60,8 @@ class EkfLocalizer:
     Input that is not finite is counted in `rejected`; a rejected odometry pose means no motion.
     """
 
+    follows_topology: ClassVar[bool] = True  # its nodes select the local area
+
     def __init__(self, config: EkfConfig | None = None) -> None:
         self.config = config or EkfConfig()
         self._rejected = 0

@@ -7,11 +7,12 @@ import numpy as np
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.correction import CorrectableGrid, CorrectedPoses
 from thinmap_ros.core.grid.edits import KeepOut, MapEdits, require_corners, split_edits
+from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.stage import LocalizedScan, Stage, Trajectory
+from thinmap_ros.core.stage import Destination, LocalizedScan, Stage, Trajectory
 
 _NOWHERE = CorrectedPoses(np.zeros((0, 3)), np.zeros((0, 3)))
 
@@ -32,9 +33,10 @@ class WholeMap:
 
 @dataclass(frozen=True, eq=False)
 class MapUpdate:
-    """What a scan has changed in the map.
+    """What has changed in the map since the last update, with the newest scan.
 
     changes: cells of the map, among them those around the robot that have changed; None: none has.
+    places (N, 2): where the robot was meanwhile, m, in the map as it is now.
     corrected_ns: stamp of the newest trajectory that all of the map follows; is_rerendering:
     whether a newer one has not reached all of it. whole: the map, once it has been rendered again.
     """
@@ -44,6 +46,7 @@ class MapUpdate:
     corrected_ns: int
     is_rerendering: bool
     whole: WholeMap | None = None
+    places: Array | None = None
 
 
 class Mapper(Stage[LocalizedScan, MapUpdate]):
@@ -84,6 +87,10 @@ class Mapper(Stage[LocalizedScan, MapUpdate]):
         self._scans = 0
         self._previous_ns = 0
         self._moved = _NOWHERE
+        # Since the last update.
+        self._newest: LocalizedScan | None = None
+        self._places: list[Array] = []
+        self._is_whole_new = False
 
     @property
     def edits(self) -> MapEdits:
@@ -123,8 +130,17 @@ class Mapper(Stage[LocalizedScan, MapUpdate]):
             self._note(before_ns, _NOWHERE)
         return is_corrected
 
+    @property
+    def has_changed(self) -> bool:
+        """Whether there is an update: the map has changed since the last one."""
+        return self._is_whole_new or bool(self._places)
+
     def step(self, localized: LocalizedScan, /) -> MapUpdate | None:
         """Add a scan; None before the next update is due."""
+        return self.update() if self.add(localized) else None
+
+    def add(self, localized: LocalizedScan) -> bool:
+        """Add a scan; returns whether the next update is due, which may also be made later."""
         if localized.trajectory is not None:
             self.correct(localized.trajectory)
         before_ns = self.grid.corrected_ns
@@ -132,44 +148,79 @@ class Mapper(Stage[LocalizedScan, MapUpdate]):
         self.refusals = self.grid.take_refusals()
         is_due = self._scans % self._scans_per_update == 0
         self._scans += 1
+        self._newest = localized
         if moved is not None:
-            self._note(before_ns, moved)
-        elif not is_due:
-            return None
+            self._take_corrected(before_ns, moved)
+        elif is_due and self._shows_place(localized):
+            self._places.append(localized.T_map_base[:2])
+        return is_due or moved is not None
+
+    def update(self) -> MapUpdate:
+        """What has changed since the last update; after the first scan."""
+        assert self._newest is not None
+        whole = self.whole_map() if self._is_whole_new else None
+        changes = self._changes(self._newest, whole)
+        places = np.array(self._places).reshape(-1, 2)
+        self._places = []
+        self._is_whole_new = False
+        grid = self.grid
         return MapUpdate(
-            localized,
-            self._changes(localized, moved is not None),
-            self.grid.corrected_ns,
-            self.grid.is_rerendering,
-            None if moved is None else self.whole_map(),
+            self._newest, changes, grid.corrected_ns, grid.is_rerendering, whole, places
         )
 
     def finish(self) -> WholeMap | None:
         """Complete a correction; returns the map where it was not complete before."""
+        if not self.complete():
+            return None
+        self._is_whole_new = False
+        return self.whole_map()
+
+    def complete(self) -> bool:
+        """Complete a correction; returns whether it was not complete before."""
         before_ns = self.grid.corrected_ns
         moved = self.grid.finish()
         self.refusals = self.grid.take_refusals()
         if moved is None:
-            return None
-        self._note(before_ns, moved)
-        return self.whole_map()
+            return False
+        self._take_corrected(before_ns, moved)
+        return True
 
     def whole_map(self) -> WholeMap:
         """All known cells."""
         grid = self.grid
         return WholeMap(grid.shown.known_area(), grid.corrected_ns, self._previous_ns, self._moved)
 
+    def _shows_place(self, localized: LocalizedScan) -> bool:
+        """Whether a scan shows the map as it is: poses during a correction are ahead of it."""
+        return localized.destination is Destination.MAP and not self.grid.is_rerendering
+
+    def _take_corrected(self, before_ns: int, moved: CorrectedPoses) -> None:
+        """All of the map has been rendered again."""
+        if self._places and len(moved.before):
+            self._places = list(MapMotion(*moved).moved(np.array(self._places)))
+        self._note(before_ns, moved)
+        self._is_whole_new = True
+
     def _note(self, before_ns: int, moved: CorrectedPoses) -> None:
         """The map has been corrected, unless it was rendered again for another reason."""
-        if before_ns != self.grid.corrected_ns:
+        if before_ns == self.grid.corrected_ns:
+            return
+        self.keep_out = self.keep_out.moved(*moved)
+        if not self._is_whole_new:
             self._previous_ns = before_ns
             self._moved = moved
-            self.keep_out = self.keep_out.moved(*moved)
+        elif len(moved.before):
+            # No update has told of the last correction.
+            self._moved = CorrectedPoses(
+                self._moved.before, MapMotion(*moved).moved_poses(self._moved.after)
+            )
 
-    def _changes(self, localized: LocalizedScan, is_whole_new: bool) -> GridPatch | None:
+    def _changes(self, localized: LocalizedScan, whole: WholeMap | None) -> GridPatch | None:
         grid = self.grid.shown
         if self._window_m is not None:
             x, y, _ = localized.T_map_base
             return grid.window(x, y, self._window_m)
         changes = grid.take_changes()
-        return None if is_whole_new else changes
+        if whole is None:
+            return changes
+        return whole.patch if self._places else None

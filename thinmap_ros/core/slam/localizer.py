@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,6 +232,8 @@ class Localizer:
 
     Input that is not finite is counted in `rejected`; a rejected odometry pose means no motion.
     """
+
+    follows_topology: ClassVar[bool] = False
 
     def __init__(self, config: LocalizerConfig | None = None) -> None:
         self.config = config or LocalizerConfig()

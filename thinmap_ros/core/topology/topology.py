@@ -579,7 +579,8 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
     def _adopt(self, update: MapUpdate) -> None:
         """Learn which correction the graph follows, from changes of its map."""
         if self._corrected_ns is None:
-            self._corrected_ns = update.corrected_ns
+            whole = update.whole
+            self._corrected_ns = update.corrected_ns if whole is None else whole.previous_ns
         elif update.corrected_ns < self._corrected_ns <= update.localized.scan.stamp_ns:
             # The mapper was restarted: its map knows of no correction.
             self._corrected_ns = update.corrected_ns
@@ -611,8 +612,9 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
         return self._take_rebuilt()
 
     def _add(self, cells: GridPatch | None, update: MapUpdate) -> bool:
+        places = update.localized.T_map_base if update.places is None else update.places
         with self._rebuilt_after_errors():
-            return cells is not None and self.builder.update(cells, update.localized.T_map_base)
+            return cells is not None and self.builder.update(cells, places)
 
     @contextmanager
     def _rebuilt_after_errors(self) -> Iterator[None]:
