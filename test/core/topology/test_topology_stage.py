@@ -212,3 +212,41 @@ def test_a_graph_that_an_error_has_left_half_changed_is_rebuilt(begin, failing, 
     expected.step(update(halved(), 0))
     assert places(topology) == places(expected)
     assert topology.step(update(hall(), 0)) is not None
+
+
+@pytest.mark.parametrize(
+    ('moved', 'passed_ns', 'is_due'),
+    [
+        ([0.1, 0.0, 0.1], 900_000_000, False),
+        ([0.2, 0.0, 0.0], 0, True),
+        ([0.0, 0.0, -0.2], 0, True),
+        ([0.0, 0.0, 0.0], 1_000_000_000, True),
+        ([0.0, 0.0, 0.0], -1, True),
+    ],
+)
+def test_a_step_is_due_after_a_motion_or_a_second(moved, passed_ns, is_due):
+    topology = Topology()
+    start = np.array([4.0, 5.0, 0.0])
+    first = update(hall(), 0, 10**10, T_map_base=start)
+    assert topology.is_due(first)
+    topology.step(first)
+    later = update(hall(), 0, 10**10 + passed_ns, T_map_base=start + moved)
+    assert topology.is_due(later) == is_due
+    assert topology.is_due(update(hall(), 9, 10**10, T_map_base=start)), 'after a correction'
+
+
+def test_what_is_held_comes_with_the_next_step_or_when_it_is_asked_for():
+    topology = Topology()
+    assert topology.flush() is None
+    closed = hall()
+    closed.cells[30:71, 60:63] = 100  # two rooms: only those in which the robot was are shown
+    poses = [np.array([3.0, 5.0, 0.0]), np.array([8.0, 5.0, 0.0]), np.array([3.1, 5.0, 0.0])]
+    topology.step(update(closed, 0, 1, T_map_base=poses[0]))
+    assert max(node.x for node in topology.map.nodes.values()) < 6.0
+    topology.hold(update(closed, 0, 2, T_map_base=poses[1]))
+    assert max(node.x for node in topology.map.nodes.values()) < 6.0
+    assert topology.step(update(closed, 0, 3, T_map_base=poses[2])) is topology.map
+    assert max(node.x for node in topology.map.nodes.values()) > 6.5, 'where it was meanwhile'
+    topology.hold(update(halved(), 0, 4, T_map_base=poses[2]))
+    assert topology.flush() is topology.map and topology.flush() is None
+    assert max(node.x for node in topology.map.nodes.values()) < 6.0
