@@ -449,7 +449,7 @@ class Tracker:
         self.belief.move(continuity(look.scan, scan, motions), is_again)
 
     def _judge_start(self, scan: Scan, points: Array, match: Match, there: Surroundings) -> None:
-        """Judge a given pose by how a scan fits on the way from there, and at other headings.
+        """Judge a given pose by how a scan fits on the path from there, and at other headings.
 
         Each place counts once: the robot may be elsewhere, or it stands turned by a right angle, as
         walls do. Furniture may have changed since a map was made that stays as it is: there the
