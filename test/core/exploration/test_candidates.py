@@ -11,7 +11,7 @@ from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.exploration.space import FrontierMap, is_enclosed, search_beside
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
-from thinmap_ros.core.exploration.views import Sight
+from thinmap_ros.core.exploration.views import Sight, ViewFinder
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.path_follower import SpeedConfig
@@ -165,20 +165,30 @@ def test_a_frontier_longer_than_the_range_is_observed_in_part_from_the_nearest_p
         assert abs(candidate.goal[1] - y) < 2.5
 
 
-def test_a_frontier_that_changes_is_examined_at_once_and_the_others_in_turn():
+def test_a_frontier_that_changes_or_expires_is_examined_at_once_and_the_others_in_turn():
     cells = open_hall(12.0)
     cells[95:105, 118:120] = 100
     room = Room(cells)
-    first = [candidate.view for candidate in room.find()]
+    room.find()
+    finder = ViewFinder()
+
+    def examine():
+        clusters = room.frontiers.clusters(0.0)
+        return clusters, finder.update(room.frontiers, room.travel, clusters, room.sight)
+
+    clusters, first = examine()
+    _, second = examine()
+    _, third = examine()
     assert len(first) == 2
-    second = [candidate.view for candidate in room.find()]
-    third = [candidate.view for candidate in room.find()]
     assert [new is old for new, old in zip(second, first, strict=True)] == [False, True]
     assert [new is old for new, old in zip(third, second, strict=True)] == [True, False]
+    finder.expire(clusters)
+    _, renewed = examine()
+    assert all(new is not old for new, old in zip(renewed, third, strict=True))
     cells[105:, 120] = 0
     room.set_cells(cells)
-    changed = room.find()[-1].view
-    assert changed is not third[-1]
+    _, changed = examine()
+    assert changed[-1] is not renewed[-1]
 
 
 def test_a_short_frontier_counts_as_its_probability_says():

@@ -138,6 +138,7 @@ class CandidateFinder:
         self.candidates = [c for c in found if not c.view.is_enclosed]
         threshold = self._config.probability_threshold
         below = [c for c in self.candidates if c.probability < threshold]
+        self._views.expire([c.cells for c in below])
         for candidate in below or self.candidates:
             _choose_viewpoint(candidate, frontiers, travel, sight.slack_rad)
         self.hidden = [(c.probability, c.area_m2) for c in (*found, *fragments)]

@@ -86,8 +86,8 @@ NO_VIEW = View(0.0, 0.0, np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros
 class ViewFinder:
     """Views of the frontiers of a growing map.
 
-    A frontier that has changed is examined again at once, the others in turn: what is around a
-    frontier seldom changes while its own cells do not.
+    A frontier that has changed, or has expired, is examined again at once, the others in turn: what
+    is around a frontier seldom changes while its own cells do not.
     """
 
     def __init__(self) -> None:
@@ -112,6 +112,11 @@ class ViewFinder:
             known |= {keys[k]: examiner.view(k) for k in missing}
         self._known = known
         return [known[key] for key in keys]
+
+    def expire(self, clusters: list[Cells]) -> None:
+        """Have some frontiers (N, 2) examined again at the next update."""
+        for cells in clusters:
+            self._known.pop(cells.tobytes(), None)
 
 
 class _Examiner:
