@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks.buildings import BuildingConfig, generate_building
 from benchmarks.kidnapped.trials import along
 from benchmarks.rows import Row, at_most
 from benchmarks.worlds import floors
@@ -16,7 +17,6 @@ from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.files import sessions
-from thinmap_ros.sim.buildings import BuildingConfig, generate_building
 from thinmap_ros.sim.drives import DriveSample, random_drive, random_start
 from thinmap_ros.sim.world import World
 

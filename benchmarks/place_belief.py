@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.buildings import BuildingConfig, generate_building
 from benchmarks.kidnapped.trials import along
 from benchmarks.rows import Row
 from thinmap_ros.core import se2
@@ -26,7 +27,6 @@ from thinmap_ros.core.slam.graph import loop_closure, reckoned
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import Estimate
-from thinmap_ros.sim.buildings import BuildingConfig, generate_building
 from thinmap_ros.sim.drives import DriveSample, random_drive, random_start
 from thinmap_ros.sim.world import World
 

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from benchmarks.buildings import Building, Wing, generate_building
+from benchmarks.floor_plan import FloorPart, FloorPlan, Kind
 from benchmarks.scoreboard.drives import samples
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
@@ -22,9 +24,7 @@ from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.regions import RegionMap
 from thinmap_ros.core.topology.segmentation import RegionTracker, find_regions
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.buildings import Building, Wing, generate_building
 from thinmap_ros.sim.drives import DriveSample, world_to_grid
-from thinmap_ros.sim.floor_plan import FloorPart, FloorPlan, Kind
 from thinmap_ros.sim.world import World
 
 _DOOR_M = 0.5  # distance up to which a door is found

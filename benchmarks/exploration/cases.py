@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.buildings import BuildingConfig, generate_building
 from benchmarks.worlds import WORLDS, Floor, floors
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.buildings import BuildingConfig, generate_building
 from thinmap_ros.sim.world import World
 
 _GENERATED = 'building/'

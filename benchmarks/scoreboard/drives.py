@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from benchmarks.buildings import Building, generate_building
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, transform_points
-from thinmap_ros.sim.buildings import Building, generate_building
 from thinmap_ros.sim.drives import MARGIN_M, DriveConfig, DriveSample, drive, world_to_grid
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS, RobotConfig

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.buildings import BuildingConfig, generate_building
 from benchmarks.rows import Row, at_least, at_most
 from benchmarks.worlds import floors
 from thinmap_ros.core.grid.patch import GridPatch
@@ -18,7 +19,6 @@ from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.experiments.drives import patch_of_world
 from thinmap_ros.files.occupancy_maps import read_map
-from thinmap_ros.sim.buildings import BuildingConfig, generate_building
 
 _FLOORS = ('kth/50052748', 'kth/50037764_PLAN1', 'dungeon/d114')
 _BUILDING = 100

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from benchmarks.buildings import BuildingConfig, generate_building
 from benchmarks.days import furnished
-from thinmap_ros.sim.buildings import BuildingConfig, generate_building
 from thinmap_ros.sim.drives import random_start
 
 

@@ -10,6 +10,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from benchmarks.buildings import DEVELOPMENT_SEEDS, BuildingConfig, generate_building
 from benchmarks.scoreboard import __main__ as program
 from benchmarks.scoreboard import drives
 from benchmarks.scoreboard.cases import (
@@ -29,7 +30,6 @@ from benchmarks.scoreboard.played import Played, consistency
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.evaluation.trajectory_errors import aligned_rms
-from thinmap_ros.sim.buildings import DEVELOPMENT_SEEDS, BuildingConfig, generate_building
 from thinmap_ros.sim.robot import PRESETS
 
 COSTS = {

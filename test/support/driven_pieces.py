@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from benchmarks.buildings import BuildingConfig, generate_building
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.places.piece import MapPiece
@@ -14,7 +15,6 @@ from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import build
-from thinmap_ros.sim.buildings import BuildingConfig, generate_building
 from thinmap_ros.sim.drives import random_drive, random_start
 
 _CONFIG = BuildingConfig(

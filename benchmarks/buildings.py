@@ -10,11 +10,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.floor_plan import (
+from benchmarks.floor_plan import (
     FloorPart,
     FloorPlan,
     FloorPlanConfig,
@@ -22,6 +18,10 @@ from thinmap_ros.sim.floor_plan import (
     Opening,
     generate_floor_plan,
 )
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.patch import GridFrame
+from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
 from thinmap_ros.sim.world import World
 

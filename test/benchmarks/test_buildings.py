@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.buildings import BuildingConfig, generate_building
+from benchmarks.floor_plan import FloorPlanConfig, Kind, generate_floor_plan
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.sim.buildings import BuildingConfig, generate_building
-from thinmap_ros.sim.floor_plan import FloorPlanConfig, Kind, generate_floor_plan
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
 from thinmap_ros.sim.robot import RobotConfig
