@@ -15,6 +15,7 @@ from benchmarks.worlds import floors
 from thinmap_ros.closed_loop import (
     SCANS_PER_GRAPH,
     ClosedLoop,
+    explorer_config,
     ground_truth_poses,
     no_progress,
 )
@@ -138,7 +139,8 @@ def _pipeline_config(
 
 def _closed_loop(simulation: Simulation, pipeline: Pipeline) -> ClosedLoop:
     navigator = Navigator(NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=_SPEED_M_S)))
-    return ClosedLoop(simulation, pipeline, make_strategy(DEFAULT), navigator)
+    strategy = make_strategy(DEFAULT, explorer_config(_ROBOT, _SPEED_M_S))
+    return ClosedLoop(simulation, pipeline, strategy, navigator)
 
 
 def _length_m(poses: Array) -> float:
