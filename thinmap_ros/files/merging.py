@@ -18,7 +18,8 @@ from thinmap_ros.core.grid.edits import (
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.places.alignment import LEAST_FOUND, align, fitted
-from thinmap_ros.core.places.recognition import JOIN_ODDS, Placement, on_one_storey, recognize
+from thinmap_ros.core.places.place_odds import JOIN_ODDS, on_one_storey
+from thinmap_ros.core.places.recognition import Placement, recognize
 from thinmap_ros.core.places.structure import storey_evidence
 from thinmap_ros.core.se2 import Array, is_bounded_pose
 from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.places.recognition import JOIN_ODDS
+from thinmap_ros.core.places.place_odds import JOIN_ODDS
 from thinmap_ros.files.merging import (
     CannotTellError,
     MapJoin,

@@ -9,7 +9,7 @@ from support.rooms import FLAT, KITCHEN, STUDY, room, turned
 from thinmap_ros.core import se2
 from thinmap_ros.core.places.alignment import align, fitted
 from thinmap_ros.core.places.piece import MapPiece
-from thinmap_ros.core.places.recognition import JOIN_ODDS
+from thinmap_ros.core.places.place_odds import JOIN_ODDS
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 T_KNOWN_QUERY = np.array([1.3, -0.7, 0.65])

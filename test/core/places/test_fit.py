@@ -8,18 +8,23 @@ import pytest
 from support.small_floor import OFFICE, START, drive, map_of
 
 from thinmap_ros.core.grid.patch import UNKNOWN
-from thinmap_ros.core.places.global_localizer import usual_share
+from thinmap_ros.core.places.global_localizer import measured_looks
 from thinmap_ros.core.places.likelihood import Judge
 from thinmap_ros.core.places.place_database import GlobalLocalizationConfig, Places, calibrate
+from thinmap_ros.core.places.place_odds import MAX_LOG_RATIO, MissingShares
 
 CONFIG = GlobalLocalizationConfig()
 
 
-def share_in(cells):
+def model_in(cells):
     places = Places.of(*map_of(cells), CONFIG)
     scan, _, _ = next(drive(OFFICE, START, []))
     judge = Judge(places, CONFIG, calibrate(places, scan, CONFIG, np.random.default_rng(1)))
-    return usual_share(places, judge, scan, CONFIG, np.random.default_rng(2))
+    return measured_looks(places, judge, scan, CONFIG, np.random.default_rng(2))
+
+
+def share_in(cells):
+    return 1.0 - model_in(cells).right
 
 
 def test_smooth_walls_explain_nearly_all_and_a_floor_full_of_small_things_less():
@@ -30,6 +35,25 @@ def test_smooth_walls_explain_nearly_all_and_a_floor_full_of_small_things_less()
     rough = share_in(littered)
     assert 0.97 < clean <= 1.0
     assert 0.7 <= rough < clean - 0.02
+
+
+def worth(model, missing, known=1.0):
+    return float(model.log_ratios(np.array([1.0 - missing]), np.array([known]))[0])
+
+
+def test_what_a_look_is_worth_falls_with_what_it_leaves_unexplained():
+    smooth = MissingShares(0.01, 0.02)
+    assert worth(smooth, 0.0) == pytest.approx(np.log(2.0))
+    assert worth(smooth, 0.0) > worth(smooth, 0.01) > 0.0 > worth(smooth, 0.02)
+    assert worth(smooth, 1.0) == -MAX_LOG_RATIO
+    assert worth(smooth, 0.0, 0.7) == pytest.approx(0.7 * np.log(2.0))
+    assert worth(smooth, 0.0, 0.5) == 0.0  # it may as well have left the map
+
+
+def test_bare_walls_tell_less_at_a_look_than_a_map_in_which_there_are_things():
+    bare = OFFICE.copy()
+    bare[1:-1, 1:-1] = 0
+    assert worth(model_in(OFFICE), 0.0) > worth(model_in(bare), 0.0) > 0.0
 
 
 def test_beams_on_which_the_map_is_silent_are_not_counted():

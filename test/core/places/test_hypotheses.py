@@ -3,8 +3,18 @@
 import numpy as np
 import pytest
 
-from thinmap_ros.core.places.hypotheses import Hypotheses, allowed_beams, missed_beams
+from thinmap_ros.core.places.hypotheses import Hypotheses, Look, allowed_beams, missed_beams
 from thinmap_ros.core.places.likelihood import LOG_ODDS_A_BEAM, SILENT_COUNTS
+from thinmap_ros.core.places.place_odds import MAX_LOG_RATIO
+
+MOST = 20.0
+
+
+def look_of(counts, beams=60, log_ratio=1.0):
+    """A look at which each place explains so many beams."""
+    counts = np.array(counts)
+    missed = missed_beams((counts, np.zeros(len(counts))), beams)
+    return Look(missed, beams, counts / beams, np.full(len(counts), log_ratio))
 
 
 def some(*poses, log_weights=None):
@@ -14,14 +24,15 @@ def some(*poses, log_weights=None):
     missed = np.where(
         logs < 0.0, allowed_beams(np.full(len(poses), 60.0)) - logs / LOG_ODDS_A_BEAM, 0.0
     )
-    known.add(poses, 0.0, missed, (np.full(len(poses), 50.0), np.zeros(len(poses))), 60.0)
+    every = np.ones(len(poses))
+    known.add(poses, 0.0, [Look(missed, 60, every, every)], MOST)
     known.resample(None, 1000, np.random.default_rng(0))
     return known
 
 
 def looked(known, *looks, novelty=1.0):
     for counts in looks:
-        known.take_evidence((np.array(counts), np.zeros(len(known))), 60, novelty)
+        known.take_evidence(look_of(counts), novelty, MOST)
     return known
 
 
@@ -43,19 +54,27 @@ def test_what_a_place_misses_at_each_look_adds_up_until_it_is_out_of_the_questio
 
 def test_one_look_settles_nothing_and_half_a_look_half_as_much():
     nonsense = looked(some([0, 0, 0], [5, 0, 1]), [58.0, 0.0])
-    assert -4.0 < nonsense.log_weights[1] < -1.0
+    assert -MAX_LOG_RATIO < nonsense.log_weights[1] < -1.0
     halves = looked(some([0, 0, 0], [5, 0, 1]), [58.0, 0.0], [58.0, 0.0], novelty=0.5)
     assert halves.log_weights == pytest.approx(nonsense.log_weights)
 
 
 def test_a_place_that_turns_up_late_is_judged_by_what_it_was_asked():
     known = looked(some([0, 0, 0], [5, 0, 1]), *([[50.0, 50.0]] * 40))
-    judged = np.array([60.0 * 6]), np.zeros(1)
-    known.add(np.array([[9.0, 9.0, 0.0]]), -3.0, np.array([-60.0]), judged, 360.0)
+    looks = [look_of([50.0, 50.0, 60.0]) for _ in range(6)]
+    known.add(np.array([[9.0, 9.0, 0.0]]), -3.0, looks, MOST)
     assert known.best() == 2
     assert known.log_weights[0] == pytest.approx(
         3.0 - LOG_ODDS_A_BEAM * (60.0 - allowed_beams(np.array(360.0)))
     )
+    assert known.evidence.tolist() == [MOST, MOST, 6.0 - 3.0]
+
+
+def test_evidence_that_adds_nothing_is_forgotten_so_that_what_changes_is_noticed():
+    known = looked(some([0, 0, 0]), *([[60.0]] * 1000))
+    known.take_evidence(look_of([0.0], log_ratio=-MAX_LOG_RATIO), 0.5, MOST)
+    assert known.evidence.tolist() == [MOST - 0.5 * MAX_LOG_RATIO]
+    assert known.found.tolist() == [0.0]
 
 
 def test_a_beam_of_which_the_map_says_nothing_counts_for_a_part():

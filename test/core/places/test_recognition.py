@@ -10,7 +10,8 @@ from support.driven_pieces import driven_piece, true_transform
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.piece import MapPiece, landmarks_around
-from thinmap_ros.core.places.recognition import JOIN_ODDS, Recognition, ViewJudge, decide, recognize
+from thinmap_ros.core.places.place_odds import JOIN_ODDS
+from thinmap_ros.core.places.recognition import Recognition, ViewJudge, decide, recognize
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import build
 

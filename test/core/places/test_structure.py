@@ -11,7 +11,8 @@ from support.storeys import piece_of, storey
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.places.piece import MapPiece
-from thinmap_ros.core.places.recognition import JOIN_ODDS, Recognition, decide, recognize
+from thinmap_ros.core.places.place_odds import JOIN_ODDS
+from thinmap_ros.core.places.recognition import Recognition, decide, recognize
 from thinmap_ros.core.places.structure import structure_evidence
 from thinmap_ros.core.topology.graph import TopologicalMap
 

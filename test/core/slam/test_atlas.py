@@ -9,7 +9,7 @@ from support.carried_robot import carried
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.places.recognition import JOIN_ODDS
+from thinmap_ros.core.places.place_odds import JOIN_ODDS
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import LOCALIZATION, Destination, config_at

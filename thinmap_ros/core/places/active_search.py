@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_CELL
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.places.global_localizer import Result
+from thinmap_ros.core.places.global_localizer import LIKELY, Result
 from thinmap_ros.core.places.hypotheses import distinct_indices
 from thinmap_ros.core.places.place_database import (
     Bytes,
@@ -26,13 +26,9 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import kernel
 
-_LIKELY = 0.05  # of the weight of the best
-# A goal stands so long, or until it is reached, or the number of places in question changes.
+# A goal stands so long, or until it is reached, or, after a quarter of that, the number of places
+# in question changes.
 _REPLAN_PERIOD_S = 4.0
-_CHANGED_S = 1.0  # but for so long at least
-# A look from elsewhere.
-_LOOK_M = 0.4
-_LOOK_RAD = 0.4
 _MAX_PLACES = 8  # the likeliest, which are compared
 _WINDOW_M = 30.0
 _SPACING_M = 0.6  # of the viewpoints that are compared
@@ -98,7 +94,7 @@ class ActiveSearch:
         """Add the result of a scan at an odometry pose (3,)."""
         self._look(T_odom_base)
         most = max((h.weight for h in result.hypotheses), default=0.0)
-        likely = [h for h in result.hypotheses if h.weight >= _LIKELY * most]
+        likely = [h for h in result.hypotheses if h.weight >= LIKELY * most]
         T_base_odom = se2.invert(T_odom_base)
         starts = np.array([se2.compose(h.T_map_base, T_base_odom) for h in likely])
         self._starts = starts.reshape(-1, 3)
@@ -107,8 +103,8 @@ class ActiveSearch:
     def _look(self, T_odom_base: Array) -> None:
         """Remember where the robot has looked from."""
         away = self._looked - T_odom_base
-        near = np.hypot(away[:, 0], away[:, 1]) < _LOOK_M
-        if not (near & (np.abs(se2.wrap(away[:, 2])) < _LOOK_RAD)).any():
+        near = np.hypot(away[:, 0], away[:, 1]) < 0.5 * _LOOKED_M
+        if not (near & (np.abs(se2.wrap(away[:, 2])) < 0.5 * _LOOKED_RAD)).any():
             self._looked = np.concatenate([self._looked, T_odom_base[None]])
 
     def step(self, T_odom_base: Array, scan: Scan | Sequence[Scan], dt_s: float) -> Command:
@@ -117,7 +113,7 @@ class ActiveSearch:
         Idle where there is nothing to drive to.
         """
         self._age_s += dt_s
-        changed = len(self._starts) != self._chosen_of and self._age_s > _CHANGED_S
+        changed = len(self._starts) != self._chosen_of and self._age_s > 0.25 * _REPLAN_PERIOD_S
         if changed or self._age_s > _REPLAN_PERIOD_S:
             self._choose(T_odom_base)
         if self._view is None:

@@ -15,6 +15,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.piece import SAME_M, SAME_RAD, MapPiece
+from thinmap_ros.core.places.place_odds import OTHER_PLACES
 from thinmap_ros.core.places.recognition import MATCH_NOISE, PieceHypothesis, Placement
 from thinmap_ros.core.places.views import LATTICE_M, View
 from thinmap_ros.core.se2 import Array, inverse, propagated_covariance
@@ -36,8 +37,6 @@ _NEAR_CELLS = 1.5  # a wall that near to another one does not contradict
 _SAME_TURN_RAD = 0.35  # two turns with less between them are one: a peak is as wide
 
 _PEAKS_OF_A_TURN = 8
-
-_OTHERS = 40  # places that tell how well maps fit by chance
 
 # Log of the range in which the surprise at the best place lies for maps of one place, as far as was
 # measured: 0.5 to 38, all alike likely.
@@ -75,12 +74,12 @@ def align(query: MapPiece, known: MapPiece) -> Alignment | None:
     reach_m = small.reach_m + large.reach_m
     if 2.0 * reach_m > _MAX_EXTENT_M:
         return None
-    peaks = _distinct(_peaks(small, large, reach_m), _OTHERS + 2)
-    if len(peaks) < _OTHERS + 2:
+    peaks = _distinct(_peaks(small, large, reach_m), OTHER_PLACES + 2)
+    if len(peaks) < OTHER_PLACES + 2:
         return None
     scores = peaks[:, 0]
     ahead = float((scores[1:-1] - scores[-1]).sum())
-    surprise = _OTHERS * math.log1p(float(scores[0] - scores[1]) / max(ahead, 1e-9))
+    surprise = OTHER_PLACES * math.log1p(float(scores[0] - scores[1]) / max(ahead, 1e-9))
     back = np.append(-small.middle, 0.0)
     first, second = (se2.compose(T, back) for T in peaks[:2, 1:])
     if is_query_larger:

@@ -1,6 +1,7 @@
 """The places where the robot may be, each with the samples round it and the evidence for it."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from thinmap_ros.core.places.place_database import (
     Places,
     profile,
 )
+from thinmap_ros.core.places.place_odds import MAX_LOG_RATIO, SURE, MissingShares
 from thinmap_ros.core.se2 import BOUND_SIGMAS, Array
 from thinmap_ros.jit import kernel
 
@@ -25,9 +27,7 @@ ODOMETRY_NOISE = 0.05
 # Of the search for candidates.
 _MIN_WALLS = 6  # beams that met something, below which a scan could be anywhere
 _MAX_SPOTS = 3000
-_MAX_REFINED = 600
 _MIN_SHARE = 0.6  # of the directions that must show what was measured
-_CLEARLY_WORSE = 0.1  # share of the directions
 _BELOW_BEST = 0.2  # share of the beams that a candidate may explain less than the best one
 
 
@@ -55,15 +55,12 @@ def candidates(
     counts += SILENT_COUNTS * silent
     good = counts >= counts.max() - _BELOW_BEST * len(seen.ranges_m)
     poses = poses[good][np.argsort(-counts[good], kind='stable')]
-    found = poses[distinct_indices(poses, _SAME_M, _SAME_RAD, _MAX_REFINED)]
-    return found, complete and len(found) < _MAX_REFINED
+    found = poses[distinct_indices(poses, _SAME_M, _SAME_RAD, _MAX_HYPOTHESES)]
+    return found, complete and len(found) < _MAX_HYPOTHESES
 
 
 def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> tuple[Array, bool]:
-    """Poses (N, 3) whose ranges in all directions agree best with a scan.
-
-    Also whether no candidate is missing.
-    """
+    """Poses (N, 3) whose ranges in all directions agree best with a scan; whether these are all."""
     ranges, known, met = profile(seen)
     # Off by half a spacing, by half a direction, and more where walls are seen at a slant.
     slack = places.spacing_m + ranges * (np.pi / DIRECTIONS)
@@ -76,10 +73,7 @@ def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> 
     # Equals in random order: where there are too many, each has its chance.
     order = np.argsort(-(counts + rng.random(len(counts))), kind='stable')[:_MAX_SPOTS]
     turns = headings[order] * (2.0 * np.pi / DIRECTIONS)
-    # Those left out must be clearly worse than the best.
-    margin = _CLEARLY_WORSE * int(known.sum())
-    cut = len(counts) > _MAX_SPOTS and counts[order[-1]] > counts.max() - margin
-    return np.column_stack([places.spots[spots[order]], turns]), not cut
+    return np.column_stack([places.spots[spots[order]], turns]), len(counts) <= _MAX_SPOTS
 
 
 def distinct_indices(poses: Array, apart_m: float, apart_rad: float, most: int) -> list[int]:
@@ -98,29 +92,69 @@ def distinct_indices(poses: Array, apart_m: float, apart_rad: float, most: int) 
     return kept
 
 
-def judged_before(
+def missed_beams(judged: tuple[Array, Array], beams: int) -> Array:
+    """Beams of an update that are not explained, more than by the best one, (N,).
+
+    judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each.
+    """
+    missing = beams - judged[0] - SILENT_COUNTS * judged[1]
+    return np.asarray(np.minimum(missing - missing.min(initial=np.inf), _MAX_MISSING_BEAMS))
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What one scan says at each of some poses (N).
+
+    missed (N,): beams that are not explained there, more than at the best one, of so many beams;
+    found (N,): share that the map shows again, of those of which it tells; log_ratios (N,): against
+    any other place.
+    """
+
+    missed: Array
+    beams: int
+    found: Array
+    log_ratios: Array
+
+
+def look_at(model: MissingShares, judge: Judge, poses: Array, seen: Observation) -> Look:
+    """The look of a scan at poses (N, 3)."""
+    judged = judge.explained(poses, seen)
+    beams = len(seen.ranges_m)
+    found, known = shares(*judged, beams)
+    return Look(missed_beams(judged, beams), beams, found, model.log_ratios(found, known))
+
+
+def shares(explained: Array, silent: Array, beams: int) -> tuple[Array, Array]:
+    """Share of beams that the map explains, of those of which it tells, and of how many it tells.
+
+    explained, silent (N,): of so many beams, those explained, and those of which it says nothing.
+    """
+    told = beams - silent
+    return np.asarray(explained / np.maximum(told, 1.0)), np.asarray(told / beams)
+
+
+def looks_before(
     judge: Judge,
-    views: list[KeyView],
+    model: MissingShares,
+    views: Sequence[KeyView],
     poses: Array,
     T_odom_base: Array,
-) -> tuple[Array, Array]:
-    """How many beams of earlier views (V) the map explains from poses (N, 3) held now.
+) -> list[Look]:
+    """The looks of earlier views at poses (N, 3) held now, the last one first.
 
-    Also of how many it says nothing; (V, N) each, by odometry back to there.
+    By odometry back to there.
     """
-    counts = np.zeros((len(views), len(poses)))
-    silent = np.zeros((len(views), len(poses)))
+    looks = []
     now = poses
     at = T_odom_base
-    for k in range(len(views) - 1, -1, -1):
-        view = views[k]
+    for view in reversed(views):
         # From view to view: what odometry is off does not add up.
         back = se2.between(at, view.T_odom_base)
         drift = _drift(back)
         now = judge.refined(moved(now, back), view.seen, np.broadcast_to(drift, (len(now), 3, 3)))
         at = view.T_odom_base
-        counts[k], silent[k] = judge.explained(now, view.seen)
-    return counts, silent
+        looks.append(look_at(model, judge, now, view.seen))
+    return looks
 
 
 def _drift(motion: Array) -> Array:
@@ -147,29 +181,17 @@ _EDGE_SHARE = 0.05
 _LASTING_SHARE = 0.01
 
 # A single scan may mislead (a person in the way, a door that has moved): its evidence is limited.
-_MAX_MISSING_BEAMS = 14.0  # beams
+_MAX_MISSING_BEAMS = MAX_LOG_RATIO / LOG_ODDS_A_BEAM
 
-_MIN_LOG_WEIGHT = -14.0
+_MIN_LOG_WEIGHT = -SURE - MAX_LOG_RATIO
 
 _MAX_HYPOTHESES = 400
 _SAME_M = 0.3
 _SAME_RAD = 0.15
-_MIN_COMPARED_SHARE = 0.6  # share of the beams
 
 # Of those this near to each other one is kept: the place may be anywhere between.
 _NEW_SIGMA_M = 0.5 * _SAME_M
 _NEW_SIGMA_RAD = 0.5 * _SAME_RAD
-
-_MEMORY = 0.85  # of what was explained, from one independent update to the next
-
-
-def missed_beams(judged: tuple[Array, Array], beams: int) -> Array:
-    """Beams of an update that are not explained, more than by the best one, (N,).
-
-    judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each.
-    """
-    missing = beams - judged[0] - SILENT_COUNTS * judged[1]
-    return np.asarray(np.minimum(missing - missing.min(initial=np.inf), _MAX_MISSING_BEAMS))
 
 
 def allowed_beams(beams: Array) -> Array:
@@ -184,9 +206,8 @@ class Hypotheses:
 
     poses (H, 3); priors (H,): log odds of each from the beginning; missed, compared (H,): beams
     that it did not explain while the best one did, and of how many; covariances (H, 3, 3);
-    ages (H,): independent updates since each was found; explained, asked, beams (H,): sums over
-    updates of the beams that the map explains, of those it says something about, and of all; older
-    ones count less.
+    evidence (H,): sum of the log likelihood ratios of each against others; found (H,): share of
+    the last look that the map shows again there.
     """
 
     poses: Array
@@ -194,10 +215,8 @@ class Hypotheses:
     missed: Array
     compared: Array
     covariances: Array
-    ages: Array
-    explained: Array
-    asked: Array
-    beams: Array
+    evidence: Array
+    found: Array
     samples: Array
     owners: NDArray[np.int64]
 
@@ -208,17 +227,10 @@ class Hypotheses:
         poses = np.empty((0, 3))
         covariances = np.empty((0, 3, 3))
         owners = np.empty(0, dtype=np.int64)
-        return Hypotheses(
-            poses, none, none, none, covariances, none, none, none, none, poses, owners
-        )
+        return Hypotheses(poses, none, none, none, covariances, none, none, poses, owners)
 
     def __len__(self) -> int:
         return len(self.poses)
-
-    @property
-    def are_too_many(self) -> bool:
-        """Whether there may be more places than can be kept."""
-        return len(self) == _MAX_HYPOTHESES
 
     @property
     def log_weights(self) -> Array:
@@ -242,16 +254,6 @@ class Hypotheses:
         odds = np.exp(self.log_weights)
         return np.asarray(odds / max(float(odds.sum()), 1e-300))
 
-    @property
-    def shares_explained(self) -> Array:
-        """Share (H,) of the beams of its updates that each explains.
-
-        Only beams that the map says something about count.
-        """
-        # Where that are few, they prove little.
-        asked = np.maximum(self.asked, _MIN_COMPARED_SHARE * self.beams)
-        return np.asarray(self.explained / np.maximum(asked, 1e-9))
-
     def move(self, motion: Array, noise: tuple[float, float], rng: np.random.Generator) -> None:
         """Move all by odometry (3,), robot frame; samples with noise: 1 sigma, m and rad."""
         self.poses = moved(self.poses, motion)
@@ -260,57 +262,58 @@ class Hypotheses:
         self.samples += rng.normal(size=self.samples.shape) * spread
         self.covariances = self.covariances + np.diag(spread**2)
 
-    def take_evidence(self, judged: tuple[Array, Array], beams: int, novelty: float) -> None:
-        """Add the evidence of an observation: inliers of each among some beams (see missed_beams).
+    def take_evidence(self, look: Look, novelty: float, most: float) -> None:
+        """Add the evidence of a look at each.
 
-        novelty: its weight, 1 for an independent one.
+        novelty: its weight, 1 for an independent one; most: evidence beyond which more tells
+        nothing.
         """
-        self.missed = self.missed + novelty * missed_beams(judged, beams)
-        self.compared = self.compared + novelty * beams
-        fade = _MEMORY**novelty
-        self.explained = fade * self.explained + novelty * judged[0]
-        self.asked = fade * self.asked + novelty * (beams - judged[1])
-        self.beams = fade * self.beams + novelty * beams
-        self.ages = self.ages + novelty
+        self.missed = self.missed + novelty * look.missed
+        self.compared = self.compared + novelty * look.beams
+        self.evidence = np.minimum(self.evidence + novelty * look.log_ratios, most)
+        self.found = look.found
 
-    def add(
-        self, poses: Array, prior: float, missed: Array, judged: tuple[Array, Array], beams: float
-    ) -> None:
+    def add(self, poses: Array, prior: float, looks: Sequence[Look], most: float) -> None:
         """Add new hypotheses (N, 3).
 
-        prior: log odds against the existing ones; judged: as in `take_evidence`, for some beams of
-        earlier observations; missed (N,): number of these that each misses more than the best
-        existing hypothesis.
+        prior: log odds, of places that turn up as late; looks: earlier ones, at the existing
+        hypotheses and at these; most: as in `take_evidence`.
         """
+        old = len(self)
         count = len(poses)
+        every = np.zeros(old + count)
+        missed = every + sum((look.missed for look in looks), every)
+        base = 0.0
+        if old:
+            best = self.best()
+            base = float(self.missed[best] - missed[best])
+        evidence = every + prior
+        for look in looks:
+            evidence = np.minimum(evidence + look.log_ratios, most)
         covariance = np.diag([_NEW_SIGMA_M**2, _NEW_SIGMA_M**2, _NEW_SIGMA_RAD**2])
         fresh = np.broadcast_to(covariance, (count, 3, 3))
-        base = float(self.missed.min()) if len(self) else 0.0
         for name, values in (
             ('poses', poses),
             ('priors', np.full(count, prior)),
-            ('missed', base + missed),
-            ('compared', np.full(count, beams)),
+            ('missed', base + missed[old:]),
+            ('compared', np.full(count, float(sum(look.beams for look in looks)))),
             ('covariances', fresh),
-            ('ages', np.zeros(count)),
-            ('explained', judged[0]),
-            ('asked', beams - judged[1]),
-            ('beams', np.full(count, beams)),
+            ('evidence', evidence[old:]),
+            ('found', looks[0].found[old:] if looks else every[old:]),
         ):
             setattr(self, name, np.concatenate([getattr(self, name), values]))
 
     def prune(self) -> None:
         """Drop what is out of the question, and of what has come together all but the likeliest."""
         logs = self.log_weights
-        order = np.lexsort((self.missed, -logs))
+        order = self.order()
         order = order[logs[order] > _MIN_LOG_WEIGHT]
         kept = order[distinct_indices(self.poses[order], _SAME_M, _SAME_RAD, _MAX_HYPOTHESES)]
         if len(kept) == len(self) == int(self.owners.max(initial=-1)) + 1:
             return
         renumbered = np.full(len(self.poses), -1)
         renumbered[kept] = np.arange(len(kept))
-        names = ('poses', 'priors', 'missed', 'compared', 'covariances', 'ages')
-        for name in (*names, 'explained', 'asked', 'beams'):
+        for name in ('poses', 'priors', 'missed', 'compared', 'covariances', 'evidence', 'found'):
             setattr(self, name, getattr(self, name)[kept])
         owners = renumbered[self.owners]
         order = np.argsort(owners, kind='stable')[int((owners < 0).sum()) :]
@@ -371,9 +374,19 @@ class Hypotheses:
         )
         self.owners = np.repeat(np.arange(count), quotas)
 
+    def is_narrow(self, number: int) -> bool:
+        """Whether a hypothesis is not wider than one place."""
+        covariance = self.covariances[number]
+        variance = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+        return variance <= _NEW_SIGMA_M**2 and float(covariance[2, 2]) <= _NEW_SIGMA_RAD**2
+
     def best(self) -> int:
-        """Number of the likeliest one; of equals that which explains most."""
-        return int(np.lexsort((-self.shares_explained, -self.log_weights))[0])
+        """Number of the likeliest one."""
+        return int(self.order()[0])
+
+    def order(self) -> NDArray[np.int64]:
+        """Numbers (H,), the likeliest first; of equals that with most evidence."""
+        return np.lexsort((-self.evidence, -self.log_weights))
 
 
 @kernel

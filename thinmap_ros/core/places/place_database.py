@@ -51,33 +51,13 @@ class GlobalLocalizationConfig(Config):
         low=0.001,
         high=1.0,
     )
-    accept_weight: float = parameter(
-        0.99,
-        'Smallest weight of the hypothesis that is accepted. Raise it against false localization, '
-        'lower it to be localized sooner.',
-        low=0.6,
-        high=1.0,
-    )
-    accept_updates: int = parameter(
-        3,
-        'Consecutive updates with one hypothesis before it is accepted. Raise it against false '
-        'localization, lower it to be localized sooner.',
-        low=1,
-        high=1000,
-    )
-    min_inlier_ratio: float = parameter(
-        0.8,
-        'Smallest inlier ratio of an accepted hypothesis, relative to the expected one. Lower it '
-        'where furniture has moved, raise it against false localization.',
-        low=0.3,
-        high=1.0,
-    )
-    not_in_map_distance_m: float = parameter(
-        2.0,
-        'Travelled distance without a hypothesis after which NOT_IN_MAP is reported (m). Raise it '
-        'for places that have changed much.',
-        low=0.0,
-        high=100.0,
+    accept_odds: float = parameter(
+        300.0,
+        'Odds of a pose, against all others in the map and against none of them, from which it is '
+        'accepted: one in so many is false at most. Raise it against false localization, lower it '
+        'to be localized sooner.',
+        low=1.0,
+        high=1e9,
     )
 
     @property
@@ -311,7 +291,6 @@ def _list_sights(
 
 
 # One scan alone has to make cells free and occupied.
-_P_FREE = 0.2
 _P_OCCUPIED = 0.8
 
 
@@ -368,7 +347,7 @@ def observed_nodes(
     grid = OccupancyGrid(
         OccupancyConfig(
             resolution_m=resolution_m,
-            p_miss=_P_FREE,
+            p_miss=1.0 - _P_OCCUPIED,
             p_hit=_P_OCCUPIED,
             no_return_clear_range_m=half,
         )
@@ -408,7 +387,6 @@ def profile(observation: Observation) -> tuple[Array, NDArray[np.bool_], NDArray
 # Of the reliability of nodes, by scans simulated in the map.
 _TRIALS = 60
 _SAME_NODE_M = 1.0
-_RAYLEIGH_MEDIAN = 1.1774  # median distance of points with 1 sigma on each axis
 
 _VIEW_SHARE = 0.25  # of the active window: where an observed node may lie
 
@@ -456,7 +434,9 @@ def calibrate(
         near = all_of_it[all_of_it < _SAME_NODE_M]
         if near.size:
             found[kind] = max(0.0, (near.size / all_of_it.size - chance) / (1.0 - chance))
-            spread[kind] = max(spread[kind], float(np.median(near)) / _RAYLEIGH_MEDIAN)
+            # The median distance of points with 1 sigma on each axis, Rayleigh distributed.
+            sigma = float(np.median(near)) / math.sqrt(2.0 * math.log(2.0))
+            spread[kind] = max(spread[kind], sigma)
     # A few trials do not prove a rate near 1.
     return NodeModel(np.minimum(found, 0.9), spread, window / (2.0 * np.pi * spread**2))
 

@@ -25,23 +25,26 @@ from thinmap_ros.core.places.piece import (
     agree,
     are_same,
 )
+from thinmap_ros.core.places.place_odds import (
+    JOIN_ODDS,
+    MAY_BE_ELSEWHERE,
+    MIN_KNOWN,
+    OTHER_PLACES,
+    Shares,
+    limited,
+    log_odds_of_first,
+    log_ratios,
+    on_one_storey,
+)
 from thinmap_ros.core.places.structure import storey_evidence, structure_evidence
 from thinmap_ros.core.places.views import SPACING_M, WINDOW_M, View
+from thinmap_ros.core.places.wall_field import BASIN_M
 from thinmap_ros.core.se2 import Array, inverse
 from thinmap_ros.core.stage import are_two_storeys
 
 # Share of its walls that a view finds again at the right place, in the map of another visit.
 # Measured: median 0.80, 5 % quantile 0.54.
-_FOUND = 0.8
-_FOUND_SIGMA = 0.12
-
-_MIN_KNOWN = 0.3  # share of its walls of which the map must tell
-
-_OTHER_PLACES = 40
-
-_MIN_OTHER_PLACES = 6
-
-_BASIN_M = 0.6  # distance from which a refinement finds a wall
+_HERE = Shares(0.8, 0.12)
 
 _MAX_STARTS = 3  # to either side
 
@@ -62,7 +65,7 @@ class ViewJudge:
     def __init__(self, piece: MapPiece, rng: np.random.Generator) -> None:
         self._field = piece.field
         self._rng = rng
-        self._elsewhere: dict[int, tuple[float, float] | None] = {}  # by the number of the view
+        self._elsewhere: dict[int, Shares | None] = {}  # by the number of the view
 
     def evidence(self, view: View, T_map_view: Array) -> Evidence:
         """Evidence of a view for a pose (3,) in the map.
@@ -72,12 +75,9 @@ class ViewJudge:
         """
         found, known = self._field.agreement(view, T_map_view)
         elsewhere = self._found_elsewhere(view)
-        if known < _MIN_KNOWN or elsewhere is None:
+        if known < MIN_KNOWN or elsewhere is None:
             return NONE
-        mean, sigma = elsewhere
-        right = -0.5 * (min(found - _FOUND, 0.0) / _FOUND_SIGMA) ** 2 - math.log(_FOUND_SIGMA)
-        wrong = -0.5 * (max(found - mean, 0.0) / sigma) ** 2 - math.log(sigma)
-        return Evidence(known * (right - wrong), found)
+        return Evidence(float(log_ratios(found, known, _HERE, elsewhere)), found)
 
     def best_near(self, view: View, T_map_view: Array, path_m: float) -> tuple[Array, Evidence]:
         """The best pose (3,) within the drift from a predicted one, and the evidence for it.
@@ -95,37 +95,27 @@ class ViewJudge:
             evidence = evidence._replace(log_ratio=log_ratio)
         return T, evidence
 
-    def _found_elsewhere(self, view: View) -> tuple[float, float] | None:
-        """Mean and standard deviation of the share of walls found at random places of the map.
-
-        None if the map tells of too few places.
-        """
+    def _found_elsewhere(self, view: View) -> Shares | None:
+        """Share of walls found at random places of the map; None if it tells of too few."""
         if view.number not in self._elsewhere:
             field = self._field
-            anywhere = field.random_poses(_OTHER_PLACES, self._rng)
+            anywhere = field.random_poses(OTHER_PLACES, self._rng)
             poses, _ = field.refined_widely(view, anywhere)
             pairs = [field.agreement(view, T) for T in poses]
-            shares = [found for found, known in pairs if known >= _MIN_KNOWN]
-            self._elsewhere[view.number] = (
-                None
-                if len(shares) < _MIN_OTHER_PLACES
-                else (float(np.mean(shares)), max(float(np.std(shares)), _FOUND_SIGMA))
-            )
+            shares = [found for found, known in pairs if known >= MIN_KNOWN]
+            known = Shares.of(shares, _HERE.sigma) if shares else None
+            self._elsewhere[view.number] = known
         return self._elsewhere[view.number]
 
 
 def _starts(T: Array, path_m: float) -> Array:
     """Poses (N, 3) from which refinements reach all that drift over a path makes possible."""
-    count = min(int(DRIFT.reach_m(path_m) / _BASIN_M), _MAX_STARTS)
-    steps = np.arange(-count, count + 1) * _BASIN_M
+    count = min(int(DRIFT.reach_m(path_m) / BASIN_M), _MAX_STARTS)
+    steps = np.arange(-count, count + 1) * BASIN_M
     x, y = np.meshgrid(steps, steps)
     offsets = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     return np.asarray(T + offsets)
 
-
-# Of one view. Neighbouring views are not independent, and the model may be wrong: with twice as
-# much a foreign pair of maps was joined, with half as much a real building was not.
-_MAX_LOG_RATIO = 6.0
 
 _INDEPENDENT = SPACING_M / WINDOW_M  # share of a view that is in no other one
 
@@ -133,7 +123,7 @@ _INDEPENDENT = SPACING_M / WINDOW_M  # share of a view that is in no other one
 _FOUND_AGAIN = 0.9
 _WRONG_AGAIN = 0.05
 _FOUND_BY_SEARCH = math.log(_FOUND_AGAIN / _WRONG_AGAIN)
-_NOT_FOUND_BY_SEARCH = math.log((1.0 - _FOUND_AGAIN) / (1.0 - _WRONG_AGAIN))
+_NOT_FOUND_BY_SEARCH = math.log1p(-_FOUND_AGAIN) - math.log1p(-_WRONG_AGAIN)
 
 _PLACES_OF_A_VIEW = 3
 
@@ -167,7 +157,7 @@ class PieceHypothesis:
     ) -> None:
         """Record the evidence of a view for a pose (3,) in the map, and that of its search."""
         log_ratio = evidence.log_ratio + by_search
-        self.log_ratios[view.number] = min(max(log_ratio, -_MAX_LOG_RATIO), _MAX_LOG_RATIO)
+        self.log_ratios[view.number] = float(limited(log_ratio))
         self.evidence_of[view.number] = evidence
         if log_ratio > 0.0:
             self.poses[view.number] = T_map_view
@@ -213,11 +203,15 @@ class Placement:
 class Recognition:
     """Looks for a growing piece of map in another one, view by view."""
 
-    def __init__(self, known: MapPiece, seed: int = 0) -> None:
-        """known: the map in which the piece is looked for; it stays as it is."""
+    def __init__(self, known: MapPiece, seed: int = 0, elsewhere: float = MAY_BE_ELSEWHERE) -> None:
+        """known: the map in which the piece is looked for; it stays as it is.
+
+        elsewhere: prior log odds that the piece lies nowhere in it.
+        """
         self.known = known
         self._judge = ViewJudge(known, np.random.default_rng(seed))
-        self._log_alternatives = log_alternatives(known)
+        self._alternatives = log_alternatives(known)
+        self._elsewhere = elsewhere
         self.views: list[View] = []
         self.hypotheses: list[PieceHypothesis] = []
         self._found: list[Array] = []  # poses (N, 3) by the search for each view
@@ -247,14 +241,15 @@ class Recognition:
         if not self.hypotheses:
             return None
         best = self.hypotheses[0]
-        logs = [other.evidence - self._log_alternatives for other in self.hypotheses]
-        if query is not None and logs[0] > least:
+        evidence = np.array([each.evidence for each in self.hypotheses])
+        likely = evidence - self._alternatives - self._elsewhere
+        if query is not None and likely[0] > least:
             for k, other in enumerate(self.hypotheses[1:], 1):
-                if logs[k] > 0.0:  # one that is less likely than none is no rival
+                if likely[k] > 0.0:  # one that is less likely than none is no rival
                     ratio = structure_evidence(query, self.known, other.motion(self.views))
-                    logs[k] += min(ratio, 0.0)
-        log_odds = logs[0] - float(np.logaddexp.reduce([0.0, *logs[1:]]))
-        return Placement(*self._transform(best), log_odds, best)
+                    evidence[k] += min(ratio, 0.0)
+        odds = log_odds_of_first(evidence, self._alternatives, self._elsewhere)
+        return Placement(*self._transform(best), odds, best)
 
     def _propose(self, view: View, T_map_view: Array) -> None:
         """Make a place where a view was found a hypothesis, or evidence for one."""
@@ -331,10 +326,8 @@ def log_odds_back(
         T_query_map = se2.compose(T_query_found, se2.invert(places[nearest]))
         T, evidence = judge.best_near(view, se2.compose(T_query_map, view.T_piece_view), 0.0)
         own.record(view, T, evidence)
-    return own.evidence - log_alternatives(query)
-
-
-JOIN_ODDS = 100_000.0
+    alternatives = log_alternatives(query)
+    return log_odds_of_first(np.array([own.evidence]), alternatives, MAY_BE_ELSEWHERE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,20 +357,12 @@ def decide(
     views = recognition.views
     if placement is None or are_two_storeys(query.tag, known.tag):
         return JoinDecision(False, None, -math.inf, len(views))
-    log_odds = placement.log_odds
-    if log_odds > least:
+    odds = placement.log_odds
+    if odds > least:
         back = log_odds_back(query, known, views, placement.hypothesis)
         ratio = storey_evidence(query, known, placement.hypothesis.motion(views))
-        log_odds = on_one_storey(min(log_odds, back), ratio, join_odds)
-    return JoinDecision(log_odds > least, placement, log_odds, len(views))
-
-
-def on_one_storey(log_odds: float, ratio: float, join_odds: float) -> float:
-    """Log odds of a place, given those without regard to storeys, and `storey_evidence`.
-
-    The same place on another storey is as rare beforehand as a false join that is accepted.
-    """
-    return -float(np.logaddexp(-log_odds, -math.log(join_odds) - ratio))
+        odds = on_one_storey(min(odds, back), ratio, join_odds)
+    return JoinDecision(odds > least, placement, odds, len(views))
 
 
 def recognize(

@@ -24,8 +24,7 @@ _POINT_SIGMA_M = 0.05  # of a point around its wall, once it is matched
 _DAMPING = 1.0
 _MAX_STEP_M = 0.3
 _MAX_STEP_RAD = 0.08
-_MIN_STEP_M = 0.002
-_MIN_STEP_RAD = 0.001
+_CONVERGED = 0.01  # of the largest step
 _ITERATIONS = 5  # for each width
 
 
@@ -131,7 +130,7 @@ def refine(
                 step *= _MAX_STEP_M / size
             step[2] = min(max(step[2], -_MAX_STEP_RAD), _MAX_STEP_RAD)
             T -= step
-            if size < _MIN_STEP_M and abs(step[2]) < _MIN_STEP_RAD:
+            if size < _CONVERGED * _MAX_STEP_M and abs(step[2]) < _CONVERGED * _MAX_STEP_RAD:
                 break
     return T, H / _POINT_SIGMA_M**2, mean
 
@@ -198,7 +197,8 @@ REACH_M = 1.0  # larger distances to walls count as this
 _KNOWN_M = 8.0
 
 # Of the loss, m: from candidates to walls, and from there to the place.
-_WIDE = np.array([0.6, 0.25])
+BASIN_M = 0.6  # distance from which a refinement finds a wall
+_WIDE = np.array([BASIN_M, 0.25])
 
 _NARROW = np.array([0.25, 0.12])
 

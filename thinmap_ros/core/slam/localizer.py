@@ -27,6 +27,7 @@ from thinmap_ros.core.ekf_slam.features import (
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
+from thinmap_ros.core.places.place_odds import SURE
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import (
@@ -51,7 +52,6 @@ from thinmap_ros.core.slam.matching.surface import (
     surface_points,
 )
 from thinmap_ros.core.slam.odometry import OdometryCalibration, PoseUncertainty
-from thinmap_ros.core.slam.place_belief import SURE
 from thinmap_ros.core.slam.track import LocalizerConfig, Surroundings, Tracked, Tracker
 from thinmap_ros.core.slam.wall_compass import Heading, Reference, WallCompass
 from thinmap_ros.core.snapshot import State

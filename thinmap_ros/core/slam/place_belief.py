@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thinmap_ros.core.places.place_odds import SURE
 from thinmap_ros.core.places.views import WINDOW_M
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.scan_matcher import Match
@@ -23,9 +24,6 @@ class SeenThrough(NamedTuple):
 
 NOTHING = SeenThrough(np.empty((0, 2)), 0.0)
 
-
-# Log odds of a robot that nothing contradicts: how rarely one is kidnapped, or let out of a lift.
-SURE = math.log(1e4)
 
 _GIVEN = math.log(1e2)  # of a start pose that a user gave: how rarely it is another one
 

@@ -21,7 +21,7 @@ from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.places.recognition import JOIN_ODDS
+from thinmap_ros.core.places.place_odds import JOIN_ODDS
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.joining.messages import KeyframeMessage, checked_poses
 from thinmap_ros.core.slam.joining.pieces import ReceivedKeyframes, RobotKeyframes

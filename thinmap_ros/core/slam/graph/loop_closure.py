@@ -15,7 +15,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.places.recognition import JOIN_ODDS
+from thinmap_ros.core.places.place_odds import JOIN_ODDS
 from thinmap_ros.core.se2 import (
     Array,
     carried,

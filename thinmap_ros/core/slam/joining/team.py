@@ -16,7 +16,8 @@ from thinmap_ros.core.grid.fused import Layer, fused
 from thinmap_ros.core.grid.moved import MapMotion, laid_on, overlaid_bent
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.places.piece import SAME_M, SAME_RAD
-from thinmap_ros.core.places.recognition import JOIN_ODDS, recognize
+from thinmap_ros.core.places.place_odds import JOIN_ODDS
+from thinmap_ros.core.places.recognition import recognize
 from thinmap_ros.core.se2 import Array, inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
