@@ -1,18 +1,10 @@
 """The launch file starts `thinmap robot`, with its options."""
 
-import ast
 import runpy
-from pathlib import Path
 
 import pytest
 from support.forks import forked
-
-FILE = Path(__file__).resolve().parents[1] / 'launch' / 'thinmap.launch.py'
-
-
-def constants():
-    assigned = [node for node in ast.parse(FILE.read_text()).body if isinstance(node, ast.Assign)]
-    return {node.targets[0].id: ast.literal_eval(node.value) for node in assigned}
+from support.launch_file import FILE, constants
 
 
 @pytest.mark.programs

@@ -71,6 +71,8 @@ KNOWN_PACKAGES = {
     'builtin_interfaces',
     'diagnostic_msgs',
     'geometry_msgs',
+    'launch',
+    'launch_ros',
     'lifecycle_msgs',
     'map_msgs',
     'nav2_msgs',

@@ -7,6 +7,7 @@ import re
 
 import pytest
 import yaml
+from support.launch_file import constants
 from support.node_list import ROOT
 
 from thinmap_ros.files.safe import parse_yaml
@@ -20,6 +21,7 @@ _GIVEN = re.compile(
     r"""(?<![\w/.:])(?:\w+:)?([A-Za-z_/][\w./]*):=(?:"([^"`\n]+)"|["']?([^\s`'"|)\]]+))"""
 )
 _REMAPPING = re.compile(r'(-r|--remap) \S+:=\S+')
+_LAUNCH = re.compile(r'ros2 launch thinmap_ros thinmap\.launch\.py((?: \w+:=[^`\s]+)*)')
 _COMMAND = re.compile(r'ros2 run thinmap_ros ([a-z_]+)((?:[^`\n]|\\\n)*)')
 TOPICS = {'scan', 'odom', 'tf', 'tf_static', 'cmd_vel', 'map', 'robot', 'stop'}
 ARGUMENTS = {'web:=true', 'web:=false'}
@@ -51,6 +53,7 @@ def is_remapping(name):
 def wrong_values(text, node='thinmap'):
     """What is no parameter of a node, or of another type, in a text."""
     wrong = []
+    text = _LAUNCH.sub('', text)
     for name, quoted, plain in _GIVEN.findall(_REMAPPING.sub('', text)):
         given = quoted or plain.rstrip(':.,')
         rule = f'{name}:={given}'
@@ -66,6 +69,8 @@ def wrong_values(text, node='thinmap'):
 @pytest.mark.parametrize('page', PAGES, ids=lambda path: path.stem)
 def test_documented_values_are_taken(page):
     assert wrong_values(page.read_text()) == []
+    for words in _LAUNCH.findall(page.read_text()):
+        assert {word.split(':=')[0] for word in words.split()} <= constants()['ARGUMENTS'].keys()
     for node, words in _COMMAND.findall(page.read_text()):
         assert node in NODES
         assert wrong_values(words, node) == [], node
