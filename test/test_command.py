@@ -56,18 +56,9 @@ def test_without_words_it_prints_the_help() -> None:
     assert done.stdout == run('--help').stdout
 
 
-@pytest.mark.parametrize(
-    ('words', 'expected'),
-    [
-        (['frobnicate'], "'frobnicate': no such subcommand"),
-        (['nodes', 'loclizer'], "'loclizer': no such node (did you mean localizer?)"),
-        (['nodes', 'sim', 'sim'], 'a name twice: expected each node once'),
-    ],
-    ids=['subcommand', 'node', 'node twice'],
-)
-def test_a_wrong_name_is_one_line_and_exit_code_2(words: list[str], expected: str) -> None:
-    done = run(*words)
-    assert expected in done.stderr
+def test_a_wrong_name_is_one_line_and_exit_code_2() -> None:
+    done = run('frobnicate')
+    assert done.stderr.startswith("thinmap: error: 'frobnicate': no such subcommand")
     assert done.returncode == 2
     assert done.stdout == ''
     assert done.stderr.count('\n') == 1

@@ -137,6 +137,10 @@ def test_what_cannot_be_run_is_reported_in_one_line(ros_domain):
     assert 'usage: thinmap' in run('--help').stdout
     done = run('localizer', 'pilot')
     assert done.returncode == 2 and done.stderr.startswith("error: 'pilot': no such node")
+    done = run('loclizer')
+    assert done.returncode == 2 and done.stderr.count('\n') == 1
+    assert "'loclizer': no such node (did you mean localizer?)" in done.stderr
+    assert 'a name twice: expected each node once' in run('localizer', 'localizer').stderr
     strict = ('-p', 'gaet:=1.0', '-p', 'strict_parameters:=true')
     done = run('localizer', 'grid_mapper', '--ros-args', *strict)
     unknown = 'nodes localizer, grid_mapper have no parameter gaet'
