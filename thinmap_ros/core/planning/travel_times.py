@@ -16,7 +16,12 @@ from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.planning.grid_search import MAX_WEIGHT, weighted_distance_field_from
 from thinmap_ros.core.planning.obstacles import RecentPath
 from thinmap_ros.core.planning.path_follower import SpeedConfig
-from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_free, open_escape_cells
+from thinmap_ros.core.planning.wavefront import (
+    WavefrontConfig,
+    cost_of_free,
+    lowest_around,
+    open_escape_cells,
+)
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.jit import kernel
 
@@ -175,7 +180,7 @@ def _ends(
                 break
             steps[count] = here
             count += 1
-            row, col = _lower(seconds, row, col)
+            row, col = lowest_around(seconds, row, col)
             if row * cols + col == here:
                 break
             if not has_end and math.hypot(row - cells[i, 0], col - cells[i, 1]) >= reach:
@@ -192,19 +197,3 @@ def _ends(
         if not has_end:
             last[i] = first[i]
     return first, last
-
-
-@kernel
-def _lower(seconds: Array, row: int, col: int) -> tuple[int, int]:
-    """The neighbour from which a cell is reached; itself where there is none."""
-    rows, cols = seconds.shape
-    to_row = row
-    to_col = col
-    for r in range(max(row - 1, 0), min(row + 2, rows)):
-        for c in range(max(col - 1, 0), min(col + 2, cols)):
-            # Diagonally only where the search stepped so.
-            is_cut = (seconds[row, c] < np.inf) != (seconds[r, col] < np.inf)
-            if not is_cut and seconds[r, c] < seconds[to_row, to_col]:
-                to_row = r
-                to_col = c
-    return to_row, to_col

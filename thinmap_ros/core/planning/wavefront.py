@@ -436,7 +436,7 @@ def _is_over_corner(field: Array, row: int, col: int, r: int, c: int) -> bool:
 
 
 @kernel
-def _lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
+def lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
     """The lowest of the eight neighbours; diagonal if both cells beside have a path, or neither."""
     rows, cols = field.shape
     best_row = row
@@ -493,7 +493,7 @@ def trace_gradient_path(field: Array, x: float, y: float, goal_row: int, goal_co
             or (stays == 0 and not field[r, c] < field[row, col])
             or _is_over_corner(field, row, col, r, c)
         ):
-            r, c = _lowest_around(field, row, col)
+            r, c = lowest_around(field, row, col)
             next_x = c + 0.5
             next_y = r + 0.5
             stays = 0
