@@ -74,9 +74,13 @@ MAX_MARKS = 9
 # Too long for every run: only their help is run, to check script, program and options.
 HELP_ONLY = {
     'scripts/demo': 'test/live/test_demo.py runs the demo to its end',
-    'scripts/demo --robots 2 --world office': 'as above',
+    'scripts/demo --robots 2': 'as above',
     'scripts/test': 'what has started this test',
     'thinmap doctor --try-watchdog': 'turns a robot: test/live/test_doctor.py',
+    'thinmap robot --preset turtlebot4 --explore --web --save maps/office': (
+        'test/live/test_robot_command.py runs it'
+    ),
+    'thinmap robot --preset turtlebot4 --map maps/office': 'as above',
     'scripts/endurance': 'hours; scripts/endurance --minutes 10 is for releases',
     'scripts/experiment all': 'test/experiments/test_experiments.py runs each experiment',
 }
