@@ -77,8 +77,7 @@ class TopologyBuilderNode(ThinmapNode):
 
     Services save_topology, load_topology and check_topology, which reads a saved graph without
     replacing the present one; name_region, which gives a region a name. A graph is published when
-    it has changed: after 0.2 m, 0.2 rad or 1 s, and with a new /grid; while somebody subscribes to
-    /local_topology, for each scan, and so is that. Where Nav2's
+    it has changed, /local_topology for each scan while somebody subscribes to it. Where Nav2's
     route server runs, it is given the route graph of `map_to_graph`, with areas of /keep_out as
     walls, when that has changed, and when the graph is saved: client of
     route_server/set_route_graph.
@@ -166,10 +165,6 @@ class TopologyBuilderNode(ThinmapNode):
         if self._stamp.is_restarted_by(stamp_ns):
             self.reset_state()
         self._stamp.latest_ns = stamp_ns
-        local = self._output.local
-        if not local.has_subscribers and not self._topology.is_due(update):
-            self._topology.hold(update)
-            return
         with self.diagnostics.time_step('graph update'):
             changed = self._topology.step(update)
         # The first one is published even if it is empty: others wait for the graph of the map.
@@ -177,8 +172,8 @@ class TopologyBuilderNode(ThinmapNode):
             self._publish(stamp_ns, again=False)
         # The local map comes last: a subscriber that receives it has all results of this scan. It
         # may wait for the result of each scan (lockstep).
-        if local.has_subscribers:
-            local.publish(self._topology.builder.local_map(), stamp_ns, again=True)
+        local = self._output.local
+        local.publish(self._topology.builder.local_map(), stamp_ns, again=local.has_subscribers)
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
         if not self._is_of_this_map(message):
@@ -189,8 +184,8 @@ class TopologyBuilderNode(ThinmapNode):
         self._regions.add_grid(stamp_ns, whole.patch)
         self._route_graph.map_changed()
         with self.diagnostics.time_step('whole map'):
-            changes = [self._topology.flush(), self._topology.add_map(whole)]
-        if any(changed is not None for changed in changes):
+            changed = self._topology.add_map(whole)
+        if changed is not None:
             self._publish(stamp_ns, again=False)
 
     def _publish(self, stamp_ns: int, again: bool = True) -> None:
@@ -212,7 +207,6 @@ class TopologyBuilderNode(ThinmapNode):
         return saved
 
     def _save(self, path: str, overwrite: bool = False) -> str:
-        self._topology.flush()
         saved = TOPOLOGY.save(path, self._topology.builder, overwrite)
         REGIONS.save(path, self._regions.tracker)
         return f'saved {saved}'

@@ -39,11 +39,6 @@ _STALE_NS = -1  # before every correction: the graph is rebuilt from the next wh
 _GRAPH_PERIOD_NS = 2_000_000_000
 _CELLS_A_PERIOD = 1_000_000
 
-# A window that comes after so little motion and time shows nearly the same cells.
-_STEP_M = 0.2
-_STEP_RAD = 0.2
-_STEP_NS = 1_000_000_000
-
 # Of saved states.
 _PERCENT = np.array([UNKNOWN, 0, 100, UNKNOWN], dtype=np.int8)  # of each state
 _A_BYTE = 4  # states
@@ -530,8 +525,6 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
         self._whole: WholeMap | None = None  # the newest one, until the graph has it
         self._job: Job | None = None
         self._pending: list[MapUpdate] = []
-        self._added: MapUpdate | None = None
-        self._held: list[MapUpdate] = []
 
     def state(self) -> State:
         """The graph, and the correction that it follows."""
@@ -545,34 +538,11 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
         self.replace(TopologyBuilder.from_state(graph, self._config))
         self._corrected_ns = corrected_ns
 
-    def is_due(self, update: MapUpdate) -> bool:
-        """Whether the robot has moved 0.2 m or 0.2 rad, or a second has passed, since a step."""
-        last = self._added
-        if last is None or last.corrected_ns != update.corrected_ns:
-            return True
-        x, y, turn = se2.between(last.localized.T_map_base, update.localized.T_map_base)
-        passed_ns = update.localized.scan.stamp_ns - last.localized.scan.stamp_ns
-        is_near = math.hypot(x, y) < _STEP_M and abs(turn) < _STEP_RAD
-        return not (is_near and 0 <= passed_ns < _STEP_NS)
-
-    def hold(self, update: MapUpdate) -> None:
-        """Leave changes to the next step: its window shows them, and the whole map what is beyond.
-
-        Where the robot was is kept.
-        """
-        self._held.append(update)
-
-    def flush(self) -> TopologicalMap | None:
-        """Add what is held; returns the graph if it is another one."""
-        return self.step(self._held.pop()) if self._held else None
-
     def step(self, update: MapUpdate) -> TopologicalMap | None:
         """Add what has changed in the map; returns the graph if it is another one.
 
         Raises InputError where the changes do not fit the map.
         """
-        update = self._with_held(update)
-        self._added = update
         self._newest = update
         self._adopt(update)
         if update.whole is not None:
@@ -605,14 +575,6 @@ class Topology(Stage[MapUpdate, TopologicalMap]):
             self.builder = job.result()
         for update in pending:
             self._add(update.changes, update)
-
-    def _with_held(self, update: MapUpdate) -> MapUpdate:
-        held = [each for each in self._held if each.corrected_ns == update.corrected_ns]
-        self._held = []
-        if not held:
-            return update
-        poses = [each.localized.T_map_base[:2] for each in [*held, update]]
-        return replace(update, places=np.array(poses))
 
     def _adopt(self, update: MapUpdate) -> None:
         """Learn which correction the graph follows, from changes of its map."""
