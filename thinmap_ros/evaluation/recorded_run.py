@@ -244,7 +244,8 @@ class RobotRun:
         first_ns = int(self.result['start_ns'])
         last_ns = int(self.result['end_ns'])
         true = self.recording.true
-        return np.array([true[ns] for ns in true if first_ns <= ns <= last_ns])
+        within = [true[ns] for ns in true if first_ns <= ns <= last_ns]
+        return np.array(within).reshape(-1, 3)
 
     @property
     def distance_m(self) -> float:

@@ -81,18 +81,18 @@ def _driven_over(layer: Layer) -> Mask:
     over = np.zeros(patch.shape, dtype=np.bool_)
     if not len(layer.driven):
         return over
-    ways = _along(layer.driven)
+    path = _along(layer.driven)
     reach = math.ceil(_FOOTPRINT_M / patch.frame.resolution)
     beside = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
-    near = np.unique((patch.frame.cells_of(ways)[:, None] + beside).reshape(-1, 2), axis=0)
+    near = np.unique((patch.frame.cells_of(path)[:, None] + beside).reshape(-1, 2), axis=0)
     near = near[((near >= 0) & (near < patch.shape)).all(axis=1)]
-    away, _ = cKDTree(ways).query(patch.frame.centres_of(near))
+    away, _ = cKDTree(path).query(patch.frame.centres_of(near))
     over[tuple(near[away < _FOOTPRINT_M].T)] = True
     return over & ~patch.occupied
 
 
 def _along(places: Array) -> Array:
-    """Places (M, 2), close together, on the way through places (N, 2)."""
+    """Places (M, 2), close together, on the line through places (N, 2)."""
     parts = [places]
     for a, b in pairwise(places):
         length_m = math.dist(a, b)

@@ -54,8 +54,8 @@ class GlobalLocalizationConfig(Config):
     accept_odds: float = parameter(
         300.0,
         'Odds of a pose, against all others in the map and against none of them, from which it is '
-        'accepted: one in so many is false at most. Raise it against false localization, lower it '
-        'to be localized sooner.',
+        'accepted: by the model, one in so many is false. Raise it against false localization, '
+        'lower it to be localized sooner.',
         low=1.0,
         high=1e9,
     )
