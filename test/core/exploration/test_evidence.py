@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.belief import FIELDS, EvidenceStore
+from thinmap_ros.core.exploration.belief import FIELDS, EvidenceStore, completed
 from thinmap_ros.core.snapshot import validate
 
 CELL_M = 0.1
@@ -63,6 +63,9 @@ def test_of_two_frontiers_side_by_side_each_keeps_its_own_evidence():
 def test_a_store_continues_from_its_state():
     store = EvidenceStore(1)
     near, far = followed(store, line(0), line(60, 7))
+    near.add_visit((0.5, 9.0))
+    near.add_visit((0.5, 8.0))
+    far.add_visit((6.0, 9.0))
     near.visits = 3
     near.failures = 1
     again = EvidenceStore(1)
@@ -70,14 +73,30 @@ def test_a_store_continues_from_its_state():
     kept, moved = again.items
     assert (kept.id, kept.place, kept.visits, kept.failures) == (1, (0.0, 10.0), 3, 0)
     assert (moved.cells == far.cells).all()
+    assert kept.seen_from == ((0.5, 9.0), (0.5, 8.0)) and moved.seen_from == ((6.0, 9.0),)
     assert [item.id for item in followed(again, line(0), line(60, 7), line(90))] == [1, 2, 3]
     again.restore(validate(EvidenceStore(1).state(), FIELDS, 'exploration'))
     assert again.items == []
 
 
+def test_a_state_of_an_earlier_release_has_no_places_of_visits():
+    store = EvidenceStore(1)
+    for evidence in followed(store, line(0), line(60)):
+        evidence.add_visit((1.0, 9.0))
+    state = store.state()
+    del state['seen_from'], state['seen_counts']
+    store.restore(validate(completed(state), FIELDS, 'exploration'))
+    assert [(item.visits, item.seen_from) for item in store.items] == [(1, ()), (1, ())]
+
+
 @pytest.mark.parametrize(
     ('name', 'value'),
-    [('cell_counts', [1, 1]), ('cell_counts', [2**62, 2**62]), ('ids', [1, 1])],
+    [
+        ('cell_counts', [1, 1]),
+        ('seen_counts', [1, 1]),
+        ('cell_counts', [2**62, 2**62]),
+        ('ids', [1, 1]),
+    ],
 )
 def test_a_state_that_contradicts_itself_is_refused(name, value):
     store = EvidenceStore(1)

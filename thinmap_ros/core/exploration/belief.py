@@ -31,6 +31,9 @@ FIELDS = {
     'cell_counts': Field(np.int64, ('n',), 0, MAX_COUNT),
     # of the lattice of the map, place after place
     'cells': Field(np.int64, ('k', 2), -MAX_CELL_INDEX, MAX_CELL_INDEX),
+    'seen_counts': Field(np.int64, ('n',), 0, MAX_COUNT),
+    # m, map frame, place after place
+    'seen_from': Field(np.float64, ('m', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
 }
 
 
@@ -197,18 +200,21 @@ class EvidenceStore:
         return found
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """All evidence but failures and `seen_from` as arrays by name, for `restore`.
+        """All evidence but failures as arrays by name, for `restore`.
 
-        What could not be reached, or seen from there, is worth another try.
+        What could not be reached is worth another try.
         """
         items = self.items
         cells, ends = _joined([item.cells for item in items])
+        seen = [place for item in items for place in item.seen_from]
         return {
             'ids': np.array([item.id for item in items], dtype=np.int64),
             'places': np.array([item.place for item in items]).reshape(-1, 2),
             'visits': np.array([item.visits for item in items], dtype=np.int64),
             'cell_counts': np.diff(ends),
             'cells': cells,
+            'seen_counts': np.array([len(item.seen_from) for item in items], dtype=np.int64),
+            'seen_from': np.array(seen, dtype=np.float64).reshape(-1, 2),
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -216,16 +222,19 @@ class EvidenceStore:
 
         Raises InputError where its arrays contradict each other.
         """
-        counts = state['cell_counts']
-        total = len(state['cells'])
-        fits = bool((counts <= total).all()) and int(counts.sum()) == total
-        snapshot.require(fits, f'exploration: {total} cells', 'as many as the places have')
         snapshot.require_unique(state['ids'], 'exploration: id of a place')
-        parts = np.split(state['cells'], np.cumsum(counts)[:-1]) if len(counts) else []
+        cells = _split(state['cells'], state['cell_counts'], 'cells')
+        seen = _split(state['seen_from'], state['seen_counts'], 'places of visits')
         self.items = [
-            Evidence(int(number), (float(place[0]), float(place[1])), cells, int(visits))
-            for number, place, cells, visits in zip(
-                state['ids'], state['places'], parts, state['visits'], strict=True
+            Evidence(
+                int(number),
+                (float(place[0]), float(place[1])),
+                frontier,
+                int(visits),
+                tuple((float(x), float(y)) for x, y in places),
+            )
+            for number, place, visits, frontier, places in zip(
+                state['ids'], state['places'], state['visits'], cells, seen, strict=True
             )
         ]
         self._next_id = max([self._next_id, *(item.id + 1 for item in self.items)])
@@ -233,6 +242,21 @@ class EvidenceStore:
     def _new_id(self) -> int:
         self._next_id += 1
         return self._next_id - 1
+
+
+def completed(state: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
+    """A state with the places of visits, which those of releases up to 0.3.0 lack."""
+    if {'seen_counts', 'seen_from'} & state.keys() or 'ids' not in state:
+        return state
+    counts = np.zeros(np.shape(state['ids']), dtype=np.int64)
+    return {**state, 'seen_counts': counts, 'seen_from': np.zeros((0, 2))}
+
+
+def _split(rows: NDArray[Any], counts: NDArray[np.int64], what: str) -> list[NDArray[Any]]:
+    """Rows (K, 2) of each place, which has so many of them; raises InputError if K differs."""
+    fits = bool((counts <= len(rows)).all()) and int(counts.sum()) == len(rows)
+    snapshot.require(fits, f'exploration: {len(rows)} {what}', 'as many as the places have')
+    return np.split(rows, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
 def _joined(parts: Sequence[Cells]) -> tuple[Cells, NDArray[np.int64]]:

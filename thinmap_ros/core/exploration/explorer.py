@@ -177,7 +177,7 @@ class Explorer:
         Raises InputError where it is no such state.
         """
         explorer = Explorer(config)
-        checked = snapshot.validate(state, belief.FIELDS, 'exploration')
+        checked = snapshot.validate(belief.completed(state), belief.FIELDS, 'exploration')
         explorer._finder.store.restore(checked)
         return explorer
 
