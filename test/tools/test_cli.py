@@ -8,19 +8,11 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.kernels import report_compilation
 from thinmap_ros.logs.log import LaserOptions, Log
 from thinmap_ros.logs.readers.bag import BagLog
 from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser
-
-
-@pytest.fixture(autouse=True)
-def nothing_compiled(capsys: pytest.CaptureFixture[str]) -> None:
-    """The report is that of the process: a test before may have compiled."""
-    report_compilation().end()
-    capsys.readouterr()
 
 
 def ends_with(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> object:
