@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
+from rclpy.executors import ExternalShutdownException
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -23,6 +23,7 @@ from thinmap_ros.core.errors import InputError, ThinmapError, one_line, one_line
 from thinmap_ros.files.package_data import config_file
 from thinmap_ros.kernels import compiler_memory_releaser, release_compiler_pages, report_compilation
 from thinmap_ros.ros import parameters
+from thinmap_ros.ros.executor import NodeExecutor
 from thinmap_ros.ros.foreign import (
     given_files,
     given_values,
@@ -264,8 +265,7 @@ def _spin(running: _Running) -> None:
 def _spin_one(
     node: Node, running: _Running, after_each_call: Callable[[], None] = lambda: None
 ) -> None:
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
+    executor = NodeExecutor(node)
     stop_event = running.stop_event
     try:
         while rclpy.ok() and not stop_event.is_set() and not getattr(node, 'finished', False):
@@ -280,22 +280,20 @@ def _spin_one(
         executor.shutdown()
 
 
-def _spin_once(executor: SingleThreadedExecutor, node: Node) -> None:
+def _spin_once(executor: NodeExecutor, node: Node) -> None:
     """Run a callback. What it raises ends the node, unless it has a `step_failed` to report it."""
+    # A bounded wait: Python handles signals only between calls.
+    ready = executor.next_callback(timeout_s=0.25)
+    if ready is None:
+        return
     try:
-        # A bounded wait: Python handles signals only between calls.
-        task, entity, _ = executor.wait_for_ready_callbacks(timeout_sec=0.25)
-    except TimeoutException:
-        return
-    task()
-    error = task.exception()
-    if error is None:
-        return
-    report = getattr(node, 'step_failed', None)
-    if report is None or not rclpy.ok():
-        raise error
-    names = (getattr(entity, name, '') for name in ('topic_name', 'srv_name'))
-    report(next(filter(None, names), 'a callback'), error)
+        ready.call()
+    except Exception as error:
+        report = getattr(node, 'step_failed', None)
+        if report is None or not rclpy.ok():
+            raise
+        names = (getattr(ready.entity, name, '') for name in ('topic_name', 'srv_name'))
+        report(next(filter(None, names), 'a callback'), error)
 
 
 def _on_signals(handler: Any) -> None:

@@ -1,4 +1,4 @@
-"""What nodes need of rclpy and it has no public way to: all private names are here.
+"""What nodes need of rclpy and it has no public way to: all private names but the executor's.
 
 Tried with rclpy of Jazzy, 7.1: test/ros/test_private_rclpy.py tells when another one is installed.
 """
@@ -22,6 +22,9 @@ from std_msgs.msg import Bool
 RCLError = rclpy_implementation.RCLError
 # Raised for unknown arguments after --ros-args, which would end in a traceback, too.
 UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
+# Without them, no executor but those of rclpy.
+InvalidHandle = rclpy_implementation.InvalidHandle
+WaitSet = rclpy_implementation.WaitSet
 _RCL = ctypes.CDLL('librcl.so')
 GID_SIZE = 16  # RMW_GID_STORAGE_SIZE of Jazzy
 
