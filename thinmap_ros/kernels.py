@@ -209,6 +209,7 @@ def localizer() -> None:
     from thinmap_ros.core.slam.odometry import OdometryCalibration
 
     _sense()
+    _check_laser()
     rehearsed = Localizer()
     for scan, T_map_base in _drive():
         rehearsed.step(scan, T_map_base)
@@ -233,6 +234,7 @@ def ekf_localizer() -> None:
     from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 
     _sense()
+    _check_laser()
     rehearsed = EkfLocalizer(EkfConfig())
     for scan, T_map_base in _drive():
         rehearsed.step(scan, T_map_base)
@@ -286,6 +288,22 @@ def _sense() -> None:
     for scan, T_map_base in _drive():
         pairing.add_odometry(scan.stamp_ns, T_map_base)
         pairing.add_scan(replace(scan, beam_period_s=beam_s))
+
+
+def _check_laser() -> None:
+    """Warm up the comparison of a laser's motion with that of the odometry."""
+    from thinmap_ros.core.sensing.consistency import (
+        MountErrorConfig,
+        MountErrorEstimator,
+        TurnComparison,
+    )
+
+    mount = MountErrorEstimator(MountErrorConfig(span_m=0.0, windows=(1, 2)))
+    turns = TurnComparison()
+    for scan, T_map_base in _drive():
+        mount.add(T_map_base, np.eye(3), T_map_base, scan.T_base_laser)
+        turns.add(scan, T_map_base)
+    mount.estimates(scan.T_base_laser)
 
 
 @cache

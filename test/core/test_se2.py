@@ -50,3 +50,11 @@ def test_a_step_ahead_of_a_robot_facing_north_goes_north():
 def test_interpolation_turns_in_the_shorter_direction():
     middle = se2.interpolate(se2.pose(0, 0, 3.0), se2.pose(2, 0, -3.0), 0.5)
     np.testing.assert_allclose(middle, [1.0, 0.0, math.pi])
+
+
+@given(number, number, number)
+def test_variances_are_the_eigenvalues_of_a_covariance(a, b, c):
+    root = np.array([[a, 0.0], [b, c]])
+    covariance = root @ root.T
+    expected = np.linalg.eigvalsh(covariance)
+    np.testing.assert_allclose(se2.variances(covariance), expected, rtol=1e-9, atol=1e-9)

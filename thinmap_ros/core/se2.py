@@ -170,6 +170,14 @@ def carried(derivative: Array, lever: Array) -> Array:
     return np.asarray(_compounding(lever) @ derivative)
 
 
+def variances(covariance: Array) -> tuple[float, float]:
+    """Variances of a covariance (2, 2) in its most and its least certain direction."""
+    (xx, xy), (_, yy) = covariance.tolist()
+    middle = 0.5 * (xx + yy)
+    apart = math.hypot(0.5 * (xx - yy), xy)
+    return middle - apart, middle + apart
+
+
 def inverse(matrix: Array) -> Array:
     """Information (3, 3) of a covariance, and vice versa."""
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)

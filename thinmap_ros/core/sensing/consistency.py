@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import MIN_HITS, Scan, laser_names, of_lasers
-from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, rotation
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, Mask, rotation
 from thinmap_ros.core.sensing.odometry_scale import OdometryScale
 from thinmap_ros.core.stage import Estimate
+from thinmap_ros.jit import kernel
 
 _ITERATIONS = 3
 
@@ -162,28 +162,36 @@ class MountErrorEstimator:
         config = self._config
         F = se2.between(begin.T_map_base, end.T_map_base)
         M = se2.between(begin.T_odom_base, end.T_odom_base)
+        turn = float(F[2])
         # The chord of an arc is rotated by half the turn that the odometry lacks.
-        unexplained = float(se2.wrap(float(F[2] - M[2])))
+        unexplained = se2.wrap(turn - float(M[2]))
         along, aside = (rotation(0.5 * unexplained)[:2, :2] @ M[:2]).tolist()
         length = math.hypot(along, aside)
-        lever = rotation(float(F[2]))[:2, :2] - np.eye(2)
+        lever = rotation(turn)[:2, :2] - np.eye(2)
         # By a coarse integration of the odometry its direction is wrong by up to half the turn.
-        turn_variance = float(begin.covariance[2, 2]) + 0.25 * (float(F[2]) ** 2 + unexplained**2)
+        turn_variance = float(begin.covariance[2, 2]) + 0.25 * (turn**2 + unexplained**2)
         noise = config.noise_m**2 + length**2 * (config.noise_share**2 + turn_variance)
         R = rotation(-float(begin.T_map_base[2]))[:2, :2]
         ends = R @ (begin.covariance + end.covariance)[:2, :2] @ R.T
-        covariance = ends + noise * np.eye(2)
         _, scale, place, _ = config.prior_sigmas
-        possible = config.noise_m**2 + float(np.linalg.eigvalsh(ends)[-1])
-        swing = math.hypot(*lever[0].tolist())
+        possible = config.noise_m**2 + se2.variances(ends)[1]
+        swing = 2.0 * abs(math.sin(0.5 * turn))
         possible += (scale * length) ** 2 + (swing * place) ** 2
         # A laser may point anywhere: then it swings to the other side.
         opposite = 2.0 * swing * math.hypot(T_base_laser[0], T_base_laser[1])
         if abs(math.hypot(F[0], F[1]) - length) > BOUND_SIGMAS * math.sqrt(possible) + opposite:
             return None
-        H = np.column_stack([[along, aside], [aside, -along], lever])
-        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        H = np.array([[along, aside, *lever[0]], [aside, -along, *lever[1]]])
+        whitening = _whitening(ends + noise * np.eye(2))
         return _Span(whitening @ H, whitening @ (F[:2] + lever @ T_base_laser[:2]))
+
+
+def _whitening(covariance: Array) -> Array:
+    """Inverse (2, 2) of the lower root of a covariance (2, 2)."""
+    (xx, _), (xy, yy) = covariance.tolist()
+    own = math.sqrt(xx)
+    rest = math.sqrt(yy - xy**2 / xx)
+    return np.array([[1.0 / own, 0.0], [-xy / (xx * rest), 1.0 / rest]])
 
 
 def _newest(spans: deque[_Span], count: int) -> list[_Span]:
@@ -198,69 +206,147 @@ def _estimate(
     spans = [*straight, *turning]
     H = np.concatenate([span.H for span in spans])
     y = np.concatenate([span.y for span in spans])
-    x, information = _solve(H, y, T_base_laser[:2], config)
-    covariance = np.linalg.inv(information)
-    largest = float(np.linalg.eigvalsh(covariance[2:, 2:])[-1])
-    yaw = float(se2.wrap(float(x[0])))
-    support = _support(straight, x, T_base_laser[:2])
-    return MountError(yaw, math.sqrt(float(covariance[0, 0])), x[2:], math.sqrt(largest), support)
+    prior = np.array(config.prior_sigmas) ** -2.0
+    x, covariance, support = _solution(
+        H, y, len(straight), T_base_laser[:2], prior, config.outlier_sigmas
+    )
+    largest = se2.variances(covariance[2:, 2:])[1]
+    yaw_sigma = math.sqrt(float(covariance[0, 0]))
+    return MountError(se2.wrap(float(x[0])), yaw_sigma, x[2:], math.sqrt(largest), support)
 
 
-def _support(straight: list[_Span], x: Array, place: Array) -> float:
-    """Ratio of straight spans for which a solution (4,) fits better than one without yaw."""
-    if not straight:
-        return 0.0
-    without = np.concatenate([[x[1], 0.0], place + x[2:]])
-    R = rotation(-float(x[0]))[:2, :2]
-    found = np.concatenate([x[1] * R[0], R @ without[2:]])
-    gains = [
-        np.square(span.y - span.H @ without).sum() - np.square(span.y - span.H @ found).sum()
-        for span in straight
-    ]
-    return float(np.mean(np.array(gains) > 1.0))
+@kernel
+def _solution(
+    H: Array, y: Array, straight: int, place: Array, prior: Array, outlier: float
+) -> tuple[Array, Array, float]:
+    """Yaw error, scale of the odometry and offset of the laser (4,), covariance, support.
 
-
-def _solve(H: Array, y: Array, place: Array, config: MountErrorConfig) -> tuple[Array, Array]:
-    """Yaw error, scale of the odometry and offset of the laser (4,), and information (4, 4).
-
-    place (2,): position of the laser as given. Gauss-Newton with Cauchy weights. Residuals beyond
-    the modelled noise lower the information. The scale has a prior: along a corridor the odometry
-    alone measures the length of a motion.
+    straight: number of spans whose support for the yaw is counted, the first ones; place (2,):
+    position of the laser as given; prior (4,): information; outlier: see `MountErrorConfig`.
+    Gauss-Newton with Cauchy weights. Residuals beyond the modelled noise lower the information.
+    The scale has a prior: along a corridor the odometry alone measures the length of a motion.
     """
     mean = np.array([0.0, 1.0, 0.0, 0.0])
-    prior = np.diag(np.array(config.prior_sigmas) ** -2.0)
-    x = np.array([_first_yaw(H, y, place, config), *mean[1:].tolist()])
+    x = mean.copy()
+    x[0] = _first_yaw(H, y, place, outlier)
+    information = np.diag(prior)
     for _ in range(_ITERATIONS):
-        R = rotation(-float(x[0]))[:2, :2]
-        turned = R @ (place + x[2:])
-        direction = x[1] * R[0]  # cos and sin of the yaw error, times the scale
-        residuals = y - H @ np.concatenate([direction, turned])
-        weights = 1.0 / (1.0 + np.square(residuals / config.outlier_sigmas))
-        by_yaw = np.array([-direction[1], direction[0], turned[1], -turned[0]])
-        J = np.column_stack([H @ by_yaw, H[:, :2] @ R[0], H[:, 2:] @ R])
-        information = prior + (J.T * weights) @ J
-        x = x + np.linalg.solve(information, (J.T * weights) @ residuals + prior @ (mean - x))
-    squared = float(weights @ np.square(residuals))
-    return x, information / max(1.0, squared / max(float(weights.sum()) - 3.0, 1.0))
+        residuals = _residuals(H, y, x, place)
+        weights = 1.0 / (1.0 + np.square(residuals / outlier))
+        information, b = _normal_equations(_derivatives(H, x, place), residuals, weights)
+        information += np.diag(prior)
+        b += prior * (mean - x)
+        x += _solved(information, b.reshape(-1, 1))[:, 0]
+    squared = np.sum(weights * np.square(residuals))
+    spread = max(1.0, squared / max(np.sum(weights) - 3.0, 1.0))
+    return x, spread * _solved(information, np.eye(4)), _support(H, y, straight, x, place)
 
 
-def _first_yaw(H: Array, y: Array, place: Array, config: MountErrorConfig) -> float:
-    """The yaw of none, of one span, or of all together that has the lowest cost.
+@kernel
+def _first_yaw(H: Array, y: Array, place: Array, outlier: float) -> float:
+    """The yaw of none, of all together, or of one span that has the lowest cost.
 
     A span with a jump of the pose would draw the solution of all together anywhere.
     """
-    blocks = H[:, :2].reshape(-1, 2, 2)
-    transposed = blocks.transpose(0, 2, 1)
+    information, b = _normal_equations(H, y, np.ones(len(y)))
+    linear = _solved(information + np.eye(4), b.reshape(-1, 1))[:, 0]
+    yaw = 0.0
+    least = _cost(H, y, yaw, place, outlier)
+    for span in range(-1, len(y) // 2):
+        found = math.atan2(linear[1], linear[0]) if span < 0 else _own_yaw(H, y, 2 * span)
+        cost = _cost(H, y, found, place, outlier)
+        if cost < least:
+            yaw = found
+            least = cost
+    return yaw
+
+
+@kernel
+def _own_yaw(H: Array, y: Array, row: int) -> float:
+    """Yaw by the translation of one span, the equations of which begin at a row."""
     # A span without translation has no direction.
-    squares = transposed @ blocks + 1e-6 * np.eye(2)
-    own = np.linalg.solve(squares, transposed @ y.reshape(-1, 2, 1))[..., 0]
-    linear = np.linalg.solve(H.T @ H + np.eye(4), H.T @ y)
-    yaws = np.arctan2([0.0, linear[1], *own[:, 1]], [1.0, linear[0], *own[:, 0]])
-    c = np.cos(yaws)
-    s = np.sin(yaws)
-    x = np.stack([c, s, c * place[0] + s * place[1], c * place[1] - s * place[0]])
-    cost = np.log1p(np.square((y[:, None] - H @ x) / config.outlier_sigmas)).sum(axis=0)
-    return float(yaws[int(cost.argmin())])
+    cos2 = H[row, 0] ** 2 + H[row + 1, 0] ** 2 + 1e-6
+    sin2 = H[row, 1] ** 2 + H[row + 1, 1] ** 2 + 1e-6
+    both = H[row, 0] * H[row, 1] + H[row + 1, 0] * H[row + 1, 1]
+    c = H[row, 0] * y[row] + H[row + 1, 0] * y[row + 1]
+    s = H[row, 1] * y[row] + H[row + 1, 1] * y[row + 1]
+    return math.atan2(cos2 * s - both * c, sin2 * c - both * s)
+
+
+@kernel
+def _cost(H: Array, y: Array, yaw: float, place: Array, outlier: float) -> float:
+    """Cost of a yaw without an offset, which outliers raise little."""
+    residuals = _residuals(H, y, np.array([yaw, 1.0, 0.0, 0.0]), place)
+    return float(np.sum(np.log1p(np.square(residuals / outlier))))
+
+
+@kernel
+def _support(H: Array, y: Array, straight: int, x: Array, place: Array) -> float:
+    """Ratio of the first spans for which a solution (4,) fits better than one without yaw."""
+    without = x.copy()
+    without[0] = 0.0
+    worse = np.square(_residuals(H, y, without, place))
+    gains = worse - np.square(_residuals(H, y, x, place))
+    count = 0
+    for span in range(straight):
+        count += gains[2 * span] + gains[2 * span + 1] > 1.0
+    return count / max(straight, 1)
+
+
+@kernel
+def _residuals(H: Array, y: Array, x: Array, place: Array) -> Array:
+    """What a solution (4,) leaves of the equations (N,)."""
+    c = math.cos(x[0])
+    s = math.sin(x[0])
+    ahead = place[0] + x[2]
+    aside = place[1] + x[3]
+    turned = H[:, 2] * (c * ahead + s * aside) + H[:, 3] * (c * aside - s * ahead)
+    left: Array = y - x[1] * (c * H[:, 0] + s * H[:, 1]) - turned
+    return left
+
+
+@kernel
+def _derivatives(H: Array, x: Array, place: Array) -> Array:
+    """Derivatives (N, 4) of the equations by a solution (4,)."""
+    c = math.cos(x[0])
+    s = math.sin(x[0])
+    ahead = place[0] + x[2]
+    aside = place[1] + x[3]
+    J = np.empty_like(H)
+    turned = H[:, 2] * (c * aside - s * ahead) - H[:, 3] * (c * ahead + s * aside)
+    J[:, 0] = x[1] * (c * H[:, 1] - s * H[:, 0]) + turned
+    J[:, 1] = c * H[:, 0] + s * H[:, 1]
+    J[:, 2] = c * H[:, 2] - s * H[:, 3]
+    J[:, 3] = s * H[:, 2] + c * H[:, 3]
+    return J
+
+
+@kernel
+def _normal_equations(J: Array, residuals: Array, weights: Array) -> tuple[Array, Array]:
+    """J' W J (4, 4) and J' W r (4,)."""
+    information = np.zeros((4, 4))
+    b = np.zeros(4)
+    for k in range(len(J)):
+        for i in range(4):
+            b[i] += weights[k] * J[k, i] * residuals[k]
+            for j in range(4):
+                information[i, j] += weights[k] * J[k, i] * J[k, j]
+    return information, b
+
+
+@kernel
+def _solved(matrix: Array, right: Array) -> Array:
+    """Solution (4, K) of linear equations with a positive definite matrix (4, 4)."""
+    left = matrix.copy()
+    solution = right.copy()
+    for k in range(4):
+        solution[k] /= left[k, k]
+        left[k] /= left[k, k]
+        for i in range(4):
+            if i != k:
+                solution[i] -= left[i, k] * solution[k]
+                left[i] -= left[i, k] * left[k]
+    return solution
 
 
 @dataclass(frozen=True)
@@ -373,7 +459,10 @@ class TurnComparison:
         turns = config.step_rad * np.arange(-count, count + 1, dtype=np.float64)
         points = reference.points_base()
         points = points[:: -(-len(points) // config.max_points)] - moved[:2]
-        score = _agreement(points, turns, scan, config)
+        beams = np.array([scan.angle_min_rad, scan.angle_increment_rad])
+        within = np.array([config.tolerance_m, config.min_share])
+        mount = scan.T_base_laser
+        score = _agreement(points, turns, mount, beams, scan.ranges_m, scan.hit, within)
         best = int(score.argmax())
         opposite = score[:count] if best > count else score[count + 1 :]
         if best == count or score[best] - opposite.max() < config.min_lead:
@@ -381,28 +470,35 @@ class TurnComparison:
         return float(turns[best])
 
 
-def _agreement(points: Array, turns: Array, scan: Scan, config: TurnComparisonConfig) -> Array:
+@kernel
+def _agreement(
+    points: Array, turns: Array, laser: Array, beams: Array, ranges: Array, hit: Mask, within: Array
+) -> Array:
     """Agreement (K,), 0 to 1, of points (N, 2) with the ranges of a scan for some turns (K,).
 
-    points: in the robot frame of the scan but for its turn; 0 where too few are in view.
+    points: in the robot frame of the scan but for its turn; 0 where too few are in view. laser:
+    pose (3,) of the laser; beams (2,): first angle and increment, rad; within (2,): tolerance, m,
+    and least share of the points in view.
     """
-    c = np.cos(turns)[:, None]
-    s = np.sin(turns)[:, None]
-    x = c * points[:, 0] + s * points[:, 1] - scan.T_base_laser[0]
-    y = c * points[:, 1] - s * points[:, 0] - scan.T_base_laser[1]
-    bearings = np.arctan2(y, x) - scan.T_base_laser[2] - scan.angle_min_rad
-    step = scan.angle_increment_rad
-    ahead = np.mod(math.copysign(1.0, step) * bearings, 2.0 * math.pi)
-    beams: NDArray[np.int64] = np.rint(ahead / max(abs(step), 1e-6)).astype(np.int64)
-    is_seen = beams < scan.ranges_m.size
-    beams[~is_seen] = 0
-    is_seen &= scan.hit[beams]
-    off = np.where(is_seen, scan.ranges_m[beams] - np.hypot(x, y), 0.0)
-    fits = is_seen / (1.0 + np.square(off / config.tolerance_m))
-    seen = np.count_nonzero(is_seen, axis=1)
-    return np.where(
-        seen >= config.min_share * len(points), fits.sum(axis=1) / np.maximum(seen, 1), 0.0
-    )
+    step = beams[1]
+    sense = math.copysign(1.0, step)
+    score = np.zeros(len(turns))
+    for k in range(len(turns)):
+        c = math.cos(turns[k])
+        s = math.sin(turns[k])
+        seen = 0
+        fits = 0.0
+        for i in range(len(points)):
+            x = c * points[i, 0] + s * points[i, 1] - laser[0]
+            y = c * points[i, 1] - s * points[i, 0] - laser[1]
+            ahead = (sense * (math.atan2(y, x) - laser[2] - beams[0])) % (2.0 * math.pi)
+            beam = round(ahead / max(abs(step), 1e-6))
+            if beam < len(ranges) and hit[beam]:
+                seen += 1
+                fits += 1.0 / (1.0 + ((ranges[beam] - math.hypot(x, y)) / within[0]) ** 2)
+        if seen > 0 and seen >= within[1] * len(points):
+            score[k] = fits / seen
+    return score
 
 
 @dataclass(frozen=True)
@@ -454,7 +550,7 @@ class ConsistencyMonitor:
             own.add_motion(scan, T_odom_base, estimate)
         fault = own.check(scan, T_odom_base)
         name = laser_names(self._lasers.keys())[scan.frame]
-        return replace(estimate, mount_fault=fault and name + fault)
+        return replace(estimate, mount_fault=name + fault) if fault else estimate
 
     def _begin_again(self, is_other_time: bool) -> None:
         """Begin new spans; is_other_time: the odometry so far was that of another time."""

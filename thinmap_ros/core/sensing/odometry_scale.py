@@ -80,7 +80,7 @@ class OdometryScale:
 
     def add(self, T_map_base: Array, information: Array, T_odom_base: Array) -> None:
         """Add a matched pose (3,), the information (3, 3) of its scan, and the odometry (3,)."""
-        if float(np.linalg.eigvalsh(information[:2, :2])[0]) < self.config.max_sigma_m**-2.0:
+        if se2.variances(information[:2, :2])[0] < self.config.max_sigma_m**-2.0:
             self.reset_span()
             return
         if self._begin is None:
