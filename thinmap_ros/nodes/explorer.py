@@ -198,6 +198,7 @@ class ExplorerNode(ThinmapNode):
 
     def _on_observation(self, observation: Observation) -> None:
         """Have the mission process a scan that is in the map."""
+        self.touch()
         stamp_ns = observation.scan.stamp_ns
         if self._stamp.is_restarted_by(stamp_ns):
             self.reset('the robot was started again, too')
@@ -231,6 +232,7 @@ class ExplorerNode(ThinmapNode):
         self._end_if_cancelled()
         if not self._mission.is_running:
             return
+        self.touch()
         self._execute(self._mission.check(self._now_s(), self._driver.is_driving))
         if self._mission.is_running:
             status = self._output.status(self._mission)

@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from rclpy.node import Node
@@ -79,6 +80,12 @@ class Checkpoint:
         except OSError as error:
             self._warn(f'{error.strerror}: checkpoint not saved')
 
+    def renew(self) -> None:
+        """The state that was saved is still that of now."""
+        if self._path is not None:
+            with suppress(OSError):
+                os.utime(self._path, follow_symlinks=False)
+
     def delete(self) -> None:
         """Delete the file."""
         if self._path is not None:
@@ -89,7 +96,10 @@ class Checkpoint:
 
 
 class PeriodicCheckpoint:
-    """A checkpoint that is saved again and again, in a small share of the node's time."""
+    """A checkpoint that is saved again and again, in a small share of the node's time.
+
+    is_outdated: whether the state may be another than that which was saved.
+    """
 
     def __init__(
         self,
@@ -110,6 +120,7 @@ class PeriodicCheckpoint:
         self._state = state
         self._saved_at_s = time.monotonic()
         self._duration_s = 0.0
+        self.is_outdated = True
 
     def save(self, is_urgent: bool = False) -> bool:
         """Save the state, unless the last checkpoint is too recent; returns whether it was due."""
@@ -118,14 +129,21 @@ class PeriodicCheckpoint:
         if now_s - self._saved_at_s < factor * self._duration_s:
             return False
         state = self._state()
+        self.is_outdated = state is None
         if state is not None:
             self._file.save(state)
         self._saved_at_s = time.monotonic()
         self._duration_s = self._saved_at_s - now_s
         return True
 
+    def renew(self) -> None:
+        """Tell the file that the node lives, if the state is as it was saved."""
+        if not self.is_outdated:
+            self._file.renew()
+
     def delete(self) -> None:
         """Delete the file."""
+        self.is_outdated = True
         self._file.delete()
 
 

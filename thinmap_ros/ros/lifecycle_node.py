@@ -56,6 +56,7 @@ class ThinmapNode(LifecycleNode):
         self.time_jumps = TimeJumps(self.get_clock())
         self.elapsed_time = ElapsedTime(self.get_clock())
         self._checkpoints: list[PeriodicCheckpoint] = []
+        self._checkpoint_timer: Timer | None = None
         self._activation_callbacks: list[Callable[[], None]] = []
         self._end_callbacks: list[Callable[[], None]] = []
         self._failure_callbacks: list[Callable[[], None]] = []
@@ -133,6 +134,8 @@ class ThinmapNode(LifecycleNode):
     ) -> None:
         """Restore the checkpoint of a killed predecessor, and save one periodically from now on.
 
+        It is saved after what may have changed the state: see `touch`.
+
         state: returns what to save; None: nothing. dear_state: the rest, which takes long to save:
         it is older than the other. restore: is called with both of a node that was killed less than
         `recovery_timeout_s` ago. Where it raises a ThinmapError, as for a node that was started
@@ -144,11 +147,12 @@ class ThinmapNode(LifecycleNode):
             PeriodicCheckpoint(dear, dear_state, _DEAR_INTERVAL),
             PeriodicCheckpoint(file, state),
         ]
-        self.create_timer(
+        self._checkpoint_timer = self.create_timer(
             _CHECKPOINT_PERIOD_S,
             self._save_checkpoints,
             clock=STEADY,
         )
+        self.diagnostics.add_update_callback(self._renew_checkpoints)
         saved = file.load()
         if saved is None:
             return
@@ -167,9 +171,25 @@ class ThinmapNode(LifecycleNode):
         for checkpoint in self._checkpoints:
             checkpoint.delete()
 
-    def _save_checkpoints(self) -> None:
+    def touch(self) -> None:
+        """The state may have changed: checkpoints are saved again.
+
+        It is called after each callback of the node but those of timers, which call it themselves.
+        """
         for checkpoint in self._checkpoints:
-            checkpoint.save()
+            checkpoint.is_outdated = True
+        if self._checkpoint_timer is not None and self._checkpoint_timer.is_canceled():
+            self._checkpoint_timer.reset()
+
+    def _save_checkpoints(self) -> None:
+        outdated = [checkpoint for checkpoint in self._checkpoints if checkpoint.is_outdated]
+        are_saved = [checkpoint.save() for checkpoint in outdated]
+        if all(are_saved) and self._checkpoint_timer is not None:
+            self._checkpoint_timer.cancel()
+
+    def _renew_checkpoints(self) -> None:
+        for checkpoint in self._checkpoints:
+            checkpoint.renew()
 
     def checkpoint_now(self) -> bool:
         """Save a checkpoint before a change is published; returns whether there was time."""

@@ -9,8 +9,11 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, MutableMapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any, NoReturn
 
 import rclpy
@@ -18,6 +21,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.timer import Timer
 
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line, one_line_reason, quoted
 from thinmap_ros.files.package_data import config_file
@@ -117,6 +121,7 @@ _SECURITY = 'ROS_SECURITY_ENABLE'
 _KEYSTORE = 'ROS_SECURITY_KEYSTORE'
 _STRATEGY = 'ROS_SECURITY_STRATEGY'
 _PERMISSIVE = 'Permissive'
+_LOOK_PERIOD_S = 1.0  # between two looks at what no event tells
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -128,9 +133,21 @@ class _Running:
     """
 
     nodes: list[Node]
-    stop_event: threading.Event = field(default_factory=threading.Event)
+    is_stopped: bool = False
     failures: list[BaseException] = field(default_factory=list)
     _closed: list[Node] = field(default_factory=list)
+    # A signal may interrupt a thread that puts or gets: events and conditions would block then.
+    _stops: SimpleQueue[None] = field(default_factory=SimpleQueue)
+
+    def stop(self) -> None:
+        """End all nodes; from any thread, or on a signal."""
+        self.is_stopped = True
+        self._stops.put(None)
+
+    def wait(self, seconds: float) -> None:
+        """Wait until the nodes are to end, at most for some seconds."""
+        with suppress(Empty):
+            self._stops.get(timeout=seconds)
 
     def close(self, node: Node) -> None:
         """Call `end()` and `close()` of a node, once; others are closed whatever error this has."""
@@ -158,6 +175,11 @@ def run(make_node: Callable[[], Node]) -> None:
     for word in split_arguments(sys.argv)[0]:
         _fail(refusal(word))
     run_all([make_node])
+
+
+def program(make_node: Callable[[], Node]) -> Callable[[], None]:
+    """The program that runs a node."""
+    return partial(run, make_node)
 
 
 def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
@@ -246,44 +268,49 @@ def _made(make_node: Callable[[], Node]) -> Node:
 
 
 def _spin(running: _Running) -> None:
+    """Spin each node in a thread; this one, the main thread, waits, as it handles the signals."""
     # Only recorded: an exception raised in compiled code is replaced by another one, or lost.
-    _on_signals(lambda number, frame: running.stop_event.set())
-    first, *others = running.nodes
-    threads = [threading.Thread(target=_spin_one, args=(node, running)) for node in others]
+    _on_signals(lambda number, frame: running.stop())
+    executors = [NodeExecutor(node) for node in running.nodes]
+    threads = [
+        threading.Thread(target=_spin_one, args=(node, executor, running))
+        for node, executor in zip(running.nodes, executors, strict=True)
+    ]
     for thread in threads:
         thread.start()
+    release = compiler_memory_releaser()
     try:
-        _spin_one(first, running, compiler_memory_releaser())
+        while not running.is_stopped:
+            running.wait(_LOOK_PERIOD_S)
+            release()
     finally:
-        running.stop_event.set()
+        running.stop()
+        for executor in executors:
+            executor.wake()
         for thread in threads:
             thread.join()
+        # The garbage collector may end its parts first; then it ends with a traceback.
+        for executor in executors:
+            executor.shutdown()
     if running.failures:
         raise running.failures[0]
 
 
-def _spin_one(
-    node: Node, running: _Running, after_each_call: Callable[[], None] = lambda: None
-) -> None:
-    executor = NodeExecutor(node)
-    stop_event = running.stop_event
+def _spin_one(node: Node, executor: NodeExecutor, running: _Running) -> None:
     try:
-        while rclpy.ok() and not stop_event.is_set() and not getattr(node, 'finished', False):
+        while rclpy.ok() and not running.is_stopped and not getattr(node, 'finished', False):
             _spin_once(executor, node)
-            after_each_call()
     except Exception as error:  # raised by the main thread
         running.failures.append(error)
     finally:
-        stop_event.set()
+        running.stop()
         running.close(node)  # now: a robot that drives does not wait for the other nodes
-        # The garbage collector may end its parts first; then it ends with a traceback.
-        executor.shutdown()
 
 
 def _spin_once(executor: NodeExecutor, node: Node) -> None:
     """Run a callback. What it raises ends the node, unless it has a `step_failed` to report it."""
-    # A bounded wait: Python handles signals only between calls.
-    ready = executor.next_callback(timeout_s=0.25)
+    # A bounded wait: a node may be finished by another thread.
+    ready = executor.next_callback(_LOOK_PERIOD_S)
     if ready is None:
         return
     try:
@@ -294,6 +321,9 @@ def _spin_once(executor: NodeExecutor, node: Node) -> None:
             raise
         names = (getattr(ready.entity, name, '') for name in ('topic_name', 'srv_name'))
         report(next(filter(None, names), 'a callback'), error)
+    finally:
+        if not isinstance(ready.entity, Timer):
+            getattr(node, 'touch', lambda: None)()
 
 
 def _on_signals(handler: Any) -> None:

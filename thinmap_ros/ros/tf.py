@@ -13,6 +13,7 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
+from rclpy.timer import Timer
 from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.core.config import Config, parameter
@@ -137,12 +138,17 @@ class MapBroadcaster:
         )
         self._T_map_odom: Array | None = None
         self._sole: SoleBroadcaster | None = None
+        self._timer: Timer | None = None
         if not self._config.publish_tf:
             return
         self._publisher = node.create_publisher(TFMessage, '/tf', qos.TRANSFORMS)
         self._sole = SoleBroadcaster(node, self._frames)
         if self._config.transform_publish_period > 0.0:
-            node.create_active_timer(self._config.transform_publish_period, self._publish)
+            # Only while there is a transform.
+            self._timer = node.create_active_timer(
+                self._config.transform_publish_period, self._publish
+            )
+            self._timer.cancel()
 
     def _on_config(self, config: BroadcastConfig) -> None:
         self._config = config
@@ -151,6 +157,8 @@ class MapBroadcaster:
         """Publish another transform (3,) from now on."""
         is_first = self._T_map_odom is None
         self._T_map_odom = T_map_odom
+        if is_first and self._timer is not None:
+            self._timer.reset()
         if self._config.publish_tf and (is_first or self._config.transform_publish_period == 0.0):
             self._publish()
 
@@ -162,6 +170,8 @@ class MapBroadcaster:
     def reset(self) -> None:
         """Publish nothing until the next `update`."""
         self._T_map_odom = None
+        if self._timer is not None:
+            self._timer.cancel()
 
     def _publish(self) -> None:
         if self._T_map_odom is None:

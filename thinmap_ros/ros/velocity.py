@@ -94,6 +94,7 @@ class CommandWatchdog:
         self._timeout = timeout
         self._lock = Lock()
         self._closed = Event()
+        self._is_moving = Event()
         self._thread = Thread(target=self._watch, daemon=True)
         self._thread.start()
 
@@ -101,19 +102,31 @@ class CommandWatchdog:
         """Publish a command."""
         with self._lock:
             self._publish(v, w)
-            self._timeout.add(v != 0.0 or w != 0.0, monotonic())
+            is_motion = v != 0.0 or w != 0.0
+            self._timeout.add(is_motion, monotonic())
+            self._wake(is_motion)
 
     def close(self) -> None:
         """End: nothing is published from now on but by `send`."""
-        self._closed.set()
+        with self._lock:
+            self._closed.set()
+            self._wake(True)
         self._thread.join()
 
+    def _wake(self, is_moving: bool) -> None:
+        """Have the thread look while the robot moves; a closed one is to end."""
+        if is_moving or self._closed.is_set():
+            self._is_moving.set()
+        else:
+            self._is_moving.clear()
+
     def _watch(self) -> None:
-        while not self._closed.wait(_WATCH_PERIOD_S):
+        while self._is_moving.wait() and not self._closed.wait(_WATCH_PERIOD_S):
             with self._lock:
                 is_stopped = self._timeout.expires(monotonic())
                 if is_stopped:
                     self._publish(0.0, 0.0)
+                    self._wake(False)
             if is_stopped:
                 self._on_stop(self._timeout.limit_s)
 

@@ -257,6 +257,7 @@ class RegionUpdates:
         pending = self._pending
         self._pending = None
         regions = pending.result()
+        self._node.touch()
         if regions is not self._published or self._is_graph_newer:
             self._publish(regions)
 
