@@ -375,6 +375,9 @@ class Sight:
         self._frame = frame
         self._known = known
         self._cells = np.ascontiguousarray(np.argwhere(standing[::step, ::step]) * step)
+        self._step = step
+        self._numbers = np.full(standing[::step, ::step].shape, -1, dtype=np.int64)
+        self._numbers[tuple((self._cells // step).T)] = np.arange(len(self._cells))
         self._xy = frame.centres_of(self._cells)
         self._tree = cKDTree(self._xy)
         self._away = np.full(len(self._cells), np.inf)
@@ -404,10 +407,7 @@ class Sight:
 
     def add(self, node: Node, least_gain: int = _MIN_GAIN) -> bool:
         """Add a node, if so some more places see the node nearest to them."""
-        near = np.array(self._tree.query_ball_point(node.position, self.reach_m), dtype=np.int64)
-        away = np.hypot(*(self._xy[near] - node.position).T)
-        closer = away < self._away[near]
-        places = near[closer]
+        places, away = self._closer(node)
         seen = self._sees(node, places)
         if seen.sum() < self._seen[places].sum() + least_gain:
             return False
@@ -417,7 +417,7 @@ class Sight:
             had = self._places[owner]
             self._places[owner] = had[self._owner[had] == owner]
         self._seen[places] = seen
-        self._away[places] = away[closer]
+        self._away[places] = away
         self._give(node.id, places)
         return True
 
@@ -435,6 +435,10 @@ class Sight:
             return order
         away = cKDTree([node.position for node in gone]).query(self._xy[order])[0]
         return order[away > self._away[order]]
+
+    def beyond(self, places: Cells, reach_m: float) -> Cells:
+        """Those places that are farther from each node than a reach."""
+        return places[self._away[places] > reach_m]
 
     def away_m(self, place: int) -> float:
         """Distance of a place from the node nearest to it."""
@@ -487,9 +491,42 @@ class Sight:
         found = graph.nodes_near(node.x, node.y, 2.0 * reach_m + nearest_m)
         return [other for other in found if other.id != node.id]
 
+    def _closer(self, node: Node) -> tuple[Cells, Array]:
+        """Indices of the places within reach to which a node is nearest, and their distances, m."""
+        cells = self._frame.cells_of(node.position)[0] // self._step
+        reach = math.ceil(self.reach_m / (self._step * self._frame.resolution)) + 1
+        box = np.concatenate([cells - reach, cells + reach + 1])
+        return _closer(self._numbers, box, self._xy, self._away, node.position, self.reach_m)
+
     def _sees(self, node: Node, places: Cells) -> Mask:
         row, col = self._frame.cells_of(node.position)[0].tolist()
         return np.asarray(_lines_clear(self._known, row, col, self._cells[places]))
+
+
+@kernel
+def _closer(
+    numbers: Cells, box: Cells, xy: Array, away: Array, point: Array, reach_m: float
+) -> tuple[Cells, Array]:
+    """Indices and distances, m, of places (N, 2) within reach, nearer to a point than before.
+
+    numbers (H, W): indices of the places of a lattice, -1: none; box: its first row and column that
+    is within reach, and its last ones; away (N,): distances, m, from what was nearest so far.
+    """
+    most = (box[2] - box[0]) * (box[3] - box[1])
+    found = np.empty(most, dtype=np.int64)
+    nearer = np.empty(most)
+    count = 0
+    for row in range(max(box[0], 0), min(box[2], numbers.shape[0])):
+        for col in range(max(box[1], 0), min(box[3], numbers.shape[1])):
+            place = numbers[row, col]
+            if place < 0:
+                continue
+            distance = math.hypot(xy[place, 0] - point[0], xy[place, 1] - point[1])
+            if distance <= reach_m and distance < away[place]:
+                found[count] = place
+                nearer[count] = distance
+                count += 1
+    return found[:count].copy(), nearer[:count].copy()
 
 
 @kernel
@@ -640,11 +677,12 @@ def spread_nodes(graph: EditedGraph, sight: Sight, reach_m: float, gone: list[No
     for node in graph.map.nodes.values():
         sight.add(node, 0)
     points = _EdgePoints(graph)
-    places = sight.farthest(gone).tolist()
+    places = sight.farthest(gone)
     count = 0
     while count < len(graph.map.nodes):
         count = len(graph.map.nodes)
-        for place in places:
+        places = sight.beyond(places, reach_m)
+        for place in places.tolist():
             if reach_m < sight.away_m(place) < 2.0 * reach_m and not _put_on_edge(
                 graph, sight, points, place, reach_m, 0
             ):
