@@ -23,7 +23,6 @@ _SPEED = {
     'voronoi': 3,
     'online': 3,
     'nodes': 6,
-    'known_map': 4,
     'localization': 4,
     'matching': 2,
     'planning': 2,
