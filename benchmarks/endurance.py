@@ -17,30 +17,25 @@ import argparse
 import csv
 import os
 import re
-import signal
-import subprocess
 import sys
 import time
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import psutil
 
 from benchmarks.faults.judge import Record
 from benchmarks.faults.kinds import KINDS, random_faults
 from benchmarks.interruption import Interruption
-from benchmarks.speed.node_process import use_own_domain
+from benchmarks.node_processes import NODES, Processes, processor_s, use_own_domain
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 
-_NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 _STEPS = {
     'localizer': 'localizer',
     'grid_mapper': 'map update',
@@ -50,7 +45,6 @@ _STEPS = {
 _MEDIAN = re.compile(r'median (\d+\.\d+) ms')
 _SCAN_S = 0.2
 _FLAT = 1.05
-_STOP_S = 10.0
 _START_S = 120.0
 _LAG = 5  # scans whose pose may not have arrived at the end
 _DEPTH = 1000
@@ -144,44 +138,21 @@ class Driver:
                     self.step_ms[name] = float(median[1])
 
 
-def start(name: str, parameters: str, state: Path) -> psutil.Popen:
-    """Start a node, its parameters given as name:=value and separated by spaces.
-
-    state: folder of its checkpoint.
-    """
-    words = [word for parameter in parameters.split() for word in ('-p', parameter)]
-    command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', '--ros-args', *words]
-    environment = {**os.environ, 'THINMAP_STATE_DIR': str(state)}
-    return psutil.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment
-    )
-
-
-def start_all(
-    world: str, at: np.ndarray, rate: float, seed: int, state: Path
-) -> dict[str, psutil.Popen]:
-    """Start nodes and simulator; returns the nodes, and the simulator as `sim`.
-
-    state: folder of the checkpoints of the nodes.
-    """
-    pose = f'initial_x_m:={at[0]} initial_y_m:={at[1]} initial_yaw_rad:={at[2]}'
-    found = {
-        name: start(name, f'use_sim_time:=true {pose if name == "localizer" else ""}', state)
-        for name in _NODES
+def start_all(nodes: Processes, world: Path, at: np.ndarray, rate: float, seed: int) -> None:
+    """Start nodes and simulator."""
+    nodes.start_nodes(at)
+    parameters = {
+        'world': world,
+        'start': ','.join(map(str, at.tolist())),
+        'real_time_factor': rate,
+        'seed': seed,
+        'lockstep': 'local_topology',
+        'wait_for_subscribers': 3,
     }
-    place = f'start:={at[0]},{at[1]},{at[2]}'
-    found['sim'] = start(
-        'sim',
-        f'world:={world} {place} real_time_factor:={rate} seed:={seed} '
-        'lockstep:=local_topology wait_for_subscribers:=3',
-        state,
-    )
-    return found
+    nodes.start('sim', parameters)
 
 
-def measure(
-    driver: Driver, nodes: dict[str, psutil.Popen], arguments: argparse.Namespace, path: Path
-) -> Samples:
+def measure(driver: Driver, nodes: Processes, arguments: argparse.Namespace, path: Path) -> Samples:
     """Drive for a duration, and record measurements of the nodes.
 
     Raises ThinmapError if a node exits, or no pose arrives.
@@ -189,7 +160,7 @@ def measure(
     columns = [
         'simulated_s',
         'wall_s',
-        *(f'{n}_mb' for n in _NODES),
+        *(f'{n}_mb' for n in NODES),
         *(f'{n}_ms' for n in _STEPS),
         'cpu_s',
         'lost',
@@ -202,30 +173,28 @@ def measure(
         writer.writerow(columns)
         while driver.simulated_s < 60.0 * arguments.minutes:
             driver.spin()
-            ended = [name for name, process in nodes.items() if process.poll() is not None]
-            if ended or (not driver.poses and time.monotonic() - begun > _START_S):
-                raise ThinmapError(
-                    f'{ended[0]} has ended' if ended else f'no pose came in {_START_S:.0f} s'
-                )
+            for text in nodes.ended().values():
+                raise ThinmapError(text)
+            if not driver.poses and time.monotonic() - begun > _START_S:
+                raise ThinmapError(f'no pose came in {_START_S:.0f} s')
             if driver.simulated_s >= every_s * (len(samples.rows) + 1):
                 samples.rows.append(sample(driver, nodes, time.monotonic() - begun))
                 writer.writerow([f'{value:.6g}' for value in samples.rows[-1]])
     return samples
 
 
-def sample(driver: Driver, nodes: dict[str, psutil.Popen], wall_s: float) -> list[float]:
+def sample(driver: Driver, nodes: Processes, wall_s: float) -> list[float]:
     """A row: private memory of each node, MB; median step times, ms; CPU time of all nodes, s."""
-    memory = [nodes[name].memory_full_info().uss / 1e6 for name in _NODES]
-    times = [nodes[name].cpu_times() for name in _NODES]
+    processes = [nodes.running[name] for name in NODES]
+    memory = [process.memory_full_info().uss / 1e6 for process in processes]
     steps = [driver.step_ms.get(name, np.nan) for name in _STEPS]
     lost = max(driver.lost() - _LAG, 0)
-    cpu_s = sum(t.user + t.system for t in times)
-    return [driver.simulated_s, wall_s, *memory, *steps, cpu_s, lost]
+    return [driver.simulated_s, wall_s, *memory, *steps, processor_s(processes), lost]
 
 
 def verdict(samples: Samples, driver: Driver) -> bool:
     """Print growth and losses; returns whether nothing grew and no scan was lost."""
-    memory = {name: samples.growth(f'{name}_mb') for name in _NODES}
+    memory = {name: samples.growth(f'{name}_mb') for name in NODES}
     steps = {name: samples.growth(f'{name}_ms') for name in _STEPS}
     for what, found in (('memory', memory), ('step time', steps)):
         print(
@@ -246,25 +215,17 @@ def verdict(samples: Samples, driver: Driver) -> bool:
     return good
 
 
-def stop(nodes: dict[str, psutil.Popen]) -> None:
-    """Stop all nodes; those that do not exit are killed."""
-    for process in nodes.values():
-        with suppress(psutil.NoSuchProcess):
-            process.send_signal(signal.SIGTERM)
-    for process in psutil.wait_procs(list(nodes.values()), timeout=_STOP_S)[1]:
-        process.kill()
-
-
 def _drive(arguments: argparse.Namespace, path: Path, world: World) -> bool:
     """Drive, measure and print the verdict; returns whether it is good."""
     driver = Driver(world, arguments.seed)
     rate = arguments.rate or _RATE
-    with TemporaryDirectory() as state:
-        nodes = start_all(str(path), world.start, rate, arguments.seed, Path(state))
+    with TemporaryDirectory() as folder:
+        nodes = Processes(Path(folder))
         try:
+            start_all(nodes, path, world.start, rate, arguments.seed)
             samples = measure(driver, nodes, arguments, arguments.out / 'endurance.csv')
         finally:
-            stop(nodes)
+            nodes.close()
             driver.close()
     return verdict(samples, driver)
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.charts import DOCS, OTHERS, OURS, Mark, Panel, chart_path, draw, picture
+from benchmarks.rows import markdown
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.results_page import made_lines, read_reports
 from thinmap_ros.evaluation.parallel_jobs import provenance
@@ -16,6 +17,16 @@ from thinmap_ros.evaluation.slam_run import INTEL, PEERS, Origin, PeerRun, runs,
 from thinmap_ros.files.safe import read_text, write_text
 
 _CHART = 'peers'
+_COLUMNS = (
+    'program',
+    'log',
+    'live',
+    'final',
+    'CPU ms per scan',
+    'memory (MB)',
+    'thinmap, live / final',
+    'source',
+)
 _TEMPLATE = Path(__file__).with_suffix('.md')
 
 
@@ -35,16 +46,11 @@ def write(folder: Path, docs: Path) -> Path:
 def page(ours: dict[str, Numbers]) -> str:
     """Text of the page; ours: reports of thinmap by log."""
     caption = 'Intel Research Lab, 5,438 scans: error, time and memory of all programs.'
-    lines = [
-        '| program | log | live | final | CPU ms per scan | memory (MB) | thinmap, live / final '
-        '| source |',
-        '|---|---|---|---|---|---|---|---|',
-        *(_line(run, ours.get(run.log)) for run in PEERS),
-    ]
+    figures = markdown(_COLUMNS, [_cells(run, ours.get(run.log)) for run in PEERS])
     return read_text(_TEMPLATE).format(
         chart=picture(_CHART, caption),
         made=made_lines(list(ours.values())),
-        figures='\n'.join(lines),
+        figures=figures,
         losses='\n'.join(_losses(ours)),
     )
 
@@ -72,9 +78,9 @@ def _title(run: PeerRun) -> str:
     return run.system + note
 
 
-def _line(run: PeerRun, own: Numbers | None) -> str:
+def _cells(run: PeerRun, own: Numbers | None) -> list[str]:
     source = run.note if run.origin is Origin.PUBLISHED else run.origin.value
-    cells = [
+    return [
         _title(run),
         f'`{run.log}`',
         shown(run.live_m),
@@ -84,7 +90,6 @@ def _line(run: PeerRun, own: Numbers | None) -> str:
         f'{own["live_m"]:.3f} / {own["final_m"]:.3f}' if own else '',
         source,
     ]
-    return f'| {" | ".join(cells)} |'
 
 
 _KEYS = (('thinmap', OURS, True), ('run by the team', OTHERS[Origin.TEAM], True))

@@ -1,13 +1,19 @@
-"""Rows of benchmarks: a value with its target, printed and written as CSV."""
+"""Rows of results: a value with its target, records of runs, as CSV and as tables in Markdown."""
 
 import csv
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from thinmap_ros.evaluation.outcome import Table
+from thinmap_ros.evaluation.parallel_jobs import write_provenance
+from thinmap_ros.files.safe import write_text
 
 COLUMNS = ('what', 'value', 'target', 'verdict')
 VERDICTS = {True: 'ok', False: 'MISSED', None: ''}
+Written = dict[str, str]  # a record as it is in a file
 
 
 @dataclass(frozen=True)
@@ -50,3 +56,56 @@ def show(rows: Iterable[Row], path: Path | None = None) -> None:
             )
             if writer is not None:
                 writer.writerow(shown)
+
+
+def markdown(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
+    """A table in Markdown, without an end of its last line."""
+    lines = [list(columns), *rows]
+    texts = [f'| {" | ".join(map(str, line))} |' for line in lines]
+    return '\n'.join([texts[0], '|' + '---|' * len(columns), *texts[1:]])
+
+
+def read_rows(path: Path) -> list[list[str]]:
+    """Rows of a CSV file below its head; none where there is no file."""
+    return [list(record.values()) for record in read_records(path)]
+
+
+def read_records(path: Path) -> list[Written]:
+    """Records of a CSV file, by column; none where there is no file."""
+    if not path.exists():
+        return []
+    with path.open(encoding='utf-8', newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def add_record(path: Path, record: dict[str, Any]) -> None:
+    """Add a line to a CSV file, which is made where it is missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open('a', encoding='utf-8', newline='') as file:
+        writer = csv.DictWriter(file, list(record), lineterminator='\n')
+        if file.tell() == 0:
+            writer.writeheader()
+        writer.writerow(record)
+
+
+def shown(table: Table) -> str:
+    """A table as Markdown."""
+    return markdown(table.columns, [map(_text, row) for row in table.rows])
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return '-'
+    if isinstance(value, float):
+        return f'{value:.3f}' if 0.0 < abs(value) < 1.0 else f'{value:.1f}'
+    return str(value)
+
+
+def show_tables(tables: Iterable[Table], folder: Path | None = None) -> None:
+    """Print each table as soon as it is available; folder: for CSV files and provenance."""
+    for table in tables:
+        print(f'\n## {table.name}\n\n{shown(table)}', flush=True)
+        if folder is not None:
+            write_text(folder / f'{table.name}.csv', table.csv())
+    if folder is not None:
+        write_provenance(folder)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.charts import DOCS
 from benchmarks.kidnapped.page import sections as localization_sections
-from benchmarks.rows import VERDICTS
+from benchmarks.rows import VERDICTS, markdown
 from benchmarks.scoreboard.board_rows import board_table
 from benchmarks.scoreboard.results_page import made_lines, read_reports
 from benchmarks.speed.page import sections as speed_sections
@@ -25,7 +25,7 @@ What the project asks of itself, for those who work on it. The pages [SLAM](../r
 measured. `python -m benchmarks release` generates this page.
 
 """
-_COLUMNS = '| quantity | target | measured |  |\n|---|---|---|---|\n'
+_COLUMNS = ('quantity', 'target', 'measured', '')
 _Line = tuple[str, str, str, str]  # quantity, target, measured, verdict as in VERDICTS
 
 
@@ -87,11 +87,8 @@ def _places(folder: Path) -> list[str]:
 def table_of(lines: list[_Line]) -> str:
     """Markdown table of lines, with the words of the board for met and missed."""
     words = {VERDICTS[True]: 'met', VERDICTS[False]: '**missed**'}
-    rows = [
-        f'| {what} | {target} | {value} | {words.get(verdict, "")} |'
-        for what, target, value, verdict in lines
-    ]
-    return _COLUMNS + '\n'.join(rows) + '\n'
+    rows = [(what, target, value, words.get(verdict, '')) for what, target, value, verdict in lines]
+    return markdown(_COLUMNS, rows) + '\n'
 
 
 if __name__ == '__main__':

@@ -21,7 +21,7 @@ with ros_domains.free_domain() as domain:
 """
 PROGRAM = """
 import os
-from benchmarks.speed.node_process import use_own_domain
+from benchmarks.node_processes import use_own_domain
 use_own_domain()
 print(os.environ['ROS_DOMAIN_ID'], flush=True)
 input()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from benchmarks.exploration.cases import generated
 from benchmarks.exploration.observed_candidates import COLUMNS, Case, observe
+from benchmarks.rows import markdown
 from thinmap_ros.core.exploration import fitted
 from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel
 from thinmap_ros.core.exploration.fitted import FITTED
@@ -29,6 +30,7 @@ UNSEEN = ('dungeon/d1573', 'dungeon/d1641', 'dungeon/d2191', 'dungeon/d3230', 'k
 _FIRST_FITTED_SEED = 2000
 _FIRST_UNSEEN_SEED = 5000
 _UNSEEN_BUILDINGS = 20
+_COLUMNS = ('probability that nothing is hidden', 'candidates', 'predicted', 'observed')
 _EDGES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001)
 _AREA_QUANTILES = (0.05, 0.15, 0.3, 0.5, 0.75)
 _STEPS = 60
@@ -121,10 +123,7 @@ def reliability_table(probabilities: Array, data: Observed) -> list[str]:
     """Lines of a table: predicted against observed share, by bins; and the scores."""
     nothing = data.hides_nothing.astype(float)
     weights = data.weights
-    lines = [
-        '| probability that nothing is hidden | candidates | predicted | observed |',
-        '|---|---|---|---|',
-    ]
+    rows = []
     worst = error = 0.0
     for low, high in pairwise(_EDGES):
         inside = (probabilities >= low) & (probabilities < high)
@@ -136,14 +135,15 @@ def reliability_table(probabilities: Array, data: Observed) -> list[str]:
         error += count * abs(p - share)
         if count >= _MIN_CANDIDATES:
             worst = max(worst, abs(p - share))
-        lines.append(f'| {low:.2f} to {min(high, 1.0):.2f} | {count:.0f} | {p:.3f} | {share:.3f} |')
+        bounds = f'{low:.2f} to {min(high, 1.0):.2f}'
+        rows.append((bounds, f'{count:.0f}', f'{p:.3f}', f'{share:.3f}'))
     brier = np.average((probabilities - nothing) ** 2, weights=weights)
-    lines += [
+    return [
+        markdown(_COLUMNS, rows),
         '',
         f'Brier score {brier:.4f}; mean error {error / weights.sum():.3f}; largest error of a bin '
         f'with at least {_MIN_CANDIDATES} candidates {worst:.3f}.',
     ]
-    return lines
 
 
 def source(model: BeliefModel) -> str:

@@ -11,9 +11,9 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from benchmarks.faults.kinds import KILL, NODES, STOP, Fault
+from benchmarks.faults.kinds import KILL, STOP, Fault
 from benchmarks.faults.observer import Observer
-from benchmarks.faults.processes import Processes
+from benchmarks.node_processes import NODES, Processes
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.drives import random_start
 from thinmap_ros.sim.world import World

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
+from benchmarks.node_processes import NODES
+
 KILL = 'kill'
 STOP = 'stop'
 _GAP_S = (10.0, 30.0)

@@ -11,10 +11,10 @@ import numpy as np
 
 from benchmarks.faults.causes import Killed, cause_of
 from benchmarks.faults.judge import Counts, Passed, PoseWatch, Record, uncounted
-from benchmarks.faults.kinds import NODES, Fault
+from benchmarks.faults.kinds import Fault
 from benchmarks.faults.observer import Observer
-from benchmarks.faults.processes import Processes
 from benchmarks.goal_client import GoalClient
+from benchmarks.node_processes import NODES, Processes
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.drives import random_start
@@ -81,9 +81,7 @@ class FaultRun:
         Raises ThinmapError if nodes do not start or time stands still.
         """
         setting = self._setting
-        self._processes.start_simulator(
-            setting.path, setting.world.start, setting.rate, setting.seed
-        )
+        self._start_simulator()
         self._start_nodes(setting.world.start)
         for fault in setting.faults:
             if self._observer.track.time_s >= setting.seconds:
@@ -237,6 +235,23 @@ class FaultRun:
         return _Census(self._observer.passed(), by_node)
 
     # Processes and time.
+
+    def _start_simulator(self) -> None:
+        """Start simulator and relay; time stands still until the relay lets it pass."""
+        setting = self._setting
+        self._processes.start('relay', {}, module='benchmarks.faults.relay')
+        parameters: dict[str, object] = {
+            'world': setting.path,
+            'start': ','.join(map(str, setting.world.start.tolist())),
+            'real_time_factor': setting.rate,
+            'seed': setting.seed,
+            'lockstep': 'local_topology',
+            'lockstep_timeout_s': 3600.0,
+            'wait_for_subscribers': 1,
+        }
+        renamed = {'local_topology': 'paced', '/clock': '/raw_clock', '/tf': '/raw_tf'}
+        renamed |= {'scan': 'raw_scan', 'odom': 'raw_odom', 'cmd_vel': 'wheels'}
+        self._processes.start('sim', parameters, renamed)
 
     def _start_nodes(self, at: Array) -> None:
         """Start all nodes while time stands still, the robot at a pose (3,)."""

@@ -12,6 +12,7 @@ from PIL import Image
 
 from benchmarks.charts import DOCS
 from benchmarks.graphs.route_measures import RouteMeasures, made, maps_below, measure
+from benchmarks.rows import markdown
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.files.occupancy_maps import read_map
@@ -79,20 +80,19 @@ def write(maps: Path, docs: Path) -> Path:
     paths = maps_below(maps)
     if not paths:
         raise InputError(f'{maps}: no map: expected YAML files of map_server in it')
-    lines = [f'| map | {" | ".join(_COLUMNS)} |', '|---' * (len(_COLUMNS) + 1) + '|']
+    rows = []
     pictures = []
     for path in paths:
         picture = docs / _IMAGES / f'graph_{path.stem}.png'
         is_shown = path.stem in _SHOWN
         graph = made(path, ('--picture', picture) if is_shown else ())
         row = measure(read_map(path, report=str, keeps_unknown=True), graph)
-        cells = ' | '.join(column(row) for column in _COLUMNS.values())
-        lines.append(f'| `{path.stem}` | {cells} |')
+        rows.append([f'`{path.stem}`', *(column(row) for column in _COLUMNS.values())])
         if is_shown:
             _shrink(picture)
             pictures.append(_figure(path.stem, picture.name))
     page = docs / _PAGE
-    table = '\n'.join(lines)
+    table = markdown(['map', *_COLUMNS], rows)
     write_text(page, _HEAD.format(made=provenance()) + f'{table}\n{_TAIL}' + ''.join(pictures))
     return page
 

@@ -11,8 +11,8 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,6 +23,7 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
+from benchmarks.rows import markdown
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
@@ -319,13 +320,11 @@ def maps_below(folder: Path) -> list[Path]:
     return sorted(folder.rglob('*.yaml'))
 
 
-def table(rows: dict[str, RouteMeasures]) -> Iterator[str]:
-    """Lines of a table in Markdown: a row for each map, by name."""
+def table(rows: dict[str, RouteMeasures]) -> str:
+    """A table in Markdown: a row for each map, by name."""
     names = [field.name for field in fields(RouteMeasures)]
-    yield f'| map | {" | ".join(names)} |'
-    yield '|---' * (len(names) + 1) + '|'
-    for name, row in rows.items():
-        yield f'| {name} | {" | ".join(_shown(getattr(row, column)) for column in names)} |'
+    cells = [[name, *map(_shown, astuple(row))] for name, row in rows.items()]
+    return markdown(['map', *names], cells)
 
 
 def _shown(value: float) -> str:
@@ -347,7 +346,7 @@ def main() -> None:
             graph = read_graph(arguments.graph) if arguments.graph else made(path, options)
             patch = read_map(path, report=str, keeps_unknown=True)  # map_to_graph has reported
             rows[path.stem] = measure(patch, graph, arguments.robot_radius_m)
-    print('\n'.join(table(rows)))
+    print(table(rows))
 
 
 if __name__ == '__main__':

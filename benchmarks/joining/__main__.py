@@ -10,10 +10,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from benchmarks.joining import tables
-from benchmarks.places.tables import lines
+from benchmarks.rows import show_tables
 from benchmarks.worlds import WORLDS, Floor, floors
 from thinmap_ros.evaluation.outcome import Table
-from thinmap_ros.evaluation.parallel_jobs import write_provenance
 
 # Three floors and three dungeons; five robots; six buildings.
 _SIX = (
@@ -37,28 +36,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog='benchmarks.joining', description='Joint maps of several robots'
     )
-    parser.add_argument('tables', nargs='*', help=f'some of {", ".join(_TABLES)} (default: all)')
+    parser.add_argument('tables', nargs='*', choices=_TABLES, help='default: all')
     parser.add_argument('--worlds', nargs='+', help='names (default: those of each table)')
     parser.add_argument('--seconds', type=float, help='of each drive (default: of each table)')
     parser.add_argument('--folder', type=Path, default=WORLDS, help='folder with worlds.json')
     parser.add_argument('-o', '--output', type=Path, help='folder for TABLE.csv')
     arguments = parser.parse_args()
-    if unknown := set(arguments.tables) - set(_TABLES):
-        parser.error(f'unknown table {sorted(unknown)[0]}: expected some of {", ".join(_TABLES)}')
     known = {floor.name: floor for floor in floors(arguments.folder)}
-    for name in arguments.tables or _TABLES:
+    if missing := set(arguments.worlds or ()) - known.keys():
+        parser.error(f'unknown world {sorted(missing)[0]}: expected some of {list(known)}')
+
+    def made(name: str) -> Table:
         make, worlds, seconds = _TABLES[name]
-        wanted = arguments.worlds or worlds
-        if missing := set(wanted) - known.keys():
-            parser.error(f'unknown world {sorted(missing)[0]}: expected some of {list(known)}')
-        table = make([known[world] for world in wanted], arguments.seconds or seconds)
-        print(f'\n## {name}\n')
-        print('\n'.join(lines(table)), flush=True)
-        if arguments.output is not None:
-            arguments.output.mkdir(parents=True, exist_ok=True)
-            (arguments.output / f'{name}.csv').write_text(table.csv(), encoding='utf-8')
-    if arguments.output is not None:
-        write_provenance(arguments.output)
+        chosen = [known[world] for world in arguments.worlds or worlds]
+        return make(chosen, arguments.seconds or seconds)
+
+    show_tables(map(made, arguments.tables or _TABLES), arguments.output)
 
 
 if __name__ == '__main__':

@@ -8,9 +8,8 @@ import sys
 from pathlib import Path
 
 from benchmarks.charts import BAD, DOCS, OURS, Mark, Panel, chart_path, draw, picture
-from benchmarks.kidnapped.__main__ import read
-from benchmarks.kidnapped.summary import Written, by_group, summary
-from benchmarks.rows import Row
+from benchmarks.kidnapped.summary import by_group, summary
+from benchmarks.rows import Row, Written, markdown, read_records
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.files.safe import write_text
@@ -57,6 +56,15 @@ _ABOUT = {
     'driven': 'Maps from a drive of 400 m, with unobserved areas; starts in the free space of the '
     'map',
 }
+_GROUP_COLUMNS = (
+    'world or laser',
+    'drives',
+    'correct',
+    'false',
+    'not localized',
+    'distance (m), median',
+    'maximum',
+)
 _DIVIDED = ('kth', 'dungeon', 'lasers', 'fine', 'driven')
 
 
@@ -73,7 +81,7 @@ def page(folder: Path) -> str:
     caption = 'Correct and false localizations in the sections of this page.'
     parts = [_HEAD.format(provenance=provenance(folder), chart=picture(_CHART, caption))]
     for name, about in _ABOUT.items():
-        records = read(folder / f'{name}.csv')
+        records = read_records(folder / f'{name}.csv')
         if records:
             parts += section(about, list(summary(name, records)))
             parts += _groups(records) if name in _DIVIDED else []
@@ -82,8 +90,8 @@ def page(folder: Path) -> str:
 
 def section(title: str, rows: list[Row]) -> list[str]:
     """Title and table of a section."""
-    lines = [f'| {row.what} | {row.value} |' for row in rows]
-    return [f'## {title}\n', '| quantity | value |\n|---|---|', *lines, '']
+    cells = [(row.what, row.value) for row in rows]
+    return [f'## {title}\n', markdown(('quantity', 'value'), cells), '']
 
 
 def sections(folder: Path) -> dict[str, list[Row]]:
@@ -93,7 +101,7 @@ def sections(folder: Path) -> dict[str, list[Row]]:
     """
     found = {}
     for name, about in _ABOUT.items():
-        records = read(folder / f'{name}.csv')
+        records = read_records(folder / f'{name}.csv')
         if records:
             found[about] = list(summary(name, records))
     if not found:
@@ -120,26 +128,16 @@ def panel(rows: dict[str, list[Row]]) -> Panel:
 
 def _groups(records: list[Written]) -> list[str]:
     """A table with a line for each world or laser."""
-    lines = [
-        '| world or laser | drives | correct | false | not localized '
-        '| distance (m), median | maximum |',
-        f'|{"---|" * 7}',
-    ]
+    rows = []
     for name, group in by_group(records).items():
         counts = [
             sum(record['outcome'] == word for record in group)
             for word in ('right', 'wrong', 'open')
         ]
         driven_m = sorted(float(record['way_m']) for record in group)
-        cells = [
-            name,
-            len(group),
-            *counts,
-            f'{driven_m[len(driven_m) // 2]:.1f}',
-            f'{driven_m[-1]:.1f}',
-        ]
-        lines.append(f'| {" | ".join(str(cell) for cell in cells)} |')
-    return [*lines, '']
+        middle = f'{driven_m[len(driven_m) // 2]:.1f}'
+        rows.append([name, len(group), *counts, middle, f'{driven_m[-1]:.1f}'])
+    return [markdown(_GROUP_COLUMNS, rows), '']
 
 
 if __name__ == '__main__':

@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from benchmarks.kidnapped.split_log import is_in_map
-from benchmarks.rows import Row, at_least, at_most
+from benchmarks.rows import Row, Written, at_least, at_most
 
-Written = dict[str, str]  # a record as it is in a file
 _SCANS = 30
 _NOTICED_S = 5.0
 

@@ -14,9 +14,9 @@ from benchmarks.places import tables
 from benchmarks.places.cases import recorded
 from benchmarks.places.generators import generators
 from benchmarks.places.recorded import RecordedPiece
+from benchmarks.rows import show_tables
 from benchmarks.worlds import WORLDS
 from thinmap_ros.evaluation.outcome import Table
-from thinmap_ros.evaluation.parallel_jobs import write_provenance
 
 _TABLES: dict[str, Callable[[list[RecordedPiece]], Table]] = {
     'shared': tables.shared,
@@ -32,7 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog='benchmarks.places', description='Place recognition between pieces of map'
     )
-    parser.add_argument('tables', nargs='*', help=f'some of {", ".join(_TABLES)} (default: all)')
+    parser.add_argument('tables', nargs='*', choices=_TABLES, help='default: all')
     parser.add_argument('--pieces', type=Path, required=True, help='folder of the pieces')
     parser.add_argument(
         '--count', type=int, help='of the logs and of the explorations the first so many'
@@ -43,18 +43,9 @@ def main() -> None:
     )
     parser.add_argument('-o', '--output', type=Path, help='folder for TABLE.csv')
     arguments = parser.parse_args()
-    if unknown := set(arguments.tables) - set(_TABLES):
-        parser.error(f'unknown table {sorted(unknown)[0]}: expected some of {", ".join(_TABLES)}')
     pieces = recorded(arguments.pieces, arguments.data, arguments.count)
-    for name in arguments.tables or _TABLES:
-        table = _TABLES[name](pieces)
-        print(f'\n## {name}\n')
-        print('\n'.join(tables.lines(table)), flush=True)
-        if arguments.output is not None:
-            arguments.output.mkdir(parents=True, exist_ok=True)
-            (arguments.output / f'{name}.csv').write_text(table.csv(), encoding='utf-8')
-    if arguments.output is not None:
-        write_provenance(arguments.output)
+    made = (_TABLES[name](pieces) for name in arguments.tables or _TABLES)
+    show_tables(made, arguments.output)
 
 
 if __name__ == '__main__':

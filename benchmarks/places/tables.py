@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -204,19 +204,3 @@ def _maps(pieces: Pieces) -> dict[str, MapPiece]:
     for each in maps.values():
         _ = (each.index, each.views)
     return maps
-
-
-def lines(table: Table) -> Iterator[str]:
-    """A table as Markdown."""
-    yield '| ' + ' | '.join(table.columns) + ' |'
-    yield '|' + '---|' * len(table.columns)
-    for row in table.rows:
-        yield '| ' + ' | '.join(_text(value) for value in row) + ' |'
-
-
-def _text(value: Any) -> str:
-    if value is None:
-        return '-'
-    if isinstance(value, float):
-        return f'{value:.3f}' if 0.0 < abs(value) < 1.0 else f'{value:.1f}'
-    return str(value)

@@ -6,6 +6,7 @@ from fnmatch import fnmatch
 
 import numpy as np
 
+from benchmarks.rows import markdown
 from benchmarks.scoreboard.board import (
     ASKED_OF_DEGRADED,
     ASKED_OF_LOGS,
@@ -79,7 +80,7 @@ def board_table(
     names: of all cases of the board; others: reports of the same cases elsewhere, if any.
     """
     heads = ['quantity', 'target', 'measured', '', *(['other run'] if others is not None else [])]
-    lines = ['| ' + ' | '.join(heads) + ' |', '|---' * len(heads) + '|']
+    lines = []
     measured = [report['name'] for report in reports]
     for row in board_rows():
         own = cases_of(row, measured)
@@ -90,8 +91,8 @@ def board_table(
             there = [others[k] for k in own]
             known = [other for other in there if other is not None]
             cells.append(_cells(row, known, len(own))[2] if known else '')
-        lines.append('| ' + ' | '.join(cells) + ' |')
-    return '\n'.join(lines) + '\n'
+        lines.append(cells)
+    return markdown(heads, lines) + '\n'
 
 
 def _cells(row: Row, own: Found, count: int) -> list[str]:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from benchmarks.rows import markdown
 from benchmarks.scoreboard.cases import Case
 from benchmarks.scoreboard.page import MAX_ERROR_M, errors, worst_tenth
 from benchmarks.scoreboard.played import Numbers
@@ -31,13 +32,12 @@ def against(
         f'(other run {np.count_nonzero(there >= MAX_ERROR_M)}). '
         f'Changes by more than {_SAME:.0%} and '
         f'{1000 * _SAME_M:.0f} mm:\n',
-        '| case | this run (m) | other run (m) | ratio |',
-        '|---|---|---|---|',
     ]
     changed = (np.abs(ratio - 1.0) > _SAME) & (np.abs(here - there) > _SAME_M)
-    lines += [
-        f'| {common[k].name} | {here[k]:.3f} | {there[k]:.3f} | {ratio[k]:.2f} |'
+    rows = [
+        (common[k].name, f'{here[k]:.3f}', f'{there[k]:.3f}', f'{ratio[k]:.2f}')
         for k in np.argsort(-ratio, kind='stable')
         if changed[k]
     ]
-    return '\n'.join(lines) + '\n'
+    columns = ('case', 'this run (m)', 'other run (m)', 'ratio')
+    return '\n'.join([*lines, markdown(columns, rows), ''])

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from benchmarks.rows import markdown
 from benchmarks.scoreboard.cases import Case, LogCase
 from benchmarks.scoreboard.measure import DISTURBED
 from benchmarks.scoreboard.played import Numbers
@@ -42,6 +43,7 @@ _HEAD = """\
 """
 _LOGS = 'Logs'
 _KINDS = {'building_': 'Buildings', 'drive_': 'Recorded drives', 'loop_': 'Closed loop'}
+_REPEATED_COLUMNS = ('case', 'runs', 'live (m), mean', 'worst', 'final (m), mean', 'worst')
 _COLUMNS = (
     ('live (m)', 'live_m', '.3f'),
     ('final (m)', 'final_m', '.3f'),
@@ -167,8 +169,7 @@ def _table(rows: list[int], reports: Sequence[Numbers], live: Sequence[float] | 
     columns = [
         each for each in _COLUMNS if each[1] == 'live_m' or any(each[1] in reports[k] for k in rows)
     ]
-    lines = ['| case | scans | ' + ' | '.join(title for title, _, _ in columns) + ' |']
-    lines.append('|---' * (len(columns) + 2) + '|')
+    lines = [markdown(['case', 'scans', *(title for title, _, _ in columns)], [])]
     for k in rows:
         report = reports[k]
         if 'error' in report:
@@ -186,21 +187,20 @@ def _repeated(cases: Sequence[Case], reports: Sequence[Numbers], live: np.ndarra
     runs: dict[str, list[int]] = {}
     for k, case in enumerate(cases):
         runs.setdefault(case.first, []).append(k)
-    lines = [
+    head = [
         '## Several runs\n',
         f'In all runs but the first, odometry has noise of {1e3 * DISTURBED[0]:g} mm and '
         f'{1e3 * DISTURBED[2]:g} mrad from scan to scan. Means are geometric. In the tables and in '
         'the worst tenth each run counts as a case.\n',
-        '| case | runs | live (m), mean | worst | final (m), mean | worst |',
-        '|---|---|---|---|---|---|',
     ]
+    rows = []
     for name, own in runs.items():
         # A log without relations has none; a run of another that failed has the largest.
         known = any('final_m' in reports[k] for k in own)
         final = [reports[k].get('final_m', MAX_ERROR_M) for k in own] if known else []
         cells = [_mean_and_worst(metres) for metres in (live[own], np.minimum(final, MAX_ERROR_M))]
-        lines.append(f'| {name} | {len(own)} | ' + ' | '.join(cells) + ' |')
-    return '\n'.join(lines) + '\n'
+        rows.append([name, len(own), *cells])
+    return '\n'.join([*head, markdown(_REPEATED_COLUMNS, rows), ''])
 
 
 def _mean_and_worst(metres: np.ndarray) -> str:

@@ -3,13 +3,13 @@
 Usage: python -m benchmarks.scoreboard.results_page DIR [DOCS].
 """
 
-import csv
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.charts import DOCS, OTHERS, OURS, Mark, Panel, chart_path, draw, picture, span
+from benchmarks.rows import markdown, read_rows
 from benchmarks.scoreboard.board_run import FOLDER
 from benchmarks.scoreboard.page import COLUMN_NOTES, case_tables
 from benchmarks.scoreboard.played import Numbers
@@ -27,6 +27,23 @@ _NAMES = {
     'aces_raw': 'ACES, Austin',
     'csail_raw': 'MIT CSAIL',
 }
+_COMPLETE_COLUMNS = (
+    'log',
+    'thinmap, live (m)',
+    'thinmap, final (m)',
+    'Cartographer, final (m)',
+    'graph mapping, final (m)',
+    'IRIS LaMa (m)',
+)
+_INTEL_COLUMNS = (
+    'program',
+    'live (m)',
+    'final (m)',
+    'CPU time per scan, mean (ms)',
+    'memory (MB)',
+    'source',
+)
+_INTEL_FORMS = {'live_m': '.3f', 'final_m': '.3f', 'ms_mean': '.2f', 'mb': '.0f'}
 _HEAD = """\
 # SLAM: accuracy
 
@@ -156,45 +173,36 @@ def _complete_table(reports: Sequence[Numbers]) -> list[str]:
     names = [name for name in COMPLETE if name in known]
     if not names:
         return []
-    lines = [
-        '## Complete logs\n',
-        '| log | thinmap, live (m) | thinmap, final (m) | Cartographer, final (m) '
-        '| graph mapping, final (m) | IRIS LaMa (m) |',
-        '|---|---|---|---|---|---|',
-    ]
+    rows = []
     for name in names:
         published = [
             _peer(system, name, Origin.PUBLISHED) for system in (CARTOGRAPHER, 'graph mapping')
         ]
         lama = _peer(LAMA, name, Origin.TEAM)
-        cells = [
+        row = [
             f'{_NAMES[name]} (`{name}`)',
             f'{known[name]["live_m"]:.3f}',
             f'{known[name]["final_m"]:.3f}',
             *(shown(run.final_m) if run else '' for run in published),
             shown(lama.live_m) if lama else '',
         ]
-        lines.append(f'| {" | ".join(cells)} |')
-    return ['\n'.join(lines), '\n\n', _COMPLETE_NOTES]
+        rows.append(row)
+    table = markdown(_COMPLETE_COLUMNS, rows)
+    return [f'## Complete logs\n\n{table}\n\n', _COMPLETE_NOTES]
 
 
 def _intel_table(reports: Sequence[Numbers]) -> list[str]:
     ours = _by_name(reports).get(INTEL)
     if ours is None:
         return []
-    lines = [
-        '## Intel Research Lab, 5,438 scans\n',
-        '| program | live (m) | final (m) | CPU time per scan, mean (ms) | memory (MB) | source |',
-        '|---|---|---|---|---|---|',
-        f'| **thinmap** | {ours["live_m"]:.3f} | {ours["final_m"]:.3f} | {ours["ms_mean"]:.2f} '
-        f'| {ours["mb"]:.0f} | this page |',
-    ]
+    own = [f'{ours[key]:{form}}' for key, form in _INTEL_FORMS.items()]
+    rows = [['**thinmap**', *own, 'this page']]
     for run in sorted(slam_run.runs(INTEL), key=_error):
         name = run.system + (f', {run.note}' if run.note else '')
         costs = [f'{cost:g}' if cost is not None else '' for cost in (run.cpu_ms, run.peak_mb)]
-        cells = [name, shown(run.live_m), shown(run.final_m), *costs, run.origin.value]
-        lines.append(f'| {" | ".join(cells)} |')
-    return ['\n'.join(lines), '\n\n', _INTEL_NOTES]
+        rows.append([name, shown(run.live_m), shown(run.final_m), *costs, run.origin.value])
+    table = markdown(_INTEL_COLUMNS, rows)
+    return [f'## Intel Research Lab, 5,438 scans\n\n{table}\n\n', _INTEL_NOTES]
 
 
 def _error(run: slam_run.PeerRun) -> float:
@@ -208,32 +216,23 @@ def _why(reports: Sequence[Numbers], stamps: Sequence[Sequence[str]]) -> list[st
         return []
     complete = known['intel_raw']['live_m']
     thinned = known[THINNED]['live_m']
-    table = _matrix(stamps)
     head = _WHY.format(complete=complete, thinned=thinned)
-    return [head, '\n'.join(table), '\n', _WHY_END]
+    return [head, _matrix(stamps), '\n', _WHY_END]
 
 
-def _matrix(stamps: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table: a row for each judgement, a column for each path."""
+def _matrix(stamps: Sequence[Sequence[str]]) -> str:
+    """A table: a row for each judgement, a column for each path."""
     values: dict[str, dict[str, str]] = {}
     for what, value in stamps:
         path, _, judgement = what.partition(': ')
         values.setdefault(judgement, {})[path] = value
     paths = list(dict.fromkeys(path for row in values.values() for path in row))
-    lines = [f'| | {" | ".join(paths)} |', '|---' * (len(paths) + 1) + '|']
-    lines += [
-        f'| {judgement} | {" | ".join(row.get(path, "") for path in paths)} |'
-        for judgement, row in values.items()
-    ]
-    return lines
+    rows = [[name, *(row.get(path, '') for path in paths)] for name, row in values.items()]
+    return markdown(['', *paths], rows).replace('|  |', '| |', 1)
 
 
 def _stamps(folder: Path) -> list[list[str]]:
-    path = folder / f'{STAMPS}.csv'
-    if not path.exists():
-        return []
-    with path.open(encoding='utf-8', newline='') as file:
-        return [row[:2] for row in csv.reader(file)][1:]
+    return [row[:2] for row in read_rows(folder / f'{STAMPS}.csv')]
 
 
 _KEYS = (

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.node_processes import NODES, Processes, placed_at, processor_s, use_own_domain
 from benchmarks.rows import Row, at_most
-from benchmarks.speed.node_process import processor_s, start, stop, use_own_domain
 
-_NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
+_START = np.array([5.0, 2.0, 0.0])
 _SETTLE_S = 5.0
 
 
@@ -25,43 +25,43 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
     use_own_domain()
     seconds = 20.0 if quick else 120.0
     with tempfile.TemporaryDirectory() as folder:
-        bag = Path(folder) / 'bag'
-        together = [['thinmap']]
-        apart = [[name] for name in _NODES]
-        yield from _measured('one process', together, seconds, bag, (40.0, 400.0))
-        yield from _measured('one process per node', apart, seconds, None, (None, None))
-        yield from _traffic(bag)
+        for what, names, limits in (
+            ('one process', ('thinmap',), (40.0, 400.0)),
+            ('one process per node', NODES, (None, None)),
+        ):
+            yield from _measured(what, names, seconds, Path(folder), limits)
+        yield from _traffic(Path(folder) / 'bag')
 
 
 def _measured(
     what: str,
-    programs: list[list[str]],
+    names: tuple[str, ...],
     seconds: float,
-    bag: Path | None,
+    folder: Path,
     limits: tuple[float | None, float | None],
 ) -> Iterator[Row]:
-    start_pose = 'initial_x_m:=5.0 initial_y_m:=2.0 initial_yaw_rad:=0.0'
-    placed = ('localizer', 'thinmap')
-    nodes = [
-        start(words, f'use_sim_time:=true {start_pose if words[0] in placed else ""}')
-        for words in programs
-    ]
-    others = [start(['sim'], 'start:=5.0,2.0,0.0 wait_for_subscribers:=4')]
-    if bag is not None:
-        others.append(start(['recorder'], f'use_sim_time:=true bag:={bag}'))
+    processes = Processes(folder)
+    for name in names:
+        placed = placed_at(_START) if name in ('localizer', 'thinmap') else {}
+        processes.start(name, {'use_sim_time': 'true', **placed})
+    nodes = list(processes.running.values())
+    place = ','.join(map(str, _START.tolist()))
+    processes.start('sim', {'start': place, 'wait_for_subscribers': 4})
+    if not (folder / 'bag').exists():
+        processes.start('recorder', {'use_sim_time': 'true', 'bag': folder / 'bag'})
     delays = _Listener()
     try:
         while not delays.heard('local_topology'):
             delays.listen(0.5)
         delays.listen(_SETTLE_S)
         delays.forget()
-        before = sum(processor_s(node) for node in nodes)
+        before = processor_s(nodes)
         delays.listen(seconds)
-        share = 100.0 * (sum(processor_s(node) for node in nodes) - before) / seconds
+        share = 100.0 * (processor_s(nodes) - before) / seconds
         memory = sum(node.memory_full_info().pss for node in nodes) / 1e6
     finally:
         delays.close()
-        stop(*nodes, *others)
+        processes.close()
     yield Row(what, f'{len(delays.of("pose"))} scans')
     for name, value, limit, unit in (
         ('CPU load', share, limits[0], '%'),

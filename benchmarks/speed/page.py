@@ -4,12 +4,12 @@ Usage: python -m benchmarks.speed.page DIR [DOCS]. The chart has the SLAM progra
 a folder of the board beside DIR, slam.
 """
 
-import csv
 import re
 import sys
 from pathlib import Path
 
 from benchmarks.charts import DOCS, OTHERS, Mark, Panel, chart_path, draw, picture
+from benchmarks.rows import markdown, read_rows
 from benchmarks.scoreboard.results_page import read_reports
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.parallel_jobs import provenance
@@ -145,8 +145,8 @@ def page(folder: Path) -> str:
         path = folder / f'{name}.csv'
         if path.exists():
             parts.append(f'## {title}\n\n{about} Benchmark: `{name}`.\n')
-            parts.append('| quantity | value |\n|---|---|')
-            parts += [f'| {" | ".join(_indented(row)[:2])} |' for row in read_rows(path)]
+            rows = [_indented(row)[:2] for row in read_rows(path)]
+            parts.append(markdown(('quantity', 'value'), rows))
             parts.append('')
     return '\n'.join(parts)
 
@@ -208,18 +208,12 @@ def _slam(folder: Path) -> list[Mark]:
 def _value(path: Path, what: str, above: str = '') -> float | None:
     """First number of a row, of the first that comes after another row; None if there is none."""
     is_after = not above
-    for title, value, *_ in read_rows(path) if path.exists() else []:
+    for title, value, *_ in read_rows(path):
         is_after = is_after or title == above
         number = re.match(r'[\d.e+-]+', value)
         if is_after and title.strip() == what and number:
             return float(number[0])
     return None
-
-
-def read_rows(path: Path) -> list[list[str]]:
-    """Rows of a file of results: what, value, target, verdict."""
-    with path.open(encoding='utf-8', newline='') as file:
-        return list(csv.reader(file))[1:]
 
 
 def _indented(row: list[str]) -> list[str]:

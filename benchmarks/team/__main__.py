@@ -7,32 +7,31 @@ again. A single run scatters by 4 to 7 %: means over worlds count.
 """
 
 import argparse
-import csv
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import add_record, markdown, read_records
 from benchmarks.team.cases import BASES, CASES
 from benchmarks.worlds import WORLDS, floors
 
+_COLUMNS = (
+    'case',
+    'against',
+    'runs',
+    'time',
+    'distance',
+    'least coverage',
+    'contacts',
+    'bytes a metre',
+)
 _WORLDS = ('dungeon/d114', 'dungeon/d1305', 'kth/50052751', 'kth/50052748')
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    """Records of a file; none where there is no file."""
-    if not path.exists():
-        return []
-    with path.open(encoding='utf-8', newline='') as file:
-        return list(csv.DictReader(file))
 
 
 def table(records: list[dict[str, str]]) -> str:
     """Mean ratios of each case to its base over the worlds and seeds of both, as Markdown."""
     by_key = {(r['case'], r['world'], r['seed']): r for r in records}
-    lines = [
-        '| case | against | runs | time | distance | least coverage | contacts | bytes a metre |',
-        '|---|---|---|---|---|---|---|---|',
-    ]
+    rows = []
     for case, base in BASES.items():
         pairs = [
             (record, by_key[base, world, seed])
@@ -48,9 +47,8 @@ def table(records: list[dict[str, str]]) -> str:
         sent = np.mean([float(a['claim_bytes_m']) + float(a['tile_bytes_m']) for a, _ in pairs])
         least = min(float(a['least_coverage']) for a, _ in pairs)
         contacts = sum(int(a['contacts']) for a, _ in pairs)
-        cells = [case, base, str(len(pairs)), *ratios, f'{least:.4f}', str(contacts), f'{sent:.0f}']
-        lines.append(f'| {" | ".join(cells)} |')
-    return '\n'.join(lines)
+        rows.append([case, base, len(pairs), *ratios, f'{least:.4f}', contacts, f'{sent:.0f}'])
+    return markdown(_COLUMNS, rows)
 
 
 def _mean(values: list[float]) -> tuple[float, float]:
@@ -65,31 +63,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog='benchmarks.team', description=__doc__)
     parser.add_argument('worlds', nargs='*', help=f'names (default: {" ".join(_WORLDS)})')
     parser.add_argument('-o', '--output', type=Path, required=True, help='CSV file')
-    parser.add_argument('--cases', nargs='+', default=list(CASES), help='some of the cases')
+    parser.add_argument(
+        '--cases', nargs='+', choices=CASES, default=CASES, help='some of the cases'
+    )
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
     parser.add_argument('--folder', type=Path, default=WORLDS, help='folder with worlds.json')
     arguments = parser.parse_args()
-    if unknown := set(arguments.cases) - set(CASES):
-        parser.error(f'unknown case {sorted(unknown)[0]!r}: expected some of {", ".join(CASES)}')
     known = {floor.name: floor for floor in floors(arguments.folder)}
     wanted = arguments.worlds or list(_WORLDS)
     if missing := set(wanted) - known.keys():
         parser.error(f'unknown world {sorted(missing)[0]!r}: expected some of {", ".join(known)}')
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    done = {(r['case'], r['world'], r['seed']) for r in read(arguments.output)}
+    done = {(r['case'], r['world'], r['seed']) for r in read_records(arguments.output)}
     for world in wanted:
         for case in arguments.cases:
             if (case, world, str(arguments.seed)) in done:
                 continue
             figures = CASES[case].run(known[world], arguments.seed)
             record = {'case': case, 'world': world, 'seed': arguments.seed, **figures}
-            with arguments.output.open('a', encoding='utf-8', newline='') as file:
-                writer = csv.DictWriter(file, list(record), lineterminator='\n')
-                if file.tell() == 0:
-                    writer.writeheader()
-                writer.writerow(record)
+            add_record(arguments.output, record)
             print(record, flush=True)
-    print(table(read(arguments.output)))
+    print(table(read_records(arguments.output)))
 
 
 if __name__ == '__main__':

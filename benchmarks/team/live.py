@@ -9,12 +9,10 @@ from the beginning; else it has to find them.
 """
 
 import argparse
-import csv
 import math
 import os
 import tempfile
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,10 +26,12 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import UInt32
 
+from benchmarks.node_processes import Processes, placed_at
+from benchmarks.rows import add_record
 from benchmarks.worlds import WORLDS, floors
 from thinmap_msgs.msg import ExplorationStatus, JoinStatus, MapTiles, TeamClaim, TileRequest
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.ros_domains import use_free_domain
@@ -44,7 +44,7 @@ from thinmap_ros.sim.drives import random_start
 from thinmap_ros.sim.other_robots import starts_side_by_side
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools.demo import Processes, map_poses
+from thinmap_ros.tools.demo import map_poses
 
 _ROBOT = '2dx'
 _RANGE_M = 8.0
@@ -202,11 +202,10 @@ def run(setting: Setting, limit_s: float) -> dict[str, str | int | float]:
             _start(processes, setting)
             while not observer.is_finished and observer.now_s < limit_s:
                 rclpy.spin_once(observer.node, timeout_sec=0.1)
-                if (name := processes.ended()) is not None:
-                    log = (Path(folder) / f'{name}.log').read_text(errors='replace')
-                    raise RuntimeError(f'{name} has ended: {log[-2000:]}')
+                for text in processes.ended().values():
+                    raise ThinmapError(text)
         finally:
-            processes.stop()
+            processes.close()
     figures = _figures(setting, observer, time.monotonic() - began)
     observer.node.destroy_node()
     return figures
@@ -214,27 +213,24 @@ def run(setting: Setting, limit_s: float) -> dict[str, str | int | float]:
 
 def _start(processes: Processes, setting: Setting) -> None:
     """Start the robots, the simulator and map_joiner."""
-    sim_time = ['-p', 'use_sim_time:=true']
-    joiner = list(sim_time)
+    sim_time: dict[str, object] = {'use_sim_time': 'true'}
+    joiner = {**sim_time, 'known_init_poses': str(setting.is_known).lower()}
     robots = zip(setting.names, setting.starts, setting.poses, strict=True)
     for name, start, T_world_map in robots:
-        remap = ['-r', f'__ns:={name}', '-r', '/tf:=tf', '-r', '/tf_static:=tf_static']
-        x, y, yaw = (f'{number:.9f}' for number in se2.between(T_world_map, start).tolist())
         given = {
-            'initial_x_m': x,
-            'initial_y_m': y,
-            'initial_yaw_rad': yaw,
+            **placed_at(se2.between(T_world_map, start)),
             'controller.max_speed_m_s': setting.speed_m_s,
             'team': 'true',
             'autostart_exploration': 'true',
         }
-        processes.start('thinmap', [*remap, *sim_time, *_words(given)], label=name.strip('/'))
+        renamed = {'__ns': name, '/tf': 'tf', '/tf_static': 'tf_static'}
+        robot = name.strip('/')
+        processes.start(robot, {**sim_time, **given}, renamed, 'thinmap_ros.nodes.thinmap')
         axes = zip(('x', 'y', 'yaw'), T_world_map.tolist(), strict=True)
         if setting.is_known:
-            joiner += _words({f'{name}/map_merge/init_pose_{axis}': at for axis, at in axes})
-    joiner += _words({'known_init_poses': str(setting.is_known).lower()})
+            joiner |= {f'{name}/map_merge/init_pose_{axis}': at for axis, at in axes}
     processes.start('map_joiner', joiner)
-    simulator = {
+    simulator: dict[str, object] = {
         'world': setting.path,
         'robot': _ROBOT,
         'robots': len(setting.starts),
@@ -244,12 +240,7 @@ def _start(processes: Processes, setting: Setting) -> None:
         'lockstep': 'local_topology',
         'wait_for_subscribers': _SCAN_LISTENERS,
     }
-    processes.start('sim', _words(simulator))
-
-
-def _words(values: Mapping[str, object]) -> list[str]:
-    """Arguments that set parameters."""
-    return [word for name, value in values.items() for word in ('-p', f'{name}:={value}')]
+    processes.start('sim', simulator)
 
 
 def _figures(setting: Setting, observer: Observer, wall_s: float) -> dict[str, str | int | float]:
@@ -307,7 +298,7 @@ def main() -> None:
                 seed,
             )
             record = run(setting, arguments.time_limit_s)
-            _append(arguments.output, record)
+            add_record(arguments.output, record)
             print(record, flush=True)
     rclpy.shutdown()
 
@@ -329,15 +320,6 @@ def _starts(world: World, robots: int, rng: np.random.Generator) -> list[Array]:
             return starts_side_by_side(world, random_start(world, rng), robots, radius_m)
         except InputError:
             continue
-
-
-def _append(path: Path, record: dict[str, str | int | float]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open('a', encoding='utf-8', newline='') as file:
-        writer = csv.DictWriter(file, list(record), lineterminator='\n')
-        if file.tell() == 0:
-            writer.writeheader()
-        writer.writerow(record)
 
 
 if __name__ == '__main__':

@@ -16,9 +16,9 @@ from benchmarks.faults.causes import place_apart, reset_faults, sim_time_faults
 from benchmarks.faults.judge import Counts, Passed, PoseWatch, Record, uncounted
 from benchmarks.faults.kinds import KINDS, Fault, random_faults
 from benchmarks.faults.map_watch import Drawn, MapWatch
-from benchmarks.faults.processes import Processes
 from benchmarks.faults.stream_faults import StreamFaults
 from benchmarks.faults.track import Located, Track
+from benchmarks.node_processes import Processes
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kidnapped.__main__ import read, run_pending
+from benchmarks.kidnapped.__main__ import run_pending
 from benchmarks.kidnapped.cases import Case
 from benchmarks.kidnapped.page import page
 from benchmarks.kidnapped.summary import summary
 from benchmarks.kidnapped.trials import Record
+from benchmarks.rows import read_records
 
 
 def cases(ran: list[str], outcomes: dict[str, str]) -> list[Case]:
@@ -36,8 +37,8 @@ def test_a_row_is_resumed_and_shown_on_the_page(tmp_path: Path) -> None:
     run_pending(cases(ran, outcomes)[:2], path)
     run_pending(cases(ran, outcomes), path)
     assert ran == list(outcomes)
-    assert [record['outcome'] for record in read(path)] == list(outcomes.values())
-    rows = {row.what: row for row in summary('kth', read(path))}
+    assert [record['outcome'] for record in read_records(path)] == list(outcomes.values())
+    rows = {row.what: row for row in summary('kth', read_records(path))}
     assert rows['correct, false, not localized'].value == '1, 1, 1'
     assert rows['false localizations (%)'].good is False
     made = 'Commit 1234567, a processor, 2 cores, Python 3.12.3'

@@ -9,6 +9,7 @@ from benchmarks.places.cases import with_shared_ground, without_shared_ground
 from benchmarks.places.generators import generators
 from benchmarks.places.recorded import RecordedPiece
 from benchmarks.places.truth import rigid_errors
+from benchmarks.rows import shown
 from thinmap_ros.core import se2
 
 
@@ -69,4 +70,4 @@ def test_nodes_are_compared_with_random_places(pieces):
     table = generators(pieces)
     shares = {row[1]: row[3] for row in table.rows}
     assert shares['pairs of branch nodes'] > shares['random places, as many as nodes']
-    assert '| pair |' in '\n'.join(tables.lines(table))
+    assert '| pair |' in shown(table)

@@ -13,8 +13,9 @@ import pytest
 from support.timeouts import PATIENCE_S
 
 from benchmarks.faults.judge import Record
-from benchmarks.faults.kinds import KINDS, NODES, Fault
+from benchmarks.faults.kinds import KINDS, Fault
 from benchmarks.faults.run import Setting, drive
+from benchmarks.node_processes import NODES
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
