@@ -8,16 +8,27 @@ run. A case that fails is named on the page, and is tried again by the next run.
 """
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 
-from benchmarks.scoreboard.board_run import run_board
-from benchmarks.scoreboard.cases import BY_HAND, Case, all_cases, compared_with, repeated
+from benchmarks.scoreboard.board import board_cases
+from benchmarks.scoreboard.board_rows import board_table
+from benchmarks.scoreboard.cases import (
+    BY_HAND,
+    Case,
+    DriveCase,
+    LogCase,
+    all_cases,
+    compared_with,
+    repeated,
+)
 from benchmarks.scoreboard.compare import against
-from benchmarks.scoreboard.measure import Task, config_of, measure
-from benchmarks.scoreboard.page import page, shortened, worst_tenth
+from benchmarks.scoreboard.measure import RecordTask, Task, config_of, measure, record
+from benchmarks.scoreboard.page import COLUMN_NOTES, case_tables, page, shortened, worst_tenth
 from benchmarks.scoreboard.played import Numbers
-from benchmarks.scoreboard.reports import report_file, report_of, reports_there
+from benchmarks.scoreboard.reports import FOLDER, RESULTS, report_file, report_of, reports_there
 from thinmap_ros.core.config import parameters_of, suggestion
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.slam.localizer import default_config, parameters_elsewhere
@@ -35,6 +46,10 @@ from thinmap_ros.files.safe import read_text, write_text
 from thinmap_ros.tools import cli
 
 _SHARED = Path(__file__).resolve().parents[3] / 'shared'
+# A graph costs more than a pose, and the pose needs little of it: of replayed drives there is a new
+# one every 2 s. Scans of these logs are up to metres apart: a new one with each.
+_SCANS_PER_GRAPH = 10
+_SPARSE_LOGS = ('aces', 'csail', 'fhw', 'intel_sparse')
 _SHORT = Path(__file__).parent / 'short.txt'
 
 
@@ -94,46 +109,111 @@ def _parser() -> argparse.ArgumentParser:
 def _run(arguments: argparse.Namespace) -> None:
     if arguments.runs < 1:
         raise ConfigError(f'--runs {arguments.runs}: expected 1 or more')
-    if arguments.board:
-        if arguments.short or arguments.runs > 1 or arguments.write_short:
-            raise ConfigError('--board: expected no --short, --runs or --write-short')
-        run_board(arguments, _options(arguments.set))
-        return
+    if arguments.board and (arguments.short or arguments.runs > 1 or arguments.write_short):
+        raise ConfigError('--board: expected no --short, --runs or --write-short')
     partial = arguments.short or arguments.only != '*' or arguments.runs > 1
     if arguments.write_short and partial:
         raise ConfigError('--write-short: expected a complete run: no --short, --only or --runs')
     options = _options(arguments.set)
-    cases = repeated(_chosen(arguments), arguments.runs)
-    for case in cases:
-        if report_file(arguments.out, case.name).exists():
-            read_report(report_file(arguments.out, case.name), options)  # before hours of work
-    failures = _run_cases(cases, options, arguments)
-    reports = [report_of(arguments.out, case.name, options, failures) for case in cases]
+    cases = _board(arguments) if arguments.board else repeated(_chosen(arguments), arguments.runs)
+    folder = FOLDER if arguments.board else RESULTS
+    files = {case.name: report_file(arguments.out, case.name, folder) for case in cases}
+    for file in files.values():
+        if file.exists():
+            read_report(file, options)  # before hours of work
+    task = Task(
+        cases[0],
+        arguments.shared / 'data',
+        arguments.shared / 'tools' / 'degrade_log.py',
+        arguments.out / 'logs',
+        options,
+        _recordings(arguments),
+        made=provenance(),
+    )
+    failures = _record([case for case in cases if not files[case.name].exists()], arguments)
+    failures |= run_pending(
+        measure,
+        [
+            replace(task, case=case, scans_per_graph=_scans_per_graph(case, arguments))
+            for case in cases
+        ],
+        lambda task: files[task.name],
+        arguments,
+        arguments.quiet,
+    )
+    reports = [report_of(arguments.out, case.name, options, failures, folder) for case in cases]
     write_provenance(arguments.out)
-    text = page(cases, reports, provenance(arguments.out))
-    if arguments.against:
-        text += '\n' + against(cases, reports, reports_there(arguments.against, cases))
-    write_text(arguments.out / 'scoreboard.md', text)
-    print(f'worst tenth, live: {worst_tenth(cases, reports):.3f} m; {arguments.out}/scoreboard.md')
+    others = reports_there(arguments.against, cases, folder) if arguments.against else None
+    write = _write_board if arguments.board else _write_page
+    write(cases, reports, others, arguments)
     if failures:
         raise failure_summary(failures)
     if arguments.write_short:
         write_text(_SHORT, shortened(cases, reports))
 
 
-def _run_cases(
-    cases: list[Case], options: Numbers, arguments: argparse.Namespace
-) -> dict[str, Failure]:
-    logs = arguments.shared / 'data' / 'logs'
-    degrade = arguments.shared / 'tools' / 'degrade_log.py'
-    tasks = [Task(case, logs, degrade, arguments.out / 'logs', options) for case in cases]
+def _record(cases: list[Case], arguments: argparse.Namespace) -> dict[str, Failure]:
+    """Record the drives that cases replay, where they are not there yet."""
+    worlds = dict.fromkeys(case.world for case in cases if isinstance(case, DriveCase))
+    recordings = _recordings(arguments)
+    folder = arguments.shared / 'data' / 'worlds'
     return run_pending(
-        measure,
-        tasks,
-        lambda task: report_file(arguments.out, task.name),
+        record,
+        [RecordTask(world, folder, recordings) for world in worlds],
+        lambda task: recordings / f'{task.name}.json',
         arguments,
         arguments.quiet,
     )
+
+
+def _recordings(arguments: argparse.Namespace) -> Path:
+    return Path(arguments.recordings or arguments.out / 'drives')
+
+
+def _scans_per_graph(case: Case, arguments: argparse.Namespace) -> int:
+    is_sparse = isinstance(case, LogCase) and case.log in _SPARSE_LOGS
+    return _SCANS_PER_GRAPH if arguments.board and not is_sparse else 1
+
+
+def _write_page(
+    cases: list[Case],
+    reports: list[Numbers],
+    others: Sequence[Numbers | None] | None,
+    arguments: argparse.Namespace,
+) -> None:
+    text = page(cases, reports, provenance(arguments.out))
+    if others is not None:
+        text += '\n' + against(cases, reports, others)
+    write_text(arguments.out / 'scoreboard.md', text)
+    print(f'worst tenth, live: {worst_tenth(cases, reports):.3f} m; {arguments.out}/scoreboard.md')
+
+
+def _write_board(
+    cases: list[Case],
+    reports: list[Numbers],
+    others: Sequence[Numbers | None] | None,
+    arguments: argparse.Namespace,
+) -> None:
+    """Write targets.md, met or missed, and cases.md."""
+    names = [case.name for case in board_cases(arguments.shared / 'data' / 'logs')]
+    table = board_table(reports, names, others)
+    taken = sum(report.get('cpu_s', 0.0) for report in reports)
+    head = f'# Targets of SLAM\n\n{provenance(arguments.out)}\n\n'
+    board = f'{head}{table}\nCPU time of all cases: {taken:.0f} s.\n'
+    write_text(arguments.out / 'targets.md', board)
+    tables = f'{COLUMN_NOTES}\n{case_tables(reports)}'
+    if others is not None:
+        tables += '\n' + against(cases, reports, others)
+    write_text(arguments.out / 'cases.md', tables)
+    print(f'{table}\n{arguments.out}/targets.md, cases.md')
+
+
+def _board(arguments: argparse.Namespace) -> list[Case]:
+    cases = board_cases(arguments.shared / 'data' / 'logs')
+    chosen = [case for case in cases if fnmatch(case.name, arguments.only)]
+    if not chosen:
+        raise InputError(f'--only {arguments.only}: no case of the board has such a name')
+    return chosen
 
 
 def _chosen(arguments: argparse.Namespace) -> list[Case]:

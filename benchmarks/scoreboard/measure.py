@@ -4,12 +4,21 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.scoreboard.cases import EXACT_S, BuildingCase, Case, LogCase
+from benchmarks.scoreboard.board import LARGEST
+from benchmarks.scoreboard.cases import (
+    EXACT_S,
+    BuildingCase,
+    Case,
+    DriveCase,
+    LogCase,
+    LoopCase,
+    flat,
+)
 from benchmarks.scoreboard.drives import samples
 from benchmarks.scoreboard.played import (
     Numbers,
@@ -18,18 +27,54 @@ from benchmarks.scoreboard.played import (
     rehearse,
     simulated_numbers,
 )
+from benchmarks.scoreboard.recordings import RecordedSimulation, read_recording
 from benchmarks.time_and_memory import forget_peak, peak_mb
+from benchmarks.worlds import floors
+from thinmap_ros.closed_loop import (
+    SCANS_PER_GRAPH,
+    ClosedLoop,
+    explorer_config,
+    ground_truth_poses,
+    no_progress,
+)
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
+from thinmap_ros.core.grid.patch import GridFrame
+from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import config_with
 from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
 from thinmap_ros.experiments.slam.logs import laser_of
+from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.reading import open_log, paired_scans
-from thinmap_ros.pipeline import PipelineConfig
+from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
+from thinmap_ros.sim.laser import LaserScannerConfig
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import Simulation
+from thinmap_ros.sim.world import World
+from thinmap_ros.strategies import DEFAULT, make_strategy
+
+LASERS = {
+    'lms200': LaserScannerConfig(),
+    'turtlebot3': LaserScannerConfig(beams=360, field_of_view_deg=360.0, range_max_m=3.5),
+    'rplidar_a1': LaserScannerConfig(beams=360, field_of_view_deg=360.0, range_max_m=12.0),
+}
+RECORDED_S = 1200.0  # of a recorded drive: 6,000 scans
+_DRAWN = Path(__file__).resolve().parents[2] / 'worlds'
+_ROBOT = PRESETS['2dx']
+_SPEED_M_S = 0.5
+_RECORDED_SEED = 0
+# A robot that has not finished by then goes round in circles; the largest floor takes too long.
+_LIMIT_S = 3000.0
+_LIMITS_S = {LARGEST: 1200.0}
+# What is cut short is not asked for its coverage, which takes long to prepare on a large floor.
+_NOTHING = ObservableCells(np.zeros((0, 0), dtype=np.bool_), GridFrame(0.0, 0.0, 0.1))
+
 
 _KNOWN_AGAIN_M = 30.0  # of way after a slip or a gap, from which on relations over it are judged
 DISTURBED = (5e-4, 5e-4, 5e-4)  # of odometry between scans, m, m, rad, in runs but the first
@@ -39,15 +84,19 @@ DISTURBED = (5e-4, 5e-4, 5e-4)  # of odometry between scans, m, m, rad, in runs 
 class Task:
     """A case, and what it is measured with.
 
-    logs: folder of the logs; degrade: the program that degrades one; folder: for what is degraded;
-    options: of the localizer.
+    data: folder of logs and worlds; degrade: the program that degrades a log; folder: for what is
+    degraded; options: of the localizer; recordings: folder of recorded drives; scans_per_graph: as
+    of the pipeline; made: line of commit and machine.
     """
 
     case: Case
-    logs: Path
+    data: Path
     degrade: Path
     folder: Path
     options: Numbers
+    recordings: Path = Path()
+    scans_per_graph: int = 1
+    made: str = ''
 
     @property
     def name(self) -> str:
@@ -60,22 +109,24 @@ def measure(task: Task) -> Numbers:
     began = time.process_time()
     case = task.case
     if isinstance(case, LogCase):
-        numbers = measure_log(case, task)
+        numbers = _measure_log(case, task)
     elif isinstance(case, BuildingCase):
-        numbers = measure_building(case, task.options)
+        numbers = _measure_building(case, task)
+    elif isinstance(case, DriveCase):
+        numbers = _measure_drive(case, task)
     else:
-        raise TypeError(f'{task.name}: neither a log nor a building')
-    taken = {'cpu_s': time.process_time() - began}
+        numbers = _measure_loop(case, task)
+    taken = {'cpu_s': time.process_time() - began, 'made': task.made}
     return {'name': task.name, 'options': task.options, **taken, **numbers}
 
 
-def measure_log(case: LogCase, task: Task, scans_per_graph: int = 1) -> Numbers:
-    """Numbers of a log, degraded if the case says so; scans_per_graph: as of the pipeline."""
-    own = task.logs / case.log
+def _measure_log(case: LogCase, task: Task) -> Numbers:
+    """Numbers of a log, degraded if the case says so."""
+    own = task.data / 'logs' / case.log
     if case.version:
         own = _degraded(case, own, task.degrade, task.folder)
     scans = _disturbed(_scans(own, case.log), case.run)
-    played = play(scans, config_of(task.options), scans_per_graph)
+    played = play(scans, config_of(task.options), task.scans_per_graph)
     numbers = played.numbers()
     times = np.array(played.stamps_ns) / 1e9
     live = np.array(played.poses)
@@ -171,13 +222,13 @@ def _disturbed(pairs: Iterator[tuple[Scan, Array]], run: int) -> Iterator[tuple[
         yield scan, T_odom_base
 
 
-def measure_building(case: BuildingCase, options: Numbers, scans_per_graph: int = 1) -> Numbers:
-    """Numbers of a drive through a generated building; scans_per_graph: as of the pipeline."""
+def _measure_building(case: BuildingCase, task: Task) -> Numbers:
+    """Numbers of a drive through a generated building."""
     drive = list(samples(case.seed, case.robot, case.noise))
     truth = np.array([sample.T_world_base for sample in drive])
-    config = config_of(options, truth[0])
-    pairs = ((sample.scan, sample.T_odom_base) for sample in drive)
-    return simulated_numbers(play(_disturbed(pairs, case.run), config, scans_per_graph), truth)
+    config = config_of(task.options, truth[0])
+    pairs = _disturbed(((sample.scan, sample.T_odom_base) for sample in drive), case.run)
+    return simulated_numbers(play(pairs, config, task.scans_per_graph), truth)
 
 
 def config_of(options: Numbers, start: Array | None = None) -> StartConfig:
@@ -209,3 +260,111 @@ def play(
     played.final = pipeline.localizer.optimized_trajectory()
     played.peak_mb = peak_mb()
     return played
+
+
+@dataclass(frozen=True)
+class RecordTask:
+    """A drive to record."""
+
+    world: str
+    worlds: Path
+    recordings: Path
+
+    @property
+    def name(self) -> str:
+        """That of the recording."""
+        return flat(self.world)
+
+
+def record(task: RecordTask) -> Numbers:
+    """Record a drive; returns what it took and how it ended."""
+    began = time.process_time()
+    numbers = record_drive(task.world, task.worlds, task.recordings / f'{task.name}.npz')
+    return {'name': task.name, 'cpu_s': time.process_time() - began, **numbers}
+
+
+def record_drive(world: str, worlds: Path, path: Path, limit_s: float = RECORDED_S) -> Numbers:
+    """Record an exploration by the true pose, from a world's first start, into a file."""
+    place, start = world_of(world, worlds)
+    laser = LASERS['lms200']
+    simulation = RecordedSimulation(place, start, _ROBOT, laser, _RECORDED_SEED)
+    pipeline = Pipeline(_pipeline_config(laser), ground_truth_poses(simulation))
+    loop = _closed_loop(simulation, pipeline)
+    ending = loop.run(_NOTHING, limit_s, no_progress)
+    recording = simulation.recording()
+    recording.write(path)
+    return {
+        'scans': len(recording.stamps_ns),
+        'distance_m': se2.path_length_m(recording.T_world_base),
+        'reason': ending.reason,
+        'collisions': ending.collisions,
+    }
+
+
+def _measure_drive(case: DriveCase, task: Task) -> Numbers:
+    """Numbers of a recorded drive with the odometry noise of the case's seed."""
+    recording = read_recording(task.recordings / f'{flat(case.world)}.npz')
+    truth = recording.T_world_base
+    config = config_of(task.options, truth[0])
+    samples = recording.replay(_ROBOT, case.odometry_seed)
+    pairs = ((sample.scan, sample.T_odom_base) for sample in samples)
+    return simulated_numbers(play(pairs, config, task.scans_per_graph), truth)
+
+
+def _measure_loop(case: LoopCase, task: Task) -> Numbers:
+    """Numbers of an exploration by the estimated pose."""
+    world, start = world_of(case.world, task.data / 'worlds')
+    laser = LASERS[case.laser]
+    simulation = Simulation(world, start, _ROBOT, laser, case.seed)
+    is_whole = case.world not in _LIMITS_S
+    goal = robot_observable_cells(world, start, _ROBOT, laser.range_max_m) if is_whole else _NOTHING
+    rehearse()
+    pipeline = PlayedPipeline(_pipeline_config(laser, task.options, start))
+    loop = _closed_loop(simulation, pipeline)
+    forget_peak()
+    ending = loop.run(goal, _LIMITS_S.get(case.world, _LIMIT_S), no_progress)
+    played = pipeline.played
+    played.final = pipeline.localizer.optimized_trajectory()
+    played.peak_mb = peak_mb()
+    truth = np.array(loop.log.true_poses)
+    coverage = {'coverage': loop.log.coverage[-1][1]} if is_whole else {}
+    return {
+        **simulated_numbers(played, truth),
+        **coverage,
+        'collisions': ending.collisions,
+        'finished': ending.finished,
+        'reason': ending.reason,
+        'distance_m': se2.path_length_m(truth),
+        'time_s': played.stamps_ns[-1] / 1e9,
+    }
+
+
+def world_of(name: str, worlds: Path) -> tuple[World, Array]:
+    """World and start (3,): FOLDER/NAME of the worlds with lists of starts, or a drawn one.
+
+    Raises InputError where there is none of that name.
+    """
+    if '/' in name:
+        for floor in floors(worlds, name):
+            if floor.name == name:
+                return floor.world, floor.starts[0]
+        raise InputError(f'{worlds}: no world {name} in worlds.json')
+    world = World.from_patch(*read_world(_DRAWN / f'{name}.yaml'))
+    return world, world.start
+
+
+def _pipeline_config(
+    laser: LaserScannerConfig, options: Numbers | None = None, start: Array | None = None
+) -> PipelineConfig:
+    """As `explore_world` has it: a beam that met nothing has seen as far as this laser can."""
+    return PipelineConfig(
+        localizer=config_of(options or {}, start),
+        grid=replace(PAPER_GRID, no_return_clear_range_m=laser.range_max_m),
+        scans_per_graph=SCANS_PER_GRAPH,
+    )
+
+
+def _closed_loop(simulation: Simulation, pipeline: Pipeline) -> ClosedLoop:
+    navigator = Navigator(NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=_SPEED_M_S)))
+    strategy = make_strategy(DEFAULT, explorer_config(_ROBOT, _SPEED_M_S))
+    return ClosedLoop(simulation, pipeline, strategy, navigator)

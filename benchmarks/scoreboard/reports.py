@@ -11,6 +11,7 @@ from thinmap_ros.evaluation.parallel_jobs import Failure, read_report
 from thinmap_ros.files.safe import read_text
 
 RESULTS = 'results'
+FOLDER = 'board'  # a case of the complete scoreboard may have the same name
 
 
 def report_file(out: Path, name: str, folder: str = RESULTS) -> Path:

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from benchmarks.scoreboard import __main__ as program
-from benchmarks.scoreboard import board_run
 from benchmarks.scoreboard.board import WORLDS, board_cases
 from benchmarks.scoreboard.board_rows import board_rows, board_table, cases_of
 from benchmarks.scoreboard.cases import BuildingCase, DriveCase, LogCase, LoopCase
-from benchmarks.scoreboard.closed_loop import LASERS, record_drive, world_of
+from benchmarks.scoreboard.measure import LASERS, record_drive, world_of
 from benchmarks.scoreboard.recordings import RecordedSimulation, read_recording
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.core.errors import InputError
@@ -199,7 +198,7 @@ def small_board(monkeypatch, tmp_path):
     """A board of one small world; the folder for its results."""
     drives = [DriveCase('room_10x10', run) for run in (1, 2)]
     cases = [LoopCase('room_10x10', 1, 'turtlebot3'), *drives]
-    monkeypatch.setattr(board_run, 'board_cases', lambda logs: cases)
+    monkeypatch.setattr(program, 'board_cases', lambda logs: cases)
     return tmp_path / 'out'
 
 
@@ -254,7 +253,7 @@ def test_what_the_board_cannot_do_is_one_line(small_board, monkeypatch, capsys):
     assert called(*words, '--only', 'drive_[ab]*') == 2
     assert 'no case of the board has such a name' in capsys.readouterr().err
     cases = [LogCase('try'), DriveCase('kth/nowhere', 1)]
-    monkeypatch.setattr(board_run, 'board_cases', lambda logs: cases)
+    monkeypatch.setattr(program, 'board_cases', lambda logs: cases)
     assert called(*words, '--only', 'drive*') == 2
     error = capsys.readouterr().err
     assert 'no world kth/nowhere' in error
