@@ -8,45 +8,39 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import days, place_belief
-from benchmarks.graphs import compactness, doors, map_to_graph, real_maps, voronoi
-from benchmarks.release import command as release
+from benchmarks import days, place_belief, release
+from benchmarks.graphs import doors, floors, real_maps
 from benchmarks.rows import Row, show
 from benchmarks.speed import (
-    ekf_step,
     exploration,
     global_localization,
     growth,
-    long_paths,
-    map_update,
+    mapping,
     node_load,
     planning,
-    pose_graph,
-    scan_matching,
-    thinning,
-    topology_update,
+    slam,
 )
 from benchmarks.time_and_memory import machine
 from benchmarks.worlds import WORLDS
 from thinmap_ros.evaluation.parallel_jobs import write_provenance
 
 _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
-    'thinning': thinning.run,
-    'mapping': map_update.run,
-    'graphs': map_to_graph.run,
+    'thinning': mapping.thinning,
+    'mapping': mapping.mapping,
+    'graphs': floors.graphs,
     'doors': doors.run,
     'real_maps': real_maps.run,
-    'compactness': compactness.run,
-    'voronoi': voronoi.run,
-    'online': topology_update.run,
+    'compactness': floors.compactness,
+    'voronoi': floors.voronoi,
+    'online': mapping.online,
     'nodes': node_load.run,
     'localization': global_localization.run,
-    'matching': scan_matching.run,
-    'planning': planning.run,
-    'long_paths': long_paths.run,
+    'matching': slam.matching,
+    'planning': planning.goals,
+    'long_paths': planning.long_paths,
     'exploration': exploration.run,
-    'slam': ekf_step.run,
-    'pose_graph': pose_graph.run,
+    'slam': slam.ekf_step,
+    'pose_graph': slam.pose_graph,
     'growth': growth.run,
     'days': days.run,
     'place_belief': place_belief.run,

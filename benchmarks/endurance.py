@@ -28,7 +28,6 @@ import numpy as np
 
 from benchmarks.faults.judge import Record
 from benchmarks.faults.kinds import KINDS, random_faults
-from benchmarks.interruption import Interruption
 from benchmarks.node_processes import NODES, Processes, processor_s, use_own_domain
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.files import package_data
@@ -87,7 +86,7 @@ class Driver:
         from rclpy.qos import QoSProfile
         from rclpy.signals import SignalHandlerOptions
 
-        from benchmarks.goal_client import GoalClient
+        from benchmarks.goal_client import GoalClient, Interruption
         from thinmap_ros.ros import messages
 
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
@@ -232,7 +231,7 @@ def _drive(arguments: argparse.Namespace, path: Path, world: World) -> bool:
 
 def _drive_with_faults(arguments: argparse.Namespace, path: Path, world: World) -> bool:
     """Drive under faults and print the table; returns whether there was no violation."""
-    from benchmarks.faults import report
+    from benchmarks.faults import judge
     from benchmarks.faults.run import Setting, drive
 
     # A node that is killed while it holds the lock of a shared memory port would block the others.
@@ -252,13 +251,13 @@ def _drive_with_faults(arguments: argparse.Namespace, path: Path, world: World) 
 
     def add(record: Record) -> None:
         records.append(record)
-        print(report.line(record), flush=True)
-        report.write_json(arguments.out / 'faults.json', records, values)
+        print(judge.line(record), flush=True)
+        judge.write_json(arguments.out / 'faults.json', records, values)
 
     try:
         drive(setting, add)
     finally:
-        print(report.table(records))
+        print(judge.table(records))
     return not any(record.violations() for record in records)
 
 

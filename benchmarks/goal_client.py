@@ -1,5 +1,6 @@
-"""A client that explores a world, then sends the robot to random places."""
+"""A client that explores a world, then sends the robot to random places, until Ctrl-C."""
 
+import signal
 from time import monotonic
 from typing import Any
 
@@ -92,3 +93,25 @@ class GoalClient:
             self._explorations = 0 if is_reached else self._explorations - 1
         else:
             self.reached += is_reached
+
+
+class Interruption:
+    """Records SIGINT and SIGTERM until `check` is called.
+
+    The second one raises KeyboardInterrupt at once.
+    """
+
+    def __init__(self) -> None:
+        self._is_requested = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._request)
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a signal was received."""
+        if self._is_requested:
+            raise KeyboardInterrupt
+
+    def _request(self, number: int, frame: object) -> None:
+        if self._is_requested:
+            raise KeyboardInterrupt
+        self._is_requested = True

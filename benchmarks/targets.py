@@ -10,7 +10,7 @@ from pathlib import Path
 from benchmarks.charts import DOCS
 from benchmarks.kidnapped.page import sections as localization_sections
 from benchmarks.rows import VERDICTS, markdown
-from benchmarks.scoreboard.board_rows import board_table
+from benchmarks.scoreboard.board import board_table
 from benchmarks.scoreboard.results_page import made_lines, read_reports
 from benchmarks.speed.page import sections as speed_sections
 from thinmap_ros.core.errors import InputError

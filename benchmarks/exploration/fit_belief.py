@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.exploration.cases import generated
-from benchmarks.exploration.observed_candidates import COLUMNS, Case, observe
+from benchmarks.exploration.observed_candidates import COLUMNS, Case, generated, observe
 from benchmarks.rows import markdown
 from thinmap_ros.core.exploration import fitted
 from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel

@@ -14,9 +14,8 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String, UInt32
 
 from benchmarks.faults.judge import Counts, Passed
-from benchmarks.faults.map_watch import MapWatch
-from benchmarks.faults.track import Track
-from benchmarks.interruption import Interruption
+from benchmarks.faults.track import MapWatch, Track
+from benchmarks.goal_client import Interruption
 from thinmap_msgs.msg import SlamStatus
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages, qos

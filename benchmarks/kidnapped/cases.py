@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.kidnapped import split_log, trials
+from benchmarks.kidnapped import trials
 from benchmarks.kidnapped.trials import Map, Record, fresh, prepared, search
 from benchmarks.worlds import floors
 from thinmap_ros.closed_loop import Options
@@ -243,7 +243,7 @@ def _carried_off(folder: Path, name: str, seed: int) -> Record:
 def halves(setting: Setting) -> Iterator[Case]:
     """A real log: the map of its first half, started at 100 stamps of the second, 60 scans."""
     for number in range(100):
-        yield Case(f'{number}', partial(split_log.in_second_half, setting.log, number))
+        yield Case(f'{number}', partial(trials.in_second_half, setting.log, number))
 
 
 def foreign_log(setting: Setting) -> Iterator[Case]:
@@ -257,7 +257,7 @@ def foreign_log(setting: Setting) -> Iterator[Case]:
 
 def _log_elsewhere(setting: Setting, name: str) -> Record:
     known = _map_of(setting.worlds, name)
-    samples = split_log.samples_from(setting.log, sum(map(ord, name)))
+    samples = trials.samples_from(setting.log, sum(map(ord, name)))
     return trials.watch_foreign(
         GlobalLocalization(known.patch, known.topology, seed=1), samples, _FOREIGN_WAY_M
     )
@@ -265,7 +265,7 @@ def _log_elsewhere(setting: Setting, name: str) -> Record:
 
 def _in_log_map(setting: Setting, name: str) -> Record:
     world = trials.floor_of(setting.worlds, name)
-    known = split_log.first_half(setting.log)
+    known = trials.first_half(setting.log)
     drive = random_drive(world, random_start(world, np.random.default_rng(6)), 6)
     return trials.watch_foreign(
         GlobalLocalization(known.patch, known.topology, seed=1), drive, _FOREIGN_WAY_M

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from benchmarks.kidnapped.split_log import is_in_map
+from benchmarks.kidnapped.trials import is_in_map
 from benchmarks.rows import Row, Written, at_least, at_most
 
 _SCANS = 30

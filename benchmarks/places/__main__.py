@@ -11,9 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.places import tables
-from benchmarks.places.cases import recorded
 from benchmarks.places.generators import generators
-from benchmarks.places.recorded import RecordedPiece
+from benchmarks.places.pieces import RecordedPiece, recorded
 from benchmarks.rows import show_tables
 from benchmarks.worlds import WORLDS
 from thinmap_ros.evaluation.outcome import Table

@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.places import cases
-from benchmarks.places.recorded import RecordedPiece
-from benchmarks.places.truth import true_pose
+from benchmarks.places.pieces import RecordedPiece, true_pose, with_shared_ground
 from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.places.piece import Landmarks, MapPiece, are_same, landmarks_of
 from thinmap_ros.core.places.views import View
@@ -38,7 +36,7 @@ class _Count:
 def generators(pieces: list[RecordedPiece]) -> Table:
     """Share of views whose place is the best candidate after refinement, and ms a view."""
     rows: list[list[Any]] = []
-    for known, query in cases.with_shared_ground(pieces):
+    for known, query in with_shared_ground(pieces):
         if known.name < query.name:
             rows += _rows(known, query)
     return Table('generators', ('pair', 'candidates', 'views', 'share', 'ms'), rows, timed=True)

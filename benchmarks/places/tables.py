@@ -8,9 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.places import cases
-from benchmarks.places.recorded import RecordedPiece
-from benchmarks.places.truth import relative_errors, rigid_errors
+from benchmarks.places.pieces import (
+    LOGS,
+    RecordedPiece,
+    is_shared,
+    relative_errors,
+    rigid_errors,
+    with_shared_ground,
+    without_shared_ground,
+)
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.places.piece import MapPiece, drawn_scans
 from thinmap_ros.core.places.recognition import JoinDecision, Recognition, decide, recognize
@@ -38,7 +44,7 @@ def shared(pieces: Pieces) -> Table:
         'ms a view',
     )
     maps = _maps(pieces)
-    rows = [_watched(known, query, maps) for known, query in cases.with_shared_ground(pieces)]
+    rows = [_watched(known, query, maps) for known, query in with_shared_ground(pieces)]
     return Table('shared', columns, rows, timed=True)
 
 
@@ -80,7 +86,7 @@ def foreign(pieces: Pieces) -> Table:
     found: list[tuple[float, float, str]] = []
     joined = 0
     costs = []
-    for known, query in cases.without_shared_ground(pieces):
+    for known, query in without_shared_ground(pieces):
         began = time.process_time()
         decision = recognize(maps[query.name], maps[known.name])
         costs.append(1e3 * (time.process_time() - began) / max(decision.views, 1))
@@ -106,21 +112,21 @@ def bare(pieces: Pieces) -> Table:
     """Grid and graph alone: scans are drawn. All pairs with shared ground, as many without."""
     maps = {piece.name: _drawn(piece) for piece in pieces}
     rows = []
-    right = cases.with_shared_ground(pieces)
-    wrong = cases.without_shared_ground(pieces)
+    right = with_shared_ground(pieces)
+    wrong = without_shared_ground(pieces)
     for known, query in [*right, *wrong[:: max(1, len(wrong) // max(len(right), 1))]]:
         began = time.process_time()
         decision = recognize(maps[query.name], maps[known.name])
         seconds = time.process_time() - began
         error = None
-        if decision.placement is not None and cases.is_shared(known, query):
+        if decision.placement is not None and is_shared(known, query):
             T_map_piece = decision.placement.T_map_piece
             error = float(rigid_errors(known, query, T_map_piece).min())
         name = f'{known.name} <- {query.name}'
         rows.append(
             [
                 name,
-                cases.is_shared(known, query),
+                is_shared(known, query),
                 decision.is_joined,
                 decision.log_odds,
                 error,
@@ -149,7 +155,7 @@ def joined(pieces: Pieces) -> Table:
     )
     rows = [
         _joined_row(known, query)
-        for known, query in cases.with_shared_ground(pieces)
+        for known, query in with_shared_ground(pieces)
         if known.name < query.name
     ]
     return Table('joined', columns, rows, timed=True)
@@ -163,7 +169,7 @@ def _joined_row(known: RecordedPiece, query: RecordedPiece) -> list[Any]:
     recognized = time.process_time()
     if decision.placement is None or not decision.is_joined:
         return [f'{known.name} + {query.name}', *[None] * 11]
-    is_simulated = not known.name.startswith(cases.LOGS)
+    is_simulated = not known.name.startswith(LOGS)
     grid = replace(PAPER_GRID, no_return_clear_range_m=LaserScannerConfig().range_max_m)
     merged = join(first, second, decision.placement, JoinConfig(grid if is_simulated else None))
     ended = time.process_time()

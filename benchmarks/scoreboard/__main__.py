@@ -13,8 +13,7 @@ from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 
-from benchmarks.scoreboard.board import board_cases
-from benchmarks.scoreboard.board_rows import board_table
+from benchmarks.scoreboard.board import board_cases, board_table
 from benchmarks.scoreboard.cases import (
     BY_HAND,
     Case,
@@ -24,11 +23,21 @@ from benchmarks.scoreboard.cases import (
     compared_with,
     repeated,
 )
-from benchmarks.scoreboard.compare import against
 from benchmarks.scoreboard.measure import RecordTask, Task, config_of, measure, record
-from benchmarks.scoreboard.page import COLUMN_NOTES, case_tables, page, shortened, worst_tenth
+from benchmarks.scoreboard.page import (
+    COLUMN_NOTES,
+    FOLDER,
+    RESULTS,
+    against,
+    case_tables,
+    page,
+    report_file,
+    report_of,
+    reports_there,
+    shortened,
+    worst_tenth,
+)
 from benchmarks.scoreboard.played import Numbers
-from benchmarks.scoreboard.reports import FOLDER, RESULTS, report_file, report_of, reports_there
 from thinmap_ros.core.config import parameters_of, suggestion
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.slam.localizer import default_config, parameters_elsewhere

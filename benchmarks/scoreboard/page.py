@@ -1,7 +1,9 @@
 """The page of all cases, and the mean error of their worst tenth."""
 
+import json
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -10,6 +12,9 @@ from benchmarks.scoreboard.cases import Case, LogCase
 from benchmarks.scoreboard.measure import DISTURBED
 from benchmarks.scoreboard.played import Numbers
 from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.evaluation.parallel_jobs import Failure, read_report
+from thinmap_ros.files.safe import read_text
 
 MAX_ERROR_M = 10.0  # larger errors count as this
 _SHORT_S = 240.0  # of the processor for the short form
@@ -213,3 +218,66 @@ def _mean_and_worst(metres: np.ndarray) -> str:
 
 def _cell(report: Numbers, key: str, form: str) -> str:
     return format(report[key], form) if key in report else ''
+
+
+_SAME = 0.05  # a change of an error by a smaller share, or by less than 5 mm, is not listed
+_SAME_M = 0.005
+
+
+def against(
+    cases: Sequence[Case], reports: Sequence[Numbers], others: Sequence[Numbers | None]
+) -> str:
+    """Markdown: live errors of both runs in their common cases, those that increase first."""
+    both = [k for k, other in enumerate(others) if other is not None]
+    common = [cases[k] for k in both]
+    ours = [reports[k] for k in both]
+    theirs = [other for other in others if other is not None]
+    here = errors(common, ours)
+    there = errors(common, theirs)
+    ratio = (here + 1e-6) / (there + 1e-6)
+    lines = [
+        f'## Comparison with another run ({len(both)} of {len(cases)} cases)\n',
+        f'Live error: median of the ratios {np.median(ratio):.3f}; worst tenth '
+        f'{worst_tenth(common, ours):.3f} m (other run {worst_tenth(common, theirs):.3f} m); '
+        f'{MAX_ERROR_M:g} m or failed: {np.count_nonzero(here >= MAX_ERROR_M)} '
+        f'(other run {np.count_nonzero(there >= MAX_ERROR_M)}). '
+        f'Changes by more than {_SAME:.0%} and '
+        f'{1000 * _SAME_M:.0f} mm:\n',
+    ]
+    changed = (np.abs(ratio - 1.0) > _SAME) & (np.abs(here - there) > _SAME_M)
+    rows = [
+        (common[k].name, f'{here[k]:.3f}', f'{there[k]:.3f}', f'{ratio[k]:.2f}')
+        for k in np.argsort(-ratio, kind='stable')
+        if changed[k]
+    ]
+    columns = ('case', 'this run (m)', 'other run (m)', 'ratio')
+    return '\n'.join([*lines, markdown(columns, rows), ''])
+
+
+RESULTS = 'results'
+FOLDER = 'board'  # a case of the complete scoreboard may have the same name
+
+
+def report_file(out: Path, name: str, folder: str = RESULTS) -> Path:
+    """File of the report of a case."""
+    return out / folder / f'{name}.json'
+
+
+def report_of(
+    out: Path, name: str, options: Numbers, failures: dict[str, Failure], folder: str = RESULTS
+) -> Numbers:
+    """Report of a case, or why it failed."""
+    if name in failures:
+        return {'name': name, 'error': failures[name].reason}
+    return read_report(report_file(out, name, folder), options)
+
+
+def reports_there(out: Path, cases: Sequence[Case], folder: str = RESULTS) -> list[Numbers | None]:
+    """Reports of another folder, whatever its options; None for a case that is not there.
+
+    Raises InputError where none is.
+    """
+    files = [report_file(out, case.name, folder) for case in cases]
+    if not any(file.exists() for file in files):
+        raise InputError(f'--against {out}: none of these cases has a result there')
+    return [json.loads(read_text(file)) if file.exists() else None for file in files]

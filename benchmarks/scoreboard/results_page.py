@@ -10,9 +10,8 @@ from pathlib import Path
 
 from benchmarks.charts import DOCS, OTHERS, OURS, Mark, Panel, chart_path, draw, picture, span
 from benchmarks.rows import markdown, read_rows
-from benchmarks.scoreboard.page import COLUMN_NOTES, case_tables
+from benchmarks.scoreboard.page import COLUMN_NOTES, FOLDER, case_tables
 from benchmarks.scoreboard.played import Numbers
-from benchmarks.scoreboard.reports import FOLDER
 from benchmarks.scoreboard.stamps import NAME as STAMPS
 from benchmarks.scoreboard.stamps import THINNED
 from thinmap_ros.core.errors import InputError

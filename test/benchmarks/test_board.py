@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scoreboard import __main__ as program
-from benchmarks.scoreboard.board import WORLDS, board_cases
-from benchmarks.scoreboard.board_rows import board_rows, board_table, cases_of
+from benchmarks.scoreboard.board import WORLDS, board_cases, board_rows, board_table, cases_of
 from benchmarks.scoreboard.cases import BuildingCase, DriveCase, LogCase, LoopCase
 from benchmarks.scoreboard.measure import LASERS, record_drive, world_of
 from benchmarks.scoreboard.recordings import RecordedSimulation, read_recording

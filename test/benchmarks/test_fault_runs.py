@@ -11,13 +11,12 @@ from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from std_srvs.srv import Trigger
 
-from benchmarks.faults import report
+from benchmarks.faults import judge
 from benchmarks.faults.causes import place_apart, reset_faults, sim_time_faults
 from benchmarks.faults.judge import Counts, Passed, PoseWatch, Record, uncounted
 from benchmarks.faults.kinds import KINDS, Fault, random_faults
-from benchmarks.faults.map_watch import Drawn, MapWatch
 from benchmarks.faults.stream_faults import StreamFaults
-from benchmarks.faults.track import Located, Track
+from benchmarks.faults.track import Drawn, Located, MapWatch, Track
 from benchmarks.node_processes import Processes
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
@@ -341,14 +340,14 @@ def test_table_and_file_name_what_must_not_happen(tmp_path: Path) -> None:
         Record(fault, 12.0, driven_m=1.9, recovered_s=6.0),
         Record(fault, 50.0, driven_m=7.5, collisions=1),
     ]
-    lines = report.table(records).splitlines()
+    lines = judge.table(records).splitlines()
     assert lines[1].split() == ['laser_inf', '2', '1', '0.00', '7.50', '6']
     assert lines[2].split() == ['none', '1', '0', '0.00', '9.00', '-']
     assert lines[3:] == [
         'laser_inf at 50.0 s: 1 collisions',
         'laser_inf at 50.0 s: drove 7.50 m, expected 2.0 m',
     ]
-    report.write_json(tmp_path / 'faults.json', records, {'seed': 4})
+    judge.write_json(tmp_path / 'faults.json', records, {'seed': 4})
     found = json.loads((tmp_path / 'faults.json').read_text())
     assert found['seed'] == 4
     assert [len(record['violations']) for record in found['records']] == [0, 0, 2]

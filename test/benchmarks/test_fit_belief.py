@@ -7,7 +7,6 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from benchmarks.exploration.cases import generated
 from benchmarks.exploration.fit_belief import (
     UNSEEN,
     fit,
@@ -18,7 +17,7 @@ from benchmarks.exploration.fit_belief import (
     reliability_table,
     source,
 )
-from benchmarks.exploration.observed_candidates import COLUMNS, Case, hidden_areas
+from benchmarks.exploration.observed_candidates import COLUMNS, Case, generated, hidden_areas
 from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.sim.coverage import ObservableCells

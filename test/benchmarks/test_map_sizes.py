@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.graphs.map_sizes import graph_in_bytes, grid_as_png, grid_in_bytes
+from benchmarks.graphs.floors import graph_in_bytes, grid_as_png, grid_in_bytes
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap

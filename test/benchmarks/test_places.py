@@ -5,10 +5,13 @@ import pytest
 from support.driven_pieces import driven_piece
 
 from benchmarks.places import tables
-from benchmarks.places.cases import with_shared_ground, without_shared_ground
 from benchmarks.places.generators import generators
-from benchmarks.places.recorded import RecordedPiece
-from benchmarks.places.truth import rigid_errors
+from benchmarks.places.pieces import (
+    RecordedPiece,
+    rigid_errors,
+    with_shared_ground,
+    without_shared_ground,
+)
 from benchmarks.rows import shown
 from thinmap_ros.core import se2
 

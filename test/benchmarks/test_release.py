@@ -10,10 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.release.command import listing, matching
-from benchmarks.release.runner import run_steps
-from benchmarks.release.state import State, read_state
-from benchmarks.release.steps import MAX_MINUTES, Folders, Step, steps
+from benchmarks.release import (
+    MAX_MINUTES,
+    Folders,
+    State,
+    Step,
+    listing,
+    matching,
+    read_state,
+    run_steps,
+    steps,
+)
 from thinmap_ros.core.errors import ConfigError, InputError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,9 +30,9 @@ HOUR_S = 3600.0
 PROGRAM = """
 import sys
 from pathlib import Path
-from benchmarks.release.runner import run_steps
-from benchmarks.release.state import read_state
-from benchmarks.release.steps import Step
+from benchmarks.release import run_steps
+from benchmarks.release import read_state
+from benchmarks.release import Step
 folder = Path(sys.argv[1])
 pid = str(folder / 'pid')
 child = f"import os, time; open({pid!r}, 'w').write(str(os.getpid())); time.sleep(600)"

@@ -23,9 +23,8 @@ from benchmarks.scoreboard.cases import (
     compared_with,
     repeated,
 )
-from benchmarks.scoreboard.compare import against
 from benchmarks.scoreboard.measure import Task, _disturbed, measure
-from benchmarks.scoreboard.page import MAX_ERROR_M, errors, page, shortened, worst_tenth
+from benchmarks.scoreboard.page import MAX_ERROR_M, against, errors, page, shortened, worst_tenth
 from benchmarks.scoreboard.played import Played, consistency
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError

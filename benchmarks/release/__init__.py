@@ -1,1 +1,0 @@
-"""All results of a release in one run that can be interrupted."""
