@@ -1,7 +1,8 @@
 """Charts of the results pages: one row for each program or case, one colour for each meaning."""
 
 import math
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,3 +128,9 @@ def _style(colour: str, is_filled: bool) -> dict[str, Any]:
     """Style of a marker: a disc, or a ring that leaves a disc at the same place visible."""
     face = colour if is_filled else 'none'
     return {'marker': 'o', 'markersize': 6 if is_filled else 9, 'markerfacecolor': face}
+
+
+def page_program(write: Callable[[Path, Path], Path]) -> None:
+    """Write a page of a folder of results; words of the command line: it, and that of the pages."""
+    results, *docs = map(Path, sys.argv[1:])
+    print(write(results, docs[0] if docs else DOCS))

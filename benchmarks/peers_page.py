@@ -4,11 +4,10 @@ Usage: python -m benchmarks.peers_page DIR [DOCS]. DIR has the folder slam of `p
 release`. The text is that of peers_page.md.
 """
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.charts import DOCS, OTHERS, OURS, Mark, Panel, chart_path, draw, picture
+from benchmarks.charts import OTHERS, OURS, Mark, Panel, chart_path, draw, page_program, picture
 from benchmarks.rows import markdown
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.results_page import made_lines, read_reports
@@ -120,4 +119,4 @@ def _errors() -> list[Mark]:
 
 
 if __name__ == '__main__':
-    print(write(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else DOCS))
+    page_program(write)

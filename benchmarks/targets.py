@@ -4,10 +4,9 @@ Usage: python -m benchmarks.targets DIR [DOCS]. DIR has the folders slam, speed 
 `python -m benchmarks release`; those that are missing are left out.
 """
 
-import sys
 from pathlib import Path
 
-from benchmarks.charts import DOCS
+from benchmarks.charts import page_program
 from benchmarks.kidnapped.page import sections as localization_sections
 from benchmarks.rows import VERDICTS, markdown
 from benchmarks.scoreboard.board import board_table
@@ -92,4 +91,4 @@ def table_of(lines: list[_Line]) -> str:
 
 
 if __name__ == '__main__':
-    print(write(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else DOCS))
+    page_program(write)

@@ -4,13 +4,12 @@ Usage: python -m benchmarks.graphs.real_maps_page MAPS [DOCS]. MAPS has map_serv
 or not.
 """
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 from PIL import Image
 
-from benchmarks.charts import DOCS
+from benchmarks.charts import page_program
 from benchmarks.graphs.route_measures import RouteMeasures, made, maps_below, measure
 from benchmarks.rows import markdown
 from thinmap_ros.core.errors import InputError
@@ -108,11 +107,5 @@ def _figure(name: str, file: str) -> str:
     return f'\n![{caption}](../{_IMAGES.as_posix()}/{file})\n\n*{caption}*\n'
 
 
-def main() -> None:
-    """Write the page."""
-    maps, *rest = map(Path, sys.argv[1:])
-    print(write(maps, rest[0] if rest else DOCS))
-
-
 if __name__ == '__main__':
-    main()
+    page_program(write)

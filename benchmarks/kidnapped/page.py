@@ -4,10 +4,9 @@ Usage: python -m benchmarks.kidnapped.page DIR [DOCS_DIR].
 """
 
 import re
-import sys
 from pathlib import Path
 
-from benchmarks.charts import BAD, DOCS, OURS, Mark, Panel, chart_path, draw, picture
+from benchmarks.charts import BAD, OURS, Mark, Panel, chart_path, draw, page_program, picture
 from benchmarks.kidnapped.summary import by_group, summary
 from benchmarks.rows import Row, Written, markdown, read_records
 from thinmap_ros.core.errors import InputError
@@ -141,4 +140,4 @@ def _groups(records: list[Written]) -> list[str]:
 
 
 if __name__ == '__main__':
-    print(write(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else DOCS))
+    page_program(write)

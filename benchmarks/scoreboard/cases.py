@@ -1,7 +1,7 @@
 """What can be on the scoreboard: logs, degraded logs, drives, and explorations."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError
@@ -50,88 +50,78 @@ BY_HAND = (
 
 
 @dataclass(frozen=True)
-class LogCase:
+class _Case:
+    """What all cases have; run: as in `repeated`."""
+
+    run: int = field(default=0, kw_only=True)
+
+    @property
+    def first(self) -> str:
+        """Name of the run that is not disturbed."""
+        raise NotImplementedError
+
+    @property
+    def name(self) -> str:
+        """What it is called on the page, and its file."""
+        return f'{self.first}.run_{self.run}' if self.run else self.first
+
+
+@dataclass(frozen=True)
+class LogCase(_Case):
     """A log of a folder, perhaps degraded; exact_s: how near a pose must be to a relation's stamp.
 
-    options: of degrade_log.py; run: as in `repeated`.
+    options: of degrade_log.py.
     """
 
     log: str
     version: str = ''
     options: tuple[str, ...] = ()
     exact_s: float = 0.1
-    run: int = 0
 
     @property
     def first(self) -> str:
-        """Name of the run that is not disturbed."""
+        """Name of the log, and of what was made worse."""
         return f'{self.log}.{self.version}' if self.version else self.log
-
-    @property
-    def name(self) -> str:
-        """What it is called on the page, and its file."""
-        return _numbered(self.first, self.run)
 
 
 @dataclass(frozen=True)
-class BuildingCase:
-    """A drive through a generated building; noise: times that of the robot's odometry.
-
-    run: as in `repeated`.
-    """
+class BuildingCase(_Case):
+    """A drive through a generated building; noise: times that of the robot's odometry."""
 
     seed: int
     robot: str
     noise: float
-    run: int = 0
 
     @property
     def first(self) -> str:
-        """Name of the run that is not disturbed."""
+        """Seed, robot and noise."""
         return f'building_{self.seed:03d}.{self.robot}_x{self.noise:g}'
-
-    @property
-    def name(self) -> str:
-        """What it is called on the page, and its file."""
-        return _numbered(self.first, self.run)
 
 
 @dataclass(frozen=True)
-class DriveCase:
+class DriveCase(_Case):
     """A recorded exploration of a world, replayed with the odometry noise of a seed."""
 
     world: str
     odometry_seed: int
-    run: int = 0
 
     @property
     def first(self) -> str:
-        """Name of the run that is not disturbed."""
-        return self.name
-
-    @property
-    def name(self) -> str:
-        """What it is called on the page, and its file."""
+        """World and seed."""
         return f'drive_{flat(self.world)}.odometry_{self.odometry_seed}'
 
 
 @dataclass(frozen=True)
-class LoopCase:
+class LoopCase(_Case):
     """An exploration of a world by the estimated pose; laser: a name of LASERS."""
 
     world: str
     seed: int
     laser: str = 'lms200'
-    run: int = 0
 
     @property
     def first(self) -> str:
-        """Name of the run that is not disturbed."""
-        return self.name
-
-    @property
-    def name(self) -> str:
-        """What it is called on the page, and its file."""
+        """World, laser and seed."""
         return f'loop_{flat(self.world)}.{self.laser}_{self.seed}'
 
 
@@ -183,10 +173,6 @@ def compared_with(case: Case, logs: Path) -> str:
     if isinstance(case, LogCase) and not (logs / case.log / 'relations').exists():
         return case.log
     return case.name
-
-
-def _numbered(name: str, run: int) -> str:
-    return f'{name}.run_{run}' if run else name
 
 
 def _log(name: str, version: str = '', options: tuple[str, ...] = ()) -> LogCase:

@@ -4,11 +4,20 @@ Usage: python -m benchmarks.scoreboard.results_page DIR [DOCS].
 """
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.charts import DOCS, OTHERS, OURS, Mark, Panel, chart_path, draw, picture, span
+from benchmarks.charts import (
+    OTHERS,
+    OURS,
+    Mark,
+    Panel,
+    chart_path,
+    draw,
+    page_program,
+    picture,
+    span,
+)
 from benchmarks.rows import markdown, read_rows
 from benchmarks.scoreboard.page import COLUMN_NOTES, FOLDER, case_tables
 from benchmarks.scoreboard.played import Numbers
@@ -266,4 +275,4 @@ def _marks(ours: Numbers, log: str) -> list[Mark]:
 
 
 if __name__ == '__main__':
-    print(write(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else DOCS))
+    page_program(write)

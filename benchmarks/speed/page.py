@@ -5,10 +5,9 @@ a folder of the board beside DIR, slam.
 """
 
 import re
-import sys
 from pathlib import Path
 
-from benchmarks.charts import DOCS, OTHERS, Mark, Panel, chart_path, draw, picture
+from benchmarks.charts import OTHERS, Mark, Panel, chart_path, draw, page_program, picture
 from benchmarks.rows import markdown, read_rows
 from benchmarks.scoreboard.results_page import read_reports
 from thinmap_ros.core.errors import InputError
@@ -222,4 +221,4 @@ def _indented(row: list[str]) -> list[str]:
 
 
 if __name__ == '__main__':
-    print(write(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else DOCS))
+    page_program(write)
