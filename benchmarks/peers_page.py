@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.charts import OTHERS, OURS, Mark, Panel, chart_path, draw, page_program, picture
-from benchmarks.rows import markdown
+from benchmarks.rows import markdown, read_records
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.results_page import made_lines, read_reports
 from thinmap_ros.evaluation.parallel_jobs import provenance
@@ -25,6 +25,14 @@ _COLUMNS = (
     'memory (MB)',
     'thinmap, live / final',
     'source',
+)
+_LAMA = Path(__file__).parent / 'peers'
+_LAMA_COLUMNS = (
+    'run',
+    'scans processed',
+    'live (m)',
+    'CPU ms per scan',
+    'per processed scan',
 )
 _TEMPLATE = Path(__file__).with_suffix('.md')
 
@@ -45,11 +53,18 @@ def write(folder: Path, docs: Path) -> Path:
 def page(ours: dict[str, Numbers]) -> str:
     """Text of the page; ours: reports of thinmap by log."""
     caption = 'Intel Research Lab, 5,438 scans: error, time and memory of all programs.'
-    figures = markdown(_COLUMNS, [_cells(run, ours.get(run.log)) for run in PEERS])
+    figures = {
+        origin: [_cells(run, ours.get(run.log)) for run in PEERS if run.origin is origin]
+        for origin in Origin
+    }
+    records = [record.values() for record in read_records(_LAMA / 'peers.csv')]
     return read_text(_TEMPLATE).format(
         chart=picture(_CHART, caption),
         made=made_lines(list(ours.values())),
-        figures=figures,
+        figures=markdown(_COLUMNS, figures[Origin.TEAM]),
+        published=markdown(_COLUMNS, figures[Origin.PUBLISHED]),
+        lama=markdown(_LAMA_COLUMNS, records),
+        lama_made=provenance(_LAMA),
         losses='\n'.join(_losses(ours)),
     )
 

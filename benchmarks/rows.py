@@ -1,7 +1,7 @@
 """Rows of results: a value with its target, records of runs, as CSV and as tables in Markdown."""
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +24,14 @@ class Row:
     value: str
     target: str = ''
     good: bool | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A run: a name that no other case of its file has, and what returns its record."""
+
+    name: str
+    run: Callable[[], dict[str, Any]]
 
 
 def at_most(what: str, value: float, limit: float, unit: str = '') -> Row:
@@ -109,3 +117,11 @@ def show_tables(tables: Iterable[Table], folder: Path | None = None) -> None:
             write_text(folder / f'{table.name}.csv', table.csv())
     if folder is not None:
         write_provenance(folder)
+
+
+def run_pending(cases: Iterable[Case], path: Path) -> None:
+    """Run the cases that a file does not have yet, and add a line for each."""
+    done = {record['case'] for record in read_records(path)}
+    for case in cases:
+        if case.name not in done:
+            add_record(path, {'case': case.name, **case.run()})

@@ -10,21 +10,13 @@ import argparse
 from itertools import islice
 from pathlib import Path
 
-from benchmarks.kidnapped.cases import ROWS, Case, Setting
+from benchmarks.kidnapped.cases import ROWS, Setting
 from benchmarks.kidnapped.summary import summary
-from benchmarks.rows import add_record, read_records, show
+from benchmarks.rows import read_records, run_pending, show
 from benchmarks.worlds import WORLDS
 from thinmap_ros.evaluation.parallel_jobs import write_provenance
 
 _LOG = WORLDS.parent / 'logs' / 'intel' / 'log.clf'
-
-
-def run_pending(cases: list[Case], path: Path) -> None:
-    """Run the cases that a file does not have yet, and add a line for each."""
-    done = {record['case'] for record in read_records(path)}
-    for case in cases:
-        if case.name not in done:
-            add_record(path, {'case': case.name, **case.run()})
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.kidnapped import trials
 from benchmarks.kidnapped.trials import Map, Record, fresh, prepared, search
+from benchmarks.rows import Case
 from benchmarks.worlds import floors
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
@@ -37,14 +38,6 @@ LASERS = {
     '360 deg in 1, 4 m': LaserScannerConfig(beams=360, field_of_view_deg=360.0, range_max_m=4.0),
     '240 deg in 0.36, 4 m': LaserScannerConfig(beams=667, field_of_view_deg=240.0, range_max_m=4.0),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """One robot: a name that no other case of the row has, and what tells how it ends."""
-
-    name: str
-    run: Callable[[], Record]
 
 
 @dataclass(frozen=True)

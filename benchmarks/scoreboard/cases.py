@@ -141,12 +141,12 @@ def all_cases(logs: Path) -> list[Case]:
     names = sorted({path.parent.name for path in logs.glob('*/log.clf*')})
     if not names:
         raise InputError(f'{logs}: no NAME/log.clf in it: expected folders with logs')
-    cases: list[Case] = [_log(name) for name in names]
+    cases: list[Case] = [log_case(name) for name in names]
     for name in names:
         versions = _DEGRADED_OF.get(name, DEGRADED)
-        cases += [_log(name, version, DEGRADED[version]) for version in versions]
+        cases += [log_case(name, version, DEGRADED[version]) for version in versions]
     thinned = [name for name in _THINNED_LOGS if name in names]
-    cases += [_log(name, *item) for name in thinned for item in THINNED.items()]
+    cases += [log_case(name, *item) for name in thinned for item in THINNED.items()]
     cases += [
         BuildingCase(seed, robot, noise)
         for seed in BUILDINGS
@@ -175,6 +175,7 @@ def compared_with(case: Case, logs: Path) -> str:
     return case.name
 
 
-def _log(name: str, version: str = '', options: tuple[str, ...] = ()) -> LogCase:
+def log_case(name: str, version: str = '', options: tuple[str, ...] = ()) -> LogCase:
+    """The case of a log, whose stamps are near enough to those of its relations."""
     exact = name.endswith('_raw') or (name == 'intel' and version == 'rate_1hz')
     return LogCase(name, version, options, EXACT_S if exact else 0.1)

@@ -125,7 +125,7 @@ def _measure_log(case: LogCase, task: Task) -> Numbers:
     own = task.data / 'logs' / case.log
     if case.version:
         own = _degraded(case, own, task.degrade, task.folder)
-    scans = _disturbed(_scans(own, case.log), case.run)
+    scans = _disturbed(scans_of(own, case.log), case.run)
     played = play(scans, config_of(task.options), task.scans_per_graph)
     numbers = played.numbers()
     times = np.array(played.stamps_ns) / 1e9
@@ -196,7 +196,7 @@ def _degraded(case: LogCase, own: Path, degrade: Path, folder: Path) -> Path:
     return made
 
 
-def _scans(own: Path, laser: str) -> Iterator[tuple[Scan, Array]]:
+def scans_of(own: Path, laser: str) -> Iterator[tuple[Scan, Array]]:
     """Scans with the odometry at their stamps, in the order of the file."""
     return paired_scans(open_log(next(own.glob('log.clf*')), laser_of(own, laser)))
 

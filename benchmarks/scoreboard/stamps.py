@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.rows import Row, show
 from benchmarks.scoreboard.cases import EXACT_S
-from benchmarks.scoreboard.measure import play
+from benchmarks.scoreboard.measure import play, scans_of
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import config_with
 from thinmap_ros.evaluation.parallel_jobs import write_provenance
@@ -24,8 +24,6 @@ from thinmap_ros.evaluation.trajectory_errors import (
     known_relation_errors,
     relation_errors,
 )
-from thinmap_ros.experiments.slam.logs import laser_of
-from thinmap_ros.logs.reading import open_log, paired_scans
 
 COMPLETE = 'intel_raw'
 THINNED = 'intel'
@@ -79,8 +77,7 @@ def _at_stamps_of(thinned: Path_, complete: Path_) -> Path_:
 
 
 def _live(folder: Path) -> Path_:
-    scans = paired_scans(open_log(next(folder.glob('log.clf*')), laser_of(folder, folder.name)))
-    played = play(scans, config_with({}), _SCANS_PER_GRAPH)
+    played = play(scans_of(folder, folder.name), config_with({}), _SCANS_PER_GRAPH)
     return np.array(played.stamps_ns) / 1e9, np.array(played.poses)
 
 

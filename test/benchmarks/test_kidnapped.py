@@ -7,12 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kidnapped.__main__ import run_pending
-from benchmarks.kidnapped.cases import Case
 from benchmarks.kidnapped.page import page
 from benchmarks.kidnapped.summary import summary
 from benchmarks.kidnapped.trials import Record
-from benchmarks.rows import read_records
+from benchmarks.rows import Case, read_records, run_pending
 
 
 def cases(ran: list[str], outcomes: dict[str, str]) -> list[Case]:

@@ -1,0 +1,1 @@
+"""Other programs, which anybody can build, beside thinmap on the same scans."""
