@@ -15,7 +15,7 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from io import BytesIO
+from io import BufferedReader, BytesIO, RawIOBase
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -48,29 +48,29 @@ class DamagedError(Exception):
     """Damaged bytes: what was found, and what was expected."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Records:
     """The records of a chunk, or of a range of the file without chunks.
 
-    definitions: schemas and channels; log_ns (N,), channel_ids (N,), offsets (N,): the messages of
-    the wanted channels in file order, with offsets into `data`, which holds only these; count,
-    first_ns, all_channel_ids: number, earliest log time (0 if there are none) and channels of all
-    messages; damaged: why records were omitted, else empty.
+    definitions: schemas and channels; log_ns (N,), offsets (N,): the messages of the wanted
+    channels in file order, with offsets into `data`, which holds only these; count, first_ns,
+    channel_ids: number, earliest log time and channels of all messages; damaged: why records were
+    omitted, else empty.
     """
 
-    data: bytes | bytearray
-    definitions: list[Definition]
-    log_ns: NDArray[np.uint64]
-    channel_ids: NDArray[np.uint16]
-    offsets: NDArray[np.uint64]
-    count: int
-    first_ns: int
-    all_channel_ids: frozenset[int]
+    data: bytearray = field(default_factory=bytearray)
+    definitions: list[Definition] = field(default_factory=list)
+    log_ns: 'array[int]' = field(default_factory=lambda: array('Q'))
+    offsets: 'array[int]' = field(default_factory=lambda: array('Q'))
+    count: int = 0
+    first_ns: int = LATEST_NS
+    channel_ids: set[int] = field(default_factory=set)
     damaged: str = ''
+    _is_last_kept: bool = False
 
     def message(self, index: int) -> Message:
         """Message by its index in `offsets`."""
-        at = int(self.offsets[index])
+        at = self.offsets[index]
         (_, length) = HEAD.unpack_from(self.data, at - HEAD.size)
         channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(self.data, at)
         content = bytes(self.data[at + _MESSAGE.size : at + length])
@@ -78,7 +78,30 @@ class Records:
 
     def messages(self) -> Iterator[Message]:
         """All messages in the order of the file."""
-        return (self.message(index) for index in range(self.offsets.size))
+        return (self.message(index) for index in range(len(self.offsets)))
+
+    def add_message(self, channel_id: int, log_ns: int, record: bytes) -> None:
+        """Count a message, and keep its whole record, unless that is empty."""
+        self.count += 1
+        self.first_ns = min(self.first_ns, log_ns)
+        self.channel_ids.add(channel_id)
+        self._is_last_kept = bool(record)
+        if record:
+            self.log_ns.append(log_ns)
+            self.offsets.append(len(self.data) + HEAD.size)
+            self.data += record
+
+    def omit(self, reason: str) -> None:
+        """Something is damaged; the first reason counts."""
+        self.damaged = self.damaged or reason
+
+    def drop_last(self) -> None:
+        """Omit the last message, once."""
+        self.count = max(self.count - 1, 0)
+        if self._is_last_kept:
+            del self.log_ns[-1:]
+            del self.offsets[-1:]
+        self._is_last_kept = False
 
 
 class Section:
@@ -113,16 +136,13 @@ def chunk_records(content: Section, whole: bool, wanted: frozenset[int] | None =
     # The length of the record itself may be damaged.
     complete = content.left >= length
     content.left = min(content.left, length)
-    found = _Found(wanted)
-    checked = 0
-    for piece in _pieces(compression, content, size, complete):
-        checked = zlib.crc32(piece, checked)
-        found.feed(piece)
-    if complete and found.size != size:
-        raise DamagedError(f'{found.size} bytes uncompressed: expected {size}')
-    if complete and checksum and checked != checksum:
+    stream = _Unpacked(_pieces(compression, content, size, complete))
+    records = _records(stream, size, complete, wanted)
+    if complete and stream.size != size:
+        raise DamagedError(f'{stream.size} bytes uncompressed: expected {size}')
+    if complete and checksum and stream.checksum != checksum:
         raise DamagedError('wrong checksum')
-    return found.records(complete)
+    return records
 
 
 def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> bytes:
@@ -178,165 +198,110 @@ def _lz4_pieces(data: Section) -> Iterator[bytes]:
             return
 
 
-def plain_records(
-    content: Section, whole: bool = True, wanted: frozenset[int] | None = None
-) -> Records:
+def plain_records(content: Section, wanted: frozenset[int] | None = None) -> Records:
     """Consecutive records outside of chunks, up to the end or to bytes that are no record.
 
-    The message before such bytes is omitted, too: most likely its length is wrong. In truncated
-    data (not `whole`) an incomplete last record is expected. wanted: as in `chunk_records`. Raises
-    DamagedError if there are too many definitions.
+    The message before such bytes is omitted, too: most likely its length is wrong. wanted: as in
+    `chunk_records`. Raises DamagedError if there are too many definitions.
     """
-    found = _Found(wanted)
-    for piece in _plain_pieces(content):
-        found.feed(piece)
-    return found.records(whole)
+    return _records(_Unpacked(_plain_pieces(content)), content.left, True, wanted)
 
 
-class _Found:
-    """Collects the records of a stream of bytes, in 18 bytes per message that is wanted."""
+class _Unpacked(RawIOBase):
+    """Pieces of bytes as a stream; counts what it has read, with its checksum."""
 
-    def __init__(self, wanted: frozenset[int] | None) -> None:
-        self.size = 0  # bytes so far
-        self._wanted = wanted
-        self._definitions: list[Definition] = []
-        self._messages = _Messages()
-        self._buffer = bytearray()  # of the record that is not complete yet
-        self._skipped = 0  # remaining bytes of a record that is not kept
-        self._skipped_message: tuple[int, int] | None = None  # its channel and log time
-        self._end_at: int | None = None  # of the records, where bytes follow that are none
-        self._damaged = ''
+    def __init__(self, pieces: Iterator[bytes]) -> None:
+        self.size = 0
+        self.checksum = 0
+        self._pieces = pieces
+        self._piece = memoryview(b'')
 
-    def feed(self, piece: bytes) -> None:
-        """Add bytes. Raises DamagedError if there are too many definitions."""
-        self.size += len(piece)
-        if self._end_at is not None:
-            return
-        jump = min(self._skipped, len(piece))
-        self._skipped -= jump
-        if self._skipped == 0 and self._skipped_message is not None:
-            self._messages.count(*self._skipped_message)
-            self._skipped_message = None
-        self._buffer += memoryview(piece)[jump:]
-        del self._buffer[: self._parse()]
+    def readable(self) -> bool:
+        return True
 
-    def records(self, whole: bool) -> Records:
-        """The records so far; whole: the bytes are complete."""
-        at = self.size - len(self._buffer) if self._end_at is None else self._end_at
-        is_record = self._end_at is None
-        is_cut = self._skipped > 0 or at < self.size
-        if is_cut and (whole or not is_record):
-            self._damaged = self._damaged or f'no record at byte {at} of {self.size}'
-            self._messages.drop_last()
-        return self._messages.as_records(self._definitions, self._damaged)
-
-    def _parse(self) -> int:
-        """Add the complete records of the buffer; returns how many of its bytes they take."""
-        data = self._buffer
-        at = 0
-        while at + HEAD.size <= len(data):
-            code, length = HEAD.unpack_from(data, at)
-            if code not in _PLAIN and code < FIRST_PRIVATE_OPCODE:
-                self._end_at = self.size - len(data) + at
-                break
-            start = at + HEAD.size
-            if start + length > len(data):
-                return self._skip(code, start, length) or at
-            self._add(code, start, length)
-            at = start + length
-        return at
-
-    def _skip(self, code: int, start: int, length: int) -> int:
-        """Skip an incomplete record that is not kept; returns the bytes up to the end, or 0."""
-        available = len(self._buffer) - start
-        if code == Opcode.MESSAGE and min(length, available) >= _MESSAGE.size:
-            channel_id, _, log_ns, _ = _MESSAGE.unpack_from(self._buffer, start)
-            if self._is_wanted(channel_id) or log_ns >= LATEST_NS:
+    def readinto(self, buffer: Any) -> int:
+        while not self._piece:
+            piece = next(self._pieces, None)
+            if piece is None:
                 return 0
-            self._skipped_message = (channel_id, log_ns)
-        elif code < FIRST_PRIVATE_OPCODE:
-            return 0
-        self._skipped = length - available
-        return len(self._buffer)
-
-    def _is_wanted(self, channel_id: int) -> bool:
-        return self._wanted is None or channel_id in self._wanted
-
-    def _add(self, code: int, start: int, length: int) -> None:
-        """Add a record by the position of its content, or store why it is invalid."""
-        data = self._buffer
-        try:
-            if code == Opcode.MESSAGE:
-                self._add_message(start, length)
-            elif code in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._definitions.append(definition(code, bytes(data[start : start + length])))
-        except DamagedError as error:
-            self._damaged = self._damaged or str(error)
-        if len(self._definitions) > LOGS.definitions:
-            raise DamagedError(f'more than {LOGS.definitions} schemas and channels')
-
-    def _add_message(self, start: int, length: int) -> None:
-        if length < _MESSAGE.size:
-            raise DamagedError(f'message of {length} bytes: expected at least {_MESSAGE.size}')
-        channel_id, _, log_ns, _ = _MESSAGE.unpack_from(self._buffer, start)
-        if log_ns >= LATEST_NS:
-            raise DamagedError(f'message logged at {log_ns} ns: expected less than {LATEST_NS}')
-        self._messages.count(channel_id, log_ns)
-        if self._is_wanted(channel_id):
-            record = memoryview(self._buffer)[start - HEAD.size : start + length]
-            self._messages.keep(channel_id, log_ns, record)
-            record.release()  # the buffer can be shortened again
+            self.size += len(piece)
+            self.checksum = zlib.crc32(piece, self.checksum)
+            self._piece = memoryview(piece)
+        n = min(len(buffer), len(self._piece))
+        buffer[:n] = self._piece[:n]
+        self._piece = self._piece[n:]
+        return n
 
 
-class _Messages:
-    """Messages: the number of all, and the content of those that are kept."""
+def _records(unpacked: _Unpacked, size: int, whole: bool, wanted: frozenset[int] | None) -> Records:
+    """Records of a stream of `size` bytes; in truncated data the last one may be incomplete."""
+    stream = BufferedReader(unpacked, _SLICE)
+    found = Records()
+    at = 0
+    is_record = True
+    is_complete = True
+    while is_complete and (head := stream.read(HEAD.size)):
+        code, length = HEAD.unpack(head) if len(head) == HEAD.size else (Opcode.MESSAGE, size)
+        is_record = code in _PLAIN or code >= FIRST_PRIVATE_OPCODE
+        end = at + HEAD.size + length
+        is_complete = is_record and end <= size and _add(found, stream, head, wanted)
+        at = end if is_complete else at
+    _skip(stream, size)
+    if not is_complete and (whole or not is_record):
+        found.omit(f'no record at byte {at} of {unpacked.size}')
+        found.drop_last()
+    return found
 
-    def __init__(self) -> None:
-        self._data = bytearray()
-        self._log_ns = array('Q')
-        self._channel_ids = array('H')
-        self._offsets = array('Q')
-        self._count = 0
-        self._first_ns = LATEST_NS
-        self._all_channel_ids: set[int] = set()
-        self._is_last_kept = False
 
-    def count(self, channel_id: int, log_ns: int) -> None:
-        """Count a message."""
-        self._count += 1
-        self._first_ns = min(self._first_ns, log_ns)
-        self._all_channel_ids.add(channel_id)
-        self._is_last_kept = False
+def _add(found: Records, stream: BinaryIO, head: bytes, wanted: frozenset[int] | None) -> bool:
+    """Add the record behind a head, or why it is invalid; returns whether it is complete."""
+    code, length = HEAD.unpack(head)
+    if code == Opcode.MESSAGE and length >= _MESSAGE.size:
+        return _add_message(found, stream, head, wanted)
+    if code >= FIRST_PRIVATE_OPCODE:
+        return _skip(stream, length)
+    content = stream.read(length)
+    if len(content) < length:
+        return False
+    if code == Opcode.MESSAGE:
+        found.omit(f'message of {length} bytes: expected at least {_MESSAGE.size}')
+        return True
+    try:
+        found.definitions.append(definition(code, content))
+    except DamagedError as error:
+        found.omit(str(error))
+    if len(found.definitions) > LOGS.definitions:
+        raise DamagedError(f'more than {LOGS.definitions} schemas and channels')
+    return True
 
-    def keep(self, channel_id: int, log_ns: int, record: memoryview) -> None:
-        """Keep the whole record of the message that was counted last."""
-        self._log_ns.append(log_ns)
-        self._channel_ids.append(channel_id)
-        self._offsets.append(len(self._data) + HEAD.size)
-        self._data += record
-        self._is_last_kept = True
 
-    def drop_last(self) -> None:
-        """Omit the last message, once."""
-        self._count = max(self._count - 1, 0)
-        if self._is_last_kept:
-            for values in (self._log_ns, self._channel_ids, self._offsets):
-                del values[-1:]
-        self._is_last_kept = False
+def _add_message(
+    found: Records, stream: BinaryIO, head: bytes, wanted: frozenset[int] | None
+) -> bool:
+    fields = stream.read(_MESSAGE.size)
+    if len(fields) < _MESSAGE.size:
+        return False
+    channel_id, _, log_ns, _ = _MESSAGE.unpack(fields)
+    rest = int(HEAD.unpack(head)[1]) - _MESSAGE.size
+    record = b''
+    if wanted is None or channel_id in wanted:
+        content = stream.read(rest)
+        is_complete = len(content) == rest
+        record = head + fields + content
+    else:
+        is_complete = _skip(stream, rest)
+    if is_complete and log_ns >= LATEST_NS:
+        found.omit(f'message logged at {log_ns} ns: expected less than {LATEST_NS}')
+    elif is_complete:
+        found.add_message(channel_id, log_ns, record)
+    return is_complete
 
-    def as_records(self, definitions: list[Definition], damaged: str) -> Records:
-        """The messages, with the definitions that were found among them."""
-        return Records(
-            self._data,
-            definitions,
-            np.frombuffer(self._log_ns, dtype=np.uint64),
-            np.frombuffer(self._channel_ids, dtype=np.uint16),
-            np.frombuffer(self._offsets, dtype=np.uint64),
-            self._count,
-            self._first_ns if self._count else 0,
-            frozenset(self._all_channel_ids),
-            damaged,
-        )
+
+def _skip(stream: BinaryIO, size: int) -> bool:
+    """Skip bytes, in pieces; returns whether there were as many."""
+    while size > 0 and (piece := stream.read(min(size, PIECE_BYTES))):
+        size -= len(piece)
+    return size == 0
 
 
 def definition(code: int, content: bytes) -> Definition:
@@ -577,12 +542,12 @@ def _first_pass(
             for record in records.definitions:
                 definitions.add(record)
             # A recorder defines a channel when it subscribes, some time before the first message.
-            while packed and any(definitions.of(k) is None for k in records.all_channel_ids):
+            while packed and any(definitions.of(k) is None for k in records.channel_ids):
                 earlier = _load_intact(stream, packed.pop(), frozenset(), damage)
                 for record in earlier.definitions if earlier else ():
                     definitions.add_missing(record)
             if records.count:
-                channel_ids = records.all_channel_ids
+                channel_ids = frozenset(records.channel_ids)
                 yield replace(block, first_ns=records.first_ns, channel_ids=channel_ids)
 
 
