@@ -29,10 +29,11 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.jit import cache as kernel_cache
 
+_WORTH_BYTES = 4e6
+_REPORT_PERIOD_S = 5.0
 
-def compiler_memory_releaser(
-    period_s: float = 3.0, threshold_bytes: float = 4e6
-) -> Callable[[], None]:
+
+def compiler_memory_releaser(period_s: float = 3.0) -> Callable[[], None]:
     """Return a function that releases the pages of the compiler, to be called repeatedly.
 
     Kernels that are loaded later, with the first message, load the compiler again.
@@ -43,7 +44,7 @@ def compiler_memory_releaser(
     def look() -> None:
         nonlocal looked_at, least
         if time.monotonic() - looked_at > period_s:
-            if _shared_bytes() > least + threshold_bytes:
+            if _shared_bytes() > least + _WORTH_BYTES:
                 release_compiler_pages()
                 least = _shared_bytes()
             looked_at = time.monotonic()
@@ -99,12 +100,11 @@ def _clean_mappings(smaps: str, name: str) -> Iterator[tuple[int, int]]:
 class CompilationReport(event.Listener):
     """Reports on stderr how many kernels are compiled: it delays the first start of a program."""
 
-    def __init__(self, period_s: float = 5.0) -> None:
-        self._period_s = period_s
+    def __init__(self) -> None:
         self._depth = 0
         self._seconds = 0.0
         self._began_at = 0.0
-        self._told_at = -period_s
+        self._told_at = -_REPORT_PERIOD_S
 
     def on_start(self, event: Any) -> None:
         """Handle the start of a compilation, possibly nested in another one."""
@@ -112,7 +112,7 @@ class CompilationReport(event.Listener):
         if self._depth == 0:
             self._began_at = now
         self._depth += 1
-        if now - self._told_at >= self._period_s:
+        if now - self._told_at >= _REPORT_PERIOD_S:
             self._told_at = now
             # Kernels that are compiled for further types count once.
             there = sum(1 for kernel in jit.KERNELS if kernel.signatures)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 
 MAX_QUOTE_LENGTH = 200
+_LONGEST_NAME = 80
 _MAX_INTEGER = 10**30
 
 # Bounds on the contents of messages and files.
@@ -164,12 +165,12 @@ def require_lengths(what: str, lengths: Iterable[float]) -> None:
             raise InputError(f'{what}: {length} m: expected 0 to {se2.MAX_COORDINATE_M:g} m')
 
 
-def quoted_name(text: str, longest: int = 80) -> str:
+def quoted_name(text: str) -> str:
     """Shorten a topic, type or frame of a file for an error message.
 
     One line of printable characters, without quotation marks.
     """
-    return repr(text if len(text) <= longest else text[:longest] + '...')[1:-1]
+    return repr(text if len(text) <= _LONGEST_NAME else text[:_LONGEST_NAME] + '...')[1:-1]
 
 
 def quoted_names(names: Sequence[str]) -> str:

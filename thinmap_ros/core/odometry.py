@@ -20,6 +20,7 @@ from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, Field
 # Between samples that are further apart, the robot need not have moved evenly. Odometry at 1 Hz is
 # interpolated, with one lost sample.
 MAX_ODOMETRY_GAP_NS = 2 * SECOND_NS
+_SPAN_NS = 10 * SECOND_NS  # of the samples that are kept
 # A stream is silent when several samples are missing; stamps of real robots come in bunches.
 _SHORTEST_GAP_NS = SECOND_NS
 _GAP_PERIODS = 3.0
@@ -99,13 +100,12 @@ class OdometryBuffer:
     discarded: number of samples with such stamps.
     """
 
-    def __init__(self, span_ns: int = 10_000_000_000, max_gap_ns: int | None = None) -> None:
+    def __init__(self, max_gap_ns: int | None = None) -> None:
         """max_gap_ns: longest time that is interpolated, and that a stamp may step back.
 
         None: any within the span.
         """
         self.discarded = 0
-        self._span_ns = span_ns
         self._max_gap_ns = max_gap_ns
         self._is_begin_kept = True
         self._silence = SilenceDetector()
@@ -129,7 +129,7 @@ class OdometryBuffer:
                 f'odometry at {stamp_ns} ns: pose {pose}: expected finite numbers, at most '
                 f'{se2.MAX_COORDINATE_M:g} m'
             )
-        if self._stamps and stamp_ns < self._stamps[-1] - (self._max_gap_ns or self._span_ns):
+        if self._stamps and stamp_ns < self._stamps[-1] - (self._max_gap_ns or _SPAN_NS):
             self.discarded += len(self._stamps) - bisect_left(self._stamps, stamp_ns)
             self._is_begin_kept = False
             self._stamps = []
@@ -243,7 +243,7 @@ class OdometryBuffer:
         return np.asarray(np.interp(since_s, (known_ns - known_ns[0]) / SECOND_NS, headings))
 
     def _drop_old(self) -> None:
-        first = bisect_left(self._stamps, self._stamps[-1] - self._span_ns)
+        first = bisect_left(self._stamps, self._stamps[-1] - _SPAN_NS)
         # In blocks, so that a long buffer is not shifted at every sample.
         if first > 256:
             self._is_begin_kept = False
@@ -253,16 +253,15 @@ class OdometryBuffer:
 class TiltBuffer:
     """How far a robot is tilted, in the last ten seconds, looked up by stamp."""
 
-    def __init__(self, span_ns: int = 10 * SECOND_NS) -> None:
-        self._span_ns = span_ns
+    def __init__(self) -> None:
         self._samples: deque[tuple[int, float]] = deque()
 
     def add(self, stamp_ns: int, tilt_rad: float) -> None:
         """Add a sample: angle between the vertical and that of the robot, rad."""
-        if self._samples and stamp_ns < self._samples[-1][0] - self._span_ns:
+        if self._samples and stamp_ns < self._samples[-1][0] - _SPAN_NS:
             self._samples.clear()
         self._samples.append((stamp_ns, tilt_rad))
-        while self._samples[0][0] < stamp_ns - self._span_ns:
+        while self._samples[0][0] < stamp_ns - _SPAN_NS:
             self._samples.popleft()
 
     def at(self, stamp_ns: int) -> float:

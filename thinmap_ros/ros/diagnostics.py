@@ -28,6 +28,9 @@ _FAILED_S = 5.0
 _MAX_TRACEBACKS = 20  # in the log of a node, each of another place in the code
 _TOPICS_OF_EVERY_NODE = ('/parameter_events', '/rosout', '/diagnostics', '/clock')
 _NUMBER = re.compile(r'-?\b(\d+\.?\d*(e[+-]?\d+)?|inf|nan)\b')
+_RECENT_S = 10.0  # older reasons are not reported
+_STEPS = 200  # whose durations are kept
+_MAX_REASONS = 8  # that are counted apart: a broken sensor must not fill the memory
 SCALE_KEY = 'odometry scale'  # of a value of the localizer: what is wrong, '' for nothing
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -36,10 +39,7 @@ ERROR = DiagnosticStatus.ERROR
 
 @dataclass
 class _Topic:
-    """Messages of a topic; times are of the monotonic clock, s.
-
-    max_reasons: that are counted apart, as a broken sensor must not fill the memory.
-    """
+    """Messages of a topic; times are of the monotonic clock, s."""
 
     received: int = 0
     published: int = 0  # value of `received` in the last diagnostics
@@ -48,12 +48,11 @@ class _Topic:
     rejected: Counter[str] = field(default_factory=Counter)
     last_reason: str = ''
     rejected_s: float = -math.inf
-    max_reasons: int = 8
 
     def reject(self, reason: str) -> None:
         """Count a rejection by its reason, whatever the numbers in it."""
         kind = _NUMBER.sub('#', reason)
-        if kind not in self.rejected and len(self.rejected) >= self.max_reasons:
+        if kind not in self.rejected and len(self.rejected) >= _MAX_REASONS:
             kind = 'other reasons'
         self.rejected[kind] += 1
         self.last_reason = reason
@@ -145,24 +144,23 @@ class MessageStatistics:
         for topic in self._topics.values():
             topic.published = topic.received
 
-    def _recent_reasons(self, within_s: float = 10.0) -> str:
+    def _recent_reasons(self) -> str:
         """Reasons of the last rejections and drops; older ones are not reported."""
         reasons = [(t.rejected_s, f'{name}: {t.last_reason}') for name, t in self._topics.items()]
         reasons += [(drops.last_s, cause) for cause, drops in self._drops.items()]
-        recent = [reason for reason in reasons if monotonic() - reason[0] <= within_s]
+        recent = [reason for reason in reasons if monotonic() - reason[0] <= _RECENT_S]
         return '; '.join(text for _, text in sorted(recent, reverse=True))
 
 
 class StepTimes:
     """Durations of the last steps of each kind, ms."""
 
-    def __init__(self, count: int = 200) -> None:
-        self._count = count
+    def __init__(self) -> None:
         self._times_ms: dict[str, deque[float]] = {}
 
     def add(self, step: str, milliseconds: float) -> None:
         """Add the duration of a step, ms."""
-        self._times_ms.setdefault(step, deque(maxlen=self._count)).append(milliseconds)
+        self._times_ms.setdefault(step, deque(maxlen=_STEPS)).append(milliseconds)
 
     def values(self) -> dict[str, str]:
         """Median, 95th percentile and maximum."""

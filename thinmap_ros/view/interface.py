@@ -77,16 +77,18 @@ Left = TypeVar('Left')
 Right = TypeVar('Right')
 
 
+_WAITING = 50  # messages without a partner
+
+
 class StampMatcher(Generic[Left, Right]):
     """Pairs the messages of two topics that carry exactly the same stamp, in any order.
 
-    A message without a partner within `capacity` later messages is dropped and counted.
+    A message without a partner within fifty later messages is dropped and counted.
     """
 
-    def __init__(self, capacity: int = 50) -> None:
+    def __init__(self) -> None:
         self._lefts: OrderedDict[int, Left] = OrderedDict()
         self._rights: OrderedDict[int, Right] = OrderedDict()
-        self._capacity = capacity
         self.dropped = 0
 
     def add_left(self, stamp_ns: int, value: Left) -> tuple[Left, Right] | None:
@@ -107,7 +109,7 @@ class StampMatcher(Generic[Left, Right]):
 
     def _keep(self, waiting: OrderedDict[int, Any], stamp_ns: int, value: Any) -> None:
         waiting[stamp_ns] = value
-        if len(waiting) > self._capacity:
+        if len(waiting) > _WAITING:
             waiting.popitem(last=False)
             self.dropped += 1
 

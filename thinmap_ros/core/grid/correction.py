@@ -503,7 +503,6 @@ class CorrectableGrid:
         self,
         grid: OccupancyGrid,
         keeps_scans: bool = True,
-        corrected_ns: int = 0,
         scans: Sequence[tuple[Scan, Array]] = (),
         erasures: Erasures | None = None,
     ) -> None:
@@ -513,7 +512,7 @@ class CorrectableGrid:
         it is until the first correction. erasures: of the grid, among its scans by their stamps.
         """
         self.shown = grid
-        self.corrected_ns = corrected_ns
+        self.corrected_ns = 0
         self.erasures = erasures or Erasures()
         self._dropping: frozenset[str] = frozenset()  # frames of the lasers that drop out
         self._bodies: dict[str, Array | None] = {}  # by the frame of the laser

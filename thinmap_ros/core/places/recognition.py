@@ -47,6 +47,7 @@ from thinmap_ros.core.stage import are_two_storeys
 _HERE = Shares(0.8, 0.12)
 
 _MAX_STARTS = 3  # to either side
+_SEED = 0
 
 
 class Evidence(NamedTuple):
@@ -203,15 +204,11 @@ class Placement:
 class Recognition:
     """Looks for a growing piece of map in another one, view by view."""
 
-    def __init__(self, known: MapPiece, seed: int = 0, elsewhere: float = MAY_BE_ELSEWHERE) -> None:
-        """known: the map in which the piece is looked for; it stays as it is.
-
-        elsewhere: prior log odds that the piece lies nowhere in it.
-        """
+    def __init__(self, known: MapPiece) -> None:
+        """known: the map in which the piece is looked for; it stays as it is."""
         self.known = known
-        self._judge = ViewJudge(known, np.random.default_rng(seed))
+        self._judge = ViewJudge(known, np.random.default_rng(_SEED))
         self._alternatives = log_alternatives(known)
-        self._elsewhere = elsewhere
         self.views: list[View] = []
         self.hypotheses: list[PieceHypothesis] = []
         self._found: list[Array] = []  # poses (N, 3) by the search for each view
@@ -242,13 +239,13 @@ class Recognition:
             return None
         best = self.hypotheses[0]
         evidence = np.array([each.evidence for each in self.hypotheses])
-        likely = evidence - self._alternatives - self._elsewhere
+        likely = evidence - self._alternatives - MAY_BE_ELSEWHERE
         if query is not None and likely[0] > least:
             for k, other in enumerate(self.hypotheses[1:], 1):
                 if likely[k] > 0.0:  # one that is less likely than none is no rival
                     ratio = structure_evidence(query, self.known, other.motion(self.views))
                     evidence[k] += min(ratio, 0.0)
-        odds = log_odds_of_first(evidence, self._alternatives, self._elsewhere)
+        odds = log_odds_of_first(evidence, self._alternatives, MAY_BE_ELSEWHERE)
         return Placement(*self._transform(best), odds, best)
 
     def _propose(self, view: View, T_map_view: Array) -> None:
@@ -306,7 +303,6 @@ def log_odds_back(
     known: MapPiece,
     views: Sequence[View],
     hypothesis: PieceHypothesis,
-    seed: int = 0,
 ) -> float:
     """Log odds of a hypothesis by the views of the map in the piece: the other way round.
 
@@ -315,7 +311,7 @@ def log_odds_back(
     """
     numbers = list(hypothesis.poses)
     places = np.array([hypothesis.poses[number] for number in numbers])
-    judge = ViewJudge(query, np.random.default_rng(seed))
+    judge = ViewJudge(query, np.random.default_rng(_SEED))
     own = PieceHypothesis(0)
     for view in known.views:
         away = np.hypot(*(places[:, :2] - view.T_piece_view[:2]).T)
@@ -365,11 +361,9 @@ def decide(
     return JoinDecision(odds > least, placement, odds, len(views))
 
 
-def recognize(
-    query: MapPiece, known: MapPiece, join_odds: float = JOIN_ODDS, seed: int = 0
-) -> JoinDecision:
+def recognize(query: MapPiece, known: MapPiece, join_odds: float = JOIN_ODDS) -> JoinDecision:
     """Look for all views of a piece in a map, and decide by all of them."""
-    recognition = Recognition(known, seed)
+    recognition = Recognition(known)
     for view in query.views:
         recognition.add(view, query.landmarks.around(view))
     return decide(recognition, query, known, join_odds)

@@ -58,6 +58,9 @@ from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stage import Correction, Estimate, StartConfig, are_two_storeys, checked_tag
 from thinmap_ros.core.topology.graph import TopologicalMap
 
+_RENDER_FIRST = 20  # keyframes that are rendered at once after a correction
+_MIN_SIGMA_RAD = 5e-4  # of the heading of a scan, at the least
+_NEW_RATIO = 0.2  # of a match's error, that is independent of the previous map update
 # A scan is added to the local map after so much motion: nearer ones show the same walls again.
 _UPDATE_M = 0.2
 _UPDATE_RAD = 0.2
@@ -74,11 +77,9 @@ class ActiveMap:
     keyframes, some in each step.
     """
 
-    def __init__(self, config: LocalMapConfig, pieces: Pieces, render_first: int = 20) -> None:
-        """render_first: keyframes that are rendered at once after a correction."""
+    def __init__(self, config: LocalMapConfig, pieces: Pieces) -> None:
         self._config = config
         self._pieces = pieces
-        self._render_first = render_first
         self.map = LocalMap(config)
         self.refused = 0  # scans that lie too far from the others for one map
         self._loaded: Mapping[str, NDArray[Any]] | None = None
@@ -127,7 +128,7 @@ class ActiveMap:
         self._pending = [
             k for k in order if k >= first and self._pieces.is_here(keyframes[k].submap)
         ]
-        self._render(keyframes, self._render_first)
+        self._render(keyframes, _RENDER_FIRST)
 
     def follow(self, keyframes: Keyframes, T_map_base: Array) -> None:
         """Render the keyframes as they were corrected last, some in each step."""
@@ -174,20 +175,12 @@ class ActiveMap:
 class HeadingCorrection:
     """Corrects the heading of scans by the wall compass before they are added to the map."""
 
-    def __init__(
-        self,
-        config: LineConfig,
-        calibration: OdometryCalibration,
-        min_sigma_rad: float = 5e-4,
-        new_ratio: float = 0.2,
-    ) -> None:
-        """new_ratio: of a match's error, that is independent of the previous map update."""
+    def __init__(self, config: LineConfig, calibration: OdometryCalibration) -> None:
         self._calibration = calibration
         self._revision = 0
-        self._new_ratio = new_ratio
         self._config = config
         self._compass = WallCompass()
-        self._variance = min_sigma_rad**2  # of the heading since its last measurement
+        self._variance = _MIN_SIGMA_RAD**2  # of the heading since its last measurement
         self.measured: Heading | None = None  # measured heading of the last scan
 
     def correct(
@@ -212,7 +205,7 @@ class HeadingCorrection:
             self._compass.calibrate(self._calibration.smoothed())
         # The gate is narrower than the variance of the pose: a larger heading error is also in the
         # local map, and a scan that is corrected alone would no longer fit this map.
-        self._variance += float(pose.motion_part[2, 2] + self._new_ratio * pose.scan_part[2, 2])
+        self._variance += float(pose.motion_part[2, 2] + _NEW_RATIO * pose.scan_part[2, 2])
         self.measured = None
         if not fits:
             return T_map_base

@@ -40,6 +40,8 @@ _OPENING_RADIUS_M = 1.5  # a gate for hospital beds, or two leaves of an automat
 
 _OPENING_PATH_M = 4.0  # of a robot that drives up to an opening and through it
 
+_LOADED_EVIDENCE = 0.5  # in a loaded map, at first: one or two fitting scans remove it
+
 # Of a pose that no scan has confirmed: less than a scan with 30 % inliers removes.
 _UNCONFIRMED_EVIDENCE = 0.3 / INLIERS_PER_CONTRADICTION
 
@@ -122,14 +124,7 @@ class PlaceBelief:
     Source: Page, "Continuous inspection schemes", 1954.
     """
 
-    def __init__(
-        self,
-        lost_threshold: float,
-        least_fit: float,
-        loaded_evidence: float = 0.5,
-    ) -> None:
-        """loaded_evidence: initial evidence in a loaded map: one or two fitting scans remove it."""
-        self._loaded_evidence = loaded_evidence
+    def __init__(self, lost_threshold: float, least_fit: float) -> None:
         self.level = 0.0
         self._seen_through = 0.0
         self._before_look = 0.0  # the same before the present look
@@ -320,7 +315,7 @@ class PlaceBelief:
         self._trial = None if is_pose_given and not is_guess else _Trial(is_guess)
         if is_tried:
             self._trial = _Trial(is_guess=False, log_odds=_GIVEN)
-        self.level = self._loaded_evidence
+        self.level = _LOADED_EVIDENCE
 
     def lose(self) -> None:
         """The robot is delocalized in the map as it is, until scans fit."""

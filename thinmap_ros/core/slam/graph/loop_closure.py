@@ -44,6 +44,9 @@ from thinmap_ros.core.stage import Correction, are_two_storeys
 AGAIN_M = 8.0  # smallest path length between two visits of a place
 
 
+_AROUND = 4  # keyframes to either side of the centre of a submap
+_STRIDE = 4  # keyframes that share a submap: building it takes longer than a match
+_CACHED = 3  # submaps
 # Keyframes to either side in a submap for a scan that looks back: as far as a laser sees well.
 # Those beside it saw nothing of the walls ahead of it; along a smooth wall it would slide by metres
 # to where more is known, and its neighbours would do alike and agree.
@@ -56,17 +59,8 @@ class Submaps:
     Consecutive keyframes often match the same submap.
     """
 
-    def __init__(
-        self, config: LocalMapConfig, around: int = 4, stride: int = 4, capacity: int = 3
-    ) -> None:
-        """around: keyframes to either side of the centre of a submap.
-
-        stride: keyframes that share a submap, as building it takes longer than a match.
-        """
+    def __init__(self, config: LocalMapConfig) -> None:
         self._config = config
-        self._around = around
-        self._stride = stride
-        self._capacity = capacity
         self._kept: OrderedDict[tuple[int, int, bool], tuple[Array, LocalMap]] = OrderedDict()
 
     def clear(self) -> None:
@@ -81,21 +75,21 @@ class Submaps:
         path_m: length of the path now; keyframes after j that belong to the current visit are not
         part of the submap; looks_back: whether it is for a scan that faces the other way.
         """
-        centre = min(j - j % self._stride + self._stride // 2, len(frames) - 1)
+        centre = min(j - j % _STRIDE + _STRIDE // 2, len(frames) - 1)
         key = (centre, frames[j].submap, looks_back)
         if key not in self._kept:
-            around = _AROUND_BACK if looks_back else self._around
+            around = _AROUND_BACK if looks_back else _AROUND
             near = range(max(0, centre - around), min(centre + around + 1, len(frames)))
             earlier = [i for i in near if i <= j or path_m - frames[i].path_m > AGAIN_M]
             self._kept[key] = self._built(frames, centre, j, earlier)
-            if len(self._kept) > self._capacity:
+            if len(self._kept) > _CACHED:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
 
     def before(self, frames: Sequence[Keyframe], j: int) -> tuple[Array, LocalMap]:
         """Pose (3,) of a submap of keyframe j and of those before it, and the map in its frame."""
-        return self._built(frames, j, j, range(max(0, j - self._around), j + 1))
+        return self._built(frames, j, j, range(max(0, j - _AROUND), j + 1))
 
     def _built(
         self, frames: Sequence[Keyframe], centre: int, j: int, numbers: Iterable[int]
