@@ -93,26 +93,14 @@ class _PosePublishers:
         self._corrected_ns = 0
 
     def publish_estimate(
-        self, scan: Scan, estimate: Estimate, localizer: AnyLocalizer, status: SlamStatus
+        self, scan: Scan, estimate: Estimate, features: list[Feature], status: SlamStatus
     ) -> None:
-        """Publish an estimate; status: with its state and step time, the rest is filled in."""
-        stamp_ns = scan.stamp_ns
+        """Publish an estimate; features: of the map."""
         frame = self.map_frame
         # At its stamp by the clock of the odometry, with which others take it on.
         self._pose.publish(messages.estimate_msg(estimate, frame, scan.odometry_ns))
-        header = messages.header(frame, stamp_ns)
-        features = [_feature_msg(feature) for feature in localizer.features]
-        self._features.publish(LineFeatureArray(header=header, features=features))
-        status.header = header
-        status.features = len(features)
-        status.local_features = estimate.n_local_features
-        status.observed = estimate.observed_lines
-        status.matched = estimate.matched_lines
-        status.rejected = localizer.rejected
-        status.inlier_ratio = estimate.inlier_ratio
-        if estimate.apart is not None:
-            status.apart_m = estimate.apart.path_m
-            status.join_odds = estimate.apart.odds
+        lines = [_feature_msg(feature) for feature in features]
+        self._features.publish(LineFeatureArray(header=status.header, features=lines))
         self._status.publish(status)
         self._scan.publish(localized_scan_msg(scan, estimate, status, frame, self._corrected_ns))
 
@@ -153,23 +141,16 @@ class _MapIds:
     is_given: bool = False
     _published: int = UNKNOWN
 
-    def begin(self) -> None:
-        """A reset begins another map."""
-        self.replaced = self._published
+    def begin(self, is_reset: bool) -> None:
+        """Another map: a reset begins it, or it was loaded."""
+        self.replaced = self._published if is_reset else UNKNOWN
         self.id = new_map_id()
         self.is_given = True
 
-    def load(self) -> None:
-        """Another map was loaded."""
-        self.replaced = UNKNOWN
-        self.id = new_map_id()
-        self.is_given = True
-
-    def fill_in(self, status: SlamStatus) -> None:
-        """Fill in the ids of a status that is published."""
-        status.map_id = self.id
-        status.replaced_map_id = self.replaced
+    def published(self) -> dict[str, int]:
+        """The ids as fields of a status that is published."""
         self._published = self.id
+        return {'map_id': self.id, 'replaced_map_id': self.replaced}
 
 
 class LocalizerNode(ThinmapNode):
@@ -227,7 +208,7 @@ class LocalizerNode(ThinmapNode):
         poses = InitialPoses(
             self, self._output.map_frame, self._on_initial_pose, self._broadcaster.received
         )
-        self._given.source.subscribe(self, self._on_new_map)
+        self._given.subscribe(self._on_new_map)
         self._given.create_interface(self._output.map_frame, poses)
         AdaptiveSubscription(self, String, 'map_tag', self._on_map_tag, qos.LATCHED)
         offer(
@@ -251,7 +232,7 @@ class LocalizerNode(ThinmapNode):
         The robot is at the start pose. A new map is of the storey that the robot is on.
         """
         if self._map_ids is not None:
-            self._map_ids.begin()
+            self._map_ids.begin(is_reset=True)
         self._output.reset()
         before = self._localizer.config
         self._begin()
@@ -401,7 +382,7 @@ class LocalizerNode(ThinmapNode):
     def _resume(self, scan: Scan, T_odom_base: Array) -> None:
         """Continue where the killed localizer was; at the start pose if the odometry was reset."""
         last = self._recovery.awaited
-        if last is None or not self._given.source.has_map:
+        if last is None or not self._given.has_map:
             return
         self._recovery.awaited = None
         if last.is_continuous_with(scan.stamp_ns, T_odom_base):
@@ -437,16 +418,16 @@ class LocalizerNode(ThinmapNode):
             return 'the session has no map of the localizer: it keeps its own'
         self._localizer = loaded
         self._recovery = Recovery()
-        self._given.source.replaced()
+        self._given.has_loaded = True
         if self._map_ids is not None:
-            self._map_ids.load()
+            self._map_ids.begin(is_reset=False)
         if self._topology is not None:
             loaded.set_topology(self._topology)
         features = loaded.features
         return f'{len(features)} line features loaded' if features else 'local map loaded'
 
     def _publish(self, scan: Scan, estimate: Estimate, step_ms: float) -> None:
-        state = _state_of(estimate) if self._given.source.has_map else SlamStatus.NO_MAP
+        state = _state_of(estimate) if self._given.has_map else SlamStatus.NO_MAP
         self.diagnostics.record_step_time('localizer', step_ms)
         self.diagnostics.set_state(*_health(state, estimate))
         if estimate.correction is not None:
@@ -456,15 +437,25 @@ class LocalizerNode(ThinmapNode):
         if state != SlamStatus.NO_MAP:
             self._broadcaster.update(estimate.T_map_odom)
         self._given.publish(scan.odometry_ns, estimate, state)
+        features = self._localizer.features
+        apart = estimate.apart
         status = SlamStatus(
+            header=messages.header(self._output.map_frame, scan.stamp_ns),
             state=state,
-            step_time_ms=step_ms,
-            no_return_is_unknown=scan.drops_out,
+            apart_m=0.0 if apart is None else apart.path_m,
+            join_odds=0.0 if apart is None else apart.odds,
             is_contradicted=estimate.is_contradicted,
+            features=len(features),
+            local_features=estimate.n_local_features,
+            observed=estimate.observed_lines,
+            matched=estimate.matched_lines,
+            rejected=self._localizer.rejected,
+            no_return_is_unknown=scan.drops_out,
+            inlier_ratio=estimate.inlier_ratio,
+            step_time_ms=step_ms,
+            **({} if self._map_ids is None else self._map_ids.published()),
         )
-        if self._map_ids is not None:
-            self._map_ids.fill_in(status)
-        self._output.publish_estimate(scan, estimate, self._localizer, status)
+        self._output.publish_estimate(scan, estimate, features, status)
         if self._map_ids is not None:
             self._output.keyframes.publish(scan.stamp_ns, self._localizer, self._map_ids.id)
 

@@ -25,7 +25,7 @@ from thinmap_ros.core.slam.localizer import AnyLocalizer, Localizer, localizer_c
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import Estimate, StartConfig, config_at
 from thinmap_ros.files import sessions
-from thinmap_ros.files.occupancy_maps import Report, read_map
+from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.safe import read_mapping, write_text
 from thinmap_ros.nodes.parts.localization import (
     GIVEN_COVARIANCE,
@@ -229,90 +229,6 @@ class LivingMap:
         self._found(message.map_id, patch)
 
 
-class MapSource:
-    """Creates localizers in the given map: of a file, a session, or a topic.
-
-    patch: None until topic map is received, where no other map is given. name: of the map, to which
-    a saved pose belongs.
-    """
-
-    def __init__(
-        self,
-        config: StartConfig,
-        localization: LocalizationConfig,
-        session: str,
-        report: Report,
-    ) -> None:
-        """report: receives lines on the map that is read.
-
-        Raises ConfigError where the parameters contradict each other, InputError for a file.
-        """
-        self._report = report
-        self._session = session
-        self._is_mapping = config.is_mapping
-        self._first_map_only = localization.first_map_only
-        self.patch: GridPatch | None = None
-        self._has_loaded = False
-        file = localization.map_file_name
-        self.name = file or session or 'topic map'
-        if self._is_mapping:
-            if file:
-                raise ConfigError('map_file_name is given: expected mode = localization')
-            return
-        if not session and not isinstance(config, LocalizerConfig):
-            raise ConfigError(
-                f'mode = localization with slam = {config.slam}: expected a session_path with its '
-                'line features'
-            )
-        if file:
-            self.patch = read_map(Path(file), report=report)
-
-    @property
-    def has_map(self) -> bool:
-        """Whether there is a map, or none is needed."""
-        return self._is_mapping or bool(self._session or self._has_loaded) or self.patch is not None
-
-    @property
-    def _is_topic(self) -> bool:
-        return not self._is_mapping and self.name == 'topic map'
-
-    def create_localizer(self, config: StartConfig) -> AnyLocalizer:
-        """A localizer at the configured pose, delocalized if in a given map."""
-        if self.patch is not None and isinstance(config, LocalizerConfig):
-            return Localizer.in_occupancy_map(self.patch, config)
-        if self._session:
-            loaded = sessions.load_localizer(self._session, config, report=self._report)
-            if loaded is not None:
-                return loaded
-        return localizer_class(config)(config)
-
-    def replace(self, patch: GridPatch) -> bool:
-        """Take another map; returns whether it is different."""
-        if self.patch is not None and (
-            self.patch.frame == patch.frame and np.array_equal(self.patch.cells, patch.cells)
-        ):
-            return False
-        self.patch = patch
-        return True
-
-    def replaced(self) -> None:
-        """A service has loaded another map: there is one."""
-        self._has_loaded = True
-
-    def subscribe(self, node: ThinmapNode, changed: Callable[[], None]) -> None:
-        """Subscribe to topic map if the map is to come from there; changed: there is a new one."""
-        if not self._is_topic:
-            return
-
-        def on_map(patch: GridPatch) -> None:
-            if self.patch is not None and self._first_map_only:
-                return
-            if self.replace(patch):
-                changed()
-
-        subscribe_to_map(node, 'map', on_map)
-
-
 class InitialPoses:
     """Subscribes to initialpose; calls `process` with pose (3,) and covariance (3, 3), map frame.
 
@@ -355,25 +271,55 @@ _WARN_PERIOD_S = 30.0
 
 
 class GivenMap:
-    """The given map, the poses to start from, and AMCL's interface; in mode mapping, a session.
+    """The given map: of a file, a session, or a topic; poses to start from, and AMCL's interface.
 
-    config: of the next localizer.
+    In mode mapping, a session. config: of the next localizer; has_loaded: whether a service has
+    loaded another map.
     """
 
     def __init__(self, node: ThinmapNode, config: StartConfig) -> None:
-        """Declare the parameters. Raises ConfigError or InputError as `MapSource`."""
+        """Declare the parameters.
+
+        Raises ConfigError where the parameters contradict each other, InputError for a file.
+        """
         self._node = node
         self.config = config
+        self.has_loaded = False
         self._settings = parameters.declare_config(node, LocalizationConfig)
-        report = node.get_logger().warning
-        session = parameters.declare_session(node)
-        self.source = MapSource(config, self._settings, session, report)
+        self._report = node.get_logger().warning
+        self._session = parameters.declare_session(node)
+        self._patch = self._read_file()
+        name = self._settings.map_file_name or self._session or 'topic map'
+        self._is_topic = not config.is_mapping and name == 'topic map'
         self._last_pose = LastPose(
-            node, self._settings.pose_file, self._settings.save_pose_rate, self.source.name
+            node, self._settings.pose_file, self._settings.save_pose_rate, name
         )
         node.add_end_callback(self._last_pose.save_latest)
         self._amcl: AmclInterface | None = None
         self._given_covariance: Array | None = None  # of an initial pose without a map
+
+    @property
+    def has_map(self) -> bool:
+        """Whether there is a map, or none is needed."""
+        is_given = bool(self._session) or self.has_loaded or self._patch is not None
+        return self.config.is_mapping or is_given
+
+    def subscribe(self, changed: Callable[[], None]) -> None:
+        """Subscribe to topic map if the map is to come from there; changed: there is a new one."""
+        if not self._is_topic:
+            return
+
+        def on_map(patch: GridPatch) -> None:
+            known = self._patch
+            if known is not None and (
+                self._settings.first_map_only
+                or (known.frame == patch.frame and np.array_equal(known.cells, patch.cells))
+            ):
+                return
+            self._patch = patch
+            changed()
+
+        subscribe_to_map(self._node, 'map', on_map)
 
     def create_interface(self, map_frame: str, poses: InitialPoses) -> None:
         """Offer AMCL's topics and services in mode localization."""
@@ -388,22 +334,19 @@ class GivenMap:
         self._given_covariance = None
         config = self.config
         if config.is_mapping:
-            return self.source.create_localizer(config)
+            return self._in_map(config)
         if self._settings.set_initial_pose:
-            T_map_base = self._settings.initial_pose.pose
-            return self._placed(T_map_base, GIVEN_COVARIANCE)
-        if config.is_start_given:
-            return self.source.create_localizer(config)
-        last = self._last_pose.load()
+            return self._placed(self._settings.initial_pose.pose, GIVEN_COVARIANCE)
+        last = None if config.is_start_given else self._last_pose.load()
         if last is None:
-            return self.source.create_localizer(config)
+            return self._in_map(config)
         x, y, yaw = last.tolist()
         self._node.get_logger().info(f'last pose: {x:.2f}, {y:.2f} m, {yaw:.2f} rad')
         return self.create_localizer_at(last)
 
     def create_localizer_at(self, T_map_base: Array) -> AnyLocalizer:
         """A localizer at a pose (3,); in a given map it is delocalized until scans fit."""
-        return self.source.create_localizer(config_at(self.config, T_map_base))
+        return self._in_map(config_at(self.config, T_map_base))
 
     def with_new_map(self, localizer: AnyLocalizer) -> AnyLocalizer:
         """The localizer that follows another one in a map from its topic."""
@@ -421,7 +364,7 @@ class GivenMap:
 
     def pose_set(self, covariance: Array) -> None:
         """A user has given a pose, with a covariance (3, 3)."""
-        if not self.source.has_map:
+        if not self.has_map:
             self._given_covariance = covariance
 
     def publish(self, stamp_ns: int, estimate: Estimate, state: int) -> None:
@@ -439,6 +382,30 @@ class GivenMap:
         elif state == SlamStatus.LOST:
             text = 'lost: waits for initialpose, a global localization, or a scan that matches'
             logger.warning(text, throttle_duration_sec=_WARN_PERIOD_S)
+
+    def _read_file(self) -> GridPatch | None:
+        """The map of map_file_name, None where there is none; checks the parameters."""
+        file = self._settings.map_file_name
+        if self.config.is_mapping:
+            if file:
+                raise ConfigError('map_file_name is given: expected mode = localization')
+            return None
+        if not self._session and not isinstance(self.config, LocalizerConfig):
+            raise ConfigError(
+                f'mode = localization with slam = {self.config.slam}: expected a session_path with '
+                'its line features'
+            )
+        return read_map(Path(file), report=self._report) if file else None
+
+    def _in_map(self, config: StartConfig) -> AnyLocalizer:
+        """A localizer at the configured pose, delocalized if in a given map."""
+        if self._patch is not None and isinstance(config, LocalizerConfig):
+            return Localizer.in_occupancy_map(self._patch, config)
+        if self._session:
+            loaded = sessions.load_localizer(self._session, config, report=self._report)
+            if loaded is not None:
+                return loaded
+        return localizer_class(config)(config)
 
     def _is_near_map(self, placed: AnyLocalizer) -> bool:
         """Whether the pose that a user gave before there was a map lies near it."""
