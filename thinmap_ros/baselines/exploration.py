@@ -24,7 +24,7 @@ from thinmap_ros.core.exploration.strategy import (
     unobserved,
 )
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.grid.raytrace import axis_setup
+from thinmap_ros.core.grid.raytrace import begin_ray, next_cell
 from thinmap_ros.core.planning.grid_search import (
     downsample_mask,
     escape_cells,
@@ -558,21 +558,15 @@ def _unknown_in_sight(cells: NDArray[np.int8], places: Cells, reach: float) -> A
     for i in range(places.shape[0]):
         for degree in range(360):
             angle = math.radians(float(degree))
-            col, step_x, next_x, delta_x = axis_setup(places[i, 1] + 0.5, math.cos(angle))
-            row, step_y, next_y, delta_y = axis_setup(places[i, 0] + 0.5, math.sin(angle))
-            travelled = 0.0
+            x = places[i, 1] + 0.5
+            ray = begin_ray(x, places[i, 0] + 0.5, math.cos(angle), math.sin(angle))
+            travelled, row, col = ray[:3]
             while (
                 travelled <= reach and 0 <= row < rows and 0 <= col < cols and cells[row, col] < 65
             ):
                 if cells[row, col] < 0 and seen[row, col] != i:
                     seen[row, col] = i
                     areas[i] += 1.0
-                if next_x < next_y:
-                    travelled = next_x
-                    next_x = next_x + delta_x
-                    col = col + step_x
-                else:
-                    travelled = next_y
-                    next_y = next_y + delta_y
-                    row = row + step_y
+                ray = next_cell(ray)
+                travelled, row, col = ray[:3]
     return areas

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.grid.raytrace import axis_setup
+from thinmap_ros.core.grid.raytrace import begin_ray, next_cell
 from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.jit import kernel
 from thinmap_ros.sim.robot import RobotConfig
@@ -186,9 +186,8 @@ def _sees_reachable(
     found = np.zeros(len(places), dtype=np.bool_)
     for i in range(len(places)):
         for k in range(angles.size):
-            col, step_x, next_x, delta_x = axis_setup(places[i, 0], math.cos(angles[k]))
-            row, step_y, next_y, delta_y = axis_setup(places[i, 1], math.sin(angles[k]))
-            travelled = 0.0
+            ray = begin_ray(places[i, 0], places[i, 1], math.cos(angles[k]), math.sin(angles[k]))
+            travelled, row, col = ray[:3]
             while (
                 travelled <= max_cells
                 and 0 <= row < rows
@@ -198,14 +197,8 @@ def _sees_reachable(
                 if wanted[row, col]:
                     found[i] = True
                     break
-                if next_x < next_y:
-                    travelled = next_x
-                    next_x = next_x + delta_x
-                    col = col + step_x
-                else:
-                    travelled = next_y
-                    next_y = next_y + delta_y
-                    row = row + step_y
+                ray = next_cell(ray)
+                travelled, row, col = ray[:3]
             if found[i]:
                 break
     return found

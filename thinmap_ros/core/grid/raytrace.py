@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.jit import inlined, kernel
 
+Ray = tuple[float, int, int, float, float, int, int, float, float]
 _FRACTION_BITS = 32
 _ONE = float(1 << _FRACTION_BITS)
 
@@ -32,6 +33,28 @@ def axis_setup(start: float, direction: float) -> tuple[int, int, float, float]:
     return cell, 0, np.inf, np.inf
 
 
+@inlined
+def begin_ray(x: float, y: float, cos: float, sin: float) -> Ray:
+    """A ray from a point in a direction: length so far, row and column, and what `next_cell` needs.
+
+    The rest is, for each axis, the length at the next border, the step and the length of a cell.
+    """
+    col, step_x, next_x, delta_x = axis_setup(x, cos)
+    row, step_y, next_y, delta_y = axis_setup(y, sin)
+    return 0.0, row, col, next_x, next_y, step_x, step_y, delta_x, delta_y
+
+
+@inlined
+def next_cell(ray: Ray) -> Ray:
+    """The ray where it enters the next cell."""
+    _, row, col, next_x, next_y, step_x, step_y, delta_x, delta_y = ray
+    if next_x < next_y:
+        border = next_x + delta_x
+        return next_x, row, col + step_x, border, next_y, step_x, step_y, delta_x, delta_y
+    border = next_y + delta_y
+    return next_y, row + step_y, col, next_x, border, step_x, step_y, delta_x, delta_y
+
+
 @kernel
 def cast_rays(
     occupied: NDArray[np.uint8], x_cell: float, y_cell: float, angles: Array, max_cells: float
@@ -45,21 +68,14 @@ def cast_rays(
     rows, cols = occupied.shape
     distances = np.full(angles.size, np.inf)
     for i in range(angles.size):
-        col, step_x, next_x, delta_x = axis_setup(x_cell, math.cos(angles[i]))
-        row, step_y, next_y, delta_y = axis_setup(y_cell, math.sin(angles[i]))
-        travelled = 0.0
+        ray = begin_ray(x_cell, y_cell, math.cos(angles[i]), math.sin(angles[i]))
+        travelled, row, col = ray[:3]
         while travelled <= max_cells and 0 <= row < rows and 0 <= col < cols:
             if occupied[row, col]:
                 distances[i] = travelled
                 break
-            if next_x < next_y:
-                travelled = next_x
-                next_x = next_x + delta_x
-                col = col + step_x
-            else:
-                travelled = next_y
-                next_y = next_y + delta_y
-                row = row + step_y
+            ray = next_cell(ray)
+            travelled, row, col = ray[:3]
     return distances
 
 
@@ -74,17 +90,13 @@ def line_is_clear(free: Mask, row_a: int, col_a: int, row_b: int, col_b: int) ->
     length = math.hypot(row_b - row_a, col_b - col_a)
     steps = abs(row_b - row_a) + abs(col_b - col_a)
     scale = 1.0 if length == 0.0 else length
-    col, step_x, next_x, delta_x = axis_setup(col_a + 0.5, (col_b - col_a) / scale)
-    row, step_y, next_y, delta_y = axis_setup(row_a + 0.5, (row_b - row_a) / scale)
+    cos = (col_b - col_a) / scale
+    ray = begin_ray(col_a + 0.5, row_a + 0.5, cos, (row_b - row_a) / scale)
     for _ in range(steps + 1):
+        _, row, col = ray[:3]
         if row < 0 or row >= rows or col < 0 or col >= cols or not free[row, col]:
             return False
-        if next_x < next_y:
-            next_x = next_x + delta_x
-            col = col + step_x
-        else:
-            next_y = next_y + delta_y
-            row = row + step_y
+        ray = next_cell(ray)
     return True
 
 

@@ -12,7 +12,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.fields import distance_cells
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.grid.raytrace import axis_setup, line_is_clear
+from thinmap_ros.core.grid.raytrace import begin_ray, line_is_clear, next_cell
 from thinmap_ros.core.places.wall_field import FREE, UNKNOWN, WALL
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -198,22 +198,15 @@ def free_way(states: Bytes, x: float, y: float, angle: float, most: float) -> tu
     FREE if there is none within `most`; UNKNOWN if the ray leaves the map.
     """
     rows, cols = states.shape
-    col, step_x, next_x, delta_x = axis_setup(x, math.cos(angle))
-    row, step_y, next_y, delta_y = axis_setup(y, math.sin(angle))
-    way = 0.0
+    ray = begin_ray(x, y, math.cos(angle), math.sin(angle))
+    way, row, col = ray[:3]
     while way <= most:
         if row < 0 or col < 0 or row >= rows or col >= cols:
             return way, UNKNOWN
         if states[row, col] != FREE:
             return way, int(states[row, col])
-        if next_x < next_y:
-            way = next_x
-            next_x = next_x + delta_x
-            col = col + step_x
-        else:
-            way = next_y
-            next_y = next_y + delta_y
-            row = row + step_y
+        ray = next_cell(ray)
+        way, row, col = ray[:3]
     return most, FREE
 
 
