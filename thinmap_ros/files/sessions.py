@@ -488,11 +488,11 @@ def _load_own_localizer(path: str, config: StartConfig) -> AnyLocalizer:
         return LOCALIZER.load(path, config)
     keyframes = KEYFRAMES.load_optional(path)
 
-    def restore(state: State, own: StartConfig | None) -> AnyLocalizer:
+    def read(state: State) -> AnyLocalizer:
         _require_own_map(state, config)
         return Localizer.from_state(state, config, keyframes)
 
-    return replace(LOCALIZER, restore=restore).load(path, config)
+    return _read_localizer(path, read)
 
 
 def load_tag(path: str) -> str:
@@ -519,14 +519,9 @@ def _cells_of(state: State) -> LocalMapConfig:
 
 def _read_localizer(path: str, read: Callable[[State], Read]) -> Read:
     """What is read of the arrays in STEM.slam.npz, of any localizer."""
-    file = LOCALIZER.file(path)
-    try:
-        with open_regular_file(file) as stream:
-            return read(read_snapshot(stream, LOCALIZER.name))
-    except OSError as error:
-        raise InputError(f'{file}: {error.strerror or one_line_reason(error)}') from error
-    except InputError as error:
-        raise InputError(f'{file}: {error}') from error
+    part: SessionPart[Any, Any] = LOCALIZER
+    found: Read = replace(part, restore=lambda state, _: read(state)).load(path)
+    return found
 
 
 def _given_tag(path: str) -> str:
