@@ -44,7 +44,7 @@ ROS_PROGRAMS = [
     f'{path.stem} = {NAME}.{folder}.{path.stem}:main'
     for folder in ('nodes', 'tools')
     for path in sorted((Path(__file__).parent / NAME / folder).glob('*.py'))
-    if '\ndef main(' in path.read_text()
+    if re.search(r'^(def )?main\b', path.read_text(), re.MULTILINE)
 ]
 
 

@@ -17,7 +17,9 @@ from thinmap_ros import __version__
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'thinmap_ros'
 MODULES = [path for room in ('nodes', 'tools') for path in (PACKAGE / room).glob('*.py')]
-PROGRAMS = sorted(path.stem for path in MODULES if 'def main(' in path.read_text())
+PROGRAMS = sorted(
+    path.stem for path in MODULES if re.search(r'^(def )?main\b', path.read_text(), re.MULTILINE)
+)
 TOOLS = sorted(
     path.stem for path in (PACKAGE / 'tools').glob('*.py') if '\ndef main(' in path.read_text()
 )

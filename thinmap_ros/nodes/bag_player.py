@@ -263,10 +263,7 @@ class BagPlayerNode(Node):
         return f'{self._playback.clock_ns / 1e9:.3f} s'
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(BagPlayerNode)
-
+main = node_main.program(BagPlayerNode)
 
 if __name__ == '__main__':
     main()

@@ -149,10 +149,7 @@ def _map_poses(config: DemoMonitorConfig) -> dict[str, Array]:
     return {f'robot{number}/': pose for number, pose in enumerate(poses, 1)}
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(DemoMonitorNode)
-
+main = node_main.program(DemoMonitorNode)
 
 if __name__ == '__main__':
     main()

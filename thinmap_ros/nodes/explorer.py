@@ -286,10 +286,7 @@ class ExplorerNode(ThinmapNode):
         return self.elapsed_time.now_s()
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(ExplorerNode)
-
+main = node_main.program(ExplorerNode)
 
 if __name__ == '__main__':
     main()

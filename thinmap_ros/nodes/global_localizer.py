@@ -449,10 +449,7 @@ class GlobalLocalizerNode(ThinmapNode):
             self._output.publish_state(LocalizationStatus.WAITING, f'waits for {missing}')
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(GlobalLocalizerNode)
-
+main = node_main.program(GlobalLocalizerNode)
 
 if __name__ == '__main__':
     main()

@@ -333,10 +333,7 @@ class GridMapperNode(ThinmapNode):
         return response
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(GridMapperNode)
-
+main = node_main.program(GridMapperNode)
 
 if __name__ == '__main__':
     main()

@@ -523,10 +523,7 @@ def _feature_msg(feature: Feature) -> LineFeature:
     )
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(LocalizerNode)
-
+main = node_main.program(LocalizerNode)
 
 if __name__ == '__main__':
     main()

@@ -210,10 +210,7 @@ class MapJoinerNode(ThinmapNode):
             raise InputError(f'{quoted(name)}: expected one of the maps: {known}')
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(MapJoinerNode)
-
+main = node_main.program(MapJoinerNode)
 
 if __name__ == '__main__':
     main()

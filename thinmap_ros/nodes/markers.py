@@ -185,10 +185,7 @@ def _colour(web: str) -> ColorRGBA:
     return ColorRGBA(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=1.0)
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(MarkersNode)
-
+main = node_main.program(MarkersNode)
 
 if __name__ == '__main__':
     main()

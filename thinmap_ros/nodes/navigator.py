@@ -356,10 +356,7 @@ class NavigatorNode(ThinmapNode):
         self._goals.finish(outcome, self._task.result(code, reason))
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(NavigatorNode)
-
+main = node_main.program(NavigatorNode)
 
 if __name__ == '__main__':
     main()

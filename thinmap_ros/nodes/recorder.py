@@ -135,10 +135,7 @@ def _common_qos(reliable: bool, latched: bool) -> QoSProfile:
     )
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(RecorderNode)
-
+main = node_main.program(RecorderNode)
 
 if __name__ == '__main__':
     main()

@@ -103,10 +103,7 @@ class RerunViewerNode(Node):
         return process
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(RerunViewerNode)
-
+main = node_main.program(RerunViewerNode)
 
 if __name__ == '__main__':
     main()

@@ -165,10 +165,7 @@ def _prefixes(count: int) -> list[str]:
     return [f'robot{number}/' for number in range(1, count + 1)] if count > 1 else ['']
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(SimNode)
-
+main = node_main.program(SimNode)
 
 if __name__ == '__main__':
     main()

@@ -244,10 +244,7 @@ def _begin_in_thread(work: Callable[[], TopologyBuilder]) -> Future[TopologyBuil
     return job
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(TopologyBuilderNode)
-
+main = node_main.program(TopologyBuilderNode)
 
 if __name__ == '__main__':
     main()

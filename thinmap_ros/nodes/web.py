@@ -172,10 +172,7 @@ def _tokens(config: WebConfig) -> access.Tokens | None:
     return access.read_tokens(Path(config.web_token_file)) if config.web_token_file else None
 
 
-def main() -> None:
-    """Run the node."""
-    node_main.run(WebNode)
-
+main = node_main.program(WebNode)
 
 if __name__ == '__main__':
     main()
