@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.baselines.exploration import NearestFrontier
-from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
+from thinmap_ros.closed_loop import (
+    ClosedLoop,
+    ExplorationOutcome,
+    Options,
+    make_loop,
+    no_progress,
+)
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import config_or_default
 from thinmap_ros.core.errors import InputError, pose_of, require_type
@@ -26,9 +32,10 @@ from thinmap_ros.evaluation.exploration_metrics import (
     missing_area_report,
 )
 from thinmap_ros.pipeline import Pipeline
-from thinmap_ros.sim.coverage import robot_observable_cells
+from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
+from thinmap_ros.team.loop import TeamLoop
 
 
 @dataclass(frozen=True)
@@ -159,6 +166,32 @@ class Kidnapping:
             loop.decide(scan, loop.pipeline.step(scan, T_odom_base).estimate)
 
 
+def observable_cells(world: World, start: Array, options: Options) -> ObservableCells:
+    """What a robot that starts at a pose (3,) can see of a world."""
+    return robot_observable_cells(world, start, PRESETS[options.robot], options.laser.range_max_m)
+
+
+def run_timed(
+    loop: ClosedLoop | TeamLoop,
+    goal: ObservableCells,
+    options: Options,
+    show: Callable[[float, float], None],
+) -> tuple[ExplorationOutcome, dict[str, Any]]:
+    """Run a loop; returns how it ended, and for its report the options and the time that it took.
+
+    goal: the cells to see; show: as of the loop.
+    """
+    began = time.perf_counter()
+    cpu_began = time.process_time()
+    outcome = loop.run(goal, options.time_limit_s, show)
+    return outcome, {
+        'strategy': options.strategy,
+        'options': asdict(options),
+        'wall_s': round(time.perf_counter() - began, 3),
+        'cpu_s': round(time.process_time() - cpu_began, 3),
+    }
+
+
 def explore(
     world: World,
     start: Array,
@@ -183,12 +216,8 @@ def explore(
         None if options.kidnap_at_s is None else Kidnapping(options.kidnap_at_s, options.seed)
     )
     loop = make_loop(world, start, options, kidnapping, watch)
-    goal = robot_observable_cells(world, start, PRESETS[options.robot], options.laser.range_max_m)
-    began = time.perf_counter()
-    cpu_began = time.process_time()
-    ending = loop.run(goal, options.time_limit_s, show)
-    wall_s = time.perf_counter() - began
-    cpu_s = time.process_time() - cpu_began
+    goal = observable_cells(world, start, options)
+    ending, about = run_timed(loop, goal, options, show)
     log = loop.log
     report = exploration_report(
         ending,
@@ -207,12 +236,7 @@ def explore(
     }
     report['missing_area'] = _missing_area(loop.decision)
     report |= {} if kidnapping is None else kidnapping.report()
-    report['world'] = world.name
-    report['strategy'] = options.strategy
-    report['options'] = asdict(options)
-    report['wall_s'] = round(wall_s, 3)
-    report['cpu_s'] = round(cpu_s, 3)
-    return loop, report
+    return loop, {**report, 'world': world.name, **about}
 
 
 def _missing_area(decision: Decision | None) -> dict[str, Any] | None:

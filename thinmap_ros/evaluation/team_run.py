@@ -1,6 +1,5 @@
 """Exploration of a simulated world by several robots, with a report."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -12,7 +11,7 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.team import Team, TeamConfig
 from thinmap_ros.core.se2 import Array, path_length_m
 from thinmap_ros.evaluation.exploration_metrics import MILESTONES, first_time
-from thinmap_ros.sim.coverage import robot_observable_cells
+from thinmap_ros.evaluation.exploration_run import observable_cells, run_timed
 from thinmap_ros.sim.other_robots import SharedWorld
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
@@ -71,14 +70,8 @@ def explore_together(
     """Explore a world from several starts (3,); returns the finished loop and the report."""
     team = team or TeamOptions()
     loop = make_team(world, starts, options, team)
-    goal = robot_observable_cells(
-        world, starts[0], PRESETS[options.robot], options.laser.range_max_m
-    )
-    began = time.perf_counter()
-    cpu_began = time.process_time()
-    outcome = loop.run(goal, options.time_limit_s, show)
-    wall_s = time.perf_counter() - began
-    cpu_s = time.process_time() - cpu_began
+    goal = observable_cells(world, starts[0], options)
+    outcome, about = run_timed(loop, goal, options, show)
     distances = [path_length_m(np.array(member.loop.log.true_poses)) for member in loop.members]
     coverage = np.array(loop.coverage)
     decision_s = [sum(member.loop.log.decision_s) for member in loop.members]
@@ -109,11 +102,8 @@ def explore_together(
         },
         'curve': [[round(float(at), 2), round(float(share), 4)] for at, share in coverage],
         'world': world.name,
-        'strategy': options.strategy,
-        'options': asdict(options),
+        **about,
         'team': asdict(team),
-        'wall_s': round(wall_s, 3),
-        'cpu_s': round(cpu_s, 3),
         'decision_s': [round(seconds, 3) for seconds in decision_s],
     }
     return loop, report
