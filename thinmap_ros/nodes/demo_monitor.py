@@ -97,7 +97,7 @@ class DemoMonitorNode(Node):
 
     def _work(self) -> None:
         for robot in self._robots.values():
-            robot.request()
+            robot.work()
         if self._ended_s is not None:
             patience_s = _LAST_MERGE_S if self._is_joined else _JOIN_PATIENCE_S
             self.finished = monotonic() - self._ended_s > patience_s

@@ -34,7 +34,6 @@ from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
 from thinmap_ros.ros.maps import received_map, received_update, updates_topic
 from thinmap_ros.ros.services import action_servers
-from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.ros.velocity import TOPIC as COMMANDS
 from thinmap_ros.ros.velocity import VelocitySubscription
 from thinmap_ros.sim.laser import LaserScanner
@@ -42,55 +41,8 @@ from thinmap_ros.sim.other_robots import starts_in, starts_side_by_side
 from thinmap_ros.sim.simulation import SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 
-_RESULT_PERIOD_S = 1.0
 # A request before the new server has discovered its client is lost.
-_REQUESTS = 20
-
-
-class GoalResult:
-    """Requests the result of a goal, and requests it again when there is another server.
-
-    What was requested of a server is lost when it is killed. One that takes its place continues
-    the goal, or answers that it does not know it, with STATUS_UNKNOWN.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        action: str,
-        handle: ClientGoalHandle,
-        on_result: Callable[[Any], None],
-    ) -> None:
-        """handle: of the goal, just accepted; on_result: receives status and result, once."""
-        self._node = node
-        self._action = action
-        self._handle = handle
-        self._on_result = on_result
-        self._servers = action_servers(node, action)
-        self._requests_left = 0
-        self._timer = node.create_timer(_RESULT_PERIOD_S, self._check, clock=STEADY)
-        self._request()
-
-    def _check(self) -> None:
-        servers = action_servers(self._node, self._action)
-        if servers - self._servers:
-            self._servers |= servers
-            self._requests_left = _REQUESTS
-        if self._requests_left > 0:
-            self._requests_left -= 1
-            self._request()
-
-    def _request(self) -> None:
-        self._handle.get_result_async().add_done_callback(self._on_done)
-
-    def _on_done(self, future: Future) -> None:
-        if self._timer is None:
-            return  # another answer
-        self._node.destroy_timer(self._timer)
-        self._timer = None
-        self._on_result(future.result())
-
-
+_REQUESTS = 40
 # Without an answer for this time, the goal is sent again: an explorer that has just been discovered
 # may be unable to answer.
 _RESEND_S = 10.0
@@ -99,6 +51,8 @@ _RESEND_S = 10.0
 class RequestedExploration:
     """Client of the action explore of a robot; its names begin with a prefix, '' or 'robot1/'.
 
+    What was requested of a server is lost when it is killed. One that takes its place continues
+    the goal, or answers that it does not know it, with STATUS_UNKNOWN.
     status: the newest one, None before; result: ready for JSON, None before the end.
     """
 
@@ -122,7 +76,9 @@ class RequestedExploration:
         self._on_progress = on_progress
         self._sent: Any = None
         self._sent_at = 0.0
-        self._accepted = False
+        self._handle: ClientGoalHandle | None = None
+        self._servers: set[bytes] = set()  # that were asked for the result
+        self._requests_left = 0
         self._client = ActionClient(node, Explore, self._action)
         self._subscribe(f'{prefix}map', on_map)
 
@@ -143,15 +99,32 @@ class RequestedExploration:
         updates = updates_topic(node, topic)
         node.create_subscription(OccupancyGridUpdate, updates, on_update, qos.STREAM)
 
-    def request(self) -> None:
-        """Send the goal, again if there is no answer for a while."""
-        if self._accepted or not self._client.server_is_ready():
+    def work(self) -> None:
+        """Send the goal, again if there is no answer for a while; ask again for its result.
+
+        To be called twice a second.
+        """
+        if self.result is not None:
             return
-        if self._sent is not None and monotonic() - self._sent_at < _RESEND_S:
+        if self._handle is not None:
+            self._ask_again(self._handle)
+            return
+        is_waiting = self._sent is not None and monotonic() - self._sent_at < _RESEND_S
+        if is_waiting or not self._client.server_is_ready():
             return
         self._sent_at = monotonic()
         self._sent = self._client.send_goal_async(self._goal, self._on_feedback)
         self._sent.add_done_callback(self._on_accepted)
+
+    def _ask_again(self, handle: ClientGoalHandle) -> None:
+        """Ask each new server for the result, some times."""
+        servers = action_servers(self._node, self._action)
+        if servers - self._servers:
+            self._servers |= servers
+            self._requests_left = _REQUESTS
+        if self._requests_left > 0:
+            self._requests_left -= 1
+            handle.get_result_async().add_done_callback(self._on_result)
 
     @property
     def doing(self) -> str:
@@ -161,14 +134,19 @@ class RequestedExploration:
     def _on_accepted(self, future: Future) -> None:
         if future is not self._sent:
             return  # replaced by a newer goal
-        self._accepted = True
-        GoalResult(self._node, self._action, future.result(), self._on_result)
+        handle = future.result()
+        self._handle = handle
+        self._servers = action_servers(self._node, self._action)
+        handle.get_result_async().add_done_callback(self._on_result)
 
     def _on_feedback(self, message: Explore.Impl.FeedbackMessage) -> None:
         self.status = message.feedback.status
         self._on_progress()
 
-    def _on_result(self, ended: Any) -> None:
+    def _on_result(self, future: Future) -> None:
+        if self.result is not None:
+            return  # another answer
+        ended = future.result()
         status: ExplorationStatus = ended.result.status
         if ended.status == GoalStatus.STATUS_UNKNOWN:
             status.reason = 'the explorer was started again, and does not know the exploration'
