@@ -1,8 +1,8 @@
 """Reads MCAP files, also truncated or damaged ones: intact messages in log order or file order.
 
 The `mcap` package has no recovery (`mcap recover` is a program written in Go), and neither it nor
-rosbags limits the decompressed size of a chunk. Only the record types of `mcap` are used. Declared
-sizes are checked before memory is allocated.
+rosbags limits the decompressed size of a chunk. Of `mcap` the record types are used, and the reader
+for the summary alone. Declared sizes are checked before memory is allocated.
 
 Source: https://mcap.dev/spec.
 """
@@ -26,6 +26,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Message, Schema, Statistics
+from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
@@ -668,9 +669,9 @@ def summary_of(path: Path) -> Summary:
         if not len(MAGIC) <= start <= footer_at or footer_at - start > LOGS.summary_bytes:
             return Summary([], [])
         stream.seek(start)
-        content = stream.read(footer_at - start)
+        content = stream.read(size - start)
     # The checksum covers the footer up to the checksum field.
-    if checksum and zlib.crc32(content + footer[: HEAD.size + _FOOTER.size - 4]) != checksum:
+    if checksum and zlib.crc32(content[: -len(MAGIC) - 4]) != checksum:
         return Summary([], [])
     try:
         return _parsed_summary(content, start)
@@ -679,34 +680,20 @@ def summary_of(path: Path) -> Summary:
 
 
 def _parsed_summary(content: bytes, data_end: int) -> Summary:
+    """The summary in the bytes from its begin to the end of the file."""
     summary = Summary([], [])
-    at = 0
-    while at < len(content):
-        code, length = HEAD.unpack_from(content, at)
-        record = content[at + HEAD.size : at + HEAD.size + length]
-        if len(record) < length:
-            raise DamagedError(f'record of {length} bytes')
-        if code in (Opcode.SCHEMA, Opcode.CHANNEL):
-            summary.definitions.append(definition(code, record))
-        elif code == Opcode.CHUNK_INDEX:
+    reader = StreamReader(BytesIO(content), skip_magic=True, record_size_limit=len(content))
+    for record in reader.records:
+        if isinstance(record, Schema | Channel):
+            summary.definitions.append(record)
+        elif isinstance(record, ChunkIndex):
             summary.blocks.append(_indexed(record, data_end))
-        elif code == Opcode.STATISTICS:
-            summary.message_counts.update(_message_counts(record))
-        at += HEAD.size + length
+        elif isinstance(record, Statistics):
+            summary.message_counts.update(record.channel_message_counts)
     return summary
 
 
-def _message_counts(record: bytes) -> dict[int, int]:
-    """Message counts by channel; empty if the record is unreadable."""
-    try:
-        statistics = Statistics.read(ReadDataStream(BytesIO(record)))
-    except (McapError, struct.error):
-        return {}
-    return dict(statistics.channel_message_counts)
-
-
-def _indexed(record: bytes, data_end: int) -> ChunkSpan:
-    index = ChunkIndex.read(ReadDataStream(BytesIO(record)))
+def _indexed(index: ChunkIndex, data_end: int) -> ChunkSpan:
     end = index.chunk_start_offset + index.chunk_length
     if not len(MAGIC) <= index.chunk_start_offset <= end - HEAD.size <= data_end - HEAD.size:
         raise DamagedError(f'chunk at byte {index.chunk_start_offset}')
