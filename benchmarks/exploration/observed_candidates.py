@@ -142,7 +142,7 @@ def hidden_areas(
     """
     own = observable.frame
     scale = own.resolution
-    missing = observable.cells & ~_known(patch, observable)
+    missing = observable.cells & ~known_free_cells(patch, observable)
     seeds = [own.cells_of(frame.centres_of(cells)) for cells in frontiers]
     owners = [np.full(len(cells), i) for i, cells in enumerate(seeds)]
     labels = _partition(missing, np.vstack(seeds), np.concatenate(owners))
@@ -150,7 +150,7 @@ def hidden_areas(
     return np.asarray(counts * scale**2)
 
 
-def _known(patch: GridPatch, observable: ObservableCells) -> Mask:
+def known_free_cells(patch: GridPatch, observable: ObservableCells) -> Mask:
     """Observable cells that are known as free, (H, W)."""
     known = np.zeros(observable.cells.shape, dtype=np.bool_)
     cells = np.argwhere(observable.cells)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thinmap_ros.core.exploration.belief import missing_area
+from thinmap_ros.core.exploration.belief import Hidden, fringe_m2, missing_area
 from thinmap_ros.core.exploration.fitted import FITTED
 
 
@@ -37,20 +37,22 @@ def test_more_in_line_of_sight_means_more_behind():
 
 
 def test_the_missing_area_is_the_sum_of_what_is_expected():
-    probabilities = np.array([0.9, 0.2, 0.5])
-    areas = np.array([10.0, 5.0, 2.0])
-    missing = missing_area(zip(probabilities, areas, strict=True))
-    assert missing.expected_m2 == pytest.approx(1.0 + 4.0 + 1.0)
+    hidden = [Hidden(0.9, 0.0, 10.0), Hidden(0.2, 0.1, 5.0), Hidden(0.5, 0.2, 2.0)]
+    missing = missing_area(hidden)
+    assert missing.expected_m2 == pytest.approx(1.0 + 4.02 + 1.1)
     assert missing.bound_m2 > missing.expected_m2
     assert missing_area([]) == (0.0, 0.0)
-    assert missing_area([(1.0, 5.0)]) == (0.0, 0.0)
+    assert missing_area([Hidden(1.0, 0.0, 5.0)]) == (0.0, 0.0)
 
 
 def test_nineteen_of_twenty_times_no_more_is_missing_than_the_bound():
-    probabilities = np.full(30, 0.8)
-    areas = np.full(30, 4.0)
+    hidden = [Hidden(0.8, 0.5, 4.0)] * 30
     rng = np.random.default_rng(3)
-    hidden = rng.random((2000, 30)) >= probabilities
-    missing = np.where(hidden, rng.exponential(areas, hidden.shape), 0.0).sum(axis=1)
-    share = np.mean(missing <= missing_area(zip(probabilities, areas, strict=True)).bound_m2)
+    is_worth_seeing = rng.random((2000, 30)) >= 0.8
+    missing = rng.exponential(np.where(is_worth_seeing, 4.0, 0.5)).sum(axis=1)
+    share = np.mean(missing <= missing_area(hidden).bound_m2)
     assert 0.9 < share < 0.98
+
+
+def test_a_fringe_is_as_long_as_its_frontier_and_as_deep_as_a_part_of_a_cell():
+    assert fringe_m2(2.0, 0.1) == pytest.approx(4.0 * fringe_m2(1.0, 0.05))

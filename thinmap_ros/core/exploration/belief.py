@@ -21,6 +21,10 @@ _MIN_M2 = 0.05
 _MIN_DEPTH_M = 0.05
 _DEVIATIONS = 1.645  # of a normal distribution at 95 %
 
+# Free cells between a frontier and the wall right behind it, for each cell of the frontier: a
+# median at the end of explorations, see `benchmarks/exploration/missing_area.py`.
+_FRINGE = 0.45
+
 SAME_M = 0.5  # cells of a frontier so far apart are the same: corrections of the map move them
 _SHARE = 0.5  # of its cells with which a frontier continues an earlier one
 
@@ -86,20 +90,34 @@ class MissingArea(NamedTuple):
     bound_m2: float
 
 
-def missing_area(hidden: Iterable[tuple[float, float]]) -> MissingArea:
-    """Area behind candidates, of each its probability that nothing is behind, and the mean if not.
+class Hidden(NamedTuple):
+    """What a frontier hides: with a probability a fringe, else an area worth seeing; means, m2."""
 
-    Each hides nothing, or an exponentially distributed area. The bound is that of the gamma
-    distribution with the mean and the variance of their sum.
+    probability: float
+    fringe_m2: float
+    area_m2: float
+
+
+def fringe_m2(length_m: float, resolution: float) -> float:
+    """Mean free area between a frontier and the wall right behind it."""
+    return _FRINGE * length_m * resolution
+
+
+def missing_area(hidden: Iterable[Hidden]) -> MissingArea:
+    """Area behind frontiers, from the means of each.
+
+    Each frontier hides an exponentially distributed area, with one mean or the other. The bound is
+    that of the gamma distribution with the mean and the variance of the sum.
     Source: Wilson and Hilferty, "The distribution of chi-square", 1931 (quantile of a gamma
     distribution).
     """
     mean = 0.0
     variance = 0.0
-    for probability, area_m2 in hidden:
+    for probability, fringe, area_m2 in hidden:
         share = 1.0 - probability
-        mean += share * area_m2
-        variance += share * (2.0 - share) * area_m2**2
+        own = probability * fringe + share * area_m2
+        mean += own
+        variance += 2.0 * (probability * fringe**2 + share * area_m2**2) - own**2
     if mean <= 0.0:
         return MissingArea(0.0, 0.0)
     per_shape = variance / mean**2

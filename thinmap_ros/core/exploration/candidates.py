@@ -15,12 +15,22 @@ from scipy.spatial.distance import cdist
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.exploration.belief import SAME_M, BeliefModel, Evidence, EvidenceStore
+from thinmap_ros.core.exploration.belief import (
+    SAME_M,
+    WORTH_SEEING_M2,
+    BeliefModel,
+    Evidence,
+    EvidenceStore,
+    Hidden,
+    MissingArea,
+    fringe_m2,
+    missing_area,
+)
 from thinmap_ros.core.exploration.space import FrontierMap, search_beside
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode, unobserved
 from thinmap_ros.core.exploration.views import NO_VIEW, Sight, View, ViewFinder
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.planning.travel_times import TravelTimes
+from thinmap_ros.core.planning.travel_times import Arrivals, TravelTimes
 from thinmap_ros.core.se2 import Array, Cells, Place
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
@@ -101,8 +111,8 @@ class Candidate:
 class CandidateFinder:
     """Finds the candidates of a growing map, each with the evidence that it had before.
 
-    settled: end nodes without a frontier; hidden: of each frontier, also of those that are too
-    short to be candidates, the probability that it hides nothing, and the area, m2, if not.
+    settled: end nodes without a frontier; missing: free area that the map does not show, behind all
+    frontiers, also those that are too short to be candidates.
     """
 
     def __init__(self, config: CandidateConfig, model: BeliefModel) -> None:
@@ -112,7 +122,7 @@ class CandidateFinder:
         self.store = EvidenceStore(FIRST_FRONTIER_ID)
         self.candidates: list[Candidate] = []
         self.settled: list[EndNode] = []
-        self.hidden: list[tuple[float, float]] = []
+        self.missing = MissingArea(0.0, 0.0)
 
     def update(
         self, topology: TopologicalMap, frontiers: FrontierMap, travel: TravelTimes, sight: Sight
@@ -138,10 +148,26 @@ class CandidateFinder:
         self.candidates = [c for c in found if not c.view.is_enclosed]
         threshold = self._config.probability_threshold
         below = [c for c in self.candidates if c.probability < threshold]
-        self._views.expire([c.cells for c in below])
-        for candidate in below or self.candidates:
-            _choose_viewpoint(candidate, frontiers, travel, sight.slack_rad)
-        self.hidden = [(c.probability, c.area_m2) for c in (*found, *fragments)]
+        self._choose_viewpoints(below or self.candidates, frontiers, travel, sight)
+        resolution = frontiers.frame.resolution
+        self.missing = missing_area(
+            [
+                Hidden(c.probability, fringe_m2(c.length_m, resolution), c.area_m2)
+                for c in (*found, *fragments)
+            ]
+        )
+
+    def _choose_viewpoints(
+        self, chosen: list[Candidate], frontiers: FrontierMap, travel: TravelTimes, sight: Sight
+    ) -> None:
+        places = [candidate.view.cells for candidate in chosen]
+        arrivals = travel.arrivals(np.concatenate([NO_VIEW.cells, *places]))
+        end = 0
+        for candidate, cells in zip(chosen, places, strict=True):
+            part = slice(end, end + len(cells))
+            end = part.stop
+            own = Arrivals(arrivals.seconds[part], arrivals.headings[part])
+            _choose_viewpoint(candidate, frontiers, travel, own, sight.slack_rad)
 
     def _find(
         self, topology: TopologicalMap, frontiers: FrontierMap, clusters: list[Cells]
@@ -157,7 +183,7 @@ class CandidateFinder:
         owned: dict[tuple[int, int], list[Cells]] = defaultdict(list)
         for i, (cells, owner) in enumerate(zip(clusters, owners, strict=True)):
             owned[owner, i if owner < 0 else 0].append(cells)
-        found = [np.vstack(parts) for parts in owned.values()]
+        found = [parts[0] if len(parts) == 1 else np.vstack(parts) for parts in owned.values()]
         end_nodes = [nodes[owner] if owner >= 0 else None for owner, _ in owned]
         middles = [frontiers.middle_of(cells) for cells in found]
         frame = frontiers.frame
@@ -186,27 +212,33 @@ class CandidateFinder:
     def _believe(self, candidate: Candidate, view: View) -> None:
         """Determine how likely a candidate hides nothing, and how much if it hides something.
 
-        At most what the best place would see: a gap into which no place sees hides no more.
+        At most what the best place would see, but no less than counts as something: places that
+        the map does not show yet may see into a gap into which none sees now.
         """
         candidate.view = view
         candidate.probability = self._model.probability(
             candidate.length_m, view.hidden_m2, view.depth_m, candidate.evidence.visits
         )
-        candidate.area_m2 = min(view.most_m2, self._model.mean_area(view.hidden_m2))
+        area_m2 = min(view.most_m2, self._model.mean_area(view.hidden_m2))
+        candidate.area_m2 = max(area_m2, WORTH_SEEING_M2)
 
 
 def _choose_viewpoint(
-    candidate: Candidate, frontiers: FrontierMap, travel: TravelTimes, slack_rad: float
+    candidate: Candidate,
+    frontiers: FrontierMap,
+    travel: TravelTimes,
+    arrivals: Arrivals,
+    slack_rad: float,
 ) -> None:
     """Choose the place that sees most of a frontier for each second that it costs.
 
     Not one from where a visit showed nothing. Without such a place, it is the nearest one beside
     the frontier: from there a passage that looks too narrow may turn out to be wide enough.
-    slack_rad: angle by which the robot need not turn to what it observes.
+    arrivals: at the places of its view; slack_rad: angle by which the robot need not turn to what
+    it observes.
     """
     view = candidate.view
     centres = frontiers.frame.centres_of(view.cells)
-    arrivals = travel.arrivals(view.cells)
     is_new = np.isfinite(arrivals.seconds)
     for place in candidate.evidence.seen_from:
         is_new &= np.hypot(*(centres - place).T) > SAME_M

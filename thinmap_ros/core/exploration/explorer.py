@@ -31,7 +31,15 @@ from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel, Ev
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.exploration.space import FrontierMap, box_of_scan, hidden_area_m2
-from thinmap_ros.core.exploration.strategy import Decision, Start, Streak, decide, is_at, is_near
+from thinmap_ros.core.exploration.strategy import (
+    Decision,
+    EndNode,
+    Start,
+    Streak,
+    decide,
+    is_at,
+    is_near,
+)
 from thinmap_ros.core.exploration.team import SAME_PLACE_M, Claim, Team
 from thinmap_ros.core.exploration.views import Sight
 from thinmap_ros.core.grid.patch import GridPatch
@@ -153,6 +161,7 @@ class Explorer:
         self._sight = Sight()
         self._target = _Target()
         self._look = LookAround()
+        self._published: list[EndNode] = []  # of the candidates, as none of them is the target
         self._now_ns = 0  # stamp of this scan
         self._found_ns = -(10**18)  # and of the last search for candidates
         self._frame = self.frontier_map.frame
@@ -200,6 +209,7 @@ class Explorer:
             frontiers = self.frontier_map
             self._travel.update(frontiers.free, frontiers.passable, frontiers.frame, T_map_base)
             self._finder.update(topology, frontiers, self._travel, self._sight)
+            self._published = [candidate.published(None) for candidate in self.candidates]
             self._choose(topology, T_map_base)
         return self._decision()
 
@@ -322,9 +332,11 @@ class Explorer:
         """
         threshold = self.config.probability_threshold
         below = [candidate for candidate in self.candidates if candidate.probability < threshold]
+        if below:
+            return below
         by_area = sorted(self.candidates, key=lambda candidate: candidate.expected_area_m2)
         sums_m2 = accumulate(candidate.expected_area_m2 for candidate in by_area)
-        return below or [c for c, m2 in zip(by_area, sums_m2, strict=True) if m2 > _MAX_RESOLVED_M2]
+        return [c for c, m2 in zip(by_area, sums_m2, strict=True) if m2 > _MAX_RESOLVED_M2]
 
     def _ready(self, worth: list[Candidate]) -> list[Candidate]:
         """Candidates to which no drive failed; if there are none, all others after a pause.
@@ -377,18 +389,20 @@ class Explorer:
 
     def _decision(self) -> Decision:
         target = self._target
-        places = self.candidates
+        end_nodes = [*self._finder.settled, *self._published]
         if target.is_turn and target.candidate is not None:
-            places = [*places, target.candidate]
-        published = [c.published(target.goal if c is target.candidate else None) for c in places]
+            end_nodes.append(target.candidate.published(target.goal))
+        for i, candidate in enumerate(self.candidates, len(self._finder.settled)):
+            if candidate is target.candidate:
+                end_nodes[i] = candidate.published(target.goal)
         doubtful = self._doubtful
         return decide(
-            self._finder.settled + published,
+            end_nodes,
             self._end.is_over,
             len(doubtful) or int(self._look.is_in_the_dark),
             (c.node_id for c in doubtful if c.evidence.failures or _is_given_up(c)),
             self.frontier_map.known_area_m2,
-            self._finder.hidden,
+            self._finder.missing,
         )
 
 

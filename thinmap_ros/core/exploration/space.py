@@ -78,6 +78,7 @@ class FrontierMap:
         self.free: Mask = np.zeros((rows, cols), dtype=np.bool_)
         self.mask: Mask = np.zeros((rows, cols), dtype=np.bool_)
         self.passable: Mask = np.ones((rows, cols), dtype=np.bool_)
+        self._changed: Mask = np.ones((rows, cols), dtype=np.bool_)
         self.free_cells = 0
         self._room = GridPatch(self.frame, self.mask.view(np.int8))
         # For each cell and a margin of one cell, kept: a map has few frontier cells.
@@ -104,9 +105,17 @@ class FrontierMap:
         beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]
         gone = int(np.count_nonzero(self.free[at]))
         self.free_cells += int(np.count_nonzero(known[inner])) - gone
+        passable = ~cut.occupied[inner]
+        self._changed[at] |= (self.free[at] != known[inner]) | (self.passable[at] != passable)
         self.free[at] = known[inner]
         self.mask[at] = (known & beside)[inner]
-        self.passable[at] = ~cut.occupied[inner]
+        self.passable[at] = passable
+
+    def take_changes(self) -> Mask:
+        """Cells (H, W) that are not what they were at the last call: free, occupied or neither."""
+        changed = self._changed
+        self._changed = np.zeros_like(changed)
+        return changed
 
     def clusters(self, min_length_m: float) -> list[Cells]:
         """Frontier cells (N, 2) of each cluster that is long enough, in the order of first cells.

@@ -10,7 +10,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import counted
-from thinmap_ros.core.exploration.belief import MissingArea, missing_area
+from thinmap_ros.core.exploration.belief import MissingArea
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array
@@ -94,8 +94,8 @@ class Decision:
 
     reason: words for the end, or for the progress; unreachable: ids of end nodes that are put aside
     or given up: without a way to them, or visited in vain; remaining: how many are not resolved,
-    these included; hidden: of each candidate the probability that it hides nothing, and the mean
-    area, m2, that it hides if not; None where the strategy does not estimate them.
+    these included; missing: free area that is not seen; None where the strategy does not estimate
+    it.
     """
 
     target: EndNode | None
@@ -106,20 +106,14 @@ class Decision:
     unreachable: list[int]
     known_area_m2: float
     remaining: int = 0
-    hidden: list[tuple[float, float]] | None = None
-
-    @property
-    def missing(self) -> MissingArea | None:
-        """Area that is not seen; None where the strategy does not estimate it."""
-        return None if self.hidden is None else missing_area(self.hidden)
+    missing: MissingArea | None = None
 
     @property
     def coverage_estimate(self) -> float:
         """Known free area over that and the missing one, 0 to 1; 0 where nothing is estimated."""
-        missing = self.missing
-        if missing is None or self.known_area_m2 <= 0.0:
+        if self.missing is None or self.known_area_m2 <= 0.0:
             return 0.0
-        return self.known_area_m2 / (self.known_area_m2 + missing.expected_m2)
+        return self.known_area_m2 / (self.known_area_m2 + self.missing.expected_m2)
 
 
 @runtime_checkable
@@ -197,7 +191,7 @@ def decide(
     left: int,
     aside: Iterable[int] = (),
     known_area_m2: float = 0.0,
-    hidden: list[tuple[float, float]] | None = None,
+    missing: MissingArea | None = None,
 ) -> Decision:
     """Decision for the end node that is the target; see there.
 
@@ -211,7 +205,7 @@ def decide(
         gone = f'{words}, which the robot cannot reach or see into'
         words = gone if left else 'all end nodes resolved'
     return Decision(
-        target, is_finished, words, code, end_nodes, sorted(aside), known_area_m2, left, hidden
+        target, is_finished, words, code, end_nodes, sorted(aside), known_area_m2, left, missing
     )
 
 

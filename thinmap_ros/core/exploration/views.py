@@ -30,7 +30,8 @@ _RAYS = 90
 _RIM_RAD = 0.6  # at the ends of its field of view the laser sees little
 _LEAST_FADE_M = 0.5
 _MIN_VIEW_M2 = 0.1  # a cell or two at a distance
-_SEARCHES = 10  # until a frontier that does not change is examined again
+_SEARCHES = 30  # until a frontier around which nothing changes is examined again
+_AROUND_M = 1.0  # of what is in view
 _HALF_DIAGONAL = 0.75  # of a cell, and a little more
 
 
@@ -86,8 +87,8 @@ NO_VIEW = View(0.0, 0.0, np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros
 class ViewFinder:
     """Views of the frontiers of a growing map.
 
-    A frontier that has changed, or has expired, is examined again at once, the others in turn: what
-    is around a frontier seldom changes while its own cells do not.
+    A frontier is examined again at once where it, or a cell near what is in view, has changed; the
+    others in turn, as places far away may come into view.
     """
 
     def __init__(self) -> None:
@@ -104,8 +105,14 @@ class ViewFinder:
         # In the order in which they were examined.
         for key in list(self._known)[: math.ceil(len(self._known) / _SEARCHES)]:
             del self._known[key]
+        changed = frontiers.take_changes()
+        margin = round(_AROUND_M / frontiers.frame.resolution)
+        known: dict[bytes, View] = {}
         keys = [cells.tobytes() for cells in clusters]
-        known = {key: view for key, view in self._known.items() if key in set(keys)}
+        for key, cells in zip(keys, clusters, strict=True):
+            view = self._known.get(key)
+            if view is not None and not changed[_around(cells, view.cells, margin)].any():
+                known[key] = view
         missing = [k for k, key in enumerate(keys) if key not in known]
         if missing:
             examiner = _Examiner(frontiers, travel, clusters, sight)
@@ -113,10 +120,13 @@ class ViewFinder:
         self._known = known
         return [known[key] for key in keys]
 
-    def expire(self, clusters: list[Cells]) -> None:
-        """Have some frontiers (N, 2) examined again at the next update."""
-        for cells in clusters:
-            self._known.pop(cells.tobytes(), None)
+
+def _around(cells: Cells, places: Cells, margin: int) -> tuple[slice, slice]:
+    """Rows and columns around a frontier (N, 2) and the places (M, 2) that see it."""
+    both = np.concatenate([cells, places])
+    (top, left), (bottom, right) = both.min(axis=0).tolist(), both.max(axis=0).tolist()
+    rows = slice(max(top - margin, 0), bottom + margin + 1)
+    return rows, slice(max(left - margin, 0), right + margin + 1)
 
 
 class _Examiner:
