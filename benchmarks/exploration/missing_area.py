@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.exploration.cases import generated, load_case
-from benchmarks.exploration.observed_candidates import known_free_cells
+from benchmarks.exploration.observed_candidates import generated, known_free_cells, load_case
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.core.exploration.belief import MissingArea
 from thinmap_ros.core.exploration.explorer import Explorer

@@ -1,7 +1,7 @@
 """The executor of a node: it waits with one wait set as long as the node has the same entities.
 
-That of rclpy collects them and makes a wait set for each callback, and once more as the callback
-wakes it: half of the CPU time of a live robot.
+That of rclpy collects them and makes a wait set twice for each callback, as the callback wakes it:
+half of the CPU time of a live robot.
 """
 
 import inspect

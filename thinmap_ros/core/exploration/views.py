@@ -124,7 +124,8 @@ class ViewFinder:
 def _around(cells: Cells, places: Cells, margin: int) -> tuple[slice, slice]:
     """Rows and columns around a frontier (N, 2) and the places (M, 2) that see it."""
     both = np.concatenate([cells, places])
-    (top, left), (bottom, right) = both.min(axis=0).tolist(), both.max(axis=0).tolist()
+    top, left = both.min(axis=0).tolist()
+    bottom, right = both.max(axis=0).tolist()
     rows = slice(max(top - margin, 0), bottom + margin + 1)
     return rows, slice(max(left - margin, 0), right + margin + 1)
 
