@@ -6,7 +6,7 @@ import pytest
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.task import Future
-from std_msgs.msg import String
+from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
 from thinmap_ros.ros.executor import NodeExecutor
@@ -130,6 +130,24 @@ def test_entities_come_and_go_while_callbacks_run(node, executor):
     publisher.publish(String())
     assert executor.next_callback(timeout_s=0.1) is None
     assert len(heard) == before
+
+
+def test_a_topic_may_come_back_with_another_type(node, executor):
+    heard = []
+    subscriptions = [node.create_subscription(String, 'a', heard.append, 10)]
+
+    def replace():
+        node.destroy_subscription(subscriptions.pop())
+        subscriptions.append(node.create_subscription(Bool, 'a', heard.append, 10))
+        timer.cancel()
+
+    timer = node.create_timer(1e-3, replace)
+    until(timer.is_canceled, executor)
+    publisher = node.create_publisher(Bool, 'a', 10)
+    until(lambda: publisher.get_subscription_count() == 1, executor)
+    publisher.publish(Bool())
+    until(lambda: heard, executor)
+    assert heard == [Bool()]
 
 
 def test_a_subscription_that_another_callback_destroys_is_not_called(node, executor):

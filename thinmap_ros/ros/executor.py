@@ -8,6 +8,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
+from threading import get_ident
 from typing import Any, NamedTuple
 
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -38,14 +39,20 @@ class NodeExecutor(SingleThreadedExecutor):
         self._node = node
         self._is_changed = True
         self._in_use = ExitStack()  # what is waited for is not destroyed meanwhile
+        self._thread = 0  # that calls the callbacks
         self._entities: dict[str, dict[int, Any]] = {}  # by kind and pointer
         self._waitables: list[Any] = []
         self._cycle: Iterator[Ready] = iter(())
         self.add_node(node)
 
     def wake(self) -> None:
-        """Wait no longer: the node has other entities, or a future is done."""
+        """Wait no longer: the node has other entities, or a future is done.
+
+        What a callback has destroyed is gone at once: its topic may come back with another type.
+        """
         self._is_changed = True
+        if get_ident() == self._thread:
+            self._in_use.close()
         super().wake()
 
     def next_callback(self, timeout_s: float) -> Ready | None:
@@ -53,6 +60,7 @@ class NodeExecutor(SingleThreadedExecutor):
 
         Raises ExternalShutdownException once ROS is shut down.
         """
+        self._thread = get_ident()
         ready = next(self._cycle, None)
         if ready is None:
             self._cycle = self._next_cycle(round(timeout_s * SECOND_NS))
@@ -79,7 +87,10 @@ class NodeExecutor(SingleThreadedExecutor):
         self._require_ros()
         pointers = {kind: self._wait_set.get_ready_entities(kind) for kind in _KINDS}
         for waitable in waited:
-            if waitable.is_ready(self._wait_set) and self.can_execute(waitable):
+            is_gone = self._is_changed and waitable not in self._node.waitables
+            if is_gone or not waitable.is_ready(self._wait_set):
+                continue
+            if self.can_execute(waitable):
                 yield self._task_of(waitable, self._take_waitable)
         for kind in _KINDS:
             entities = self._entities[kind]

@@ -739,6 +739,17 @@ def test_a_map_is_taken_over_by_another_localizer(whole_drive):
     assert worst(rows[10:]) < 0.08
 
 
+@pytest.mark.parametrize('scans', [0, 1])
+def test_a_pose_that_is_set_before_the_robot_moves_needs_no_drive_to_be_confirmed(scans):
+    localizer = Localizer(LocalizerConfig())
+    rng = np.random.default_rng(1)
+    for k in range(8):
+        if k == scans:
+            localizer.set_pose(START, np.diag([0.25, 0.25, 0.07]))
+        estimate = localizer.step(scan_in(ROOM, START, rng, k * PERIOD_NS), np.zeros(3))
+    assert estimate.destination is Destination.MAP
+
+
 def test_after_set_pose_in_a_loaded_map_localization_continues(whole_drive):
     _, first = whole_drive
     second = Localizer.from_state(first.state())

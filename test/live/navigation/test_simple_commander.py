@@ -125,7 +125,7 @@ def test_its_sequence_of_calls_drives_the_simulated_robot(graph):
 
     assert commander.go_to_pose(pose_at(3.0, 3.0, math.pi / 2))
     remaining = complete()
-    assert commander.get_result() is TaskResult.SUCCEEDED
+    assert commander.get_result() is TaskResult.SUCCEEDED, commander.result.result()
     assert max(remaining) == pytest.approx(math.sqrt(2.0), abs=0.3)
     assert math.dist(position(), (3.0, 3.0)) < 0.3
     yaw = decode.yaw(truth[-1].pose.orientation)
@@ -143,7 +143,7 @@ def test_its_sequence_of_calls_drives_the_simulated_robot(graph):
     places = ((2.6, 2.6), (3.2, 2.0), (2.0, 2.0))
     assert commander.go_through_poses([pose_at(*place) for place in places])
     complete()
-    assert commander.get_result() is TaskResult.SUCCEEDED
+    assert commander.get_result() is TaskResult.SUCCEEDED, commander.result.result()
     path = np.array([(t.pose.position.x, t.pose.position.y) for t in truth])
     nearest = [np.hypot(*(path - place).T).min() for place in places]
     assert max(nearest) < 0.3

@@ -308,7 +308,8 @@ class Localizer:
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Set the pose (3,) with covariance (3, 3) in the current map.
 
-        The map is not updated until scans confirm the pose: looks on the way may speak against it.
+        A map that is not empty is not updated until scans confirm the pose: looks on the way may
+        speak against it.
         In a map that does not change, the robot is lost until then. A piece of map that is apart is
         left: the pose is in the published map.
         """
@@ -317,7 +318,10 @@ class Localizer:
             return
         T_map_base = se2.pose(*T_map_base.tolist())
         self._place(T_map_base, covariance)
-        self._tracker.belief.place(is_map_given=not self.config.is_mapping)
+        if self._local.map.is_empty and not self.keyframes:
+            self._tracker.belief.start_submap()  # there is nothing that could confirm the pose
+        else:
+            self._tracker.belief.place(is_map_given=not self.config.is_mapping)
         self._local.rerender(self.keyframes, T_map_base)
 
     def complete_map(self) -> None:
