@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import networkx
@@ -224,6 +225,7 @@ def is_part(module, name):
     return module == name or module.startswith(f'{name}.')
 
 
+@cache
 def reached_by_core():
     """Modules of the core that each of them imports, also through others."""
     arrows = networkx.DiGraph()
