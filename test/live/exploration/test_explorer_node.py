@@ -15,6 +15,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from support.forks import forked
 from support.localized import local_grid
+from support.timeouts import PATIENCE_S
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import (
@@ -161,6 +162,15 @@ def test_it_reports_why_it_ended(robot):
     assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_ABORTED)
     robot.knows(60)
     assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_the_time_that_it_took_is_none_of_the_calendar(graph):
+    robot = Robot(graph)
+    graph.start('explorer', laser_pose='0,0,0')
+    status = graph.act(Explore, 'explore', Explore.Goal(area_limit_m2=1.0)).result.status
+    assert status.reason_code == ExplorationStatus.BUDGET_EXHAUSTED, status.reason
+    assert 0 <= status.elapsed.sec < PATIENCE_S
+    assert robot.end_nodes
 
 
 def test_it_waits_for_the_graph_of_its_map(robot):

@@ -462,14 +462,13 @@ class MissionPublishers:
 
     def status_now(self, mission: Mission) -> ExplorationStatus:
         """Message of the present state and progress."""
-        now_ns = self._node.now_ns
         status = ExplorationStatus(
-            header=messages.header(self._frame_id, now_ns),
+            header=messages.header(self._frame_id, self._node.now_ns),
             state=int(mission.state),
             reason_code=int(mission.end.code),
             reason=mission.end.reason,
             distance_m=mission.odometer.distance_m,
-            elapsed=messages.duration_msg(mission.elapsed_s(now_ns / 1e9)),
+            elapsed=messages.duration_msg(mission.elapsed_s(self._node.elapsed_time.now_s())),
             missing_area_m2=_NOT_ESTIMATED,
             missing_area_bound_m2=_NOT_ESTIMATED,
         )
