@@ -9,6 +9,7 @@ from support.carried_robot import carried
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.places.place_odds import JOIN_ODDS
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.track import LocalizerConfig
@@ -233,3 +234,29 @@ def test_a_storey_without_a_name_or_that_the_given_map_does_not_show_is_refused(
         given.enter_storey('second')
     given.enter_storey('first')
     assert given.map_tag == 'first'
+
+
+@pytest.mark.parametrize(('building', 'path_m'), [(3, 3.0), (10, 6.0)])
+def test_a_killed_localizer_continues_where_its_saved_map_ends(building, path_m):
+    """Its pose is known to the last scan, its map was saved two metres before."""
+    localizer = Localizer(LocalizerConfig())
+    first = last = saved = None
+    is_killed = False
+    driven_m = 0.0
+    for moment in carried((building, 1, path_m + 8.0)):
+        first = moment.T_world_base if first is None else first
+        if last is not None:
+            driven_m += math.dist(last.T_odom_base[:2], moment.T_odom_base[:2])
+        if saved is None and driven_m > path_m:
+            saved = localizer.state()
+        if not is_killed and driven_m > path_m + 2.0:
+            is_killed = True
+            localizer = Localizer.from_state(saved, LocalizerConfig())
+            localizer.resume(last, moment.T_odom_base)
+        estimate = localizer.step(moment.scan, moment.T_odom_base)
+        stamp_ns = moment.scan.stamp_ns
+        last = OdometryAnchor(stamp_ns, estimate.T_map_odom, moment.T_odom_base)
+        if is_killed:
+            assert not estimate.is_lost and estimate.apart is None
+            here = se2.between(first, moment.T_world_base)
+            assert math.dist(estimate.T_map_base[:2], here[:2]) < 0.3

@@ -439,10 +439,11 @@ class Localizer:
         turn = float(last.T_map_odom[2] + last.T_odom_base[2])
         variances = odometry_variances(moved, self.config.odometry)
         cell = np.full(3, self.config.local_map.resolution_m)
-        self.set_pose(
-            se2.compose(last.T_map_odom, T_odom_base),
-            rotated_covariance(np.diag(variances), turn) + np.diag(np.square(cell)),
-        )
+        covariance = rotated_covariance(np.diag(variances), turn) + np.diag(np.square(cell))
+        T_map_base = se2.compose(last.T_map_odom, T_odom_base)
+        self._place(T_map_base, covariance)
+        self._tracker.belief.place(not self.config.is_mapping, is_tried=False)
+        self._local.rerender(self.keyframes, T_map_base)
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
         """Estimate the pose of a scan, given the odometry pose (3,) at its stamp; update the map.

@@ -273,16 +273,17 @@ class PlaceBelief:
         if seen_through == 0.0:
             self._opening = _Opening()
 
-    def place(self, is_map_given: bool = False) -> None:
+    def place(self, is_map_given: bool = False, is_tried: bool = True) -> None:
         """The pose was given: the robot is delocalized until scans fit, and looks do not deny it.
 
         is_map_given: the map does not change: the robot is also lost until the first scan that
-        fits. Outside of the map no scan contradicts it.
+        fits. Outside of the map no scan contradicts it. is_tried: whether looks on the path may
+        deny it, and the map waits for them; else one scan that fits confirms it.
         """
         self.is_delocalized = True
         self._carried = 0.0
         self._is_elsewhere = False
-        self._trial = _Trial(is_guess=False, log_odds=_GIVEN)
+        self._trial = _Trial(is_guess=False, log_odds=_GIVEN) if is_tried else None
         self.is_unconfirmed = False
         self.level = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
         self._end_look(0.0)
