@@ -224,7 +224,7 @@ def _draw_cells(axes: 'Axes', patch: GridPatch, regions: RegionMap | None) -> di
     surfaces['unknown'] = _UNKNOWN
     labels = None
     if regions is not None and regions.regions:
-        labels = block_maximum(regions.labels, factor)
+        labels = block_maximum(regions.labels.astype(np.int32), factor)
         labels = _spread_labels(labels, cells.free, round(_REGION_MARGIN_M / cell_m))
         for kind, name in _KINDS.items():
             ids = [region.id for region in regions.regions.values() if region.kind == kind]

@@ -29,6 +29,15 @@ def resident_bytes():
     return int(Path('/proc/self/statm').read_text().split()[1]) * mmap.PAGESIZE
 
 
+def test_a_cell_of_a_tile_takes_the_memory_of_a_page():
+    tiles = TileStore(np.float64)
+    before = resident_bytes()
+    tiles.grow_to(0, 0, 0, KILOMETRE - 1)
+    tiles.allocate(line_of_tiles(0, KILOMETRE))
+    tiles.pool[:KILOMETRE, 0, 0] = 1.0
+    assert resident_bytes() - before < 4 * KILOMETRE * mmap.PAGESIZE
+
+
 def test_the_directory_of_a_corridor_of_a_kilometre_grows_a_few_times():
     tiles = TileStore()
     grown = 0

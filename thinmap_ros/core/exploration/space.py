@@ -81,8 +81,6 @@ class FrontierMap:
         self._changed: Mask = np.ones((rows, cols), dtype=np.bool_)
         self.free_cells = 0
         self._room = GridPatch(self.frame, self.mask.view(np.int8))
-        # For each cell and a margin of one cell, kept: a map has few frontier cells.
-        self._zeros = np.zeros((rows + 2) * (cols + 2), dtype=np.int32)
 
     def _holds(self, patch: GridPatch) -> bool:
         """Whether all cells of a map are cells of these arrays."""
@@ -123,7 +121,7 @@ class FrontierMap:
         Cells of a cluster are joined over edges and corners.
         """
         cells = true_cells(self.mask)
-        numbers, sizes = _clusters(self.mask.shape, cells, self._zeros)
+        numbers, sizes = _clusters(cells)
         cells = cells[np.argsort(numbers, kind='stable')]
         ends = np.cumsum(sizes).tolist()
         return [
@@ -173,42 +171,41 @@ def _middle(cells: Cells) -> tuple[int, int]:
 
 
 @kernel
-def _clusters(
-    shape: tuple[int, int], cells: Cells, at: NDArray[np.int32]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number of the cluster of each cell (N, 2) of an array, (N,), and the size of each cluster.
+def _clusters(cells: Cells) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of the cluster of each cell (N, 2), (N,), and the size of each cluster.
 
-    at: zeros for the array with a margin of one cell; they are zeros again afterwards.
+    cells: row by row, as are the numbers of clusters by their first cells.
     """
-    cols = shape[1] + 2
-    # Index + 1 of the cell that lies there; the empty margin makes bounds checks unnecessary.
-    places = (cells[:, 0] + 1) * cols + cells[:, 1] + 1
-    for i in range(places.size):
-        at[places[i]] = i + 1
-    numbers = np.full(places.size, -1, dtype=np.int64)
-    sizes = np.zeros(places.size, dtype=np.int64)
-    stack = np.empty(places.size, dtype=np.int64)
+    first = np.arange(cells.shape[0])  # an earlier cell of the cluster, or the cell itself
+    above = 0
+    for i in range(cells.shape[0]):
+        row, col = cells[i]
+        if i > 0 and cells[i - 1, 0] == row and cells[i - 1, 1] == col - 1:
+            _join(first, i - 1, i)
+        while cells[above, 0] < row - 1 or (cells[above, 0] < row and cells[above, 1] < col - 1):
+            above += 1
+        k = above
+        while cells[k, 0] < row and cells[k, 1] <= col + 1:
+            _join(first, k, i)
+            k += 1
+    numbers = np.empty(cells.shape[0], dtype=np.int64)
+    sizes = np.zeros(cells.shape[0], dtype=np.int64)
     clusters = 0
-    for first in range(places.size):
-        if numbers[first] >= 0:
-            continue
-        numbers[first] = clusters
-        stack[0] = first
-        count = 1
-        while count > 0:
-            count -= 1
-            here = places[stack[count]]
-            sizes[clusters] += 1
-            for to in (-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1):
-                i = at[here + to] - 1
-                if i >= 0 and numbers[i] < 0:
-                    numbers[i] = clusters
-                    stack[count] = i
-                    count += 1
-        clusters += 1
-    for place in places:
-        at[place] = 0
+    for i in range(cells.shape[0]):
+        numbers[i] = clusters if first[i] == i else numbers[first[i]]
+        clusters += first[i] == i
+        sizes[numbers[i]] += 1
     return numbers, sizes[:clusters].copy()
+
+
+@inlined
+def _join(first: NDArray[np.int64], a: int, b: int) -> None:
+    """Make two cells those of one cluster."""
+    while first[a] != a:
+        a = first[a]
+    while first[b] != b:
+        b = first[b]
+    first[max(a, b)] = min(a, b)
 
 
 def hidden_area_m2(frontiers: FrontierMap, place: Place, reach_m: float = HIDDEN_REACH_M) -> float:

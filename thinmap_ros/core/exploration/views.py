@@ -166,7 +166,7 @@ class _Examiner:
 
 
 @kernel
-def _first_reached(seconds: Array, stands: Mask, size: int) -> Cells:
+def _first_reached(seconds: NDArray[np.float32], stands: Mask, size: int) -> Cells:
     """The cell that is reached first of each square of size x size cells (H, W) in which one is."""
     rows, cols = seconds.shape
     found = np.empty(((rows // size + 1) * (cols // size + 1), 2), dtype=np.int64)

@@ -1,5 +1,7 @@
 """Tile storage for maps that grow in any direction; memory is proportional to the area touched."""
 
+import math
+import mmap
 import resource
 from collections.abc import Iterator
 from contextlib import suppress
@@ -250,6 +252,17 @@ def _empty_pool(tile: tuple[int, ...], dtype: DTypeLike, least: int) -> NDArray[
     `least` tiles.
     """
     if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
-        with suppress(MemoryError):
-            return np.zeros((MAX_TILES, *tile), dtype=dtype)
+        with suppress(OSError):
+            return _sparse_zeros((MAX_TILES, *tile), np.dtype(dtype))
     return np.zeros((least, *tile), dtype=dtype)
+
+
+def _sparse_zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Zeros that need memory only where they are written; raises OSError if the system refuses.
+
+    NumPy asks for pages of 2 MB, of which a surface in one cell of a wall would take a whole one.
+    """
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
+    memory = mmap.mmap(-1, math.prod(shape) * dtype.itemsize, flags=flags)
+    memory.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(memory, dtype).reshape(shape)

@@ -20,10 +20,12 @@ from thinmap_ros.core.planning.wavefront import (
     WavefrontConfig,
     cost_of_free,
     lowest_around,
-    open_escape_cells,
+    ways_out,
 )
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.jit import kernel
+
+Array32 = NDArray[np.float32]
 
 _END_M = 0.6  # of a path: the pieces with whose directions it begins and ends
 
@@ -50,11 +52,11 @@ class TravelTimes:
         self.frame = GridFrame(0.0, 0.0, 1.0)
         self.traversable: Mask = np.zeros((0, 0), dtype=np.bool_)
         self.allowed = self.traversable
-        self.seconds: Array = np.zeros((0, 0))
+        self.seconds: Array32 = np.zeros((0, 0), dtype=np.float32)
         self._planner = planner
         self._controller = controller
         self._recent_path = RecentPath()
-        self._cost: Array = np.zeros((0, 0))
+        self._weights = np.zeros((0, 0), dtype=np.uint8)  # of traversable cells; 0 elsewhere
         self._passable = self.traversable
         self._pose: Array = np.zeros(3)
 
@@ -80,9 +82,11 @@ class TravelTimes:
         self.frame = frame
         self._pose = T_map_base
         self._passable = passable
-        self._cost = cost_of_free(free, passable, frame.resolution, self._planner)
-        self.traversable = np.isfinite(self._cost)
-        weights = self._weights(T_map_base, self._recent_path.cells(frame, free.shape))
+        cost = cost_of_free(free, passable, frame.resolution, self._planner)
+        self.traversable = np.isfinite(cost)
+        cost[~self.traversable] = 0.0
+        self._weights = np.rint(np.minimum(cost, MAX_WEIGHT)).astype(np.uint8)
+        weights = self._weights_from(T_map_base, self._recent_path.cells(frame, free.shape))
         self.allowed = weights > 0
         self.seconds = self._search(weights, T_map_base)
 
@@ -109,7 +113,7 @@ class TravelTimes:
 
         Where the map shows no path, that of a straight line: the other one may have one.
         """
-        field = self._search(self._weights(T_map_base), T_map_base)
+        field = self._search(self._weights_from(T_map_base), T_map_base)
         found = self._at(field, self.frame.cells_of(goals[:, :2]))
         straight_s = np.hypot(*(goals[:, :2] - T_map_base[:2]).T) / self.speed_m_s
         return np.asarray(np.where(np.isfinite(found), np.maximum(found, straight_s), straight_s))
@@ -118,30 +122,31 @@ class TravelTimes:
         """Time (N,), s, of turns by some angles (N,), rad."""
         return np.abs(se2.wrap(angles)) / self._controller.max_angular_speed_rad_s
 
-    def _weights(self, T_map_base: Array, trail: Cells | None = None) -> NDArray[np.uint8]:
+    def _weights_from(self, T_map_base: Array, trail: Cells | None = None) -> NDArray[np.uint8]:
         """Cost of each cell (H, W) as a small number, 0: none; trail (N, 2): of the recent path."""
+        weights = self._weights.copy()
         start = self._cell_of(T_map_base)
-        cost = self._cost
         if self._holds(start):
-            cost = cost.copy()
-            resolution = self.frame.resolution
-            open_escape_cells(cost, ~self._passable, start, resolution, self._planner, trail)
-        weights = np.where(np.isfinite(cost), np.rint(np.minimum(cost, MAX_WEIGHT)), 0.0)
-        return weights.astype(np.uint8)
+            occupied = ~self._passable
+            cell_m = self.frame.resolution
+            ways = ways_out(self.traversable, occupied, start, cell_m, self._planner, trail)
+            weights[tuple(ways[~self.traversable[tuple(ways.T)]].T)] = MAX_WEIGHT
+        return weights
 
-    def _search(self, weights: NDArray[np.uint8], T_map_base: Array) -> Array:
+    def _search(self, weights: NDArray[np.uint8], T_map_base: Array) -> Array32:
         lengths = weighted_distance_field_from(weights, self._cell_of(T_map_base))
-        return lengths * (self.frame.resolution / self.speed_m_s)
+        # Half the memory; the order of lengths is that of whole numbers of steps.
+        return (lengths * (self.frame.resolution / self.speed_m_s)).astype(np.float32)
 
     def _cell_of(self, T_map_base: Array) -> tuple[int, int]:
         row, col = self.frame.cells_of(T_map_base[None, :2])[0].tolist()
         return row, col
 
     def _holds(self, cell: tuple[int, int]) -> bool:
-        rows, cols = self._cost.shape
+        rows, cols = self._weights.shape
         return bool(0 <= cell[0] < rows and 0 <= cell[1] < cols)
 
-    def _at(self, field: Array, cells: Cells) -> Array:
+    def _at(self, field: Array32, cells: Cells) -> Array:
         """Values (N,) of a field (H, W) at cells (N, 2); inf outside."""
         rows, cols = cells.T
         inside = (rows >= 0) & (rows < field.shape[0]) & (cols >= 0) & (cols < field.shape[1])
@@ -152,7 +157,7 @@ class TravelTimes:
 
 @kernel
 def _ends(
-    seconds: Array, cells: Cells, start: tuple[int, int], reach: float
+    seconds: Array32, cells: Cells, start: tuple[int, int], reach: float
 ) -> tuple[Array, Array]:
     """Directions, rad, of the first and the last piece of the path to each cell (N, 2).
 

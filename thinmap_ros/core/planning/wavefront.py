@@ -10,6 +10,7 @@ Source: topological map paper section 3.2; Konolige, "A gradient method for real
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,11 +133,11 @@ def find_path(
         return None
     cost = cost_of_cells(patch, config)
     occupied = patch.occupied.copy()
+    cell_m = patch.frame.resolution
     if obstacles is not None:
         points = obstacles.points[patch.contains(obstacles.points)]
         at = patch.frame.cells_of(points)
         occupied[at[:, 0], at[:, 1]] = True
-        cell_m = patch.frame.resolution
         inflation_radius = config.inflation_radius_m / cell_m
         _inflate_points(
             cost,
@@ -147,7 +148,8 @@ def find_path(
         )
     start = (int(cells[0, 0]), int(cells[0, 1]))
     wished = (int(cells[1, 0]), int(cells[1, 1]))
-    open_escape_cells(cost, occupied, start, patch.frame.resolution, config, trail)
+    ways = tuple(ways_out(np.isfinite(cost), occupied, start, cell_m, config, trail).T)
+    cost[ways] = np.minimum(cost[ways], config.escape_cost)
     if band is not None:
         cost[~band] = np.inf
     goal = nearest_true(
@@ -205,37 +207,29 @@ def navigation_function(
     return np.asarray(_march(cost, goal[0], goal[1], row, col))
 
 
-def open_escape_cells(
-    cost: Array,
+def ways_out(
+    allowed: Mask,
     occupied: Mask,
     start: Cell,
     resolution: float,
     config: WavefrontConfig,
     trail: Cells | None = None,
-) -> None:
-    """Allow what a robot needs to leave its place, at a high cost, in the costs of cells (H, W).
+) -> Cells:
+    """Cells (N, 2) that a robot may cross, at a high cost, to leave its place.
 
-    The inflated cells around a start in collision, and those of its recent path (N, 2). Occupied
-    cells stay forbidden, except the cell of the robot itself. So do cells from which a step over a
-    corner leads through a wall.
+    The inflated ones around a start that is not allowed, and those of its recent path (M, 2).
+    Occupied cells (H, W) stay forbidden, except the cell of the robot itself. So do cells from
+    which a step over a corner leads through a wall.
     """
-    if not math.isfinite(cost[start]):
-        _open_around(cost, occupied, start, resolution, config)
-    if trail is not None:
-        back = trail[~occupied[trail[:, 0], trail[:, 1]]]
-        back = back[~_beside_thin_wall(occupied, back)]
-        cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], config.escape_cost)
-
-
-def _open_around(
-    cost: Array, occupied: Mask, start: Cell, resolution: float, config: WavefrontConfig
-) -> None:
-    where, within = disc(cost, start, start_escape_m(config.robot_radius_m) / resolution)
-    opened = np.argwhere(within & ~np.isfinite(cost[where]) & ~occupied[where])
+    back = np.zeros((0, 2), dtype=np.int64) if trail is None else trail
+    back = back[~occupied[tuple(back.T)]]
+    if allowed[start]:
+        return np.asarray(back[~_beside_thin_wall(occupied, back)])
+    where, within = disc(allowed, start, start_escape_m(config.robot_radius_m) / resolution)
+    opened = np.argwhere(within & ~allowed[where] & ~occupied[where])
     opened += (where[0].start, where[1].start)
-    rows, cols = opened[~_beside_thin_wall(occupied, opened)].T
-    cost[rows, cols] = config.escape_cost
-    cost[start] = min(cost[start], config.escape_cost)
+    ways = np.concatenate([opened, back])
+    return np.concatenate([ways[~_beside_thin_wall(occupied, ways)], [start]])
 
 
 def _beside_thin_wall(occupied: Mask, cells: Cells) -> Mask:
@@ -436,7 +430,7 @@ def _is_over_corner(field: Array, row: int, col: int, r: int, c: int) -> bool:
 
 
 @kernel
-def lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
+def lowest_around(field: NDArray[np.floating[Any]], row: int, col: int) -> tuple[int, int]:
     """The lowest of the eight neighbours; diagonal if both cells beside have a path, or neither."""
     rows, cols = field.shape
     best_row = row

@@ -76,7 +76,7 @@ class RegionMap:
     """Regions by id; labels (H, W): id of the region of each cell of a grid, 0 for none."""
 
     frame: GridFrame
-    labels: NDArray[np.int32]
+    labels: NDArray[np.unsignedinteger[Any]]
     regions: Mapping[int, Region]
     doors: tuple[Door, ...]
 

@@ -49,7 +49,7 @@ _WALL_MARGIN_M = 0.5
 
 # Of ids that stay.
 _UPDATES = 5  # after which a cell forgets its earlier id
-_STRIDE_M = 0.4  # between the cells that a state keeps
+_STRIDE_M = 0.2  # between the cells that remember an id
 
 _OWN_FIELDS = {
     'region_frame': Field(np.float64, (3,), -snapshot.MAX_COORDINATE_M, snapshot.MAX_COORDINATE_M),
@@ -505,7 +505,8 @@ def describe(segmentation: Segmentation, ids: NDArray[np.int64], config: RegionC
         regions[int(ids[number])] = Region(
             int(ids[number]), kind, x, y, float(areas[number]), _outline(found, number, box)
         )
-    labels = np.asarray(ids, dtype=np.int32)[found.labels]
+    # The smallest type: a map keeps them for each cell.
+    labels = ids.astype(np.min_scalar_type(int(ids.max())))[found.labels]
     return RegionMap(found.patch.frame, labels, regions, _doors(found, ids))
 
 
@@ -553,9 +554,10 @@ def _doors(found: Segmentation, ids: NDArray[np.int64]) -> tuple[Door, ...]:
 
 
 class _Memory:
-    """Ids of the cells (H, W) of a grid: remembered, and at the last update.
+    """Ids of the cells (H, W) of a coarse lattice: remembered, and at the last update.
 
-    changed: since how many updates they differ.
+    Its cells lie on multiples of their edge, so that one map after the other has the same ones.
+    changed: since how many updates the ids differ.
     """
 
     def __init__(
@@ -570,21 +572,36 @@ class _Memory:
         self.last = labels if last is None else last
         self._changed = np.zeros(labels.shape, dtype=np.int16) if changed is None else changed
 
-    def resampled(self, patch: GridPatch) -> '_Memory':
-        """The same memory on the cells of a patch."""
-        frame = patch.frame
-        ratio = frame.resolution / self.frame.resolution
-        low_row = (frame.origin_y - self.frame.origin_y) / self.frame.resolution
-        low_col = (frame.origin_x - self.frame.origin_x) / self.frame.resolution
-        rows = np.floor(low_row + (np.arange(patch.shape[0]) + 0.5) * ratio).astype(np.int64)
-        cols = np.floor(low_col + (np.arange(patch.shape[1]) + 0.5) * ratio).astype(np.int64)
+    @staticmethod
+    def of(patch: GridPatch) -> '_Memory':
+        """Memory of the cells of a map, without any id."""
+        edge_m = max(1, round(_STRIDE_M / patch.frame.resolution)) * patch.frame.resolution
+        origin = patch.frame.as_array()[:2]
+        low = np.floor(origin / edge_m) * edge_m
+        end = origin + patch.frame.resolution * np.array(patch.shape[::-1])
+        cols, rows = np.ceil((end - low) / edge_m).astype(np.int64).tolist()
+        return _Memory(
+            GridFrame(float(low[0]), float(low[1]), edge_m), np.zeros((rows, cols), dtype=np.int32)
+        )
+
+    def filled(self, other: '_Memory') -> '_Memory':
+        """The memory of other cells, on the cells of this one."""
+        arrays = (other.labels, other.last, other._changed)
+        return _Memory(self.frame, *(self.sampled(array, other.frame) for array in arrays))
+
+    def sampled(self, array: NDArray[Any], frame: GridFrame) -> NDArray[Any]:
+        """Values (H, W) at the centres of the cells, of an array on the cells of another frame."""
+        ratio = self.frame.resolution / frame.resolution
+        low_row = (self.frame.origin_y - frame.origin_y) / frame.resolution
+        low_col = (self.frame.origin_x - frame.origin_x) / frame.resolution
+        rows = np.floor(low_row + (np.arange(self.labels.shape[0]) + 0.5) * ratio).astype(np.int64)
+        cols = np.floor(low_col + (np.arange(self.labels.shape[1]) + 0.5) * ratio).astype(np.int64)
         # A row and a column of zeros stand for all that is outside.
         here = np.ix_(
-            np.where((rows >= 0) & (rows < self.labels.shape[0]), rows, -1),
-            np.where((cols >= 0) & (cols < self.labels.shape[1]), cols, -1),
+            np.where((rows >= 0) & (rows < array.shape[0]), rows, -1),
+            np.where((cols >= 0) & (cols < array.shape[1]), cols, -1),
         )
-        arrays = (self.labels, self.last, self._changed)
-        return _Memory(frame, *(np.pad(array, ((0, 1), (0, 1)))[here] for array in arrays))
+        return np.asarray(np.pad(array, ((0, 1), (0, 1)))[here])
 
     def updated(self, labels: Labels) -> '_Memory':
         """The memory after an update with the ids (H, W); cells in no region keep theirs."""
@@ -617,10 +634,12 @@ class RegionTracker:
     def update(self, patch: GridPatch) -> RegionMap:
         """Regions of a grid, which need not have the frame or size of the last one."""
         found = segment(patch, self.config)
-        before = self._memory or _Memory(patch.frame, np.zeros(patch.shape, dtype=np.int32))
-        memory = before.resampled(patch)
-        self.regions = describe(found, self._ids(found.labels, memory), self.config)
-        self._memory = memory.updated(self.regions.labels)
+        memory = _Memory.of(patch)
+        memory = memory if self._memory is None else memory.filled(self._memory)
+        labels = memory.sampled(found.labels, patch.frame)
+        ids = self._ids(labels, int(found.labels.max(initial=0)), memory)
+        self.regions = describe(found, ids, self.config)
+        self._memory = memory.updated(ids[labels].astype(np.int32))
         return self.regions
 
     def follow(self, whole: WholeMap) -> None:
@@ -639,13 +658,9 @@ class RegionTracker:
         memory = self._memory  # another thread may replace it by one of other cells
         if memory is None:
             return {}
-        frame = memory.frame
-        labels = np.where(memory.last > 0, memory.last, memory.labels)
-        stride = max(1, round(_STRIDE_M / frame.resolution))
-        coarse = GridFrame(frame.origin_x, frame.origin_y, stride * frame.resolution)
         return {
-            'region_frame': coarse.as_array(),
-            'region_labels': labels[stride // 2 :: stride, stride // 2 :: stride],
+            'region_frame': memory.frame.as_array(),
+            'region_labels': np.where(memory.last > 0, memory.last, memory.labels),
             'next_region_id': np.array(self._next_id),
             **self.names.state(),
         }
@@ -675,9 +690,9 @@ class RegionTracker:
         tracker._memory = _Memory(GridFrame(*checked['region_frame'].tolist()), labels)
         return tracker
 
-    def _ids(self, labels: Labels, memory: _Memory) -> NDArray[np.int64]:
-        """Ids (R + 1,) of the regions (H, W) of a grid, by number."""
-        ids = np.zeros(1 + int(labels.max(initial=0)), dtype=np.int64)
+    def _ids(self, labels: Labels, count: int, memory: _Memory) -> NDArray[np.int64]:
+        """Ids (R + 1,) of the regions (H, W) of a memory's cells, by number; count: of regions."""
+        ids = np.zeros(1 + count, dtype=np.int64)
         used = {0}
         # What has been new since the last few updates is not remembered yet.
         for number, earlier in [*_claims(labels, memory.labels), *_claims(labels, memory.last)]:
