@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -335,7 +336,7 @@ class SilenceDetector:
         """
         period_ns = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
         self._stamp_ns = stamp_ns
-        usual_ns = float(np.median(self._periods)) if self._periods else math.inf
+        usual_ns = median(self._periods) if self._periods else math.inf
         if period_ns > 0:
             self._periods.append(period_ns)
         is_gap = period_ns > max(_SHORTEST_GAP_NS, _GAP_PERIODS * usual_ns)

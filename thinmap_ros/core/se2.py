@@ -65,9 +65,10 @@ def compose(T_a_b: Array, T_b_c: Array) -> Array:
 
 def invert(T_a_b: Array) -> Array:
     """Pose of a in b, (3,)."""
-    c = math.cos(T_a_b[2])
-    s = math.sin(T_a_b[2])
-    return pose(-c * T_a_b[0] - s * T_a_b[1], s * T_a_b[0] - c * T_a_b[1], -T_a_b[2])
+    x, y, theta = T_a_b.tolist()
+    c = math.cos(theta)
+    s = math.sin(theta)
+    return pose(-c * x - s * y, s * x - c * y, -theta)
 
 
 def between(T_a_b: Array, T_a_c: Array) -> Array:
@@ -176,6 +177,11 @@ def variances(covariance: Array) -> tuple[float, float]:
     middle = 0.5 * (xx + yy)
     apart = math.hypot(0.5 * (xx - yy), xy)
     return middle - apart, middle + apart
+
+
+def sigma_m(covariance: Array) -> float:
+    """Standard deviation, m, of a position with a covariance (3, 3), where it is least certain."""
+    return math.sqrt(max(variances(covariance[:2, :2])[1], 0.0))
 
 
 def inverse(matrix: Array) -> Array:

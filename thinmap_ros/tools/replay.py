@@ -157,8 +157,7 @@ class ReplayView:
             self._T_map_odom = estimate.T_map_odom
         # Dead reckoning from the first pose.
         view.trajectory(ns, 'odometry', se2.compose(self._T_map_odom, T_odom_base))
-        sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1], 0.0)))
-        view.scalar(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
+        view.scalar(ns, 'error', '2 sigma, cm', 200.0 * se2.sigma_m(estimate.covariance))
         for curve, count in (
             ('features', estimate.n_features),
             ('local features', estimate.n_local_features),

@@ -109,8 +109,7 @@ class MessageView:
         if not np.isfinite(covariance).all():
             raise InputError('covariance: expected finite numbers')
         self._view.pose(ns, T_map_base, covariance)
-        sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)))
-        self._view.scalar(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
+        self._view.scalar(ns, 'error', '2 sigma, cm', 200.0 * se2.sigma_m(covariance))
         self._compare(ns, self._pairs.add_left(ns, T_map_base))
         if self._T_map_odom is None and self._T_odom_base is not None:
             self._T_map_odom = se2.compose(T_map_base, se2.invert(self._T_odom_base))

@@ -377,8 +377,8 @@ class Hypotheses:
     def is_narrow(self, number: int) -> bool:
         """Whether a hypothesis is not wider than one place."""
         covariance = self.covariances[number]
-        variance = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-        return variance <= _NEW_SIGMA_M**2 and float(covariance[2, 2]) <= _NEW_SIGMA_RAD**2
+        is_near = se2.sigma_m(covariance) <= _NEW_SIGMA_M
+        return is_near and float(covariance[2, 2]) <= _NEW_SIGMA_RAD**2
 
     def best(self) -> int:
         """Number of the likeliest one."""

@@ -68,7 +68,7 @@ class SweepTiming:
         if scan.beam_period_s == 0.0 or step == 0.0:
             return False
         revolution_s = abs(scan.beam_period_s) * 2.0 * math.pi / step
-        measured_s = float(np.median(self._periods_s)) if self._periods_s else 0.0
+        measured_s = median(self._periods_s) if self._periods_s else 0.0
         if measured_s > 0.0 and revolution_s > (1.0 + _TOLERANCE) * measured_s:
             return False
         return any(

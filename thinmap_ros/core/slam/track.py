@@ -114,7 +114,7 @@ def misses_walls(scan: Scan, local_map: LocalMap, T_map_base: Array, covariance:
 
     T_map_base (3,) with covariance (3, 3), map frame.
     """
-    reach_m = _REACH * scan.range_max_m - _uncertainty_m(covariance)
+    reach_m = _REACH * scan.range_max_m - BOUND_SIGMAS * se2.sigma_m(covariance)
     if local_map.is_empty or not reach_m > 0.0:
         return False
     T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
@@ -138,14 +138,9 @@ def seen_through(
         return NOTHING
     T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
     angles = T_map_laser[2] + scan.angles_rad[returned]
-    reaches_m = scan.ranges_m[returned] - _BEHIND_M - _uncertainty_m(covariance)
+    reaches_m = scan.ranges_m[returned] - _BEHIND_M - BOUND_SIGMAS * se2.sigma_m(covariance)
     walls = _walls_through(angles, reaches_m, T_map_laser, local_map.lattice, MIN_HIT_RATIO)
     return SeenThrough(walls, len(walls) / total)
-
-
-def _uncertainty_m(covariance: Array) -> float:
-    """How far a position with a covariance (3, 3) may be off, m."""
-    return BOUND_SIGMAS * math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
 
 
 @kernel

@@ -603,7 +603,7 @@ class LoopClosure:
         """Jobs for the most similar keyframe of each earlier visit, the most similar first."""
         frames = self.keyframes.frames
         covariance = here.covariance + self.calibration.covariance_of(here.systematic)
-        reach_m = self._config.reach_m(_sigma_m(covariance))
+        reach_m = self._config.reach_m(se2.sigma_m(covariance))
         near = self.keyframes.near(here.T_map_base, reach_m)
         near = [j for j in near if self._is_earlier(j, here)]
         if not near:
@@ -612,7 +612,7 @@ class LoopClosure:
         ranked = []
         for i, (j, covariance) in enumerate(zip(near, covariances, strict=True)):
             away_m = math.dist(frames[j].T_map_base[:2], here.T_map_base[:2])
-            if away_m <= self._config.reach_m(_sigma_m(covariance)):
+            if away_m <= self._config.reach_m(se2.sigma_m(covariance)):
                 ranked.append((view_difference_m(frames[j].T_map_base, here.T_map_base), i))
         ranked.sort()
         found: list[_Job] = []
@@ -796,7 +796,7 @@ class LoopClosure:
         smooth hall, and those beside them do, too: in a ring of 670 m with a hall of which the
         laser saw no wall, four such matches closed the loop 5 m beside its place.
         """
-        reach_m = self._config.search_sigmas * _sigma_m(covariance)
+        reach_m = self._config.search_sigmas * se2.sigma_m(covariance)
         return reach_m > self._config.max_uncertainty_m
 
     def _confirm(self, edge: Edge) -> None:
@@ -876,8 +876,3 @@ class LoopClosure:
             self.step()
         self._add_pending()
         return self.graph.optimized()
-
-
-def _sigma_m(covariance: Array) -> float:
-    """Largest standard deviation, m, of a position with covariance (3, 3)."""
-    return math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
