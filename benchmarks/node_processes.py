@@ -5,7 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -67,13 +67,15 @@ class Processes:
         parameters: Mapping[str, object],
         renamed: Mapping[str, str] | None = None,
         module: str = '',
+        arguments: Sequence[str] = (),
     ) -> None:
-        """Start a program; module: '' for the node of that name."""
+        """Start a program; module: '' for the node of that name; arguments: before those of ROS."""
         words = [word for old, new in (renamed or {}).items() for word in ('-r', f'{old}:={new}')]
         words += [word for key, value in parameters.items() for word in ('-p', f'{key}:={value}')]
+        program = [sys.executable, '-m', module or f'thinmap_ros.nodes.{name}']
         with (self._folder / f'{name}.log').open('ab') as log:
             self.running[name] = psutil.Popen(
-                [sys.executable, '-m', module or f'thinmap_ros.nodes.{name}', '--ros-args', *words],
+                [*program, *arguments, '--ros-args', *words],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, 'THINMAP_STATE_DIR': str(self._folder / 'state')},
