@@ -471,9 +471,13 @@ class Navigator:
         return self._safe_speed(T_map_base, v, v * curvature, radius_m)
 
     def _safe_speed(self, T_map_base: Array, v: float, w: float, radius_m: float) -> float:
-        """Highest speed up to v at which the robot stops before a point comes within radius_m."""
+        """Highest speed up to v at which the robot stops before a point comes within radius_m.
+
+        What moves is taken to be as fast as this robot may be.
+        """
         braking = self.config.controller.max_acceleration_m_s2
         needed = v * self.config.reaction_time_s + v * v / (2.0 * braking)
-        free_m = self._obstacles.free_arc_length_m(T_map_base, w / v, needed, radius_m)
         late = self.config.reaction_time_s
+        moved_m = self.config.controller.max_speed_m_s * late
+        free_m = self._obstacles.free_arc_length_m(T_map_base, w / v, needed, radius_m, moved_m)
         return min(v, braking * (math.sqrt(late * late + 2.0 * free_m / braking) - late))

@@ -23,6 +23,11 @@ _SWEEP_STEP_M = 0.03
 _NEIGHBOURS = 2  # beams on either side
 _SAME_M = 0.03  # maximum difference of ranges of the same obstacle
 
+# What is where a scan saw free space so long ago has moved, unless noise of pose and ranges did it.
+_LATELY_NS = 400_000_000
+_MOVED_M = 0.1
+_MOVED_BEAMS = 2  # on either side
+
 
 class _Observation(NamedTuple):
     """Observed ranges (N,), m (NaN: invalid), of a scan, and the laser pose (3,), map frame."""
@@ -39,6 +44,7 @@ class _Views:
 
     newest: _Observation
     earlier: deque[_Observation]
+    lately: deque[tuple[int, _Observation]]  # with their stamps, ns; the oldest first
 
     def near(self, remembered_m: float) -> Iterator[_Observation]:
         """Earlier scans made within this distance of the newest one, the last ones first."""
@@ -71,6 +77,10 @@ class BlindSectors:
         newest = _Observation(seen_m, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser)
         last = self._views.get(scan.frame)
         earlier = deque[_Observation](maxlen=self._remembered) if last is None else last.earlier
+        lately = deque[tuple[int, _Observation]]() if last is None else last.lately
+        while len(lately) > 1 and lately[1][0] <= scan.stamp_ns - _LATELY_NS:
+            lately.popleft()
+        lately.append((scan.stamp_ns, newest))
         if last is not None and (
             not earlier
             or se2.are_apart(
@@ -79,8 +89,16 @@ class BlindSectors:
         ):
             earlier.append(last.newest)
         self._scans = with_newest(self._scans, scan)
-        views = self._views | {scan.frame: _Views(newest, earlier)}
+        views = self._views | {scan.frame: _Views(newest, earlier, lately)}
         self._views = {each.frame: views[each.frame] for each in self._scans}
+
+    def have_moved(self, points: Array, frame: str) -> Mask:
+        """Which points (K, 2) of the newest scan of a laser are where it saw free space lately."""
+        seen_m, first, step, laser = self._views[frame].lately[0][1]
+        beside = np.pad(seen_m, _MOVED_BEAMS, constant_values=np.nan)
+        shifted = [beside[k : k + seen_m.size] for k in range(2 * _MOVED_BEAMS + 1)]
+        least = np.minimum.reduce(shifted) - _MOVED_M
+        return np.asarray(_is_seen(points, least, first, step, laser))
 
     def points(self, reach_m: float, remembered_m: float) -> Array:
         """Points (K, 2), map frame, in unobserved space up to reach_m from the laser.
@@ -176,6 +194,7 @@ class ObstaclePoints:
         self._blind_sectors = BlindSectors()
         self._scans: tuple[Scan, ...] = ()
         self._hits: dict[str, Array] = {}  # of the newest scan by the frame of its laser
+        self._moving: dict[str, Array] = {}  # those of them that have moved
         self._remembered: Array = np.empty((0, 2))
 
     def add_scan(self, T_map_base: Array, scan: Scan | None) -> None:
@@ -195,6 +214,9 @@ class ObstaclePoints:
         points = _points_around(hits, first, step, T_map_laser, earlier, T_map_base)
         count = int(np.count_nonzero(~np.isnan(hits)))
         self._hits = {**others, scan.frame: points[:count]}
+        has_moved = self._blind_sectors.have_moved(points[:count], scan.frame)
+        still = {frame: self._moving[frame] for frame in others}
+        self._moving = {**still, scan.frame: points[:count][has_moved]}
         self._remembered = points[count:]
         self.points = np.concatenate([*self._hits.values(), self._remembered])
 
@@ -212,15 +234,23 @@ class ObstaclePoints:
         return float(_clearance_along(path, first, length_m, self.points))
 
     def free_arc_length_m(
-        self, T_map_base: Array, curvature: float, length_m: float, radius_m: float
+        self,
+        T_map_base: Array,
+        curvature: float,
+        length_m: float,
+        radius_m: float,
+        moved_m: float = 0.0,
     ) -> float:
         """Free length, m, of an arc from a pose (3,) for a disc, at most length_m.
 
-        Along it the disc touches no point and sweeps no unobserved space.
+        Along it the disc touches no point and sweeps no unobserved space. moved_m: by which points
+        that move may come nearer meanwhile.
         """
         count = math.ceil(length_m / _SWEEP_STEP_M)
         arc = _arc(T_map_base, curvature, length_m, count)
         clear = _clear_steps(arc, self.points, radius_m)
+        for moving in self._moving.values():
+            clear = min(clear, _clear_steps(arc, moving, radius_m + moved_m))
         seen = _clear_steps(arc, self._blind_points_ahead(T_map_base, length_m, radius_m), radius_m)
         self.is_hidden = seen < clear
         return float(length_m * min(clear, seen) / max(count, 1))
