@@ -319,7 +319,8 @@ def main() -> None:
         '--robots',
         type=int,
         default=1,
-        help='number of robots, each with its own map, in one world (default 1)',
+        help='number of robots, each with its own map, in one world (default 1); several gain time '
+        'in lab, not in office',
     )
     parser.add_argument('--speed-m-s', type=float, default=0.2, help='top speed, m/s (default 0.2)')
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
