@@ -336,10 +336,14 @@ class SilenceDetector:
         """
         period_ns = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
         self._stamp_ns = stamp_ns
-        usual_ns = median(self._periods) if self._periods else math.inf
+        silence_s = self._silence_s(period_ns) if period_ns > _SHORTEST_GAP_NS else 0.0
         if period_ns > 0:
             self._periods.append(period_ns)
-        is_gap = period_ns > max(_SHORTEST_GAP_NS, _GAP_PERIODS * usual_ns)
+        return silence_s
+
+    def _silence_s(self, period_ns: int) -> float:
+        usual_ns = median(self._periods) if self._periods else math.inf
+        is_gap = period_ns > _GAP_PERIODS * usual_ns
         return (period_ns - usual_ns) / SECOND_NS if is_gap else 0.0
 
 

@@ -2,10 +2,9 @@
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
-
-import numpy as np
+from statistics import median
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, rotation
@@ -97,7 +96,7 @@ class OdometryScale:
         """The ratios that are known: of turn, distance and sideways motion."""
         least, _ = self.config.spans
         return {
-            kind: _median(np.array(ratios), self.config.common)
+            kind: _median(ratios, self.config.common)
             for kind, ratios in self._ratios.items()
             if len(ratios) >= least
         }
@@ -132,10 +131,10 @@ class OdometryScale:
 _VERBS = {'turn': 'turns', 'distance': 'moves', 'sideways': 'moves sideways'}
 
 
-def _median(ratios: Array, common: float) -> Ratio:
-    """Median of ratios (N,), with its standard deviation where they are normally distributed."""
-    value = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(ratios - value)))
+def _median(ratios: Collection[float], common: float) -> Ratio:
+    """Median of ratios, with its standard deviation where they are normally distributed."""
+    value = median(ratios)
+    spread = 1.4826 * median(abs(ratio - value) for ratio in ratios)
     return Ratio(value, math.hypot(1.2533 * spread / math.sqrt(len(ratios)), common))
 
 
