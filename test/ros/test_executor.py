@@ -4,7 +4,9 @@ import threading
 
 import pytest
 import rclpy
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
@@ -217,6 +219,28 @@ def test_another_thread_wakes_it(node, executor):
     until(lambda: rung, executor)
     thread.join()
     assert rung == [threading.get_ident()]
+
+
+def test_events_of_qos_come_and_are_not_waited_for_with_each_message(node, executor, monkeypatch):
+    monkeypatch.setattr('thinmap_ros.ros.executor.monotonic', lambda: 0.0)
+    heard = []
+    told = []
+    added = []
+    events = SubscriptionEventCallbacks(incompatible_qos=told.append)
+    subscription = node.create_subscription(String, 'a', heard.append, 10, event_callbacks=events)
+    publisher = node.create_publisher(String, 'a', 10)
+    until(lambda: publisher.get_subscription_count() == 1, executor)
+    handler = next(each for each in subscription.event_handlers if each.callback == told.append)
+    add = handler.add_to_wait_set
+    monkeypatch.setattr(handler, 'add_to_wait_set', lambda it: (added.append(it), add(it)))
+    for number in range(10):
+        publisher.publish(String(data=str(number)))
+    until(lambda: len(heard) == 10, executor)
+    assert len(added) < 5
+    lesser = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    node.create_publisher(String, 'a', lesser)
+    until(lambda: told, executor)
+    assert told[0].total_count == 1
 
 
 def test_it_ends_once_ros_is_shut_down(node, executor):
