@@ -1,15 +1,20 @@
 """Lookup of transforms along the tree of frames, at a time and at the newest one."""
 
 import math
+import time
 
 import numpy as np
 import pytest
+import rclpy
 from geometry_msgs.msg import TransformStamped
+from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.transforms import TransformBuffer
-from thinmap_ros.ros import messages
+from thinmap_ros.ros import messages, qos
+from thinmap_ros.ros.executor import NodeExecutor
+from thinmap_ros.ros.tf import TransformListener
 
 SECOND_NS = 10**9
 
@@ -119,3 +124,35 @@ def test_time_zero_is_a_time_and_static_transforms_alone_have_none():
     assert buffer.latest_common_ns('base_footprint', 'laser') is None
     buffer.add(transform('odom', 'base_footprint', (1.0, 0.0, 0.0), 0.0), is_static=False)
     assert buffer.latest_common_ns('odom', 'laser') == 0
+
+
+def test_transforms_wake_no_node_and_lookups_read_them(ros_domain):
+    rclpy.init(args=[])
+    node = rclpy.create_node('some')
+    executor = NodeExecutor(node)
+    listener = TransformListener(node)
+    publisher = node.create_publisher(TFMessage, '/tf', qos.TRANSFORMS)
+    sent = [transform('map', 'odom', (float(second), 0.0, 0.0), second) for second in range(1, 50)]
+    try:
+        while publisher.get_subscription_count() < 1:
+            executor.next_callback(timeout_s=0.01)
+        for each in sent:
+            publisher.publish(TFMessage(transforms=[each]))
+        assert executor.next_callback(timeout_s=0.2) is None
+        _wait_for(listener, 49.0)
+        np.testing.assert_allclose(listener.lookup('map', 'odom', 45 * SECOND_NS), (45.0, 0.0, 0.0))
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _wait_for(listener, x):
+    for _ in range(1000):
+        try:
+            if listener.lookup('map', 'odom')[0] == x:
+                return
+        except InputError:
+            pass
+        time.sleep(0.01)
+    pytest.fail('never')

@@ -14,7 +14,8 @@ from threading import get_ident
 from time import monotonic
 from typing import Any, NamedTuple
 
-from rclpy.event_handler import EventHandler
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.event_handler import EventHandler, SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.waitable import NumberOfEntities
@@ -29,8 +30,28 @@ _EVENT_PERIOD_S = 1.0
 class Ready(NamedTuple):
     """A callback that can be called, and its timer, subscription, service or the like, if any."""
 
-    call: Callable[[], None]
+    call: Callable[[], object]
     entity: Any
+
+
+class _Unawaited(MutuallyExclusiveCallbackGroup):
+    def can_execute(self, entity: Any) -> bool:
+        """Never."""
+        return False
+
+
+# Options of a subscription that wakes no executor: `take_all` takes what is in its queue. What is
+# there ends each wait for events of its QoS, so it has none.
+UNAWAITED: dict[str, Any] = {
+    'callback_group': _Unawaited(),
+    'event_callbacks': SubscriptionEventCallbacks(use_default_callbacks=False),
+}
+
+
+def take_all(subscription: Any) -> None:
+    """Call a subscription for each message in its queue."""
+    while _call_subscription(subscription):
+        pass
 
 
 class NodeExecutor(SingleThreadedExecutor):
@@ -194,17 +215,21 @@ def _call_timer(timer: Any) -> None:
     timer.callback()
 
 
-def _call_subscription(subscription: Any) -> None:
-    """Take a message, unless the subscription was destroyed by another callback of this cycle."""
+def _call_subscription(subscription: Any) -> bool:
+    """Take a message, unless the subscription was destroyed by another callback of this cycle.
+
+    Returns whether there was one.
+    """
     try:
         with subscription.handle:
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
     except InvalidHandle:
-        return
+        return False
     if taken is None:
-        return
+        return False
     is_plain = subscription._callback_type is subscription.CallbackType.MessageOnly
     subscription.callback(*(taken[:1] if is_plain else taken))
+    return True
 
 
 def _run(task: Any) -> None:

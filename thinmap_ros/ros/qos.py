@@ -34,6 +34,10 @@ KEYFRAMES = QoSProfile(
 TRANSFORMS = QoSProfile(
     depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
 )
+# Read once a second: those of a robot that publishes each joint at 50 Hz.
+QUEUED_TRANSFORMS = QoSProfile(
+    depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
+)
 STATIC_TRANSFORMS = QoSProfile(
     depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )

@@ -13,6 +13,7 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from tf2_msgs.msg import TFMessage
 
@@ -23,11 +24,12 @@ from thinmap_ros.logs.frames import NONE, SOURCES, TF, TOPIC
 from thinmap_ros.logs.transforms import OdometryFrames, TransformBuffer, TransformOdometry
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.diagnostics import WARN, full_name
+from thinmap_ros.ros.executor import UNAWAITED, take_all
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded
 
 _RECENT_S = 3.0  # a source that publishes more rarely is one that has ended
-_OWN_STAMPS = 2 * qos.TRANSFORMS.depth  # at most the depth is queued
+_OWN_STAMPS = 2 * qos.QUEUED_TRANSFORMS.depth  # at most the depth is queued
 
 
 class SoleBroadcaster:
@@ -58,8 +60,9 @@ class SoleBroadcaster:
         parent = transform.header.frame_id.lstrip('/')
         child = transform.child_frame_id.lstrip('/')
         is_same = any(child == own for _, own in self._frames) or (child, parent) in self._frames
-        is_own = not is_static and messages.stamp_ns(transform.header.stamp) in self._stamps
-        if not is_same or is_own:
+        if not is_same:
+            return
+        if not is_static and messages.stamp_ns(transform.header.stamp) in self._stamps:
             return
         self._foreign = f'{parent} -> {child} on {_topic(is_static)}'
         self._received_s = monotonic()
@@ -394,7 +397,11 @@ _LOOKUP_STEP_NS = 20_000_000  # between two times that are tried
 
 
 class TransformListener:
-    """Transforms between the frames of a robot: a buffer that is filled from /tf and /tf_static."""
+    """Transforms between the frames of a robot: a buffer that is filled from /tf and /tf_static.
+
+    Messages of /tf, which are the most of all, wait in their queue: they are read by lookups, and
+    once a second.
+    """
 
     def __init__(
         self, node: Node, received: Callable[[Any, bool], None] = lambda transform, is_static: None
@@ -403,14 +410,17 @@ class TransformListener:
         self._node = node
         self._received = received
         self._buffer = TransformBuffer()
-        self._subscribe('/tf', qos.TRANSFORMS, is_static=False)
-        self._subscribe('/tf_static', qos.STATIC_TRANSFORMS, is_static=True)
+        self._moving = self._subscribe('/tf', qos.QUEUED_TRANSFORMS, **UNAWAITED)
+        self._subscribe('/tf_static', qos.STATIC_TRANSFORMS)
+        if isinstance(node, ThinmapNode):
+            node.diagnostics.add_update_callback(self._read)
 
     def lookup(self, target_frame: str, source_frame: str, stamp_ns: int | None = None) -> Array:
         """Pose of the source frame in the target frame, T_target_source (3,).
 
         stamp_ns: None for the newest. Raises InputError with the reason where it is unknown.
         """
+        self._read()
         return self._buffer.lookup(target_frame, source_frame, stamp_ns)
 
     def lookup_lately(
@@ -427,9 +437,14 @@ class TransformListener:
 
     def clear(self) -> None:
         """Forget all but the static transforms: the time was set back."""
+        self._read()
         self._buffer.clear()
 
-    def _subscribe(self, topic: str, profile: QoSProfile, is_static: bool) -> None:
+    def _read(self) -> None:
+        take_all(self._moving)
+
+    def _subscribe(self, topic: str, profile: QoSProfile, **options: Any) -> Subscription:
+        is_static = profile is qos.STATIC_TRANSFORMS
         reader = TransformReader(self._buffer.is_used)
 
         def add(data: bytes) -> None:
@@ -440,7 +455,7 @@ class TransformListener:
             except InputError as error:
                 self._warn(error)
 
-        self._node.create_subscription(TFMessage, topic, add, profile, raw=True)
+        return self._node.create_subscription(TFMessage, topic, add, profile, raw=True, **options)
 
     def _add(self, transform: Any, is_static: bool) -> None:
         try:
