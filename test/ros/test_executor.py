@@ -243,6 +243,32 @@ def test_events_of_qos_come_and_are_not_waited_for_with_each_message(node, execu
     assert told[0].total_count == 1
 
 
+def test_a_cancelled_timer_is_not_waited_for_and_one_that_is_reset_is_called(node, executor):
+    called = []
+    timer = node.create_timer(1e-3, lambda: called.append(1))
+    until(lambda: called, executor)
+    timer.cancel()
+    waited = []
+    handle = executor._wait_set
+
+    class Recorded:
+        def add_timer(self, each):
+            waited.append(each)
+
+        def __getattr__(self, name):
+            return getattr(handle, name)
+
+    executor._wait_set = Recorded()
+    executor._fill()
+    assert timer.handle not in waited
+    timer.reset()
+    executor._fill()
+    assert timer.handle in waited
+    executor._wait_set = handle
+    called.clear()
+    until(lambda: called, executor)
+
+
 def test_it_ends_once_ros_is_shut_down(node, executor):
     rclpy.shutdown()
     with pytest.raises(ExternalShutdownException):

@@ -24,6 +24,7 @@ NAMES = (
     '_goal_handles',
     '_result_futures',
     '_update_state',
+    '_time_source',
     '_wake_executor',
 )
 HIDDEN = ('rclpy.impl', 'rclpy._rclpy_pybind11')

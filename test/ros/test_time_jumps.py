@@ -1,12 +1,17 @@
 """Time for time-outs: it follows a simulation, stands while that is paused, and does not jump."""
 
+from threading import Thread
 from time import monotonic_ns
 
 import pytest
-from rclpy.clock import ClockType, ROSClock
+import rclpy
+from rclpy.clock import ClockType, JumpThreshold, ROSClock
+from rclpy.duration import Duration
 from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
 
-from thinmap_ros.ros.time_jumps import ElapsedTime
+from thinmap_ros.ros.executor import NodeExecutor
+from thinmap_ros.ros.time_jumps import ElapsedTime, shared_clocks
 
 S = 1_000_000_000
 
@@ -48,6 +53,51 @@ def test_a_jump_is_no_time(jump_s):
     assert time.now_ns() == before
     simulation.advance(S // 10)
     assert time.now_ns() - before == S // 10
+
+
+def test_another_thread_does_not_see_half_of_a_jump():
+    simulation = Simulation()
+    seen = []
+    reader = Thread(target=lambda: seen.append(time.now_ns()))
+
+    def read(jump):
+        reader.start()
+        reader.join(timeout=0.1)
+
+    threshold = JumpThreshold(
+        min_forward=Duration(seconds=50), min_backward=None, on_clock_change=False
+    )
+    earlier = simulation.clock.create_jump_callback(threshold, post_callback=read)
+    time = ElapsedTime(simulation.clock)
+    before = time.now_ns()
+    simulation.advance(100 * S)
+    reader.join()
+    assert seen == [before]
+    earlier.unregister()
+
+
+def test_nodes_of_a_process_follow_the_clock_by_one_subscription(ros_domain):
+    rclpy.init(args=['--ros-args', '-p', 'use_sim_time:=true'])
+    nodes = [rclpy.create_node(name) for name in ('one', 'other')]
+    assert not list(shared_clocks(nodes[:1]))
+    (shared,) = shared_clocks(nodes)
+    executor = NodeExecutor(shared)
+    publisher = nodes[0].create_publisher(Clock, '/clock', 1)
+    try:
+        assert nodes[0].count_subscribers('/clock') == 1
+        for _ in range(1000):
+            publisher.publish(Clock(clock=Time(seconds=5).to_msg()))
+            ready = executor.next_callback(timeout_s=0.01)
+            if ready is not None:
+                ready.call()
+                break
+        assert [node.get_clock().now().nanoseconds for node in nodes] == [5 * S, 5 * S]
+    finally:
+        executor.shutdown()
+        shared.close()
+        for node in nodes:
+            node.destroy_node()
+        rclpy.try_shutdown()
 
 
 def test_the_first_time_of_a_simulation_is_the_beginning():

@@ -177,6 +177,8 @@ class NodeExecutor(SingleThreadedExecutor):
         for kind, entities in self._entities.items():
             add = getattr(wait_set, f'add_{kind}')
             for entity in filter(self.can_execute, entities.values()):
+                if kind == 'timer' and entity.is_canceled():
+                    continue  # in simulated time each message of /clock would end the wait
                 add(entity.handle)
         for guard in (self._guard, self._sigint_gc):
             wait_set.add_guard_condition(guard.handle)

@@ -37,6 +37,7 @@ from thinmap_ros.ros.foreign import (
     split_arguments,
 )
 from thinmap_ros.ros.private_rclpy import RCLError, UnknownROSArgsError
+from thinmap_ros.ros.time_jumps import shared_clocks
 
 _RULES = {
     '-p': 'NAME:=VALUE',
@@ -271,10 +272,11 @@ def _spin(running: _Running) -> None:
     """Spin each node in a thread; this one, the main thread, waits, as it handles the signals."""
     # Only recorded: an exception raised in compiled code is replaced by another one, or lost.
     _on_signals(lambda number, frame: running.stop())
-    executors = [NodeExecutor(node) for node in running.nodes]
+    spun = [*running.nodes, *shared_clocks(running.nodes)]
+    executors = [NodeExecutor(each) for each in spun]
     threads = [
-        threading.Thread(target=_spin_one, args=(node, executor, running))
-        for node, executor in zip(running.nodes, executors, strict=True)
+        threading.Thread(target=_spin_one, args=(each, executor, running))
+        for each, executor in zip(spun, executors, strict=True)
     ]
     for thread in threads:
         thread.start()

@@ -4,7 +4,7 @@ Tried with rclpy of Jazzy, 7.1: test/ros/test_private_rclpy.py tells when anothe
 """
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rclpy.action import ActionServer
@@ -66,6 +66,32 @@ def begin_goal(handle: ServerGoalHandle) -> None:
     """
     event: Any = rclpy_implementation.GoalEvent.EXECUTE
     handle._update_state(event)
+
+
+def clock_subscription(node: Node) -> Subscription | None:
+    """The subscription of /clock with which a node follows simulated time; None without.
+
+    Without it: each node of a process takes each message of /clock.
+    """
+    subscription: Subscription | None = node._time_source._clock_sub
+    return subscription
+
+
+def share_clock(node: Node, others: Iterable[Node]) -> Subscription:
+    """Have a node's subscription of /clock set the clocks of others, which lose theirs.
+
+    No executor of the node waits for it any longer. Without it: as above.
+    """
+    source = node._time_source
+    for other in others:
+        other.destroy_subscription(other._time_source._clock_sub)
+        other._time_source._clock_sub = None
+        source.attach_clock(other.get_clock())
+    subscription: Subscription = source._clock_sub
+    node._subscriptions.remove(subscription)
+    for handler in subscription.event_handlers:
+        node.remove_waitable(handler)
+    return subscription
 
 
 class _Gid(ctypes.Structure):
