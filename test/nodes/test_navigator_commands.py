@@ -222,6 +222,8 @@ def test_a_base_that_is_discovered_is_told_to_stand_and_one_that_creeps_as_long_
     told = commands_of_idle(driven, other, heard)
     assert 0 < len(told) <= 10 and set(told) == {(0.0, 0.0)}
     assert not commands_of_idle(driven, other, heard)
+    driven.node._look()
+    assert driven.node._timer.is_canceled()
     driven.step(50)
     driven.node._output.command(0.0, 0.0)
     driven.creep(4.0, 0.0)
@@ -232,6 +234,8 @@ def test_a_base_that_is_discovered_is_told_to_stand_and_one_that_creeps_as_long_
     assert message.startswith('the base moves at 0.1') and message.endswith(
         ', and is commanded to stand'
     )
+    driven.node._look()
+    assert not driven.node._timer.is_canceled()
     told = commands_of_idle(driven, other, heard)
     assert len(told) > 10 and set(told) == {(0.0, 0.0)}
     driven.creep(3.0, 0.0)

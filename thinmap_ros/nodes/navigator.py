@@ -37,6 +37,7 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.tf import OdometrySource
+from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.ros.velocity import VelocityPublisher, declare_stamped
 
 # As in Nav2, there is no estimate of the remaining time below this speed or distance.
@@ -51,6 +52,7 @@ _POSE_FAULTS = {
     SlamStatus.MISALIGNED: 'laser misaligned (turned on the robot)',
     SlamStatus.NO_MAP: 'the localizer has no map',
 }
+_LOOK_PERIOD_S = 0.25  # without a goal
 # A base that was told to drive by a node that is gone drives on: stops of a second after each new
 # subscription of cmd_vel, which may discover this node later than it is discovered.
 _STOPS = round(1.0 / CONTROL_PERIOD_S)
@@ -79,8 +81,16 @@ class _NavigatorPublishers:
         self.base.add_sent(v, w)
         self.is_moving = v != 0.0 or w != 0.0
 
-    def stand(self) -> None:
-        """Without a goal, tell to stand who has just subscribed, and a base that moves."""
+    @property
+    def has_to_stand(self) -> bool:
+        """Whether a base has come, or moves."""
+        return self.base.subscribers != self._subscribers or self.base.is_creeping
+
+    def stand(self) -> bool:
+        """Without a goal, tell to stand who has just subscribed, and a base that moves.
+
+        Returns whether there was one.
+        """
         count = self.base.subscribers
         if count > self._subscribers and (self._subscribers == 0 or self.base.is_obeyed):
             self._stops = _STOPS
@@ -88,6 +98,8 @@ class _NavigatorPublishers:
         if self._stops > 0 or self.base.is_creeping:
             self._stops -= self._stops > 0
             self.command(0.0, 0.0)
+            return True
+        return False
 
     def add_stop(self, topic: StopTopic) -> None:
         """Protective stops are published on a topic."""
@@ -158,7 +170,8 @@ class NavigatorNode(ThinmapNode):
         self._own_client = ActionClient(self, NavigateToPose, 'navigate_to_pose')
         self._check_inputs()
         self._output.add_stop(StopTopic(self, self._on_stop))
-        self.create_active_timer(CONTROL_PERIOD_S, self._control)
+        self._timer = self.create_active_timer(CONTROL_PERIOD_S, self._control)
+        self.create_active_timer(_LOOK_PERIOD_S, self._look, clock=STEADY)
 
     def _check_inputs(self) -> None:
         """Report a mapper that is silent; drive neither by two poses nor by two maps."""
@@ -255,6 +268,7 @@ class NavigatorNode(ThinmapNode):
         self._own_client.send_goal_async(NavigateToPose.Goal(pose=message))
 
     def _on_task(self, task: NavigationTask) -> None:
+        self._timer.reset()
         self._task = task
         self._drive_to(task.poses)
 
@@ -270,9 +284,14 @@ class NavigatorNode(ThinmapNode):
         reason = 'cancelled' if is_canceled else 'replaced by a newer goal'
         return self._task.result(ErrorCode.NONE, reason)
 
+    def _look(self) -> None:
+        if self._timer.is_canceled() and self._output.has_to_stand:
+            self._timer.reset()
+
     def _control(self) -> None:
         if not self._goals.active:
-            self._output.stand()
+            if not self._output.stand():
+                self._timer.cancel()  # until there is a goal
             return
         if self._goals.is_cancel_requested:
             self._end(Outcome.CANCELED, ErrorCode.NONE, 'cancelled')

@@ -136,9 +136,9 @@ UNSTAMPED = 'geometry_msgs/msg/Twist'
 STAMPED = 'geometry_msgs/msg/TwistStamped'
 KINDS: dict[str, type] = {UNSTAMPED: Twist, STAMPED: TwistStamped}
 _CHECK_PERIOD_S = 0.25
-# Checks after which the type changes: a subscriber that follows the type of the publishers, as the
-# simulated robot, is given the time to do so.
-_MISMATCHES = 4
+# Checks, one a second, after which the type changes: a subscriber that follows the type of the
+# publishers, as the simulated robot, is given the time to do so.
+_MISMATCHES = 2
 _ECHO_S = 0.5  # after a robot is held, motions from before are still received
 _REPORT_S = 2.0  # a report stays so long: diagnostics look once a second
 _ACKNOWLEDGEMENT = Duration(seconds=1.0)
@@ -189,7 +189,7 @@ class CommandPublisher:
         self._held_s = math.inf
         self._answered_s = -math.inf
         node.diagnostics.add_check(ERROR, self._fault)
-        node.create_timer(_CHECK_PERIOD_S, self._follow_base, clock=STEADY)
+        node.diagnostics.add_update_callback(self._follow_base)
 
     def open(self) -> None:
         """Create the publisher, at once or as soon as that is possible; in the node's thread."""
