@@ -68,6 +68,7 @@ class NodeExecutor(SingleThreadedExecutor):
         self._thread = 0  # that calls the callbacks
         self._entities: dict[str, dict[int, Any]] = {}  # by kind and pointer
         self._waitables: list[Any] = []
+        self._events: list[EventHandler] = []
         self._events_s = -math.inf  # when they were last waited for
         self._cycle: Iterator[Ready] = iter(())
         self.add_node(node)
@@ -144,12 +145,16 @@ class NodeExecutor(SingleThreadedExecutor):
         lists = (node.timers, node.subscriptions, node.guards, node.clients, node.services)
         for kind, entities in zip(_KINDS, lists, strict=True):
             self._entities[kind] = {
-                each.handle.pointer: each for each in entities if self._uses(each.handle)
+                each.handle.pointer: each
+                for each in entities
+                if not isinstance(each.callback_group, _Unawaited) and self._uses(each.handle)
             }
-        self._waitables = [each for each in node.waitables if self._uses(each)]
+        used = [each for each in node.waitables if self._uses(each)]
+        self._waitables = [each for each in used if not isinstance(each, EventHandler)]
+        self._events = [each for each in used if isinstance(each, EventHandler)]
         timers, subscriptions, guards, clients, services = map(len, self._entities.values())
         counts = NumberOfEntities(subscriptions, guards + 2, timers, clients, services)
-        for waitable in self._waitables:
+        for waitable in used:
             counts += waitable.get_num_entities()
         self._in_use.enter_context(self._context.handle)
         self._wait_set = WaitSet(
@@ -174,22 +179,21 @@ class NodeExecutor(SingleThreadedExecutor):
         """Fill the wait set: waiting empties it. Returns the waitables that are in it."""
         wait_set = self._wait_set
         wait_set.clear_entities()
+        # Nothing but a task that waits keeps an entity from being executed.
+        can_execute = self.can_execute if self._tasks else _always
         for kind, entities in self._entities.items():
             add = getattr(wait_set, f'add_{kind}')
-            for entity in filter(self.can_execute, entities.values()):
+            for entity in filter(can_execute, entities.values()):
                 if kind == 'timer' and entity.is_canceled():
                     continue  # in simulated time each message of /clock would end the wait
                 add(entity.handle)
         for guard in (self._guard, self._sigint_gc):
             wait_set.add_guard_condition(guard.handle)
-        is_event_due = monotonic() - self._events_s >= _EVENT_PERIOD_S
-        if is_event_due:
+        waited = self._waitables
+        if monotonic() - self._events_s >= _EVENT_PERIOD_S:
             self._events_s = monotonic()
-        waited = [
-            each
-            for each in self._waitables
-            if (is_event_due or not isinstance(each, EventHandler)) and self.can_execute(each)
-        ]
+            waited = [*waited, *self._events]
+        waited = list(filter(can_execute, waited))
         for waitable in waited:
             waitable.add_to_wait_set(wait_set)
         return waited
@@ -203,6 +207,10 @@ class NodeExecutor(SingleThreadedExecutor):
 
     def _task_of(self, entity: Any, take: Callable[[Any], Any]) -> Ready:
         return Ready(partial(_run, self._make_handler(entity, self._node, take)), entity)
+
+
+def _always(_entity: Any) -> bool:
+    return True
 
 
 def _call_timer(timer: Any) -> None:
