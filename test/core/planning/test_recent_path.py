@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.planning.obstacles import RecentPath
+from thinmap_ros.core.planning.path_follower import SpeedConfig
+from thinmap_ros.core.planning.travel_times import TravelTimes
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, find_path, plan
 
 FRAME = GridFrame(-1.0, 2.0, 0.1)
@@ -29,7 +32,7 @@ def test_its_cells_are_those_that_it_led_over_each_beside_the_one_before(seed):
 
 
 def test_a_discontinuity_resets_it_and_old_points_are_forgotten():
-    trail = RecentPath()
+    trail = RecentPath(length_m=60.0)
     for x in np.arange(0.0, 99.0, 0.05):
         trail.add_pose(np.array([x, 3.0, 0.0]))
     cells = trail.cells(FRAME, (100, 1000))
@@ -39,15 +42,38 @@ def test_a_discontinuity_resets_it_and_old_points_are_forgotten():
     assert len(RecentPath().cells(FRAME, (100, 1000))) == 0
 
 
-@pytest.mark.parametrize('count', [1300, 1301, 2600, 2601, 3899, 3901, 9000])
-def test_of_a_long_path_it_keeps_the_last_points(count):
-    trail = RecentPath()
-    way = np.arange(count) * 0.05
+@pytest.mark.parametrize('step_m', [0.031, 0.05, 0.1, 0.4])
+@pytest.mark.parametrize('path_m', [19.0, 39.0, 41.0, 79.0, 83.0, 300.0])
+def test_of_a_long_path_it_keeps_the_last_metres_however_often_it_hears_of_a_pose(path_m, step_m):
+    trail = RecentPath(length_m=20.0)
+    way = np.arange(0.0, path_m, step_m)
     for x in way:
         trail.add_pose(np.array([x, 3.0, 0.0]))
-    columns = FRAME.cells_of(np.stack([way[-1300:], np.full(1300, 3.0)], axis=1))[:, 1]
     kept = np.unique(trail.cells(FRAME, (100, 10_000))[:, 1])
-    assert kept.tolist() == np.unique(columns).tolist()
+    assert (np.diff(kept) == 1).all()
+    assert kept[-1] == FRAME.cells_of(np.array([[way[-1], 3.0]]))[0, 1]
+    assert 0.1 * (kept[-1] - kept[0]) == pytest.approx(min(way[-1], 20.0), abs=step_m + 0.1)
+
+
+def test_a_navigator_and_an_explorer_know_the_same_way_back():
+    cells = np.zeros((20, 1000), dtype=np.int8)
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    cells[:, 20] = 100
+    cells[8:11, 20] = 0  # a gap that looks too narrow, through which the robot has come
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
+    navigator = Navigator(NavigatorConfig())
+    travel = TravelTimes(WavefrontConfig(), SpeedConfig())
+    for step, x in enumerate(np.arange(1.0, 91.0, 0.05)):
+        pose = np.array([x, 0.95, 0.0])
+        navigator.step(pose, patch, None, 0.1)
+        if step % 2 == 0:
+            travel.add_pose(pose)
+    travel.update(patch.free, ~patch.occupied, patch.frame, pose)
+    home = (1.5, 0.95)
+    assert np.isfinite(travel.seconds[tuple(patch.frame.cells_of(np.array([home]))[0])])
+    navigator.set_goal(*home)
+    assert navigator.step(pose, patch, None, 0.1).state == 'driving'
 
 
 def test_a_pose_that_is_not_finite_leaves_no_trail():

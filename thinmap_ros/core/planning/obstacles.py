@@ -367,48 +367,51 @@ def _points_around(
 class RecentPath:
     """The last metres of the robot's path; reset when the pose jumps, as after a correction.
 
-    The robot can return along it, even if noise in the map makes a passage appear too narrow.
+    The robot can return along it, even if noise in the map makes a passage appear too narrow. All
+    that choose or plan paths remember the same metres, however often each of them hears of a pose:
+    else one sends the robot where another one knows no path.
     """
 
-    def __init__(self, step_m: float = 0.03, jump_m: float = 0.5, capacity: int = 1300) -> None:
-        """Keep the last points, step_m apart; a longer step than jump_m is a jump."""
+    def __init__(self, step_m: float = 0.03, jump_m: float = 0.5, length_m: float = 300.0) -> None:
+        """Keep the last length_m, by points step_m apart or more; longer than jump_m is a jump."""
         self._step_m = step_m
         self._jump_m = jump_m
-        self._capacity = capacity
-        # Twice the capacity: points are moved to the front only when the array is full.
-        self._points = np.empty((2 * capacity, 2))
+        self._length_m = length_m
+        # Points x, y, and the length of the path to each. Twice as many as are kept: they are moved
+        # to the front only when the array is full.
+        self._points = np.empty((2 * math.ceil(length_m / step_m + 1), 3))
         self._begin = self._end = 0
 
     def add_pose(self, T_map_base: Array) -> None:
         """Add a pose of the robot, (3,); poses that are not finite are ignored."""
         if not se2.is_finite(T_map_base):
             return
-        here = float(T_map_base[0]), float(T_map_base[1])
-        away = math.dist(here, self._points[self._end - 1]) if self._end > self._begin else math.inf
+        x, y, _ = T_map_base.tolist()
+        last_x, last_y, along_m = self._points[self._end - 1].tolist()
+        away = math.dist((x, y), (last_x, last_y)) if self._end > self._begin else math.inf
         if away > self._jump_m:
             self._begin = self._end = 0
-        if away >= self._step_m:
-            self._append(here)
+            self._append(x, y, 0.0)
+        elif away >= self._step_m:
+            self._append(x, y, along_m + away)
 
     def cells(self, frame: GridFrame, shape: tuple[int, ...]) -> Cells:
         """Cells (N, 2) of a map (H, W) on the path; consecutive cells share an edge."""
         if self._end == self._begin:
             return np.empty((0, 2), dtype=np.int64)
-        return np.asarray(
-            _connected_cells(
-                frame.cells_of(self._points[self._begin : self._end]), shape[0], shape[1]
-            )
-        )
+        points = self._points[self._begin : self._end, :2]
+        return np.asarray(_connected_cells(frame.cells_of(points), shape[0], shape[1]))
 
-    def _append(self, here: tuple[float, float]) -> None:
+    def _append(self, x: float, y: float, along_m: float) -> None:
         if self._end == len(self._points):
-            kept = self._capacity - 1
-            self._points[:kept] = self._points[self._end - kept :]
+            kept = self._end - self._begin
+            self._points[:kept] = self._points[self._begin : self._end]
             self._begin = 0
             self._end = kept
-        self._points[self._end] = here
+        self._points[self._end] = x, y, along_m
         self._end += 1
-        self._begin = max(self._begin, self._end - self._capacity)
+        while self._points[self._begin, 2] < along_m - self._length_m:
+            self._begin += 1
 
 
 @kernel
