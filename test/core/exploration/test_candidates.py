@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2
+from thinmap_ros.core.exploration.belief import MAX_VISITS, WORTH_SEEING_M2
 from thinmap_ros.core.exploration.candidates import CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.fitted import FITTED
@@ -175,7 +175,8 @@ def test_a_frontier_near_which_a_cell_changes_is_examined_at_once_and_the_others
 
     def examine():
         clusters = room.frontiers.clusters(0.0)
-        return finder.update(room.frontiers, room.travel, clusters, room.sight)
+        are_last = [False] * len(clusters)
+        return finder.update(room.frontiers, room.travel, clusters, room.sight, are_last)
 
     first = examine()
     second = examine()
@@ -202,13 +203,56 @@ def test_a_change_beyond_a_wall_makes_no_frontier_worth_a_look():
     room.find()
     finder = ViewFinder()
     clusters = room.frontiers.clusters(0.0)
-    finder.update(room.frontiers, room.travel, clusters, room.sight)
+    are_last = [False] * len(clusters)
+    finder.update(room.frontiers, room.travel, clusters, room.sight, are_last)
     # The one that was examined first is examined again now, and the other one the next time.
-    before = finder.update(room.frontiers, room.travel, clusters, room.sight)
+    before = finder.update(room.frontiers, room.travel, clusters, room.sight, are_last)
     cells[30, 150] = 100
     room.set_cells(cells)
-    after = finder.update(room.frontiers, room.travel, clusters, room.sight)
+    after = finder.update(room.frontiers, room.travel, clusters, room.sight, are_last)
     assert after[0] is before[0]
+
+
+def test_the_last_visit_is_to_where_most_of_a_frontier_is_in_sight():
+    room = Room(open_hall(12.0))
+    at = se2.pose(2.0, 4.0, 0.0)
+    (candidate,) = room.find(at)
+    visited = (float(candidate.goal[0]), float(candidate.goal[1]))
+
+    def share_in_sight():
+        places = FRAME.centres_of(candidate.view.cells)
+        areas_m2 = candidate.view.areas_m2
+        is_new = np.hypot(*(places - visited).T) > 0.5
+        away_m = np.hypot(*(places - candidate.goal[:2]).T)
+        return areas_m2[away_m.argmin()] / areas_m2[is_new].max()
+
+    assert share_in_sight() < 0.9
+    candidate.evidence.add_visit(visited)
+    (candidate,) = room.find(at)
+    assert share_in_sight() < 0.9
+    candidate.evidence.add_visit(visited)
+    (candidate,) = room.find(at)
+    assert share_in_sight() == 1.0
+
+
+def test_more_places_are_examined_for_the_last_visit():
+    """Only a few places see into a deep gap, and none of those that are examined first."""
+    cells = np.full((60, 120), -1)
+    cells[:21] = 0
+    cells[[0, 20]] = 100
+    cells[:21, [0, -1]] = 100
+    cells[10:20, [59, 62]] = 100
+    cells[20, 60:62] = 0
+    room = Room(cells)
+    at = se2.pose(10.0, 0.95, 0.0)
+    (candidate,) = room.find(at)
+    assert candidate.view.most_m2 == 0.0
+    for _ in range(MAX_VISITS - 1):
+        candidate.evidence.add_visit((candidate.goal[0], candidate.goal[1]))
+    (candidate,) = room.find(at)
+    assert candidate.view.most_m2 > WORTH_SEEING_M2
+    place = FRAME.cells_of(candidate.goal[None, :2])[0]
+    assert any(line_is_clear(cells == 0, *place, *cell) for cell in candidate.cells)
 
 
 def test_a_short_frontier_counts_as_its_probability_says():

@@ -14,6 +14,7 @@ from thinmap_ros.core.se2 import Cells, Place
 from thinmap_ros.core.snapshot import MAX_CELL_INDEX, MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
 from thinmap_ros.jit import inlined, kernel
 
+MAX_VISITS = 3  # that show nothing, until a candidate is given up
 WORTH_SEEING_M2 = 0.5  # a smaller hidden area counts as nothing
 _LOG_ODDS_LIMIT = 14.0
 _MIN_LENGTH_M = 0.1
@@ -168,6 +169,11 @@ class Evidence:
     def is_tried(self) -> bool:
         """Whether it is kept when its place has no frontier for a while."""
         return self.visits > 0 or self.failures > 0
+
+    @property
+    def is_last_visit(self) -> bool:
+        """Whether the next visit that shows nothing is the last one."""
+        return self.visits >= MAX_VISITS - 1
 
     def add_visit(self, place: Place) -> None:
         """Add a visit that showed nothing, at a place, m; it is reachable, whatever failed."""

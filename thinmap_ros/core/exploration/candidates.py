@@ -134,7 +134,9 @@ class CandidateFinder:
             topology, frontiers, [c for c in clusters if frontiers.is_long(len(c), min_length_m)]
         )
         short = [c for c in clusters if not frontiers.is_long(len(c), min_length_m)]
-        views = self._views.update(frontiers, travel, [*(c.cells for c in found), *short], sight)
+        cells = [*(candidate.cells for candidate in found), *short]
+        are_last = [c.evidence.is_last_visit for c in found] + [False] * len(short)
+        views = self._views.update(frontiers, travel, cells, sight, are_last)
         for candidate, view in zip(found, views[: len(found)], strict=True):
             self._believe(candidate, view)
         fragments = [
@@ -232,8 +234,9 @@ def _choose_viewpoint(
 ) -> None:
     """Choose the place that sees most of a frontier for each second that it costs.
 
-    Not one from where a visit showed nothing. Without such a place, it is the nearest one beside
-    the frontier: from there a passage that looks too narrow may turn out to be wide enough.
+    Not one from where a visit showed nothing; for the last visit, it is the one that sees most at
+    all. Without such a place, it is the nearest one beside the frontier: from there a passage that
+    looks too narrow may turn out to be wide enough.
     arrivals: at the places of its view; slack_rad: angle by which the robot need not turn to what
     it observes.
     """
@@ -248,7 +251,8 @@ def _choose_viewpoint(
     off = se2.wrap(view.directions - arrivals.headings)
     turns = off - np.clip(off, -slack_rad, slack_rad)
     seconds = arrivals.seconds + travel.turn_s(turns)
-    best = int(np.argmax(np.where(is_new, view.areas_m2 / seconds, 0.0)))
+    worth = view.areas_m2 if candidate.evidence.is_last_visit else view.areas_m2 / seconds
+    best = int(np.argmax(np.where(is_new, worth, 0.0)))
     heading = float(arrivals.headings[best] + turns[best])
     x, y = centres[best].tolist()
     candidate.goal = se2.pose(x, y, heading)

@@ -27,7 +27,12 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import config_or_default, part
 from thinmap_ros.core.exploration import belief
-from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel, Evidence
+from thinmap_ros.core.exploration.belief import (
+    MAX_VISITS,
+    WORTH_SEEING_M2,
+    BeliefModel,
+    Evidence,
+)
 from thinmap_ros.core.exploration.candidates import Candidate, CandidateConfig, CandidateFinder
 from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.exploration.space import FrontierMap, box_of_scan, hidden_area_m2
@@ -60,7 +65,6 @@ _SAME_PLACE_M = 1.5  # a target or viewpoint that moves less is the same one
 # Saving for which the target is changed, so that the robot does not oscillate.
 _SWITCH_MARGIN_S = 4.0
 _FIND_PERIOD_S = 1.0  # between two searches for candidates, which take time in large maps
-_MAX_VISITS = 3  # until a candidate is given up
 _MAX_FAILURES = 2
 _MAX_RESOLVED_M2 = 2.0  # of area that candidates may hide of which none is worth a visit
 _GONE_S = 0.35
@@ -414,7 +418,7 @@ def _is_given_up(candidate: Candidate) -> bool:
     tried = candidate.evidence
     is_small = candidate.expected_area_m2 < WORTH_SEEING_M2
     max_failures = 1 if is_small else _MAX_FAILURES
-    is_tried = tried.visits >= _MAX_VISITS or tried.failures >= max_failures
+    is_tried = tried.visits >= MAX_VISITS or tried.failures >= max_failures
     return candidate.goal is None or is_tried
 
 

@@ -6,6 +6,7 @@ the mean f of all ranges so far.
 """
 
 import math
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.jit import kernel
 
 _SPACING_M = 0.6  # of places: at most the width of a robot and of a door
+_CLOSE_M = 0.2  # and for the last visit to a frontier: past the edge of a leaf of a door
 _RAYS = 90
 _RIM_RAD = 0.6  # at the ends of its field of view the laser sees little
 _LEAST_FADE_M = 0.5
@@ -93,12 +95,21 @@ class ViewFinder:
 
     def __init__(self) -> None:
         self._frame = GridFrame(0.0, 0.0, 1.0)
-        self._known: dict[bytes, View] = {}
+        self._known: dict[tuple[bytes, bool], View] = {}
 
     def update(
-        self, frontiers: FrontierMap, travel: TravelTimes, clusters: list[Cells], sight: Sight
+        self,
+        frontiers: FrontierMap,
+        travel: TravelTimes,
+        clusters: list[Cells],
+        sight: Sight,
+        are_last: list[bool],
     ) -> list[View]:
-        """View of each frontier of some cells (N, 2), from the places that the robot can reach."""
+        """View of each frontier of some cells (N, 2), from the places that the robot can reach.
+
+        are_last: which of them are visited for the last time. These may be in sight of a few places
+        only, as past the edge of a leaf of a door: more places are examined.
+        """
         if self._frame != frontiers.frame:
             self._frame = frontiers.frame
             self._known = {}
@@ -107,8 +118,9 @@ class ViewFinder:
             del self._known[key]
         changed = frontiers.take_changes()
         margin = round(_AROUND_M / frontiers.frame.resolution)
-        known: dict[bytes, View] = {}
-        keys = [cells.tobytes() for cells in clusters]
+        known: dict[tuple[bytes, bool], View] = {}
+        cluster_bytes = (cells.tobytes() for cells in clusters)
+        keys = list(zip(cluster_bytes, are_last, strict=True))
         for key, cells in zip(keys, clusters, strict=True):
             view = self._known.get(key)
             if view is not None and not changed[_around(cells, view.cells, margin)].any():
@@ -116,7 +128,7 @@ class ViewFinder:
         missing = [k for k, key in enumerate(keys) if key not in known]
         if missing:
             examiner = _Examiner(frontiers, travel, clusters, sight)
-            known |= {keys[k]: examiner.view(k) for k in missing}
+            known |= {keys[k]: examiner.view(k, are_last[k]) for k in missing}
         self._known = known
         return [known[key] for key in keys]
 
@@ -143,25 +155,37 @@ class _Examiner:
         self._owner = np.full(frontiers.free.shape, -1, dtype=np.int32)
         for k, cells in enumerate(clusters):
             self._owner[cells[:, 0], cells[:, 1]] = k
-        self._allowed = travel.allowed
-        size = max(round(_SPACING_M / resolution), 1)
-        self._places = _first_reached(travel.seconds, travel.reachable & frontiers.free, size)
+        self._travel = travel
 
-    def view(self, k: int) -> View:
+    @cached_property
+    def _places(self) -> Cells:
+        return self._places_each(_SPACING_M)
+
+    @cached_property
+    def _close_places(self) -> Cells:
+        return self._places_each(_CLOSE_M)
+
+    def _places_each(self, spacing_m: float) -> Cells:
+        stands = self._travel.reachable & self._frontiers.free
+        size = max(round(spacing_m / self._frontiers.frame.resolution), 1)
+        return _first_reached(self._travel.seconds, stands, size)
+
+    def view(self, k: int, is_last: bool) -> View:
         """View of frontier k."""
         frontiers = self._frontiers
         cells = self._clusters[k]
         known = (frontiers.free, frontiers.passable)
-        areas, sums = _areas(known, self._owner, k, cells, self._places, self._reach)
+        places = self._close_places if is_last else self._places
+        areas, sums = _areas(known, self._owner, k, cells, places, self._reach)
         areas_m2 = areas * frontiers.frame.resolution**2
         seen = areas_m2 >= _MIN_VIEW_M2
         return View(
             hidden_area_m2(frontiers, frontiers.middle_of(cells)),
             depth_behind_m(frontiers, cells),
-            self._places[seen],
+            places[seen],
             areas_m2[seen],
             np.arctan2(sums[seen, 1], sums[seen, 0]),
-            not seen.any() and is_enclosed(frontiers.free, cells, self._allowed),
+            not seen.any() and is_enclosed(frontiers.free, cells, self._travel.allowed),
         )
 
 
