@@ -13,12 +13,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba.core import event
+from numba.core.codegen import CPUCodeLibrary, ll
+from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
 from thinmap_ros import jit
@@ -71,10 +73,11 @@ def release_compiler_pages() -> None:
     """Release the memory pages of the kernel compiler.
 
     Its library, some 100 MB, is idle once all kernels are loaded. Only unmodified mappings are
-    released: the system reads them again from the library when needed. Without /proc, nothing
-    happens.
+    released: the system reads them again from the library when needed. Without /proc, nothing of
+    it is.
     """
     gc.collect()
+    _pack_modules()
     try:
         smaps = Path('/proc/self/smaps').read_text()
     except OSError:
@@ -83,6 +86,19 @@ def release_compiler_pages() -> None:
     libc = ctypes.CDLL(None)
     for first, last in _clean_mappings(smaps, 'llvmlite'):
         libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), mmap.MADV_DONTNEED)
+
+
+def _pack_modules() -> None:
+    """Keep the modules of loaded kernels as bitcode, which needs a sixth of their memory.
+
+    They serve only for a kernel that is compiled later and calls one of these.
+    """
+    with global_compiler_lock:
+        for library in gc.get_objects():
+            if issubclass(type(library), CPUCodeLibrary) and library._shared_module is not None:
+                bitcode = library._shared_module.as_bitcode()
+                library._shared_module = None
+                library._get_module_for_linking = partial(ll.parse_bitcode, bitcode)
 
 
 def _clean_mappings(smaps: str, name: str) -> Iterator[tuple[int, int]]:

@@ -4,7 +4,12 @@ import gc
 import os
 import resource
 
+import numba
+import numpy as np
+from numba.core.codegen import CPUCodeLibrary
+
 from thinmap_ros import kernels
+from thinmap_ros.core.topology.thinning import column_distance, true_cells
 
 
 def test_without_a_file_that_may_be_opened_nothing_is_released_and_nothing_raised():
@@ -21,3 +26,26 @@ def test_without_a_file_that_may_be_opened_nothing_is_released_and_nothing_raise
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     assert kernels._shared_bytes() > 0
+
+
+def kept_modules():
+    libraries = [each for each in gc.get_objects() if issubclass(type(each), CPUCodeLibrary)]
+    return [library for library in libraries if library._shared_module is not None]
+
+
+def test_modules_of_kernels_are_released_and_others_can_still_be_compiled_from_them():
+    gc.unfreeze()
+    mask = np.ones((3, 3), dtype=bool)
+    true_cells(mask)
+    column_distance(mask)
+    assert kept_modules()
+    kernels.release_compiler_pages()
+    assert not kept_modules()
+
+    @numba.njit
+    def both(mask):
+        return true_cells(mask).sum() + column_distance(mask).sum()
+
+    assert both(mask) == true_cells(mask).sum() + column_distance(mask).sum()
+    kernels.release_compiler_pages()
+    assert not kept_modules()
