@@ -83,7 +83,7 @@ _SCANS = 200
 
 
 def mapping(worlds: Path, quick: bool) -> list[Row]:
-    """One row: 181 beams, 8 m, 10 cm, a real floor, rotation in place at ten places."""
+    """A row for cells of 10 cm and of 5 cm: a real floor, rotation in place at ten places."""
     floor = floors(worlds, 'kth/50052748')[0]
     laser = LaserScanner(LaserScannerConfig(), 0)
     turns = [
@@ -92,9 +92,18 @@ def mapping(worlds: Path, quick: bool) -> list[Row]:
         for k in range(_SCANS // 10)
     ]
     scans = [(laser.scan(floor.world, T, 0), T) for T in turns]
-    grid = OccupancyGrid(PAPER_GRID)
-    seconds = best_seconds({'update': lambda: _update(grid, scans)}, 10 if quick else 40)['update']
-    return [at_least('map update, 181 beams, 8 m, 10 cm', len(scans) / seconds, _TARGET, 'scans/s')]
+    what = 'map update, 181 beams, 8 m'
+    rate = _rate(OccupancyGrid(PAPER_GRID), scans, quick)
+    usual_rate = _rate(OccupancyGrid(), scans, quick)
+    return [
+        at_least(f'{what}, 10 cm', rate, _TARGET, 'scans/s'),
+        Row(f'{what}, 5 cm (the default)', f'{usual_rate:.4g} scans/s'),
+    ]
+
+
+def _rate(grid: OccupancyGrid, scans: list[tuple[Scan, Array]], quick: bool) -> float:
+    rounds = 10 if quick else 40
+    return len(scans) / best_seconds({'update': lambda: _update(grid, scans)}, rounds)['update']
 
 
 def _update(grid: OccupancyGrid, scans: list[tuple[Scan, Array]]) -> None:

@@ -54,7 +54,7 @@ def test_errors_of_logs(log, case):
 def test_times_beside_others():
     (page,) = rows((RESULTS / 'slam.md').read_text(), 'intel')
     assert page[0] == '5438'
-    (times,) = rows(README, 'CPU time per scan, same log (ms)')
+    (times,) = rows(README, 'CPU time of poses per scan, same log (ms)')
     assert float(times[0]) == pytest.approx(float(page[10]), abs=0.05)
     known = {run.system: run.cpu_ms for run in runs('intel') if run.cpu_ms is not None}
     for program, cell in zip(PROGRAMS, times[1:], strict=True):
