@@ -68,6 +68,10 @@ class WebClient:
     def send_text(self, text):
         self._loop.call_soon_threadsafe(self._write, text)
 
+    def send_at_once(self, texts):
+        """Send messages as a link does that has held them back."""
+        self._loop.call_soon_threadsafe(lambda: [self._write(text) for text in texts])
+
     def _write(self, text):
         # What a socket that was closed says of it, nobody asks for.
         done = asyncio.ensure_future(self._send(text))

@@ -270,9 +270,8 @@ def test_a_stop_at_the_end_of_what_a_cut_has_held_back_is_heard(site):
     one = site()
     page = one.open()
     page.until(lambda: 'beat' in page.items, 'a beat')
-    for _ in range(200):
-        page.ask_at(page.items['beat'] - 600, 'drive', ahead=1.0, left=0.0)
-    page.ask('stop')
+    late = {'action': 'drive', 'beat': page.items['beat'] - 600, 'ahead': 1.0, 'left': 0.0}
+    page.send_at_once([*[json.dumps(late)] * 200, json.dumps({'action': 'stop'})])
     page.until(lambda: one.robot.requests, 'the stop')
     assert one.robot.requests == [(1, 'stop')]
 
