@@ -120,7 +120,7 @@ def test_a_robot_in_another_building_is_told_so():
 def test_a_pose_found_is_followed_and_a_robot_carried_off_is_found_again(finder):
     before = list(drive(OFFICE, START, WAY))
     after = [
-        (scan, se2.compose(before[-1][1], se2.between((5.0, -3.0, 0.7), odometry)), T)
+        (scan, se2.compose(before[-1][1], se2.between(se2.pose(5.0, -3.0, 0.7), odometry)), T)
         for scan, odometry, T in drive(OFFICE, (6.2, 7.0, -0.5), [(0.15, 0.05)] * 30)
     ]
     results = run(finder, before + after)
