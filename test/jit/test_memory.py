@@ -3,13 +3,12 @@
 import gc
 import os
 import resource
+import subprocess
+import sys
 
-import numba
-import numpy as np
-from numba.core.codegen import CPUCodeLibrary
+import pytest
 
 from thinmap_ros import kernels
-from thinmap_ros.core.topology.thinning import column_distance, true_cells
 
 
 def test_without_a_file_that_may_be_opened_nothing_is_released_and_nothing_raised():
@@ -28,24 +27,33 @@ def test_without_a_file_that_may_be_opened_nothing_is_released_and_nothing_raise
     assert kernels._shared_bytes() > 0
 
 
+# In a process of its own: others release, too.
+_RELEASES = """
+import gc
+import numba
+import numpy as np
+from numba.core.codegen import CPUCodeLibrary
+from thinmap_ros import kernels
+from thinmap_ros.core.topology.thinning import column_distance, true_cells
+
 def kept_modules():
     libraries = [each for each in gc.get_objects() if issubclass(type(each), CPUCodeLibrary)]
     return [library for library in libraries if library._shared_module is not None]
 
+mask = np.ones((3, 3), dtype=bool)
+expected = true_cells(mask).sum() + column_distance(mask).sum()
+assert kept_modules()
+kernels.release_compiler_pages()
+assert not kept_modules()
 
+@numba.njit
+def both(mask):
+    return true_cells(mask).sum() + column_distance(mask).sum()
+
+assert both(mask) == expected
+"""
+
+
+@pytest.mark.programs
 def test_modules_of_kernels_are_released_and_others_can_still_be_compiled_from_them():
-    gc.unfreeze()
-    mask = np.ones((3, 3), dtype=bool)
-    true_cells(mask)
-    column_distance(mask)
-    assert kept_modules()
-    kernels.release_compiler_pages()
-    assert not kept_modules()
-
-    @numba.njit
-    def both(mask):
-        return true_cells(mask).sum() + column_distance(mask).sum()
-
-    assert both(mask) == true_cells(mask).sum() + column_distance(mask).sum()
-    kernels.release_compiler_pages()
-    assert not kept_modules()
+    subprocess.run([sys.executable, '-c', _RELEASES], check=True)

@@ -2,6 +2,7 @@
 
 import copy
 import mmap
+import os
 import pickle
 import resource
 import subprocess
@@ -36,6 +37,16 @@ def test_a_cell_of_a_tile_takes_the_memory_of_a_page():
     tiles.allocate(line_of_tiles(0, KILOMETRE))
     tiles.pool[:KILOMETRE, 0, 0] = 1.0
     assert resident_bytes() - before < 4 * KILOMETRE * mmap.PAGESIZE
+
+
+def test_a_process_with_many_stores_can_fork():
+    # Together more than the memory of any machine that runs this.
+    stores = [TileStore(np.float64, (6,)) for _ in range(64)]
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert len(stores) == 64
 
 
 def test_the_directory_of_a_corridor_of_a_kilometre_grows_a_few_times():

@@ -24,6 +24,7 @@ _MIN_POOL_TILES = 64  # minimum capacity of a pool, tiles
 # least some tiles.
 _ROOM_SHARE = 0.25
 _MIN_ROOM = 4
+_MAP_NORESERVE = 0x4000  # of Linux: a process with some of these can still fork
 
 
 class _Span(NamedTuple):
@@ -262,7 +263,7 @@ def _sparse_zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
 
     NumPy asks for pages of 2 MB, of which a surface in one cell of a wall would take a whole one.
     """
-    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | _MAP_NORESERVE
     memory = mmap.mmap(-1, math.prod(shape) * dtype.itemsize, flags=flags)
     memory.madvise(mmap.MADV_NOHUGEPAGE)
     return np.frombuffer(memory, dtype).reshape(shape)
