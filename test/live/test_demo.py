@@ -122,6 +122,25 @@ def test_ctrl_c_ends_everything(ros_domain, tmp_path, robots, nodes):
     assert not (out / 'report.json').exists()
 
 
+@pytest.mark.cpu_budget(30.0, 'nine nodes that start as those of a user')
+def test_a_page_stays_open_when_the_exploration_has_ended(ros_domain, tmp_path):
+    out = tmp_path / 'demo'
+    port = random.SystemRandom().randrange(20_000, 30_000)
+    process = demo(out, '--rate', '20', '--time-limit-s', '1', '--web', '--web-port', str(port))
+    until_there_is_a_page(process, port)
+    until = time.monotonic() + PATIENCE_S
+    while not (out / 'report.html').exists():
+        assert time.monotonic() < until and process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    tree = process_tree(process)
+    until_there_is_a_page(process, port)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, stderr
+    assert 'the page stays open' in stderr and 'results in' in stdout
+    assert not psutil.wait_procs(tree, timeout=PATIENCE_S)[1]
+
+
 @pytest.mark.slow
 def test_two_robots_join_their_maps_and_nothing_is_left(ros_domain, tmp_path):
     """With real localizers and mappers, which do not know the starts of each other."""

@@ -70,7 +70,7 @@ def held_joystick(page, is_done, **values):
 
 
 def news(page):
-    return page.items.get('news', [0, ''])[1]
+    return page.news[-1] if page.news else ''
 
 
 def velocities(heard):

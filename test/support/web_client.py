@@ -63,7 +63,7 @@ class WebClient:
                     self.refusals.append(value)
                 else:
                     self.items[name] = value
-                    self.news += [value[1]] if name == 'news' else []
+                    self.news = [text for _, text in value] if name == 'news' else self.news
 
     def send_text(self, text):
         self._loop.call_soon_threadsafe(self._write, text)

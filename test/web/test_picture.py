@@ -10,8 +10,10 @@ import pytest
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.ros import diagnostics
 from thinmap_ros.web.pages import Board
 from thinmap_ros.web.picture import (
+    ENDED,
     DiagnosticsTable,
     DrivenPath,
     Picture,
@@ -65,6 +67,29 @@ def test_an_exploration_in_words():
     assert 'm, to a frontier at 1.0, -2.0,' in exploration_words(status)['detail']
     status.missing_area_m2 = -1.0
     assert 'missing' not in exploration_words(status)['detail']
+
+
+@pytest.mark.parametrize(
+    ('code', 'reason', 'state', 'words'),
+    [
+        (1, 'all end nodes resolved', 'finished', '3.0 m, all end nodes resolved'),
+        (3, 'cancelled', 'cancelled', '3.0 m'),
+        (4, '2 end nodes unreachable', 'ended', '3.0 m, 2 end nodes unreachable'),
+    ],
+)
+def test_an_exploration_that_is_cancelled_has_not_finished(code, reason, state, words):
+    status = SimpleNamespace(
+        state=3,
+        reason_code=code,
+        reason=reason,
+        distance_m=3.0,
+        has_target=False,
+        missing_area_m2=-1.0,
+        missing_area_bound_m2=-1.0,
+        coverage_estimate=1.0,
+    )
+    shown = exploration_words(status)
+    assert (shown['state'], shown['detail']) == (state, words)
 
 
 def test_a_scan_is_drawn_at_the_pose_of_its_stamp():
@@ -221,5 +246,8 @@ def test_the_worst_diagnostics_come_first_and_a_silent_node_is_stale():
         ['OK', 'b', 'fine'],
     ]
     assert table.rows(now_s=5.5)[0] == ['STALE', 'a', 'silent']
+    table.update([status('a', b'\x00', diagnostics.ENDED)], now_s=6.0)
+    assert ENDED == diagnostics.ENDED
+    assert ['OK', 'a', 'ended'] in table.rows(now_s=60.0)
     table.update((status(f'n{i}', 0, '') for i in range(1000)), now_s=6.0)
     assert len(table.rows(now_s=6.0)) == 100

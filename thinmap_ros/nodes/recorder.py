@@ -61,6 +61,7 @@ class RecorderNode(Node):
             for message in self._early:
                 self._write(*message, self.get_clock().now().nanoseconds)
             self._writer.close()
+        self._diagnostics.end()
         self.get_logger().info(f'{self._path}: {counted(self._written, "message")}')
 
     def _discover_topics(self) -> None:

@@ -197,6 +197,9 @@ class _StepFailures:
         return self.last if monotonic() - self._last_s < _FAILED_S else ''
 
 
+ENDED = 'ended'  # the last message of a node
+
+
 @dataclass
 class _Check:
     """A condition that returns what is wrong, '' for nothing; logged now and then."""
@@ -259,6 +262,11 @@ class NodeDiagnostics(MessageStatistics):
     def set_state(self, level: bytes, text: str) -> None:
         """Set level and message that are published while no check fails."""
         self._state = (level, text)
+
+    def end(self) -> None:
+        """Publish that the node ends in order: whoever shows it does not wait for more."""
+        self.set_state(OK, ENDED)
+        self._publish()
 
     def set_paused(self, is_paused: bool) -> None:
         """Publish `paused` instead of the state while that is so."""

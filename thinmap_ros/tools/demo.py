@@ -78,31 +78,33 @@ class Processes:
             (name for name, process in self.running.items() if process.poll() is not None), None
         )
 
-    def stop(self) -> None:
-        """Send SIGTERM to every group, and SIGKILL to those that still run a little later."""
+    def stop(self, *names: str) -> None:
+        """End some processes, or all: by SIGTERM, and those that run a little later by SIGKILL."""
+        ending = [self.running.pop(name) for name in names or list(self.running)]
         # Unlike SIGINT it ends importing processes without a traceback.
-        self._signal(signal.SIGTERM)
+        self._signal(ending, signal.SIGTERM)
         until = time.monotonic() + _PATIENCE_S
-        while time.monotonic() < until and any(p.poll() is None for p in self.running.values()):
+        while time.monotonic() < until and any(process.poll() is None for process in ending):
             time.sleep(_SLEEP_S)
-        self._signal(signal.SIGKILL)
-        for process in self.running.values():
+        self._signal(ending, signal.SIGKILL)
+        for process in ending:
             process.wait()
 
-    def _signal(self, number: int) -> None:
-        for process in self.running.values():
+    def _signal(self, processes: Sequence[subprocess.Popen[bytes]], number: int) -> None:
+        for process in processes:
             if process.poll() is None:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, number)
 
 
-def explore(arguments: argparse.Namespace, world: Path, starts: Sequence[Array]) -> None:
+def explore(
+    processes: Processes, arguments: argparse.Namespace, world: Path, starts: Sequence[Array]
+) -> None:
     """Run the graph until the explorations have ended. Raises ThinmapError if a node exits early.
 
     starts: pose (3,) of each robot.
     """
     out: Path = arguments.out
-    processes = Processes(out / 'log')
     common = _parameters(world=world, robot=arguments.robot)
     listeners = _SCAN_LISTENERS + arguments.view + arguments.web
     lockstep = _parameters(lockstep='local_topology', wait_for_subscribers=listeners)
@@ -114,22 +116,19 @@ def explore(arguments: argparse.Namespace, world: Path, starts: Sequence[Array])
     if is_team:
         where = _parameters(robots=len(starts), starts=_text(starts))
         maps = _parameters(map_poses=_text(map_poses(starts)))
-    try:
-        if is_team:
-            _start_robots(processes, starts, arguments.speed_m_s)
-        else:
-            _start_nodes(processes, starts[0], arguments.speed_m_s)
-        processes.start('recorder', [*_SIM_TIME, *_parameters(bag=out / 'bag')])
-        if arguments.view:
-            processes.start('rerun_viewer', _SIM_TIME)
-        if arguments.web:
-            _start_pages(processes, len(starts), arguments.web_port)
-        processes.start('demo_monitor', [*_SIM_TIME, *common, *limit, *maps], quiet=False)
-        # The last one: what comes after the first scan is seen sooner.
-        processes.start('sim', [*common, *lockstep, *clock, *where])
-        _wait(processes)
-    finally:
-        processes.stop()
+    if is_team:
+        _start_robots(processes, starts, arguments.speed_m_s)
+    else:
+        _start_nodes(processes, starts[0], arguments.speed_m_s)
+    processes.start('recorder', [*_SIM_TIME, *_parameters(bag=out / 'bag')])
+    if arguments.view:
+        processes.start('rerun_viewer', _SIM_TIME)
+    if arguments.web:
+        _start_pages(processes, len(starts), arguments.web_port)
+    processes.start('demo_monitor', [*_SIM_TIME, *common, *limit, *maps], quiet=False)
+    # The last one: what comes after the first scan is seen sooner.
+    processes.start('sim', [*common, *lockstep, *clock, *where])
+    _wait(processes)
 
 
 def _start_nodes(processes: Processes, start: Array, speed: float) -> None:
@@ -253,7 +252,27 @@ def _work(arguments: argparse.Namespace) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     _prepare(arguments.out)
     _choose_domain()
-    explore(arguments, world, starts)
+    processes = Processes(arguments.out / 'log')
+    try:
+        explore(processes, arguments, world, starts)
+        # Robots with a page stay: the results are written beside them.
+        processes.stop(*(('recorder', 'demo_monitor') if arguments.web else ()))
+        _write_results(arguments, world, starts)
+        if arguments.web:
+            _stay(processes)
+    finally:
+        processes.stop()
+
+
+def _stay(processes: Processes) -> None:
+    """Leave the pages open until Ctrl-C, or until a node ends."""
+    print('the page stays open: Ctrl-C ends it', file=sys.stderr)
+    with contextlib.suppress(KeyboardInterrupt):
+        while processes.ended() is None:
+            time.sleep(_SLEEP_S)
+
+
+def _write_results(arguments: argparse.Namespace, world: Path, starts: Sequence[Array]) -> None:
     result = json.loads((arguments.out / 'result.json').read_text())
     run = (arguments.out, world, arguments.robot, result)
     command = cli.command_line()
@@ -332,7 +351,7 @@ def main() -> None:
     )
     add_out(parser, 'out/demo')
     parser.add_argument('--view', action='store_true', help='show it in rerun')
-    web_help = f'show it in a browser, at http://127.0.0.1:{_PORT}/'
+    web_help = f'show it in a browser, at http://127.0.0.1:{_PORT}/, until Ctrl-C'
     parser.add_argument('--web', action='store_true', help=web_help)
     port_help = f'of the page; each further robot has the next one (default {_PORT})'
     parser.add_argument('--web-port', type=int, default=_PORT, help=port_help)

@@ -18,7 +18,6 @@ from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.core.scan import Scan, with_newest
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
-from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.logs import decode
 from thinmap_ros.view import palette
 from thinmap_ros.view.interface import ApartScans, StampMatcher
@@ -28,10 +27,14 @@ _LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 _STALE = 3
 _SILENT_S = 5.0
 _MAX_ROWS = 100
+ENDED = 'ended'  # the last message of a node, as in thinmap_ros.ros.diagnostics
 
 
 class DiagnosticsTable:
-    """The newest level, name and message of each node, the worst first; a silent one is stale."""
+    """The newest level, name and message of each node, the worst first; a silent one is stale.
+
+    One that has ended in order is not.
+    """
 
     def __init__(self) -> None:
         self._rows: dict[str, tuple[float, int, str]] = {}
@@ -49,7 +52,9 @@ class DiagnosticsTable:
         """Level, name and message of each row, the worst first; now_s: monotonic time, s."""
         now_s = monotonic() if now_s is None else now_s
         rows = [
-            (_STALE, name, 'silent') if now_s - heard_s > _SILENT_S else (level, name, message)
+            (_STALE, name, 'silent')
+            if now_s - heard_s > _SILENT_S and message != ENDED
+            else (level, name, message)
             for name, (heard_s, level, message) in self._rows.items()
         ]
         rows.sort(key=lambda row: (-row[0], row[1]))
@@ -111,23 +116,25 @@ class DrivenPath:
         self._board.put('path', len(starts))
 
 
-def colours() -> dict[str, str]:
-    """Colour of each thing that is drawn, as in summary.png, by its name on the page."""
+def key() -> dict[str, dict[str, list[str]]]:
+    """Colours of what is drawn, as in summary.png, by layer and by name on the page.
+
+    Those of the cells of the map are the page's own, as they depend on its theme.
+    """
+    rooms = {kind.name.lower(): list(shades) for kind, shades in palette.REGIONS.items()}
     return {
-        'end node': palette.NODES[NodeKind.END],
-        'branch node': palette.NODES[NodeKind.BRANCH],
-        'corner node': palette.NODES[NodeKind.CORNER],
-        'edge': palette.EDGE,
-        'robot and its path': palette.ESTIMATE,
-        'other robots': palette.ROBOTS[4],
-        'laser': palette.PALETTE[5],
-        'mapped apart': palette.APART,
-        'room': palette.REGIONS[RegionKind.ROOM][0],
-        'corridor': palette.REGIONS[RegionKind.CORRIDOR][0],
-        'hall': palette.REGIONS[RegionKind.HALL][0],
-        'plan and goal': palette.TRUTH,
-        'keep out': palette.KEEP_OUT,
-        'limit of the exploration': palette.HIDDEN,
+        'regions': rooms,
+        'graph': {
+            'end node': [palette.NODES[NodeKind.END]],
+            'branch node': [palette.NODES[NodeKind.BRANCH]],
+            'corner node': [palette.NODES[NodeKind.CORNER]],
+            'edge': [palette.EDGE],
+        },
+        'end nodes': {'p: probability that its position is final': []},
+        'path': {'robot and its path': [palette.ESTIMATE], 'other robots': [palette.ROBOTS[4]]},
+        'laser': {'laser': [palette.PALETTE[5]], 'mapped apart': [palette.APART]},
+        'plan': {'plan and goal': [palette.TRUTH]},
+        'keep out': {'keep out': [palette.KEEP_OUT], 'limit of the exploration': [palette.HIDDEN]},
     }
 
 
@@ -226,7 +233,8 @@ _DETAILS = (
     'lost: a piece of its own is mapped',
 )
 _MAPPING_APART = 5
-_DOING = ('idle', 'exploring', 'returning', 'finished')
+_DOING = ('idle', 'exploring', 'returning')
+_ENDINGS = {1: 'finished', 3: 'cancelled'}  # by ExplorationStatus.reason_code
 
 
 def slam_words(message: Any) -> dict[str, Any]:
@@ -244,7 +252,8 @@ def slam_words(message: Any) -> dict[str, Any]:
 
 def exploration_words(message: Any) -> dict[str, Any]:
     """Progress of a thinmap_msgs/ExplorationStatus."""
-    doing = _DOING[min(int(message.state), len(_DOING) - 1)]
+    state = int(message.state)
+    doing = _DOING[state] if state < len(_DOING) else _ENDINGS.get(message.reason_code, 'ended')
     words = [f'{message.distance_m:.1f} m']
     if message.has_target:
         place = message.target_position
@@ -253,7 +262,7 @@ def exploration_words(message: Any) -> dict[str, Any]:
         words.append(f'to {what} at {place.x:.1f}, {place.y:.1f}')
     if message.state != 0:
         words += _missing(message)
-    if message.reason:
+    if message.reason not in ('', doing):
         words.append(message.reason)
     return {
         'state': doing,
@@ -294,10 +303,11 @@ class Picture:
         self._table = DiagnosticsTable()
         self._apart = ApartScans()
         self._is_localized = False
+        self._scanned_s: float | None = None  # when the localizer last said its state
         self._pairs: dict[str, StampMatcher[Array, Scan]] = {}  # by the frame of the laser
         self._scans: tuple[Scan, ...] = ()
         self._poses: dict[str, Array] = {}  # of the robot, when they were made
-        board.put('key', colours())
+        board.put('key', key())
 
     def grid(self, patch: GridPatch) -> None:
         """Show a map."""
@@ -413,8 +423,13 @@ class Picture:
         points = np.vstack([points[:-1:step], points[-1:]])
         self.board.put('plan', np.round(points, 2).ravel().tolist())
 
+    def no_plan(self) -> None:
+        """Show no planned path."""
+        self.board.put('plan', [])
+
     def slam(self, message: Any) -> None:
         """Show a thinmap_msgs/SlamStatus."""
+        self._scanned_s = monotonic()
         inliers = float(message.inlier_ratio)
         step_ms = float(message.step_time_ms)
         errors.require_bounded('inlier_ratio, step_time_ms', (inliers, step_ms))
@@ -443,6 +458,8 @@ class Picture:
     def tick(self) -> None:
         """Show what changes by time alone; called about once a second."""
         self.board.put('diagnostics', self._table.rows())
+        if self._scanned_s is not None:
+            self.board.put('scan_age', int(monotonic() - self._scanned_s))
 
 
 def _region(region: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
-from time import monotonic
+from time import monotonic, time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -220,6 +220,7 @@ NAVIGATE = 'navigate_to_pose'
 EXPLORE = 'explore'
 _PAUSED = 'exploration_paused'  # as explore_lite has it, on explore/status
 _DRIVING = (NAVIGATE, 'navigate_through_poses')
+_GOALS = ('goal', 'go_to_region', 'home')  # requests of a page that drive there
 _ACTIVE = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING)
 _OUTCOMES = {
     GoalStatus.STATUS_SUCCEEDED: 'done',
@@ -237,12 +238,17 @@ class RobotTasks:
         map_frame: str,
         on_news: Callable[[str], None],
         on_goal: Callable[[Array | None], None],
+        on_idle: Callable[[], None],
     ) -> None:
-        """on_news: receives how a goal ends, in words; on_goal: the place (3,) of it, or None."""
+        """on_news: receives how a goal ends, in words; on_goal: the place (3,) of it, or None.
+
+        on_idle: called when the robot no longer drives to a goal of anybody.
+        """
         self._node = node
         self._map_frame = map_frame
         self._on_news = on_news
         self._on_goal = on_goal
+        self._on_idle = on_idle
         self._navigate = ActionClient(node, NavigateToPose, NAVIGATE)
         self._explore = ActionClient(node, Explore, EXPLORE)
         self._cancels = {
@@ -275,27 +281,39 @@ class RobotTasks:
         for name in self._cancels:
             self._cancel(name)
 
+    def refusal(self, action: str) -> str:
+        """Why an action cannot be done now; '' where it can."""
+        if action in _GOALS and not self._navigate.server_is_ready():
+            return f'no server of {NAVIGATE}: expected navigator to run'
+        if action == EXPLORE and not self._explore.server_is_ready():
+            return f'no server of {EXPLORE}: expected explorer to run'
+        if action == 'resume' and not self._is_paused:
+            return 'no exploration is paused: expected one, or Explore to start'
+        return ''
+
+    def pointlessness(self, action: str) -> str:
+        """Why an action would change nothing, by what is known; it is done all the same."""
+        if action == 'pause' and (self._is_paused or not self._active[EXPLORE]):
+            return 'nothing is explored'
+        if action == 'cancel' and not any(self._active.values()):
+            return 'there is no goal'
+        return ''
+
+    @property
+    def _is_paused(self) -> bool:
+        """Whether an exploration waits to be continued."""
+        return self._active[EXPLORE] and self._word == _PAUSED
+
     def drive_to(self, pose: Array) -> None:
-        """Send a goal (3,), map frame. Raises InputError where no navigator runs."""
-        self._require(self._navigate, NAVIGATE, 'navigator')
+        """Send a goal (3,), map frame."""
         target = messages.pose_stamped_msg(pose, self._map_frame, self._node.now_ns)
         self._on_goal(pose)
         self._send(self._navigate, NavigateToPose.Goal(pose=target), 'goal')
 
-    def require_paused(self) -> None:
-        """Raise InputError unless there is an exploration that waits to be continued."""
-        if not self._active[EXPLORE] or self._word != _PAUSED:
-            raise InputError('resume: no exploration is paused: expected one, or Explore to start')
-
     def explore(self, area: list[tuple[float, float]], return_home: bool) -> None:
-        """Start an exploration inside a polygon, m. Raises InputError where no explorer runs."""
-        self._require(self._explore, EXPLORE, 'explorer')
+        """Start an exploration inside a polygon, m."""
         goal = Explore.Goal(area=messages.polygon_msg(area), return_home=return_home)
         self._send(self._explore, goal, 'exploration')
-
-    def _require(self, client: ActionClient, name: str, node: str) -> None:
-        if not client.server_is_ready():
-            raise InputError(f'no server of {name}: expected {node} to run')
 
     def _send(self, client: ActionClient, goal: Any, what: str) -> None:
         sent = client.send_goal_async(goal)
@@ -336,9 +354,16 @@ class RobotTasks:
             self._cancels[name].call_async(CancelGoal.Request())
 
     def _on_status(self, name: str, message: GoalStatusArray) -> None:
+        has_driven = self._is_driving
         self._active[name] = any(status.status in _ACTIVE for status in message.status_list)
+        if has_driven and not self._is_driving:
+            self._on_idle()
         if self._is_held and self._active[name]:
             self._cancel(name)
+
+    @property
+    def _is_driving(self) -> bool:
+        return any(self._active[name] for name in _DRIVING)
 
     def _on_word(self, message: String) -> None:
         self._word = message.data
@@ -423,6 +448,7 @@ class Teleoperation:
 
 _RESUME = 'explore/resume'
 
+_HELD = 'the robot is stopped: expected it to be released first'
 # What a robot that is held may be asked for.
 _ALWAYS = (
     'cancel',
@@ -438,6 +464,17 @@ _ALWAYS = (
     'remove_keep_out',
     'erase',
 )
+
+# Type and name of the service that does an action, and the node that has it.
+_SERVICES: dict[str, tuple[type, str, str]] = {
+    'save': (SaveMap, 'save_map', 'grid_mapper'),
+    'load': (LoadMap, 'load_map', 'grid_mapper'),
+    'name_region': (NameRegion, 'name_region', 'topology_builder'),
+    'keep_out': (AddKeepOut, 'add_keep_out', 'grid_mapper'),
+    'remove_keep_out': (RemoveKeepOut, 'remove_keep_out', 'grid_mapper'),
+    'erase': (EraseArea, 'erase_area', 'grid_mapper'),
+}
+_MAX_NEWS = 50
 
 
 class Hold:
@@ -502,25 +539,20 @@ class Steering:
         self._map_frame, base_frame = frames
         self._held = Hold()
         self._drive = Teleoperation(node, base_frame, top)
-        self._tasks = RobotTasks(node, self._map_frame, self.tell, self._show_goal)
+        self._tasks = RobotTasks(node, self._map_frame, self.tell, self._show_goal, picture.no_plan)
         self._publishers = {
             _RESUME: node.create_publisher(Bool, _RESUME, qos.STREAM),
             'initialpose': node.create_publisher(
                 PoseWithCovarianceStamped, 'initialpose', qos.STREAM
             ),
         }
-        self._clients = {
-            'save': node.create_client(SaveMap, 'save_map'),
-            'load': node.create_client(LoadMap, 'load_map'),
-            'name': node.create_client(NameRegion, 'name_region'),
-            'keep out': node.create_client(AddKeepOut, 'add_keep_out'),
-            'remove': node.create_client(RemoveKeepOut, 'remove_keep_out'),
-            'erase': node.create_client(EraseArea, 'erase_area'),
+        self._clients: dict[str, Client] = {
+            action: node.create_client(kind, name) for action, (kind, name, _) in _SERVICES.items()
         }
         self._merge = SessionMerge(node, picture.board, self.tell)
         self._works = self._works_by_action()
         self._later = NodeQueue(node, self.tell).put
-        self._news = 0
+        self._news: deque[tuple[float, str]] = deque(maxlen=_MAX_NEWS)
         self._show_held()
         self._held.topic = StopTopic(node, self._stop_changed)
         self._held.topic.prepare()
@@ -537,7 +569,7 @@ class Steering:
             self._release(**request.values)
             return
         if self._held.is_on and action not in _ALWAYS:
-            raise InputError(f'{action}: the robot is stopped: expected it to be released first')
+            raise InputError(f'{action}: {_HELD}')
         if action == 'drive' and self._drive.take(page):
             self._later(self._tasks.cancel_all)
         stops = self._held.last
@@ -565,9 +597,9 @@ class Steering:
     # In the node's thread.
 
     def tell(self, news: str) -> None:
-        """Show what has happened on all pages."""
-        self._news += 1
-        self._picture.board.put('news', [self._news, news])
+        """Show what has happened, and when, on all pages."""
+        self._news.append((round(time(), 1), news))
+        self._picture.board.put('news', list(self._news))
 
     def tick(self) -> None:
         """Keep a robot that is held standing; called ten times a second."""
@@ -576,6 +608,23 @@ class Steering:
             self._drive.keep_standing()
         else:
             self._drive.tidy()
+
+    def show_refusals(self) -> None:
+        """Show what would be refused now, and why; called about once a second."""
+        reasons = {action: self._refusal(action) for action in self._works}
+        for action in ('pause', 'cancel'):
+            reasons[action] = reasons[action] or self._tasks.pointlessness(action)
+        self._picture.board.put('refusals', {k: reason for k, reason in reasons.items() if reason})
+
+    def _refusal(self, action: str) -> str:
+        """Why an action cannot be done now; '' where it can."""
+        if self._held.is_on and action not in _ALWAYS:
+            return _HELD
+        if action in _SERVICES and not self._clients[action].service_is_ready():
+            return f'no service {_SERVICES[action][1]}: expected {_SERVICES[action][2]} to run'
+        if action == 'home' and self._picture.path.start is None:
+            return 'no pose of the robot yet'
+        return self._tasks.refusal(action)
 
     def close(self) -> None:
         """Stop the robot, if a page drives it, and a merge."""
@@ -613,6 +662,8 @@ class Steering:
         if is_stopped and request.action not in _ALWAYS:
             return  # stopped since it was taken, and perhaps released
         request.require_recent()  # it may have waited for the node
+        if reason := self._refusal(request.action):
+            raise InputError(f'{request.action}: {reason}')
         self._works[request.action](**request.values)
 
     def _works_by_action(self) -> dict[str, Callable[..., None]]:
@@ -634,16 +685,16 @@ class Steering:
             'save': lambda name: call('save', SaveMap.Request(path=name)),
             'load': lambda name: call('load', LoadMap.Request(path=name)),
             'name_region': lambda region, name: call(
-                'name', NameRegion.Request(id=region, name=name)
+                'name_region', NameRegion.Request(id=region, name=name)
             ),
             'sessions': merge.list_sessions,
             'merge': merge.begin,
             'merge_save': merge.save,
             'merge_drop': merge.drop,
             'keep_out': lambda corners, is_wall: call(
-                'keep out', AddKeepOut.Request(corners=area_of(corners), is_wall=is_wall)
+                'keep_out', AddKeepOut.Request(corners=area_of(corners), is_wall=is_wall)
             ),
-            'remove_keep_out': lambda area: call('remove', RemoveKeepOut.Request(id=area)),
+            'remove_keep_out': lambda area: call('remove_keep_out', RemoveKeepOut.Request(id=area)),
             'erase': lambda corners: call('erase', EraseArea.Request(corners=area_of(corners))),
         }
 
@@ -655,8 +706,7 @@ class Steering:
 
     def _go_home(self) -> None:
         start = self._picture.path.start
-        if start is None:
-            raise InputError('home: no pose of the robot yet')
+        assert start is not None  # as `_refusal` says
         self._tasks.drive_to(np.array([*start, 0.0]))
 
     def _set_initial_pose(self, x: float, y: float, theta: float) -> None:
@@ -673,18 +723,14 @@ class Steering:
         self.tell('exploration paused')
 
     def _resume(self) -> None:
-        self._tasks.require_paused()
         self._publishers[_RESUME].publish(Bool(data=True))
         self.tell('exploration continues')
 
-    def _call(self, name: str, request: Any) -> None:
-        client: Client = self._clients[name]
-        if not client.service_is_ready():
-            owner = 'topology_builder' if name == 'name' else 'grid_mapper'
-            raise InputError(f'no service {client.srv_name}: expected {owner} to run')
-
+    def _call(self, action: str, request: Any) -> None:
         def answered(future: AnswerFuture) -> None:
             answer = future.result()
-            self.tell(f'{name}: {answer.message if answer else "no answer"}')
+            self.tell(f'{action.replace("_", " ")}: {answer.message if answer else "no answer"}')
+            if action == 'save':
+                self._merge.list_sessions()
 
-        client.call_async(request).add_done_callback(answered)
+        self._clients[action].call_async(request).add_done_callback(answered)

@@ -1,5 +1,22 @@
 // The map on a canvas: tiles, graph, robot. Positions in m, map frame; y points up.
 
+const CELLS = ['--unknown', '--free', '--wall']; // colours of the classes, as the theme has them
+export const TINT = 0.55; // of a region over the map
+
+function rgb(colour) {
+  return [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16));
+}
+
+const themed = (name) => getComputedStyle(document.documentElement).getPropertyValue(name);
+
+function isInside([x, y], corners) {
+  let inside = false;
+  corners.forEach(([x1, y1], i) => {
+    const [x2, y2] = corners.at(i - 1);
+    if (y1 > y !== y2 > y && x < x1 + ((y - y1) * (x2 - x1)) / (y2 - y1)) inside = !inside;
+  });
+  return inside;
+}
 
 async function unpacked(text) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
@@ -22,7 +39,11 @@ export class MapView {
     this.centre = [0, 0];
     this.follow = false;
     this.showsAll = true; // until somebody moves the map
+    this.colours = {}; // by name, as the key says
+    this.hidden = new Set(); // layers
+    this.chosen = null; // id of a region
     this.sketch = null; // what is being drawn: {from, to} or {corners}
+    this.onscale = () => {}; // receives pixels of a metre
     this.isDirty = true;
     new ResizeObserver(() => (this.showsAll ? this.fit() : null, this.redraw())).observe(canvas);
     const frame = () => {
@@ -37,7 +58,7 @@ export class MapView {
   }
 
   colour(name) {
-    return (this.items.get('key') ?? {})[name] ?? '#777777';
+    return this.colours[name] ?? '#777777';
   }
 
   newMap() {
@@ -64,10 +85,7 @@ export class MapView {
 
   imageOf(tile, side) {
     if (tile.image || !tile.cells) return tile.image;
-    const dark = document.documentElement.classList.contains('dark');
-    const colours = dark
-      ? [[43, 47, 51], [92, 99, 107], [245, 245, 245]]
-      : [[214, 214, 214], [255, 255, 255], [25, 25, 25]];
+    const colours = CELLS.map((name) => rgb(themed(name)));
     const image = new ImageData(side, side);
     tile.cells.forEach((kind, i) => {
       const [r, g, b] = colours[kind];
@@ -143,16 +161,31 @@ export class MapView {
     const s = this.scale * ratio;
     ctx.setTransform(s, 0, 0, -s, (w / 2) * ratio - this.centre[0] * s, (h / 2) * ratio + this.centre[1] * s);
     this.px = 1 / this.scale; // a pixel, in m
+    this.onscale(this.scale);
     this.drawTiles(ctx);
-    this.drawRegions(ctx);
-    this.drawKeepOut(ctx);
-    this.drawGraph(ctx);
-    this.drawPaths(ctx);
-    this.drawLaser(ctx);
-    this.drawTargets(ctx);
+    for (const [layer, drawn] of this.layers) if (!this.hidden.has(layer)) drawn.call(this, ctx);
     this.drawOthers(ctx);
     if (robot) this.drawRobot(ctx, robot);
     this.drawSketch(ctx);
+  }
+
+  // From the lowest to the highest.
+  get layers() {
+    return [
+      ['regions', this.drawRegions],
+      ['keep out', this.drawKeepOut],
+      ['graph', this.drawGraph],
+      ['path', this.drawPath],
+      ['plan', this.drawPlan],
+      ['laser', this.drawLaser],
+      ['end nodes', this.drawEndNodes],
+    ];
+  }
+
+  // Id of the region at a place; null for none.
+  regionAt(place) {
+    const regions = this.hidden.has('regions') ? [] : this.items.get('regions') ?? [];
+    return regions.find(({ outline }) => isInside(place, pairs(outline)))?.id ?? null;
   }
 
   drawTiles(ctx) {
@@ -205,7 +238,7 @@ export class MapView {
     const dark = document.documentElement.classList.contains('dark');
     for (const region of this.items.get('regions') ?? []) {
       const points = pairs(region.outline);
-      ctx.globalAlpha = 0.55;
+      ctx.globalAlpha = TINT;
       // What is black inside of a region stays black.
       ctx.globalCompositeOperation = dark ? 'source-over' : 'multiply';
       ctx.beginPath();
@@ -215,6 +248,7 @@ export class MapView {
       ctx.fill();
       ctx.globalAlpha = 1;
       ctx.globalCompositeOperation = 'source-over';
+      if (region.id === this.chosen) this.line(ctx, points, themed('--first'), 2, true);
       if (this.scale > 12) {
         this.text(ctx, ...region.center, `${region.name}, ${region.area} m²`);
       }
@@ -248,13 +282,18 @@ export class MapView {
     }
   }
 
-  drawPaths(ctx) {
+  drawPath(ctx) {
     const pieces = this.items.get('path') ?? 0;
     for (let i = 0; i < pieces; i += 1) {
       const points = pairs(this.items.get(`path/${i}`) ?? []);
       this.line(ctx, points, this.colour('robot and its path'), 2);
     }
+  }
+
+  drawPlan(ctx) {
     this.line(ctx, pairs(this.items.get('plan') ?? []), this.colour('plan and goal'), 2);
+    const goal = this.items.get('goal');
+    if (goal) this.arrow(ctx, goal, this.colour('plan and goal'), 26);
   }
 
   drawLaser(ctx) {
@@ -274,13 +313,11 @@ export class MapView {
     }
   }
 
-  drawTargets(ctx) {
+  drawEndNodes(ctx) {
     for (const [, x, y, probability, isTarget] of this.items.get('end_nodes') ?? []) {
       this.dot(ctx, x, y, isTarget ? 8 : 5, this.colour('end node'));
       if (this.scale > 15) this.text(ctx, x, y - 16 * this.px, `p ${probability.toFixed(2)}`, 11);
     }
-    const goal = this.items.get('goal');
-    if (goal) this.arrow(ctx, goal, this.colour('plan and goal'), 26);
   }
 
   arrow(ctx, [x, y, theta], colour, length) {

@@ -1,7 +1,8 @@
 // The page: a socket, what it brings, and what it asks for.
 
-import { MapView } from './map.js';
-import { Plot } from './plot.js';
+import { MapView, TINT } from './map.js';
+import { Plot, roundUp } from './plot.js';
+import { statusOf } from './status.js';
 
 const DRIVE_PERIOD_MS = 100;
 const RETRY_MS = 1000;
@@ -16,20 +17,24 @@ const HINTS = {
   wall: 'Click the points of a line that robots must not cross, then Done.',
   erase: 'Click the corners of a part of the map that becomes unknown, then Done.',
 };
+const CELLS = { free: 'var(--free)', wall: 'var(--wall)', unknown: 'var(--unknown)' };
+const MOST_EVENTS = 50;
+const CLICK_PX = 5; // a pointer that moves no farther has clicked
 const LEAST_CORNERS = { keep_out: 3, wall: 2, erase: 3 };
 const items = new Map();
 const find = (id) => document.getElementById(id);
 const view = new MapView(find('map'), items);
 const plots = {
-  coverage: new Plot(find('plot-coverage'), 'coverage over path', '%'),
-  step: new Plot(find('plot-step'), 'step of the localizer', 'ms'),
-  inliers: new Plot(find('plot-inliers'), 'scan points on walls', '%'),
+  coverage: new Plot(find('plot-coverage'), 'coverage over path', '%', 'm'),
+  step: new Plot(find('plot-step'), 'step of the localizer', 'ms', 's'),
+  inliers: new Plot(find('plot-inliers'), 'scan points on walls', '%', 's'),
 };
 let socket = null;
 let mode = 'pan';
 let limit = [];
 let drawn = []; // corners of what is being drawn: an area, a wall, a part to erase
-const state = { isHeld: false, opened: performance.now(), heard: 0, link: '' };
+const state = { opened: performance.now(), heard: 0, link: '', slam: '' };
+const own = []; // events of this page: time, s, and words
 window.thinmap = { items, view }; // for tests and the curious
 
 function ask(action, values = {}) {
@@ -40,21 +45,84 @@ function ask(action, values = {}) {
 }
 
 function say(text) {
-  find('news').textContent = text;
+  own.push([Date.now() / 1000, text]);
+  showEvents();
 }
 
-function showLink(text, isBad) {
-  find('link').textContent = text;
-  find('link').className = isBad ? 'bad' : '';
+// The newest first, those of the robot and of this page.
+function showEvents() {
+  const events = [...(items.get('news') ?? []), ...own].sort((a, b) => b[0] - a[0]);
+  find('log').replaceChildren(...events.slice(0, MOST_EVENTS).map(([seconds, text]) => {
+    const line = document.createElement('li');
+    const time = document.createElement('time');
+    time.append(new Date(1000 * seconds).toTimeString().slice(0, 8));
+    line.append(time, text);
+    return line;
+  }));
 }
 
 const silentMs = () => performance.now() - state.heard;
 
-setInterval(() => {
-  if (!state.link) return;
-  const isLate = silentMs() > GONE_MS;
-  showLink(isLate ? `late: nothing heard for ${Math.round(silentMs() / 1000)} s` : state.link, isLate);
-}, LATE_MS);
+// What is heard from the robot: words, and whether what is shown is what is.
+function link() {
+  const seconds = Math.round(silentMs() / 1000);
+  if (!state.link) return { text: 'connecting', isLive: false };
+  if (state.link === 'connected' || state.link === 'watching') {
+    const isLive = silentMs() < GONE_MS;
+    return { text: isLive ? state.link : `late: nothing heard for ${seconds} s`, isLive };
+  }
+  const since = state.heard ? `, nothing heard for ${seconds} s` : '';
+  return { text: `${state.link}${since}`, isLive: false };
+}
+
+function showStatus() {
+  const now = link();
+  const [level, text] = statusOf(items, now);
+  find('status').textContent = text;
+  find('status').className = level;
+  find('status').title = text;
+  document.body.classList.toggle('old', !now.isLive);
+  showButtons(now.isLive);
+}
+
+// Why a button would do nothing, as the page itself knows.
+const missing = {
+  go_to_region: () => (find('regions').value ? '' : 'no region is known yet'),
+  name_region: () => (find('regions').value ? '' : 'no region is known yet'),
+  save: () => (find('name').value ? '' : 'expected a name of the map'),
+  load: () => (sessions().includes(find('name').value) ? '' : 'expected the name of a saved map'),
+  merge: () => (sessions().length > 1 ? '' : 'expected two saved maps'),
+};
+const sessions = () => items.get('sessions') ?? [];
+
+function showButtons(isLive) {
+  const refusals = items.get('refusals') ?? {};
+  for (const button of document.querySelectorAll('[data-does]')) {
+    const does = button.dataset.does;
+    const reason = isLive ? refusals[does] || missing[does]?.() || '' : 'no link to the robot';
+    if (does !== 'merge' || !isMerging()) button.disabled = Boolean(reason);
+    button.title = reason;
+  }
+  find('resume').hidden = Boolean(refusals.resume);
+  find('pause').hidden = !find('resume').hidden;
+}
+
+setInterval(showStatus, LATE_MS);
+
+// Ask before something is lost. It is no modal dialog: STOP has to work meanwhile.
+function whenSure(question, verb, act) {
+  find('sure').hidden = false;
+  find('sure').firstElementChild.textContent = question;
+  find('sure-yes').textContent = verb;
+  find('sure-no').onclick = () => {
+    find('sure').hidden = true;
+  };
+  find('sure-yes').onclick = () => {
+    find('sure').hidden = true;
+    act();
+  };
+  find('sure-no').focus();
+}
 
 function connect() {
   const scheme = location.protocol === 'https:' ? 'wss' : 'ws';
@@ -64,8 +132,10 @@ function connect() {
   socket.onclose = (event) => {
     release();
     const isRefused = event.code === 1008;
-    state.link = '';
-    showLink(isRefused ? event.reason || 'refused' : `${event.reason || 'lost'}: trying again`, true);
+    const before = state.link;
+    state.link = isRefused ? event.reason || 'refused' : `${event.reason || 'lost'}: trying again`;
+    if (state.heard && state.link !== before) say(`link ${state.link}`);
+    showStatus();
     if (!isRefused) setTimeout(connect, RETRY_MS);
   };
 }
@@ -78,7 +148,7 @@ const takers = {
     document.body.classList.toggle('watch', role !== 'steer');
     state.heard = performance.now();
     state.link = role === 'steer' ? 'connected' : 'watching';
-    showLink(state.link, false);
+    if (role === 'steer') ask('sessions');
   },
   beat: () => {
     state.heard = performance.now();
@@ -92,7 +162,9 @@ const takers = {
   slam: (slam) => {
     find('slam-state').textContent = slam.state;
     find('slam-state').className = slam.is_well ? '' : 'bad';
-    find('slam-detail').textContent = `${slam.state}: ${slam.detail}`;
+    find('slam-detail').textContent = slam.detail;
+    if (state.slam && slam.state !== state.slam) say(slam.state);
+    state.slam = slam.state;
     const seconds = (performance.now() - state.opened) / 1000;
     plots.step.add(seconds, slam.step_ms);
     plots.inliers.add(seconds, 100 * slam.inliers);
@@ -102,24 +174,22 @@ const takers = {
     find('exploration-detail').textContent = status.detail;
     plots.coverage.add(status.distance, 100 * status.coverage);
   },
-  news: ([, text]) => say(text),
+  news: showEvents,
   refused: say,
   held: (stop) => {
     const isHeld = stop > 0;
-    state.isHeld = isHeld;
     find('stop').textContent = isHeld ? 'STOPPED' : 'STOP';
     find('stop').classList.toggle('held', isHeld);
     find('release').hidden = !isHeld;
-  },
-  held_by: (reason) => {
-    find('held-by').textContent = reason;
   },
   regions: (regions) => {
     const chosen = find('regions').value;
     find('regions').replaceChildren(...regions.map((region) => new Option(region.name, region.id)));
     if (regions.some((region) => `${region.id}` === chosen)) find('regions').value = chosen;
+    if (!regions.some((region) => region.id === view.chosen)) view.chosen = null;
   },
   sessions: (names) => {
+    find('sessions').replaceChildren(...names.map((name) => new Option(name)));
     for (const id of ['first', 'second']) {
       const chosen = find(id).value;
       find(id).replaceChildren(...names.map((name) => new Option(name)));
@@ -146,22 +216,54 @@ const takers = {
       return row;
     }));
   },
-  key: (key) => {
-    find('key').replaceChildren(...Object.entries(key).map(([name, colour]) => {
-      const line = document.createElement('li');
-      const patch = document.createElement('i');
-      patch.style.background = colour;
-      line.append(patch, name);
-      return line;
-    }));
-  },
+  key: showKey,
 };
+
+// A line for each layer: a switch, and the colours that are drawn in it.
+function showKey(key) {
+  view.colours = Object.fromEntries(Object.values(key).flatMap(Object.entries).map(([name, [first]]) => [name, first]));
+  const cells = Object.entries(CELLS).map(([name, colour]) => entry(name, [colour]));
+  const map = document.createElement('li');
+  map.append(...cells);
+  find('key').replaceChildren(map, ...Object.entries(key).map(([layer, names]) => {
+    const line = document.createElement('li');
+    const shown = document.createElement('input');
+    shown.type = 'checkbox';
+    shown.checked = !view.hidden.has(layer);
+    shown.ariaLabel = layer;
+    shown.onchange = () => {
+      if (shown.checked) view.hidden.delete(layer);
+      else view.hidden.add(layer);
+      view.redraw();
+    };
+    const words = document.createElement('div');
+    words.append(...Object.entries(names).map(([name, colours]) => entry(name, colours.map(layer === 'regions' ? tinted : String))));
+    line.append(shown, words);
+    return line;
+  }));
+}
+
+// Colour of a region where it is drawn: on free cells.
+const tinted = (colour) => `color-mix(in srgb, ${colour} ${100 * TINT}%, var(--free))`;
+
+function entry(name, colours) {
+  const words = document.createElement('span');
+  for (const colour of colours) {
+    const patch = document.createElement('i');
+    patch.style.background = colour;
+    words.append(patch);
+  }
+  words.append(name);
+  return words;
+}
+
+const isMerging = () => ['working', 'shown'].includes(items.get('merge')?.state);
 
 async function showMerge({ state: stage, words, picture }) {
   find('merge-words').textContent = [stage, ...words].filter(Boolean).join('\n');
-  find('merge').disabled = stage === 'working' || stage === 'shown';
+  find('merge').disabled = isMerging();
   find('merged').hidden = stage !== 'shown';
-  find('merge-drop').hidden = !find('merge').disabled;
+  find('merge-drop').hidden = !isMerging();
   const canvas = find('merge-picture');
   canvas.hidden = !picture;
   if (!picture) return;
@@ -178,8 +280,11 @@ function take(name, value) {
   }
   if (name !== 'hello') items.set(name, value);
   takers[name]?.(value);
-  if (name !== 'beat') view.redraw();
+  if (name === 'beat') return;
+  view.redraw();
+  if (TELLING.has(name)) showStatus();
 }
+const TELLING = new Set(['hello', 'held', 'held_by', 'slam', 'goal', 'exploration', 'diagnostics', 'refusals', 'regions', 'sessions', 'scan_age']);
 
 // Stop: also while something else has the focus, except the name of a region.
 
@@ -224,7 +329,19 @@ find('name-region').onclick = () => {
   const region = Number(find('regions').value);
   if (region) ask('name_region', { region, name: find('region-name').value });
 };
-for (const action of ['save', 'load']) find(action).onclick = () => ask(action, { name: find('name').value });
+find('regions').onchange = (event) => chooseRegion(event.target.value);
+find('name').oninput = showStatus;
+find('save').onclick = () => {
+  const name = find('name').value;
+  const save = () => ask('save', { name });
+  if (sessions().includes(name)) whenSure(`${name} exists. Replace it?`, 'Replace', save);
+  else save();
+};
+find('load').onclick = () => {
+  const name = find('name').value;
+  const question = `Load ${name}? The map in use is lost where it is not saved.`;
+  whenSure(question, 'Load', () => ask('load', { name }));
+};
 find('merging').ontoggle = (event) => {
   if (event.target.open) ask('sessions');
 };
@@ -239,6 +356,11 @@ find('follow').onchange = (event) => {
   view.showsAll = false;
   view.redraw();
 };
+function chooseRegion(id) {
+  find('regions').value = id;
+  view.chosen = Number(id);
+  view.redraw();
+}
 function setTheme(isDark) {
   document.documentElement.classList.toggle('dark', isDark);
   view.newTheme();
@@ -288,6 +410,7 @@ function setMode(chosen) {
 
 const pointers = new Map();
 let hasPinched = false; // since there was no pointer
+let pressed = [0, 0];
 const canvas = find('map');
 const placeOf = (event) => [event.offsetX, event.offsetY];
 
@@ -295,12 +418,14 @@ canvas.onpointerdown = (event) => {
   canvas.setPointerCapture(event.pointerId);
   pointers.set(event.pointerId, placeOf(event));
   hasPinched = pointers.size > 1;
+  pressed = placeOf(event);
   if (hasPinched) view.sketch = null;
   else if (mode === 'goal' || mode === 'initial_pose') {
     view.sketch = { from: view.toMap(...placeOf(event)), to: null };
   }
 };
 canvas.onpointermove = (event) => {
+  showPlace(...view.toMap(...placeOf(event)));
   const before = pointers.get(event.pointerId);
   if (!before) return;
   const now = placeOf(event);
@@ -325,9 +450,27 @@ canvas.onpointerup = (event) => {
   } else if (isSingle && mode in LEAST_CORNERS) {
     drawn.push(place);
     view.sketch = { corners: drawn, isOpen: mode === 'wall', colour: 'keep out' };
+  } else if (isSingle && mode === 'pan' && hasClicked(event)) {
+    const region = view.regionAt(place);
+    if (region !== null) chooseRegion(`${region}`);
   }
   view.redraw();
 };
+function hasClicked(event) {
+  const [x, y] = placeOf(event);
+  return Math.hypot(x - pressed[0], y - pressed[1]) < CLICK_PX;
+}
+
+function showPlace(x, y) {
+  find('place').textContent = `x ${x.toFixed(2)}, y ${y.toFixed(2)} m`;
+}
+
+view.onscale = (scale) => {
+  const metres = roundUp(60 / scale);
+  find('scale').style.width = `${metres * scale}px`;
+  find('scale').textContent = `${metres} m`;
+};
+
 canvas.onpointercancel = (event) => {
   pointers.delete(event.pointerId);
   if (view.sketch?.from) view.sketch = null;
@@ -378,7 +521,7 @@ function push(event) {
 }
 
 function drive() {
-  if (!hold || state.isHeld) return;
+  if (!hold || items.get('held')) return;
   if (silentMs() > LATE_MS) say('the link is late: the joystick does not drive');
   else ask('drive', { ahead: hold.ahead, left: hold.left });
 }
