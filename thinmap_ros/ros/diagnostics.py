@@ -264,7 +264,7 @@ class NodeDiagnostics(MessageStatistics):
         self._state = (level, text)
 
     def end(self) -> None:
-        """Publish that the node ends in order: whoever shows it does not wait for more."""
+        """Publish that the node ends in order, so that nobody waits for more."""
         self.set_state(OK, ENDED)
         self._publish()
 
