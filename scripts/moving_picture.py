@@ -1,14 +1,12 @@
-"""Draws explorations, of one robot or two, as GIFs, and a finished map as a PNG.
+"""Draws explorations, of one robot or two, as GIFs.
 
     python scripts/moving_picture.py exploration [WORLD] [-o docs/images/exploration.gif]
     python scripts/moving_picture.py team [WORLD] [-o docs/images/two_robots.gif]
-    python scripts/moving_picture.py map MAP.yaml [-o docs/images/intel.png]
 
 `exploration` explores a simulated world with SLAM, as explore_world does, and draws a frame every
 few seconds of simulated time: occupancy map, topological graph, path, robot and laser. The first
 frame is the finished one, which is all that is seen where pictures do not move.
 `team` does so with two robots that explore together, as explore_world --robots 2.
-`map` draws a map_server map, as `replay` writes it.
 """
 
 import argparse
@@ -31,7 +29,6 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.team_run import TeamOptions, make_team
-from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.package_data import world_path
 from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.files.worlds import read_world
@@ -54,9 +51,6 @@ FRAME_MS = 100
 FIRST_FRAME_MS = 1500
 LAST_FRAME_MS = 3000
 TEAM = 2
-MAP_MARGIN_M = 1.0
-WALL_QUANTILE = 0.01
-MAP_SHADES = 16
 LIMIT_S = 3600.0
 GREY = '#CCCCCC'
 PLAN = '#D55E00'
@@ -357,29 +351,6 @@ def write_team(arguments: argparse.Namespace) -> None:
     write_gif(arguments.out, images, palette.ROBOTS[:TEAM])
 
 
-def building(patch: GridPatch) -> tuple[int, int, int, int]:
-    """Rows and columns (first, end, first, end) of the walls, without rays through windows."""
-    cells = np.argwhere(patch.occupied)
-    margin = round(MAP_MARGIN_M / patch.frame.resolution)
-    first = np.maximum(np.quantile(cells, WALL_QUANTILE, axis=0) - margin, 0).astype(int)
-    end = np.quantile(cells, 1.0 - WALL_QUANTILE, axis=0) + margin
-    row, col = first.tolist()
-    end_row, end_col = np.minimum(end, patch.shape).astype(int).tolist()
-    return row, end_row, col, end_col
-
-
-def write_map_picture(arguments: argparse.Namespace) -> None:
-    """Write the building of a map as a PNG of the height of the GIF."""
-    patch = read_map(arguments.map)
-    row, end_row, col, end_col = building(patch)
-    rows = patch.shape[0]
-    image = map_image(patch).crop((col, rows - end_row, end_col, rows - row))
-    size = (round(image.width * arguments.height / image.height), arguments.height)
-    small = image.resize(size, Image.Resampling.LANCZOS).quantize(MAP_SHADES)
-    with atomic_write(arguments.out) as aside:
-        small.save(aside, format='PNG', optimize=True)
-
-
 def main() -> None:
     """Run the script."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -394,11 +365,6 @@ def main() -> None:
     team.add_argument('-o', '--out', type=Path, default=IMAGES / 'two_robots.gif')
     team.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
     team.set_defaults(work=write_team)
-    finished = commands.add_parser('map', help='a PNG of a map_server map')
-    finished.add_argument('map', type=Path, help='YAML file of the map')
-    finished.add_argument('-o', '--out', type=Path, default=IMAGES / 'intel.png')
-    finished.add_argument('--height', type=int, default=437, help='px (default 437, as the GIF)')
-    finished.set_defaults(work=write_map_picture)
     arguments = parser.parse_args()
     arguments.work(arguments)
 
