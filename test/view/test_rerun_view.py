@@ -370,7 +370,7 @@ def test_regions_are_shown_in_the_colour_of_their_kind():
     assert ns == 3 * S and outline == [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0]]
     assert colour in palette.REGIONS[RegionKind.CORRIDOR]
     region.kind = 7
-    with pytest.raises(InputError, match='7 is not a valid RegionKind'):
+    with pytest.raises(InputError, match='region 5: kind 7: expected 0 to 2'):
         feed.show('regions', stamped(regions=[region], doors=[]))
     region.kind = 1
     points[0].x = float('nan')

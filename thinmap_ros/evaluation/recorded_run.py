@@ -102,11 +102,9 @@ def read(path: Path, prefix: str = '/') -> Recording:
         elif topic == 'topology':
             recording.topology = recorded_topology(path, raw.topic, message)
         elif topic == 'end_nodes':
-            nodes = [(int(n.node_id), n.position.x, n.position.y) for n in message.end_nodes]
-            recording.end_nodes.append((ns, nodes))
-            recording.hidden = [
-                (n.position.x, n.position.y, float(n.expected_area_m2)) for n in message.end_nodes
-            ]
+            nodes = decode.end_nodes(message)
+            recording.end_nodes.append((ns, [node[:3] for node in nodes]))
+            recording.hidden = [(node.x, node.y, node.area_m2) for node in nodes]
         elif topic == 'exploration_status':
             recording.missing = _missing_area(message)
         else:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,6 +128,43 @@ def region_kind(region: Any) -> RegionKind:
         return RegionKind(region.kind)
     except ValueError as error:
         raise InputError(f'region {region.id}: kind {region.kind}: expected 0 to 2') from error
+
+
+class ShownEndNode(NamedTuple):
+    """An end node as its explorer shows it: place, m, position probability, and expected area.
+
+    id: in the topological map. area_m2: that probably lies behind it.
+    """
+
+    id: int
+    x: float
+    y: float
+    probability: float
+    area_m2: float
+    is_target: bool
+
+
+def end_nodes(message: Any) -> list[ShownEndNode]:
+    """End nodes of a thinmap_msgs/EndNodeArray. Raises InputError where a number is invalid."""
+    found = []
+    for node in message.end_nodes:
+        place = (float(node.position.x), float(node.position.y))
+        probability = float(node.position_probability)
+        errors.require_bounded(f'end node {node.node_id}', place)
+        errors.require_bounded(f'probability of end node {node.node_id}', (probability,), 1.0)
+        area_m2 = float(node.expected_area_m2)
+        found.append(
+            ShownEndNode(int(node.node_id), *place, probability, area_m2, bool(node.is_target))
+        )
+    return found
+
+
+def path(message: Any) -> Array:
+    """Points (K, 2) of a nav_msgs/Path, m. Raises InputError where one is invalid."""
+    positions = [each.pose.position for each in message.poses]
+    points = np.array([[p.x, p.y] for p in positions], dtype=np.float64).reshape(-1, 2)
+    errors.require_bounded('path', points.ravel().tolist())
+    return points
 
 
 def corners(polygon: Any) -> Array:

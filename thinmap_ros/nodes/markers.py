@@ -116,11 +116,7 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
     Raises InputError where a position or probability is out of range.
     """
     markers: list[Marker] = []
-    for node in message.end_nodes:
-        errors.require_bounded(f'end node {node.node_id}', (node.position.x, node.position.y))
-        errors.require_bounded(
-            f'probability of end node {node.node_id}', (node.position_probability,), 1.0
-        )
+    for node in decode.end_nodes(message):
         ball = _marker(
             message.header,
             'end_nodes',
@@ -129,14 +125,14 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
             _END,
         )
         ball.id = len(markers)
-        ball.color.a = 0.3 + 0.7 * node.position_probability
-        ball.pose.position = _point(node.position.x, node.position.y, _NODE.z_m)
+        ball.color.a = 0.3 + 0.7 * node.probability
+        ball.pose.position = _point(node.x, node.y, _NODE.z_m)
         text = _marker(
             message.header, 'probabilities', Marker.TEXT_VIEW_FACING, _TEXT.size_m, _TEXT_COLOUR
         )
         text.id = len(markers)
-        text.text = f'{node.position_probability:.2f}'
-        text.pose.position = _point(node.position.x, node.position.y, _TEXT.z_m)
+        text.text = f'{node.probability:.2f}'
+        text.pose.position = _point(node.x, node.y, _TEXT.z_m)
         markers += [ball, text]
     return _shown(markers)
 

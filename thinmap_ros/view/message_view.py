@@ -14,7 +14,6 @@ from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import topology_from_msg
-from thinmap_ros.core.topology.regions import RegionKind
 from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.readers.bag import SCAN, Bag
@@ -143,14 +142,13 @@ class MessageView:
 
     def _on_regions(self, ns: int, message: Any) -> None:
         outlines = [decode.outline(region) for region in message.regions]
-        colours = [palette.region(RegionKind(r.kind), int(r.id)) for r in message.regions]
+        colours = [palette.region(decode.region_kind(r), int(r.id)) for r in message.regions]
         self._view.regions(ns, outlines, colours)
 
     def _on_end_nodes(self, ns: int, message: Any) -> None:
-        places = np.array([[n.position.x, n.position.y] for n in message.end_nodes]).reshape(-1, 2)
-        self._view.end_nodes(
-            ns, places, np.array([float(n.position_probability) for n in message.end_nodes])
-        )
+        nodes = decode.end_nodes(message)
+        places = np.array([[node.x, node.y] for node in nodes]).reshape(-1, 2)
+        self._view.end_nodes(ns, places, np.array([node.probability for node in nodes]))
 
     def _on_lines(self, ns: int, message: Any) -> None:
         ends = [[[f.start.x, f.start.y], [f.end.x, f.end.y]] for f in message.features]
@@ -165,8 +163,7 @@ class MessageView:
         self._view.particles(ns, np.array(places, dtype=np.float64).reshape(-1, 2))
 
     def _on_plan(self, ns: int, message: Any) -> None:
-        points = [[p.pose.position.x, p.pose.position.y] for p in message.poses]
-        self._view.plan(ns, np.array(points, dtype=np.float64).reshape(-1, 2))
+        self._view.plan(ns, decode.path(message))
 
     def _on_exploration(self, ns: int, message: Any) -> None:
         place = message.target_position

@@ -403,22 +403,15 @@ class Picture:
 
     def end_nodes(self, message: Any) -> None:
         """Show a thinmap_msgs/EndNodeArray. Raises InputError where a number is invalid."""
-        shown = []
-        for node in message.end_nodes:
-            place = (node.position.x, node.position.y)
-            errors.require_bounded(f'end node {node.node_id}', place)
-            probability = float(node.position_probability)
-            errors.require_bounded(f'probability of {node.node_id}', (probability,), 1.0)
-            x, y = (round(number, 2) for number in place)
-            shown.append([node.node_id, x, y, round(probability, 2), bool(node.is_target)])
+        shown = [
+            [node.id, *(round(number, 2) for number in node[1:4]), node.is_target]
+            for node in decode.end_nodes(message)
+        ]
         self.board.put('end_nodes', shown)
 
     def plan(self, message: Any) -> None:
         """Show the planned path, a nav_msgs/Path. Raises InputError where a number is invalid."""
-        points = np.array(
-            [[p.pose.position.x, p.pose.position.y] for p in message.poses], dtype=np.float64
-        ).reshape(-1, 2)
-        errors.require_bounded('plan', points.ravel().tolist())
+        points = decode.path(message)
         step = -(-len(points) // _MAX_PATH_POINTS) or 1
         points = np.vstack([points[:-1:step], points[-1:]])
         self.board.put('plan', np.round(points, 2).ravel().tolist())
