@@ -104,7 +104,8 @@ class FreeSpace:
         """
         self._store.add(row, col, percent >= 0)
         lattice = self.lattice
-        changed = _set_states(lattice, percent, row, col)
+        # Views, and maps that are read-only, would compile further variants of the kernel.
+        changed = _set_states(lattice, percent.copy(), row, col)
         known = _close_gaps(lattice, changed, self._gap)
         _update_columns(lattice, known)
         reach = math.ceil(self._radius)
