@@ -40,8 +40,18 @@ def _linked(text: str, folder: str) -> dict[str, str]:
     return found
 
 
+def on_config(config: Any) -> Any:
+    """Say the version on each page."""
+    version = re.search(r'<version>(.+)</version>', (ROOT / 'package.xml').read_text())
+    assert version is not None
+    config.site_name += f' {version[1]}'
+    return config
+
+
 def on_files(files: Any, config: Any) -> Any:
-    """Add a page for each file of the project that a page links to."""
+    """Add the icon of the web page, and a page for each file of the project that a page links to."""
+    icon = (ROOT / 'thinmap_ros' / 'web' / 'page' / 'icon.svg').read_text()
+    files.append(File.generated(config, 'images/icon.svg', content=icon))
     texts = [(f'docs/{file.src_uri}', file.content_string) for file in files.documentation_pages()]
     texts += [(name, (ROOT / name).read_text()) for name in _INCLUDED if (ROOT / name).exists()]
     names = {n for path, text in texts for n in _linked(text, posixpath.dirname(path)).values()}

@@ -5,6 +5,7 @@ scripts/generate rewrites the page.
 
 import inspect
 import os
+import re
 from importlib.resources import files
 
 import pytest
@@ -33,8 +34,28 @@ HEAD = """# Nodes
 Made from the nodes themselves; do not edit (see `test/docs/test_node_reference.py`). Names without a leading slash are
 relative: a namespace goes before them. Every node but the monitor publishes `/diagnostics`; all follow `/clock` with
 `use_sim_time`. Nodes with the parameter `autostart` are lifecycle nodes (`~/change_state`, `~/get_state`, ...).
-[Messages](messages.md) lists the fields of the types of `thinmap_msgs`.
+[Messages](messages.md) lists the fields of the types of `thinmap_msgs`. The order is that in which data pass, from the laser to the wheels; then come
+nodes for several robots, for people, and for recordings.
+
+![A laser and odometry lead to a pose, a map, a graph, an exploration and commands](../images/nodes.svg)
 """  # noqa: E501
+PICTURE = ROOT / 'docs' / 'images' / 'nodes.svg'
+ORDER = (
+    'sim',
+    'localizer',
+    'grid_mapper',
+    'topology_builder',
+    'global_localizer',
+    'explorer',
+    'navigator',
+    'map_joiner',
+    'web',
+    'markers',
+    'rerun_viewer',
+    'recorder',
+    'bag_player',
+    'demo_monitor',
+)
 
 
 @pytest.fixture
@@ -154,9 +175,33 @@ def other_parameters(rows, others):
     return [variant_text(rows, others, quote='`'), '', *parameter_table(own)]
 
 
+def arrows():
+    """Source, target and topics of each arrow of the picture."""
+    found = re.findall(
+        r'data-from="(.+?)" data-to="(.+?)" data-topics="(.+?)"', PICTURE.read_text()
+    )
+    assert len(found) > 5
+    return [(source, target, set(topics.split(', '))) for source, target, topics in found]
+
+
+def section_of(text, node):
+    return text.partition(f'\n## {node}\n')[2].partition('\n## ')[0]
+
+
+def listed(text, what):
+    """Topics of a table of a node."""
+    table = text.partition(f'| {what} |')[2].partition('\n\n')[0]
+    return set(re.findall(r'^\| `(.+?)`', table, re.MULTILINE))
+
+
+def actions_of(text):
+    return set(re.findall(r'`(\w+)` \(`\w+/action/', text))
+
+
 def test_the_page_lists_what_the_nodes_declare(declared):
     lines = [HEAD]
-    for name in NODES:
+    assert sorted(ORDER) == NODES
+    for name in ORDER:
         head, rows = declared(name, lambda *node: (section(*node), parameters(*node)))
         lines += [*head, *parameter_table(rows.values())]
         if name in VARIANTS:
@@ -168,4 +213,8 @@ def test_the_page_lists_what_the_nodes_declare(declared):
     assert PAGE.read_text() == text, (
         f'{PAGE.name}: see the top of {__file__} for how to regenerate it'
     )
+    for source, target, topics in arrows():
+        taken = section_of(text, target)
+        assert topics <= listed(section_of(text, source), 'Publishes') | actions_of(taken)
+        assert topics <= listed(taken, 'Subscribes to') | actions_of(taken)
     assert files('thinmap_ros').joinpath('nodes', 'thinmap.py').is_file()
