@@ -49,7 +49,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the icon of the web page, and a page for each file of the project that a page links to."""
+    """Add the icon of the web page, and pages for files of the project that pages link to."""
     icon = (ROOT / 'thinmap_ros' / 'web' / 'page' / 'icon.svg').read_text()
     files.append(File.generated(config, 'images/icon.svg', content=icon))
     texts = [(f'docs/{file.src_uri}', file.content_string) for file in files.documentation_pages()]

@@ -193,4 +193,5 @@ def _free_places(scans: Sequence[Scan], poses: Array) -> Array:
     )
     half = round(_MAX_OFFSET_M / LATTICE_M)
     cells = np.argwhere(passed_cells(lasers, ranges, bearings, LATTICE_M, half))
-    return np.asarray((cells[:, ::-1] - half + 0.5) * LATTICE_M)
+    # Rows as those of a whole map: another order would compile a second variant of a kernel.
+    return np.ascontiguousarray((cells[:, ::-1] - half + 0.5) * LATTICE_M)
