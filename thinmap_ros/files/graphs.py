@@ -27,12 +27,11 @@ import yaml
 
 from thinmap_ros.core.errors import InputError, require_type
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.graph import MAX_ID, Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.regions import Membership, Region
 from thinmap_ros.files.safe import atomic_write, path_of, write_text
 
 Writer = Callable[[Path, TopologicalMap, Membership | None], None]
-_MAX_ID = 2**32 - 1
 _REGION = 'Polygon'  # type of the geometry of regions
 _GRAPHML_KEYS = {
     'node': ('x', 'y', 'kind', 'clearance', 'region'),
@@ -121,8 +120,8 @@ def write_geojson(
     Raises InputError if an id is too large for an unsigned int.
     """
     highest = max([0, *topology.nodes, *topology.edges])
-    if highest + max([0, *topology.edges]) > _MAX_ID:
-        raise InputError(f'{path}: id {highest}: expected ids whose sum stays below {_MAX_ID}')
+    if highest + max([0, *topology.edges]) > MAX_ID:
+        raise InputError(f'{path}: id {highest}: expected ids whose sum stays below {MAX_ID}')
     with atomic_write(path) as aside, aside.open('w', encoding='utf-8') as file:
         file.write(f'{{"type":"FeatureCollection","name":{json.dumps(path.stem)},"features":[')
         separator = '\n'

@@ -9,12 +9,12 @@ from time import monotonic
 from typing import Any
 
 from thinmap_ros.core.errors import InputError, quoted
+from thinmap_ros.core.grid.edits import MAX_CORNERS
 from thinmap_ros.core.se2 import MAX_COORDINATE_M
+from thinmap_ros.core.topology.graph import MAX_ID
 from thinmap_ros.core.topology.regions import checked_name
 
 MAX_MESSAGE_BYTES = 16_384
-_MAX_CORNERS = 200
-_MAX_ID = 2**32 - 1
 _MAX_BEAT = 2**53  # what a page can count to
 # Ages, there and back, beyond which a request no longer says what a person wants now: a hand on
 # the joystick has moved on; who has clicked and seen nothing for two seconds clicks again, or walks
@@ -81,8 +81,8 @@ def _number(limit: float) -> Callable[[Any], float]:
 
 
 def _identity(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _MAX_ID:
-        raise InputError(f'{quoted(value)}: expected an id from 0 to {_MAX_ID}')
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MAX_ID:
+        raise InputError(f'{quoted(value)}: expected an id from 0 to {MAX_ID}')
     return value
 
 
@@ -115,15 +115,15 @@ def _words(value: Any) -> str:
 
 def _limit(value: Any) -> list[tuple[float, float]]:
     """Corners of a polygon, m; none: no limit."""
-    if not isinstance(value, list) or len(value) > _MAX_CORNERS or len(value) in (1, 2):
-        raise InputError(f'{quoted(value)}: expected no corner, or 3 to {_MAX_CORNERS}')
+    if not isinstance(value, list) or len(value) > MAX_CORNERS or len(value) in (1, 2):
+        raise InputError(f'{quoted(value)}: expected no corner, or 3 to {MAX_CORNERS}')
     return _places(value)
 
 
 def _line(value: Any) -> list[tuple[float, float]]:
     """Corners of a line or polygon, m."""
-    if not isinstance(value, list) or not 2 <= len(value) <= _MAX_CORNERS:
-        raise InputError(f'{quoted(value)}: expected 2 to {_MAX_CORNERS} corners')
+    if not isinstance(value, list) or not 2 <= len(value) <= MAX_CORNERS:
+        raise InputError(f'{quoted(value)}: expected 2 to {MAX_CORNERS} corners')
     return _places(value)
 
 

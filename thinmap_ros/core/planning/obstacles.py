@@ -452,8 +452,8 @@ _MIN_PATH_M = 0.2
 _MIN_TURN_RAD = 0.5
 
 # Another pose than the one at which the robot was stuck.
-_MOVED_M = 0.1
-_MOVED_RAD = 0.3
+_AWAY_M = 0.1
+_AWAY_RAD = 0.3
 _RING = 2.0 * np.pi * np.arange(8) / 8.0
 
 
@@ -559,9 +559,9 @@ class StuckPlaces:
         if self._stuck is None:
             return
         moved = se2.between(self._stuck, T_map_base)
-        if moved[0] >= _MOVED_M:
+        if moved[0] >= _AWAY_M:
             self._stuck = None  # it drove on
-        elif math.hypot(moved[0], moved[1]) >= _MOVED_M or abs(moved[2]) >= _MOVED_RAD:
+        elif math.hypot(moved[0], moved[1]) >= _AWAY_M or abs(moved[2]) >= _AWAY_RAD:
             if self._is_place:
                 self._places.append(self._ahead(self._stuck))
             self._stuck = None

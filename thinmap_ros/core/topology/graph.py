@@ -35,7 +35,7 @@ FIELDS = {
 _READ = {'node_ids': np.uint64, 'edge_ids': np.uint64}
 _PAIRS = ('node_xy', 'edge_nodes')
 _POINTS = 'edge_xy'
-_MAX_ID = 2**32 - 1  # of ids in other messages (EndNode, Region), and in Nav2's route graphs
+MAX_ID = 2**32 - 1  # of ids in other messages (EndNode, Region), and in Nav2's route graphs
 
 Flat = dict[str, NDArray[Any]]
 
@@ -373,8 +373,8 @@ def _check_paths(ids: list[int], begins: NDArray[np.int64], points: NDArray[np.f
 def _checked_ids(what: str, numbers: NDArray[np.uint64]) -> list[int]:
     """List of ids. Raises InputError where one is out of range or occurs twice."""
     ids: list[int] = numbers.tolist()
-    for i in _first((numbers < 1) | (numbers > _MAX_ID)):
-        raise InputError(f'{what} id {ids[i]}: expected 1 to {_MAX_ID}')
+    for i in _first((numbers < 1) | (numbers > MAX_ID)):
+        raise InputError(f'{what} id {ids[i]}: expected 1 to {MAX_ID}')
     errors.require_unique(f'{what}s', ids)
     return ids
 
