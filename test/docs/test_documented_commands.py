@@ -101,7 +101,13 @@ SHORTER = {
 }
 
 # Errors of commands whose exit code is 0 all the same.
-FAILED = ('Traceback', 'success=False', 'Setting parameter failed', 'Transitioning failed')
+FAILED = (
+    'Traceback',
+    'success=False',
+    'Setting parameter failed',
+    'Transitioning failed',
+    'compiling kernels',  # the set-up has compiled all that a documented command needs
+)
 
 
 Nodes = dict[str, dict[str, Any]]
