@@ -80,6 +80,9 @@ class Mishap(Protocol):
     def add_estimate(self, loop: 'ClosedLoop', scan: Scan, estimate: Estimate) -> None:
         """Receive the estimate of a scan."""
 
+    def command(self, T_odom_base: Array, period_s: float) -> Command:
+        """Command of a lost robot at a pose (3,) of its odometry."""
+
 
 @dataclass
 class _Drive:
@@ -226,14 +229,9 @@ class ClosedLoop:
         self._drive.drives.add_result(False, reason)
         self.strategy.target_failed(reason)
 
-    def replace_strategy(
-        self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator
-    ) -> None:
-        """Replace pipeline, strategy and navigator; the robot stops first."""
+    def decide_anew(self) -> None:
+        """Forget the last decision and its goal; the robot stops first."""
         self.navigator.cancel()
-        self.pipeline = pipeline
-        self.strategy = strategy
-        self.navigator = navigator
         self.decision = None
         self._observation = None
         self._drive = _Drive()
@@ -249,11 +247,15 @@ class ClosedLoop:
 
     def control(self, moment: SensorReadings, right_of_way: RightOfWay = drives_alone) -> None:
         """Command the robot until the next step; right_of_way: among other robots."""
+        period_s = CONTROL_STEPS * STEP_NS / 1e9
+        if self.mishap is not None and self.mishap.is_lost:
+            lost = self.mishap.command(moment.T_odom_base, period_s)
+            self._drive.command = (lost.v, lost.w)
+            return
         observation = self._observation
         if observation is None or self._stop_reason:
             return
         T_map_base = self.pose_at(moment.T_odom_base)
-        period_s = CONTROL_STEPS * STEP_NS / 1e9
         command = self.navigator.step(T_map_base, observation.patch, self._scans, period_s)
         command = right_of_way(T_map_base, command, period_s)
         self._drive.command = (command.v, command.w)

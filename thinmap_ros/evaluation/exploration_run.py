@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.baselines.exploration import NearestFrontier
 from thinmap_ros.closed_loop import (
     ClosedLoop,
     ExplorationOutcome,
@@ -19,10 +18,11 @@ from thinmap_ros.closed_loop import (
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import config_or_default
 from thinmap_ros.core.errors import InputError, pose_of, require_type
-from thinmap_ros.core.exploration.strategy import Decision, Strategy
+from thinmap_ros.core.exploration.strategy import Decision
+from thinmap_ros.core.places.active_search import ActiveSearch
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
-from thinmap_ros.core.planning.navigator import Navigator
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.planning.navigator import Command
+from thinmap_ros.core.scan import Scan, with_newest
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.evaluation.exploration_metrics import (
@@ -31,7 +31,6 @@ from thinmap_ros.evaluation.exploration_metrics import (
     exploration_report,
     missing_area_report,
 )
-from thinmap_ros.pipeline import Pipeline
 from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
@@ -58,8 +57,8 @@ _CRITERIA = _Criteria(far_m=3.0, margin_m=0.1, right_m=0.5, right_rad=math.radia
 class Kidnapping:
     """Teleports the robot of a closed loop once to a random place of its map.
 
-    When its localizer is lost, global localization starts. Meanwhile the robot explores its
-    surroundings with a separate pipeline and map.
+    When its localizer is lost, global localization starts, and drives the robot, as the node
+    global_localizer does, to where the places in question differ.
     """
 
     def __init__(self, at_s: float, seed: int) -> None:
@@ -70,8 +69,9 @@ class Kidnapping:
         self._found_s: float | None = None
         self._off: Array | None = None
         self._travelled_m = 0.0
-        self._own: tuple[Pipeline, Strategy, Navigator] | None = None
         self._finder: GlobalLocalization | None = None
+        self._search: ActiveSearch | None = None
+        self._scans: tuple[Scan, ...] = ()  # the newest of each laser
 
     def report(self) -> dict[str, Any]:
         """Results for the report: times in s, None for events that did not happen."""
@@ -105,8 +105,15 @@ class Kidnapping:
             return True
         if self._finder is None:
             return False
-        self._search(loop, self._finder, scan, T_odom_base)
+        self._look(loop, self._finder, scan, T_odom_base)
         return True
+
+    def command(self, T_odom_base: Array, period_s: float) -> Command:
+        """Command of the lost robot at a pose (3,) of its odometry."""
+        assert self._search is not None
+        if not self._scans:
+            return Command(0.0, 0.0, 'idle')
+        return self._search.step(T_odom_base, self._scans, period_s)
 
     def add_estimate(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
         """Start global localization when the robot is lost."""
@@ -120,8 +127,9 @@ class Kidnapping:
             self._finder = GlobalLocalization(
                 loop.pipeline.grid.known_area(), loop.pipeline.topology.map, seed=self._seed
             )
-            self._own = loop.pipeline, loop.strategy, loop.navigator
-            loop.replace_strategy(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
+            driving = loop.navigator.config
+            self._search = ActiveSearch(self._finder.places, self._finder.config, driving)
+            loop.decide_anew()
 
     def _kidnap(self, loop: ClosedLoop, seconds: float) -> None:
         """Teleport the robot to a random mapped place far from its position."""
@@ -144,26 +152,27 @@ class Kidnapping:
         )
         self._carried_s = seconds
 
-    def _search(
+    def _look(
         self, loop: ClosedLoop, finder: GlobalLocalization, scan: Scan, T_odom_base: Array
     ) -> None:
-        """Process a scan of a lost robot, with all of its localizers."""
-        assert self._own is not None
-        localizer = self._own[0].localizer
+        """Process a scan of a lost robot, with both of its localizers."""
+        assert self._search is not None
+        localizer = loop.pipeline.localizer
         T_world_base = loop.simulation.robot.T_world_base
-        estimate = self._own[0].step(scan, T_odom_base).estimate
+        estimate = loop.pipeline.step(scan, T_odom_base).estimate
         self._travelled_m += float(np.hypot(*(T_world_base - loop.log.true_poses[-1])[:2]))
         loop.log_poses(scan, estimate)
-        found = finder.step(scan, T_odom_base).pose
+        result = finder.step(scan, T_odom_base)
+        self._search.take(result, T_odom_base)
+        self._scans = with_newest(self._scans, scan)
+        found = result.pose
         if found is not None:
             localizer.set_pose(found.T_map_base, found.covariance)
         if found is not None or not estimate.is_lost:
             self._found_s = scan.stamp_ns / 1e9
             self._off = se2.between(T_world_base, localizer.pose)
             self._finder = None
-            loop.replace_strategy(*self._own)
-        else:
-            loop.decide(scan, loop.pipeline.step(scan, T_odom_base).estimate)
+            loop.decide_anew()
 
 
 def observable_cells(world: World, start: Array, options: Options) -> ObservableCells:
