@@ -71,7 +71,7 @@ def draw_graph(axes: 'Axes', topology: TopologicalMap, size: float = 5.0) -> Non
             edge.path[:, 1],
             '-',
             color=palette.EDGE,
-            linewidth=1.2,
+            linewidth=2.0,
             label=label,
             zorder=4,
         )

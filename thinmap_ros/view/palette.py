@@ -10,7 +10,7 @@ TRUTH = '#332288'
 # Paths of several robots; none is a colour of nodes or edges.
 ROBOTS = ('#332288', '#CC79A7', '#56B4E9', '#999933', '#661100', '#555555')
 HIDDEN = '#882255'
-APART = '#DDB5CC'
+APART = '#A6761D'
 KEEP_OUT = '#D41159'
 # Pale, in turn by id.
 REGIONS = {

@@ -28,7 +28,7 @@ LEGEND = """
   **dark blue** branch, **amber** corner, **green** skeleton
 - **pink** estimated path, pose and its 95 %; **indigo** true path; **grey** odometry;
   **yellow** planned path and target; **purple** samples
-- **red** scan; **pale pink** scans of a piece of map whose place is unknown;
+- **red** scan; **brown** scans of a piece of map whose place is unknown;
   **blue** features of the local area, its nodes ringed; **pale blue** other features
 - **pale outlines** on the walls: rooms (blue), corridors (sand), halls (green)
 """

@@ -287,14 +287,14 @@ def _draw_paths(axes: 'Axes', estimated: Array, true: Array | None) -> None:
         axes.plot(
             *estimated[:, :2].T,
             color=palette.ESTIMATE,
-            linewidth=4.5,
+            linewidth=2.6,
             solid_capstyle='round',
             label='path, estimated',
             zorder=2,
         )
     if true is not None and len(true):
         axes.plot(
-            *true[:, :2].T, color=palette.TRUTH, linewidth=1.5, label='path, driven', zorder=3
+            *true[:, :2].T, color=palette.TRUTH, linewidth=0.9, label='path, driven', zorder=3
         )
     if len(estimated):
         style: dict[str, Any] = {
@@ -312,7 +312,7 @@ def _draw_robots(axes: 'Axes', robots: Mapping[str, Array]) -> None:
     """Draw the path of each robot in a colour of its own, from a star to a cross."""
     for number, (name, path) in enumerate(robots.items()):
         colour = palette.ROBOTS[number % len(palette.ROBOTS)]
-        axes.plot(*path[:, :2].T, color=colour, linewidth=2.2, label=name, zorder=3)
+        axes.plot(*path[:, :2].T, color=colour, linewidth=1.5, label=name, zorder=3)
         style: dict[str, Any] = {'color': 'white', 'markeredgecolor': colour, 'zorder': 6}
         axes.plot(*path[0, :2], marker='*', markersize=14, markeredgewidth=1.2, **style)
         axes.plot(*path[-1, :2], marker='X', markersize=9, markeredgewidth=1.2, **style)
