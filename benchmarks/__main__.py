@@ -9,10 +9,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from benchmarks import days, place_belief, release
-from benchmarks.graphs import doors, floors, real_maps
+from benchmarks.graphs import floors
 from benchmarks.rows import Row, show
 from benchmarks.speed import (
-    exploration,
     global_localization,
     growth,
     mapping,
@@ -28,8 +27,6 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'thinning': mapping.thinning,
     'mapping': mapping.mapping,
     'graphs': floors.graphs,
-    'doors': doors.run,
-    'real_maps': real_maps.run,
     'compactness': floors.compactness,
     'voronoi': floors.voronoi,
     'online': mapping.online,
@@ -38,7 +35,6 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'matching': slam.matching,
     'planning': planning.goals,
     'long_paths': planning.long_paths,
-    'exploration': exploration.run,
     'slam': slam.ekf_step,
     'pose_graph': slam.pose_graph,
     'growth': growth.run,

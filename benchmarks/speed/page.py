@@ -42,17 +42,6 @@ _ABOUT = {
         'Topological maps of whole floors',
         'Time against a Voronoi diagram by SciPy; drivable edges and connectivity.',
     ),
-    'doors': (
-        'Narrow doors',
-        'Doors of 0.7 m in walls at several angles, on cells of 5 and 10 cm, for robots of 0.25 to '
-        '0.35 m radius, with and without noise at the walls: the planner passes those that the '
-        'graph passes.',
-    ),
-    'real_maps': (
-        'Route graphs of real maps',
-        'Saved maps of buildings and of replayed logs: edges that are safe, long enough and few, '
-        'and a node in sight. Places behind glass are among those that see no node.',
-    ),
     'compactness': (
         'Memory of graph and grid',
         'Bytes of a graph and of the grid of the same floor, cells of 0.1 m: median of the floors '
@@ -94,7 +83,6 @@ _ABOUT = {
         'that of OpenKarto (package karto-scanmatcher, if installed), which renders its map again '
         'for each match.',
     ),
-    'exploration': ('Exploration', 'Complete explorations, and decisions on a large floor.'),
     'slam': (
         'EKF-SLAM',
         'A filter step against the number of features in the map: with the features of the local '
