@@ -28,25 +28,6 @@ EXACT_S = 0.002  # of the logs in which a scan lies at each stamp of a relation
 BUILDINGS = range(30)
 ROBOTS = ('2dx', '3at')
 NOISES = (1.0, 3.0)
-# The short form before there is a short.txt: logs of each kind with what they bear worst, and
-# buildings; some 2 minutes on 2 cores.
-BY_HAND = (
-    'aces',
-    'aces.no_turn',
-    'aces.scale',
-    'csail',
-    'csail.no_odometry',
-    'csail_raw',
-    'fhw',
-    'fhw.gap_anew',
-    'fhw.slip',
-    'intel.every_5',
-    'mrpt_office.every_5',
-    'sena.turn_noise_0.15',
-    'building_000.2dx_x1',
-    'building_003.3at_x3',
-    'building_007.2dx_x3',
-)
 
 
 @dataclass(frozen=True)
@@ -163,16 +144,6 @@ def repeated(cases: Iterable[Case], runs: int) -> list[Case]:
     all, is not told by a single run.
     """
     return [replace(case, run=run) for case in cases for run in range(runs)]
-
-
-def compared_with(case: Case, logs: Path) -> str:
-    """Name of the case that a case is judged by: the undegraded log where there are no relations.
-
-    Else its own name.
-    """
-    if isinstance(case, LogCase) and not (logs / case.log / 'relations').exists():
-        return case.log
-    return case.name
 
 
 def log_case(name: str, version: str = '', options: tuple[str, ...] = ()) -> LogCase:

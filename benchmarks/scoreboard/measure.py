@@ -77,7 +77,7 @@ _NOTHING = ObservableCells(np.zeros((0, 0), dtype=np.bool_), GridFrame(0.0, 0.0,
 
 
 _KNOWN_AGAIN_M = 30.0  # of way after a slip or a gap, from which on relations over it are judged
-DISTURBED = (5e-4, 5e-4, 5e-4)  # of odometry between scans, m, m, rad, in runs but the first
+_DISTURBED_BY = (5e-4, 5e-4, 5e-4)  # of odometry between scans, m, m, rad, in runs but the first
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _measure_log(case: LogCase, task: Task) -> Numbers:
     times = np.array(played.stamps_ns) / 1e9
     live = np.array(played.poses)
     if not (own / 'relations').exists():
-        return numbers | {'path': np.column_stack([times, live]).tolist()}
+        return numbers
     for name, path in (('live', live), ('final', played.final)):
         numbers |= _relations(own, times, path, name, case.exact_s)
     return numbers | _over_the_event(own, times, live, case.exact_s)
@@ -216,7 +216,7 @@ def _disturbed(pairs: Iterator[tuple[Scan, Array]], run: int) -> Iterator[tuple[
         if last is None:
             T_odom_base = T
         else:
-            increment = se2.between(last, T) + rng.normal(0.0, DISTURBED)
+            increment = se2.between(last, T) + rng.normal(0.0, _DISTURBED_BY)
             T_odom_base = se2.compose(T_odom_base, increment)
         last = T
         yield scan, T_odom_base

@@ -1,6 +1,5 @@
-"""The scoreboard: its page, comparisons, resuming, and small real runs."""
+"""The scoreboard: its tables, comparisons, resuming, and small real runs."""
 
-import argparse
 import json
 import math
 import sys
@@ -15,16 +14,13 @@ from benchmarks.scoreboard import __main__ as program
 from benchmarks.scoreboard import drives
 from benchmarks.scoreboard.cases import (
     BUILDINGS,
-    BY_HAND,
     DEGRADED,
     BuildingCase,
     LogCase,
     all_cases,
-    compared_with,
-    repeated,
 )
 from benchmarks.scoreboard.measure import Task, _disturbed, measure
-from benchmarks.scoreboard.page import MAX_ERROR_M, against, errors, page, shortened, worst_tenth
+from benchmarks.scoreboard.page import against, case_tables
 from benchmarks.scoreboard.played import Played, consistency
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError
@@ -52,38 +48,19 @@ def of_building(case, live_m):
     return {'name': case.name, 'options': {}, 'live_m': live_m, **COSTS, **given}
 
 
-def of_log(case, path):
-    return {'name': case.name, 'options': {}, 'path': path, **COSTS}
-
-
-def straight(sideways_m):
-    """Path of 11 poses along x, with an offset to the side from the third one on."""
-    return [[float(k), float(k), sideways_m * (k > 2), 0.0] for k in range(11)]
+def of_log(case):
+    return {'name': case.name, 'options': {}, **COSTS}
 
 
 @pytest.fixture
 def reports():
-    found = [of_log(LOGS[0], straight(0.0)), of_log(LOGS[1], straight(0.5))]
+    found = [of_log(case) for case in LOGS]
     return found + [of_building(case, 0.01 * (1 + k)) for k, case in enumerate(DRIVES)]
 
 
-def test_a_degraded_log_without_relations_is_judged_by_the_undegraded_one(reports):
-    found = errors(CASES, reports)
-    assert found[0] == 0.0
-    assert found[1] == pytest.approx(0.5 * math.sqrt(8 / 11))
-    assert errors(CASES[1:], reports[1:])[0] == MAX_ERROR_M  # no ground truth
-
-
-def test_the_worst_tenth_is_one_number_and_named(reports):
-    assert worst_tenth(CASES, reports) == pytest.approx(0.5 * (0.5 * math.sqrt(8 / 11) + 0.18))
-    text = page(CASES, reports)
-    assert '**Worst tenth, live: 0.303 m**' in text
-    assert 'Its cases: hall.slip 0.43, building_017.2dx_x1 0.18.' in text
-
-
-def test_the_page_has_each_case_with_all_its_numbers(reports):
-    text = page(CASES, reports)
-    assert '| hall | 100 | 0.000 (degraded) | 12.5% | 1.00 | 2.00 | 3.0 | 40 | 250 | 20 |' in text
+def test_the_tables_have_each_case_with_all_its_numbers(reports):
+    text = case_tables(reports)
+    assert '| hall | 100 |  | 12.5% | 1.00 | 2.00 | 3.0 | 40 | 250 | 20 |' in text
     row = '0.010 | 0.010 | 12.5% | 90% | 1.2 | 7 | 1.00 | 2.00 | 3.0 | 40 | 250 | 20 |'
     assert f'| building_000.2dx_x1 | 100 | {row}' in text
     for title in (
@@ -95,24 +72,12 @@ def test_the_page_has_each_case_with_all_its_numbers(reports):
         '99 %',
     ):
         assert f'| {title} |' in text
-    assert 'Failed' not in text
+    assert 'failed' not in text
 
 
-def test_a_case_that_failed_is_named_and_counts_as_the_worst(reports):
+def test_a_case_that_failed_is_named(reports):
     reports[5] = {'name': CASES[5].name, 'error': 'no scan'}
-    text = page(CASES, reports)
-    assert f'**Failed**: {CASES[5].name}.' in text
-    assert f'| {CASES[5].name} | | failed: no scan |' in text
-    assert errors(CASES, reports)[5] == MAX_ERROR_M
-
-
-def test_the_short_form_is_the_worst_tenth_in_so_far_as_time_permits(reports):
-    lines = shortened(CASES, reports).splitlines()
-    assert lines[0].startswith('#')
-    assert lines[1:] == ['hall.slip', 'building_017.2dx_x1']
-    reports[1]['cpu_s'] = 10_000.0
-    lines = shortened(CASES, reports).splitlines()
-    assert lines[1:] == ['# too long, 10003 s: hall.slip', 'building_017.2dx_x1']
+    assert f'| {CASES[5].name} |  | failed: no scan |' in case_tables(reports)
 
 
 def test_another_run_beside_it(reports):
@@ -120,13 +85,15 @@ def test_another_run_beside_it(reports):
     others[4]['live_m'] = 2.0 * reports[4]['live_m']
     others[6] = of_building(CASES[6], 20.0)
     others[7] = None
-    text = against(CASES, reports, others)
+    others[8] = {'name': CASES[8].name, 'error': 'no scan'}
+    text = against(reports, others)
     assert '(19 of 20 cases)' in text
     assert 'median of the ratios 1.000' in text
-    assert '10 m or failed: 0 (other run 1)' in text
+    assert '10 m or failed: 0 (other run 2)' in text
     rows = [line for line in text.splitlines() if line.startswith('| building')]
     assert rows == [
         f'| {CASES[4].name} | 0.030 | 0.060 | 0.50 |',
+        f'| {CASES[8].name} | 0.070 | 10.000 | 0.01 |',
         f'| {CASES[6].name} | 0.050 | 10.000 | 0.01 |',
     ]
 
@@ -182,35 +149,11 @@ def test_all_that_was_asked_for_is_a_case(tmp_path):
         (robot, noise) for robot in ('2dx', '3at') for noise in (1.0, 3.0)
     }
     assert len(runs) == 4 * len(BUILDINGS)
-    (tmp_path / 'logs' / 'aces' / 'relations').touch()
-    assert compared_with(logs['aces.slip'], tmp_path / 'logs') == 'aces.slip'
-    assert compared_with(logs['sena.slip'], tmp_path / 'logs') == 'sena'
-    assert compared_with(runs[0], tmp_path / 'logs') == runs[0].name
 
 
 def test_every_real_log_is_a_case(shared_data):
     names = {case.name for case in all_cases(shared_data / 'logs')}
     assert {path.name for path in (shared_data / 'logs').iterdir() if path.is_dir()} <= names
-    assert set(BY_HAND) <= names
-    assert set(program._short_names()) <= names
-
-
-def test_a_short_list_that_names_none_gives_way_to_one_chosen_by_hand(tmp_path):
-    for text, names in (('', list(BY_HAND)), ('# none\n', list(BY_HAND)), ('# a\nb.c\n', ['b.c'])):
-        (tmp_path / 'short.txt').write_text(text)
-        with patch.object(program, '_SHORT', tmp_path / 'short.txt'):
-            assert program._short_names() == names
-    with patch.object(program, '_SHORT', tmp_path / 'nowhere.txt'):
-        assert program._short_names() == list(BY_HAND)
-
-
-def test_the_short_form_comes_with_what_its_cases_are_compared_with(tmp_path):
-    logs_in(tmp_path / 'data' / 'logs', ['sena'])
-    (tmp_path / 'short.txt').write_text('sena.slip\nbuilding_004.3at_x3\n')
-    arguments = argparse.Namespace(shared=tmp_path, short=True, only='*')
-    with patch.object(program, '_SHORT', tmp_path / 'short.txt'):
-        names = [case.name for case in program._chosen(arguments)]
-    assert names == ['sena', 'sena.slip', 'building_004.3at_x3']
 
 
 def test_a_covariance_that_is_right_is_found_to_be():
@@ -263,18 +206,6 @@ def test_a_disturbed_run_has_noise_of_its_own_and_the_first_has_none():
     np.testing.assert_allclose(np.std(off, axis=0), 5e-4, rtol=0.1)
 
 
-def test_the_page_shows_mean_and_worst_of_several_runs(reports):
-    cases = repeated([LOGS[0], DRIVES[0]], 2)
-    names = ['hall', 'hall.run_1', 'building_000.2dx_x1', 'building_000.2dx_x1.run_1']
-    assert [case.name for case in cases] == names
-    runs = [of_building(cases[2], 0.1), of_building(cases[3], 0.4) | {'final_m': 0.9}]
-    own = [of_log(cases[0], straight(0.0)), of_log(cases[1], straight(0.5))]
-    text = page(cases, own + runs)
-    assert '| hall | 2 | 0.021 | 0.426 | | |' in text
-    assert '| building_000.2dx_x1 | 2 | 0.200 | 0.400 | 0.300 | 0.900 |' in text
-    assert 'Several runs' not in page(CASES, reports)
-
-
 def called(*words):
     """Run the program in this process; returns the exit code."""
     with patch.object(sys, 'argv', ['scoreboard', *map(str, words)]):
@@ -306,33 +237,28 @@ def test_it_resumes_and_a_failed_run_stops_no_other(tmp_path, capsys):
     words.append('--quiet')
     assert called(*words) == 2
     assert '1 failed: try_1: ' in capsys.readouterr().err
-    text = (out / 'scoreboard.md').read_text()
-    assert '| try_1 | | failed: ' in text
-    assert '| try_2 | 8 | 0.000 (degraded) |' in text
+    text = (out / 'cases.md').read_text()
+    assert '| try_1 |  | failed: ' in text
+    assert '| try_2 | 8 |' in text
     # Existing results are not computed again; failed ones are.
-    file = out / 'results' / 'try_2.json'
+    file = out / 'board' / 'try_2.json'
     file.write_text(json.dumps(json.loads(file.read_text()) | {'scans': 12345}))
     write_log(logs / 'try_1', 6)
     assert called(*words) == 0
-    text = (out / 'scoreboard.md').read_text()
+    text = (out / 'cases.md').read_text()
     assert '| try_1 | 6 |' in text
     assert '| try_2 | 12345 |' in text
-    assert 'worst tenth, live: 0.000 m' in capsys.readouterr().out
     # Results of other options are not used.
     assert called(*words, '--set', 'slam=ekf_ti') == 2
     assert 'other options' in capsys.readouterr().err
     assert called(*words, '--against', out) == 0
-    assert '## Comparison with another run (2 of 2 cases)' in (out / 'scoreboard.md').read_text()
+    assert '## Comparison with another run (2 of 2 cases)' in (out / 'cases.md').read_text()
     assert called(*words, '--against', tmp_path) == 2
-    assert called(*words, '--write-short') == 2
     capsys.readouterr()
-    assert called('-o', out, '--runs', 2, '--write-short') == 2
-    assert 'no --short, --only or --runs' in capsys.readouterr().err
     assert called(*words, '--runs', 0) == 2
     assert '--runs 0: expected 1 or more' in capsys.readouterr().err
     assert called(*words, '--runs', 2) == 0
-    disturbed = json.loads((out / 'results' / 'try_2.run_1.json').read_text())
-    assert 0.0 < np.abs(np.array(disturbed['path'])[1:, 1:]).max() < 0.01
+    assert '| try_2.run_1 | 8 |' in (out / 'cases.md').read_text()
 
 
 def test_a_drive_in_a_small_building(tmp_path, monkeypatch):
@@ -350,7 +276,7 @@ def test_a_drive_in_a_small_building(tmp_path, monkeypatch):
     assert 0.0 < report['live_aligned_m'] <= report['live_m']
     assert 0.0 < report['ms_median'] <= report['ms_99'] <= report['stall_ms']
     assert report['mb'] > report['mb_more'] >= 0.0
-    assert 'building_003.2dx_x3' in page([case], [report])
+    assert '| building_003.2dx_x3 |' in case_tables([report])
 
 
 def test_a_drive_ends_where_it_began_and_its_noise_is_what_is_asked_for():
@@ -384,7 +310,7 @@ def test_a_piece_of_a_real_log_and_the_same_made_worse(shared_data, tmp_path):
         (own / name).write_text(''.join(kept))
     words = ['-o', tmp_path / 'out', '--shared', tmp_path / 'shared', '--jobs', 2]
     assert called(*words, '--only', 'aces.s*', '--quiet') == 0
-    results = tmp_path / 'out' / 'results'
+    results = tmp_path / 'out' / 'board'
     reports = {path.stem: json.loads(path.read_text()) for path in results.iterdir()}
     assert set(reports) == {'aces.scale', 'aces.slip'}
     for report in reports.values():
