@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.buildings import BuildingConfig, generate_building
 from benchmarks.kidnapped.trials import along
 from benchmarks.rows import Row, at_most
-from benchmarks.worlds import floors
+from benchmarks.worlds import floor
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
@@ -38,7 +38,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         config = BuildingConfig(area_m2=350.0, people_per_1000_m2=0.0, moving_doors=0.0)
         world = generate_building(9, config).world
     else:
-        world = floors(worlds, 'kth/50052751')[0].world
+        world = floor('kth/50052751', worlds).world
     way_m = _WAY_QUICK_M if quick else _WAY_M
     start = random_start(world, np.random.default_rng(1))
     days = [_drive(furnished(world, start, day), start, day, way_m) for day in range(_DAYS)]

@@ -29,9 +29,8 @@ import numpy as np
 from benchmarks.faults.judge import Record
 from benchmarks.faults.kinds import KINDS, random_faults
 from benchmarks.node_processes import NODES, Processes, processor_s, use_own_domain
+from benchmarks.worlds import floor
 from thinmap_ros.core.errors import InputError, ThinmapError
-from thinmap_ros.files import package_data
-from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 
@@ -270,11 +269,10 @@ def work(arguments: argparse.Namespace) -> None:
         raise InputError(
             f'{given}: expected more than 0 minutes and at least {_MIN_SAMPLES} samples'
         )
-    path = package_data.world_path(arguments.world)
-    world = World.from_patch(*read_world(path))
+    there = floor(arguments.world)
     arguments.out.mkdir(parents=True, exist_ok=True)
     run = _drive_with_faults if arguments.faults else _drive
-    if not run(arguments, path, world):
+    if not run(arguments, there.path, there.world):
         sys.exit(1)
 
 

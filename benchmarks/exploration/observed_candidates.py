@@ -1,15 +1,13 @@
 """Worlds to explore, by name: `building/SEED/AREA` is generated, all others are given."""
 
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.buildings import BuildingConfig, generate_building
-from benchmarks.worlds import WORLDS, Floor, floors
+from benchmarks.worlds import floor
 from thinmap_ros.closed_loop import Options, make_loop, no_progress
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.strategy import Decision
@@ -26,8 +24,8 @@ _GENERATED = 'building/'
 def load_case(name: str, start: int = 0) -> tuple[World, Array]:
     """World and start (3,) of a case; a generated one has one start."""
     if not name.startswith(_GENERATED):
-        floor = _given()[name]
-        return floor.world, floor.starts[start]
+        there = floor(name)
+        return there.world, there.starts[start]
     _, seed, area_m2 = name.split('/')
     config = BuildingConfig(
         area_m2=float(area_m2), people_per_1000_m2=0.0, moving_doors=0.0, glass_share=0.0
@@ -43,11 +41,6 @@ def generated(first_seed: int, count: int) -> list[str]:
 
 def _seeds(first_seed: int, count: int) -> range:
     return range(first_seed, first_seed + count)
-
-
-@cache
-def _given(folder: Path = WORLDS) -> dict[str, Floor]:
-    return {floor.name: floor for floor in floors(folder)}
 
 
 Mask = NDArray[np.bool_]

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from benchmarks.joining import tables
 from benchmarks.rows import show_tables
-from benchmarks.worlds import WORLDS, Floor, floors
+from benchmarks.worlds import WORLDS, Floor, floor
 from thinmap_ros.evaluation.outcome import Table
+from thinmap_ros.tools import cli
 
 # Three floors and three dungeons; five robots; six buildings.
 _SIX = (
@@ -32,7 +33,7 @@ _TABLES: dict[str, tuple[Callable[[Sequence[Floor], float], Table], tuple[str, .
 
 
 def main() -> None:
-    """Print the tables that are named, or all."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         prog='benchmarks.joining', description='Joint maps of several robots'
     )
@@ -41,14 +42,15 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, help='of each drive (default: of each table)')
     parser.add_argument('--folder', type=Path, default=WORLDS, help='folder with worlds.json')
     parser.add_argument('-o', '--output', type=Path, help='folder for TABLE.csv')
-    arguments = parser.parse_args()
-    known = {floor.name: floor for floor in floors(arguments.folder)}
-    if missing := set(arguments.worlds or ()) - known.keys():
-        parser.error(f'unknown world {sorted(missing)[0]}: expected some of {list(known)}')
+    cli.run(_run, parser)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    """Print the tables that are named, or all."""
 
     def made(name: str) -> Table:
         make, worlds, seconds = _TABLES[name]
-        chosen = [known[world] for world in arguments.worlds or worlds]
+        chosen = [floor(world, arguments.folder) for world in arguments.worlds or worlds]
         return make(chosen, arguments.seconds or seconds)
 
     show_tables(map(made, arguments.tables or _TABLES), arguments.output)

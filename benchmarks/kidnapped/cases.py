@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.kidnapped import trials
 from benchmarks.kidnapped.trials import Map, Record, fresh, prepared, search
 from benchmarks.rows import Case
-from benchmarks.worlds import floors
+from benchmarks.worlds import floor, floors
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.se2 import pose
@@ -67,7 +67,7 @@ def voronoi(_: Setting) -> Iterator[Case]:
 
 
 def _in_lab(seed: int, steps: int, row: str) -> Record:
-    world = trials.lab()
+    world = floor('lab').world
     known = trials.voronoi_lab_map() if row == 'voronoi' else trials.lab_map()
     if row == 'paper':
         start = pose(*trials.LAB_START)
@@ -96,15 +96,13 @@ def _floor_by_floor(
 ) -> Iterator[Case]:
     """So many drives in each world, some at a time: a row that is cut off has been everywhere."""
     for first in range(0, drives, at_a_time):
-        for floor in floors(setting.worlds, part):
+        for each in floors(setting.worlds, part):
             for number in range(first, first + at_a_time):
-                yield Case(
-                    f'{floor.name} {number}', partial(run, setting.worlds, floor.name, number)
-                )
+                yield Case(f'{each.name} {number}', partial(run, setting.worlds, each.name, number))
 
 
 def _in_building(folder: Path, name: str, number: int) -> Record:
-    world = trials.floor_of(folder, name)
+    world = floor(name, folder).world
     laser = _FULL
     start = random_start(world, np.random.default_rng([2, number]))
     return search(
@@ -117,7 +115,7 @@ def _finder(
     folder: Path, name: str, laser: str, finer: int, driven: bool = False
 ) -> GlobalLocalization:
     """A search that is ready to begin in a world's map."""
-    world = trials.floor_of(folder, name)
+    world = floor(name, folder).world
     kind = LASERS.get(laser, _FULL)
     shift = _SHIFT_M if finer > 1 else (0.0, 0.0)
     known = trials.driven_map(world, kind) if driven else trials.shifted_map(world, finer, shift)
@@ -128,15 +126,15 @@ def _finder(
 def lasers(setting: Setting) -> Iterator[Case]:
     """Other lasers than the usual one, in all worlds."""
     for first in range(0, 20, 2):
-        for floor in floors(setting.worlds):
+        for each in floors(setting.worlds):
             for laser in LASERS:
                 for number in range(first, first + 2):
-                    run = partial(_with_laser, setting.worlds, floor.name, laser, number)
-                    yield Case(f'{laser}: {floor.name} {number}', run)
+                    run = partial(_with_laser, setting.worlds, each.name, laser, number)
+                    yield Case(f'{laser}: {each.name} {number}', run)
 
 
 def _with_laser(folder: Path, name: str, laser: str, number: int) -> Record:
-    world = trials.floor_of(folder, name)
+    world = floor(name, folder).world
     start = random_start(world, np.random.default_rng([3, number]))
     drive = random_drive(world, start, number, laser=LASERS[laser])
     return search(fresh(_finder(folder, name, laser, 1)), drive, _WAY_M)
@@ -148,7 +146,7 @@ def fine(setting: Setting) -> Iterator[Case]:
 
 
 def _in_fine_map(folder: Path, name: str, number: int) -> Record:
-    world = trials.floor_of(folder, name)
+    world = floor(name, folder).world
     drive = random_drive(world, random_start(world, np.random.default_rng([2, number])), number)
     return search(fresh(_finder(folder, name, '', 2)), drive, _WAY_M, shift_m=_SHIFT_M)
 
@@ -159,7 +157,7 @@ def driven(setting: Setting) -> Iterator[Case]:
 
 
 def _in_driven_map(folder: Path, name: str, number: int) -> Record:
-    world = trials.floor_of(folder, name)
+    world = floor(name, folder).world
     finder = fresh(_finder(folder, name, '', 1, driven=True))
     within = np.zeros(world.occupied.shape, dtype=np.bool_)
     cells = world.frame.cells_of(
@@ -192,7 +190,7 @@ def foreign(setting: Setting) -> Iterator[Case]:
 
     Each map against buildings after it, and others.
     """
-    names = ['lab', *sorted(floor.name for floor in floors(setting.worlds))]
+    names = ['lab', *sorted(each.name for each in floors(setting.worlds))]
     for distance in range(1, len(names)):
         for number, mapped in enumerate(names):
             driven_in = names[(number + distance * _COPRIME) % len(names)]
@@ -205,7 +203,7 @@ _COPRIME = 7  # to 25 worlds: all pairs come, and worlds of both kinds meet at o
 
 
 def _elsewhere(folder: Path, mapped: str, driven_in: str) -> Record:
-    world = trials.lab() if driven_in == 'lab' else trials.floor_of(folder, driven_in)
+    world = floor(driven_in, folder).world
     known: Map = trials.lab_map() if mapped == 'lab' else _map_of(folder, mapped)
     start = random_start(world, np.random.default_rng([5, sum(map(ord, mapped + driven_in))]))
     finder = GlobalLocalization(known.patch, known.topology, seed=1)
@@ -214,21 +212,21 @@ def _elsewhere(folder: Path, mapped: str, driven_in: str) -> Record:
 
 @lru_cache(maxsize=1)
 def _map_of(folder: Path, name: str) -> Map:
-    return trials.shifted_map(trials.floor_of(folder, name), 1, (0.0, 0.0))
+    return trials.shifted_map(floor(name, folder).world, 1, (0.0, 0.0))
 
 
 def kidnapped(setting: Setting) -> Iterator[Case]:
     """Robots kidnapped after 150 s of exploration with SLAM at 0.5 m/s, elsewhere on the map."""
-    for number, floor in enumerate(floors(setting.worlds)):
-        yield Case(floor.name, partial(_carried_off, setting.worlds, floor.name, number))
+    for number, each in enumerate(floors(setting.worlds)):
+        yield Case(each.name, partial(_carried_off, setting.worlds, each.name, number))
 
 
 def _carried_off(folder: Path, name: str, seed: int) -> Record:
-    floor = next(floor for floor in floors(folder, name) if floor.name == name)
+    there = floor(name, folder)
     options = Options(
         seed=seed, speed_m_s=0.5, localization='slam', time_limit_s=_LIMIT_S, kidnap_at_s=_CARRIED_S
     )
-    report = explore(floor.world, floor.starts[0], options)[1]
+    report = explore(there.world, there.starts[0], options)[1]
     keys = ('detected_after_s', 'found_after_s', 'found_after_m', 'found_error_m', 'found_right')
     return {key: '' if report[key] is None else report[key] for key in keys}
 
@@ -241,7 +239,7 @@ def halves(setting: Setting) -> Iterator[Case]:
 
 def foreign_log(setting: Setting) -> Iterator[Case]:
     """The log's robot in the maps of other buildings, and robots of other buildings in its map."""
-    names = sorted(floor.name for floor in floors(setting.worlds))
+    names = sorted(each.name for each in floors(setting.worlds))
     for name in names:
         yield Case(f'{name} <- log', partial(_log_elsewhere, setting, name))
     for name in names:
@@ -257,7 +255,7 @@ def _log_elsewhere(setting: Setting, name: str) -> Record:
 
 
 def _in_log_map(setting: Setting, name: str) -> Record:
-    world = trials.floor_of(setting.worlds, name)
+    world = floor(name, setting.worlds).world
     known = trials.first_half(setting.log)
     drive = random_drive(world, random_start(world, np.random.default_rng(6)), 6)
     return trials.watch_foreign(

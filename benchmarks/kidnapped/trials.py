@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.worlds import floors
 from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
@@ -30,7 +29,6 @@ from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.trajectory_errors import between_paths
 from thinmap_ros.experiments.drives import Source, grid_of
-from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.log import OdometryEvent
 from thinmap_ros.logs.readers.carmen import CarmenLog
 from thinmap_ros.pipeline import Pipeline
@@ -38,7 +36,6 @@ from thinmap_ros.sim.drives import DriveSample, random_drive, random_start, worl
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.world import World
 
-LAB = Path(__file__).resolve().parents[2] / 'worlds' / 'lab.yaml'
 LAB_START = (2.0, 2.0, -np.pi / 2.0)
 _RIGHT_RAD = np.radians(10.0)
 _MAPPED_WAY_M = 400.0
@@ -59,20 +56,9 @@ def map_of_patch(patch: GridPatch) -> Map:
     return Map(patch, build(patch, None, TopologyConfig()))
 
 
-@lru_cache(maxsize=2)
-def floor_of(folder: Path, name: str) -> World:
-    """World of a folder."""
-    return next(floor.world for floor in floors(folder, name) if floor.name == name)
-
-
-def lab() -> World:
-    """The laboratory of the topological map paper."""
-    return World.from_patch(*read_world(LAB))
-
-
 @lru_cache(maxsize=1)
 def lab_map() -> Map:
-    """Its map, merged from its stops."""
+    """The map of the laboratory of the topological map paper, merged from its stops."""
     patch = grid_of(Source().samples('lab_stops')).known_area()
     return Map(patch, build(patch, LAB_START[:2], TopologyConfig()))
 

@@ -23,6 +23,7 @@ from benchmarks.rows import Case, run_pending
 from benchmarks.scoreboard.cases import log_case
 from benchmarks.scoreboard.measure import scans_of
 from benchmarks.scoreboard.played import rehearse
+from benchmarks.worlds import SHARED
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.scan import Scan
@@ -32,7 +33,6 @@ from thinmap_ros.evaluation.trajectory_errors import relation_errors
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 
 _OUT = Path(__file__).parent  # of the page Peers
-_SHARED = Path(__file__).resolve().parents[3] / 'shared'
 _LOGS = ('intel', 'aces_raw')
 _MODES = ('slam2d', 'graph', 'pf')
 _THRESHOLDS = ('0.5 0.5', '0.2 0.2', '0.05 0.1')  # m and rad
@@ -114,7 +114,7 @@ def main() -> None:
     parser.add_argument('driver', type=Path, help='program made of benchmarks/peers/iris_lama.cpp')
     parser.add_argument('-o', '--out', type=Path, default=_OUT, help='folder for peers.csv')
     parser.add_argument('--logs', nargs='+', default=_LOGS, help=f'default: {" ".join(_LOGS)}')
-    parser.add_argument('--shared', type=Path, default=_SHARED, help='folder of logs and tools')
+    parser.add_argument('--shared', type=Path, default=SHARED, help='folder of logs and tools')
     arguments = parser.parse_args()
     write_provenance(arguments.out)
     for log in arguments.logs:

@@ -1,6 +1,5 @@
 """Pieces of map: recorded from logs and explorations, in files, their pairs and true errors."""
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from benchmarks.worlds import floor
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, Mishap, no_progress
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
@@ -24,7 +24,6 @@ from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.topology.graph import TopologicalMap, flat_topology, topology_from_msg
-from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.reading import open_log, paired_scans
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import ObservableCells
@@ -203,9 +202,8 @@ def make_exploration(worlds: Path, name: str, start: int, folder: Path, limit_s:
     piece = f'{name.replace("/", "_")}.s{start}'
     if (folder / f'{piece}.npz').exists():
         return
-    starts = json.loads((worlds / 'worlds.json').read_text(encoding='utf-8'))[name]['starts']
-    world = World.from_patch(*read_world(worlds / f'{name}.yaml'))
-    pipeline, truth = explored(world, np.array(starts[start]), start, limit_s)
+    there = floor(name, worlds)
+    pipeline, truth = explored(there.world, there.starts[start], start, limit_s)
     _recorded(piece, pipeline, truth).save(folder)
 
 

@@ -32,6 +32,7 @@ from benchmarks.scoreboard.page import (
     reports_there,
 )
 from benchmarks.scoreboard.played import Numbers
+from benchmarks.worlds import SHARED
 from thinmap_ros.core.config import parameters_of, suggestion
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.slam.localizer import default_config, parameters_elsewhere
@@ -47,7 +48,6 @@ from thinmap_ros.evaluation.parallel_jobs import (
 from thinmap_ros.files.safe import write_text
 from thinmap_ros.tools import cli
 
-_SHARED = Path(__file__).resolve().parents[3] / 'shared'
 # A graph costs more than a pose, and the pose needs little of it: of replayed drives there is a new
 # one every 2 s. Scans of these logs are up to metres apart: a new one with each.
 _SCANS_PER_GRAPH = 10
@@ -62,7 +62,7 @@ def main() -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='benchmarks.scoreboard', description=__doc__)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for all results')
-    parser.add_argument('--shared', type=Path, default=_SHARED, help='folder of logs and tools')
+    parser.add_argument('--shared', type=Path, default=SHARED, help='folder of logs and tools')
     parser.add_argument('--board', action='store_true', help='only the cases of the board')
     parser.add_argument(
         '--recordings',

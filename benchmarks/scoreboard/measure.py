@@ -29,7 +29,7 @@ from benchmarks.scoreboard.played import (
 )
 from benchmarks.scoreboard.recordings import RecordedSimulation, read_recording
 from benchmarks.time_and_memory import forget_peak, peak_mb
-from benchmarks.worlds import floors
+from benchmarks.worlds import floor
 from thinmap_ros.closed_loop import (
     SCANS_PER_GRAPH,
     ClosedLoop,
@@ -49,14 +49,12 @@ from thinmap_ros.core.slam.localizer import config_with
 from thinmap_ros.core.stage import StartConfig
 from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
 from thinmap_ros.experiments.slam.logs import laser_of
-from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.reading import open_log, paired_scans
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
-from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, make_strategy
 
 LASERS = {
@@ -65,7 +63,6 @@ LASERS = {
     'rplidar_a1': LaserScannerConfig(beams=360, field_of_view_deg=360.0, range_max_m=12.0),
 }
 RECORDED_S = 1200.0  # of a recorded drive: 6,000 scans
-_DRAWN = Path(__file__).resolve().parents[2] / 'worlds'
 _ROBOT = PRESETS['2dx']
 _SPEED_M_S = 0.5
 _RECORDED_SEED = 0
@@ -285,9 +282,9 @@ def record(task: RecordTask) -> Numbers:
 
 def record_drive(world: str, worlds: Path, path: Path, limit_s: float = RECORDED_S) -> Numbers:
     """Record an exploration by the true pose, from a world's first start, into a file."""
-    place, start = world_of(world, worlds)
+    there = floor(world, worlds)
     laser = LASERS['lms200']
-    simulation = RecordedSimulation(place, start, _ROBOT, laser, _RECORDED_SEED)
+    simulation = RecordedSimulation(there.world, there.starts[0], _ROBOT, laser, _RECORDED_SEED)
     pipeline = Pipeline(_pipeline_config(laser), ground_truth_poses(simulation))
     loop = _closed_loop(simulation, pipeline)
     ending = loop.run(_NOTHING, limit_s, no_progress)
@@ -313,7 +310,9 @@ def _measure_drive(case: DriveCase, task: Task) -> Numbers:
 
 def _measure_loop(case: LoopCase, task: Task) -> Numbers:
     """Numbers of an exploration by the estimated pose."""
-    world, start = world_of(case.world, task.data / 'worlds')
+    there = floor(case.world, task.data / 'worlds')
+    world = there.world
+    start = there.starts[0]
     laser = LASERS[case.laser]
     simulation = Simulation(world, start, _ROBOT, laser, case.seed)
     is_whole = case.world not in _LIMITS_S
@@ -337,20 +336,6 @@ def _measure_loop(case: LoopCase, task: Task) -> Numbers:
         'distance_m': se2.path_length_m(truth),
         'time_s': played.stamps_ns[-1] / 1e9,
     }
-
-
-def world_of(name: str, worlds: Path) -> tuple[World, Array]:
-    """World and start (3,): FOLDER/NAME of the worlds with lists of starts, or a drawn one.
-
-    Raises InputError where there is none of that name.
-    """
-    if '/' in name:
-        for floor in floors(worlds, name):
-            if floor.name == name:
-                return floor.world, floor.starts[0]
-        raise InputError(f'{worlds}: no world {name} in worlds.json')
-    world = World.from_patch(*read_world(_DRAWN / f'{name}.yaml'))
-    return world, world.start
 
 
 def _pipeline_config(

@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks.rows import Row, show
 from benchmarks.scoreboard.cases import EXACT_S
 from benchmarks.scoreboard.measure import play, scans_of
+from benchmarks.worlds import SHARED
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import config_with
 from thinmap_ros.evaluation.parallel_jobs import write_provenance
@@ -30,7 +31,6 @@ THINNED = 'intel'
 NAME = 'stamps'
 _NEAR_S = 0.1
 _SCANS_PER_GRAPH = 10
-_SHARED = Path(__file__).resolve().parents[3] / 'shared'
 
 Path_ = tuple[Array, Array]  # times (N,), s, and poses (N, 3)
 
@@ -85,7 +85,7 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog='benchmarks.scoreboard.stamps', description=__doc__)
     parser.add_argument('-o', '--out', type=Path, required=True, help=f'folder for {NAME}.csv')
-    parser.add_argument('--shared', type=Path, default=_SHARED, help='folder of logs and tools')
+    parser.add_argument('--shared', type=Path, default=SHARED, help='folder of logs and tools')
     arguments = parser.parse_args()
     show(rows(arguments.shared / 'data' / 'logs'), arguments.out / f'{NAME}.csv')
     write_provenance(arguments.out)

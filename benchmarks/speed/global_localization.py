@@ -13,7 +13,7 @@ from benchmarks.kidnapped.summary import summary
 from benchmarks.kidnapped.trials import shifted_map
 from benchmarks.rows import Row, at_most
 from benchmarks.time_and_memory import median_seconds
-from benchmarks.worlds import floors
+from benchmarks.worlds import floor
 from thinmap_ros.core.places.likelihood import Judge
 from thinmap_ros.core.places.place_database import (
     GlobalLocalizationConfig,
@@ -30,9 +30,9 @@ _QUICK = {'paper': 5, 'lab': 20, 'voronoi': 20, 'twins': 2, 'foreign': 4, 'dunge
 
 def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
     """5,000 samples against 10 observed nodes and a scan's beams, in maps of few and many nodes."""
-    floor = floors(folder, 'kth/50052749')[0]
-    patch = shifted_map(floor.world, 1, (0.0, 0.0)).patch
-    drive_sample = next(random_drive(floor.world, floor.starts[0], 0))
+    there = floor('kth/50052749', folder)
+    patch = shifted_map(there.world, 1, (0.0, 0.0)).patch
+    drive_sample = next(random_drive(there.world, there.starts[0], 0))
     rng = np.random.default_rng(0)
     for count, limit in ((30, 2.0), (120, 3.0), (2000, 5.0)):
         config = GlobalLocalizationConfig()

@@ -12,17 +12,16 @@ import numpy as np
 
 from benchmarks.rows import Row, at_most
 from benchmarks.time_and_memory import resident_mb
+from benchmarks.worlds import floor
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.track import LocalizerConfig
-from thinmap_ros.files.package_data import world_path
-from thinmap_ros.files.worlds import read_tour, read_world
+from thinmap_ros.files.worlds import read_tour
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.drives import DriveConfig, DriveSample, drive, tour_paths
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
-from thinmap_ros.sim.world import World
 
 _SPEED_M_S = 1.0
 _ROBOT = '2dx'
@@ -168,9 +167,9 @@ def _drive(samples: Iterator[DriveSample], marks_m: list[float]) -> Iterator[_Ma
 
 def _samples() -> tuple[Iterator[DriveSample], float]:
     """The tour of the warehouse, again and again, and its length, m."""
-    path = world_path('warehouse')
-    world = World.from_patch(*read_world(path))
-    tour = read_tour(path)
+    warehouse = floor('warehouse')
+    world = warehouse.world
+    tour = read_tour(warehouse.path)
     robot = PRESETS[_ROBOT]
     simulation = Simulation(world, world.start, robot, LaserScannerConfig(range_max_m=_RANGE_M), 0)
     ways = list(tour_paths(world, tour, robot.radius_m))  # closed: it begins where it ends

@@ -15,7 +15,7 @@ from skimage.morphology import skeletonize
 from benchmarks.graphs.graph_metrics import agreement, drivable_share, loop_count
 from benchmarks.rows import Row, at_least, at_most
 from benchmarks.time_and_memory import best_seconds
-from benchmarks.worlds import floors
+from benchmarks.worlds import floor
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
@@ -33,7 +33,7 @@ _FASTER = {400: (20.0, 40.0), 1000: (50.0, 100.0), 4000: (50.0, 100.0)}
 
 def floor_of(worlds: Path, side: int) -> Mask:
     """Free cells of a real floor, laid side by side until the size is reached."""
-    free = floors(worlds, 'kth/50052749')[0].world.occupied == 0
+    free = floor('kth/50052749', worlds).world.occupied == 0
     rows, cols = free.shape
     return np.ascontiguousarray(np.tile(free, (-(-side // rows), -(-side // cols)))[:side, :side])
 
@@ -84,14 +84,14 @@ _SCANS = 200
 
 def mapping(worlds: Path, quick: bool) -> list[Row]:
     """A row for cells of 10 cm and of 5 cm: a real floor, rotation in place at ten places."""
-    floor = floors(worlds, 'kth/50052748')[0]
+    there = floor('kth/50052748', worlds)
     laser = LaserScanner(LaserScannerConfig(), 0)
     turns = [
         np.array([*start[:2], start[2] + 0.3 * k])
-        for start in floor.starts
+        for start in there.starts
         for k in range(_SCANS // 10)
     ]
-    scans = [(laser.scan(floor.world, T, 0), T) for T in turns]
+    scans = [(laser.scan(there.world, T, 0), T) for T in turns]
     what = 'map update, 181 beams, 8 m'
     rate = _rate(OccupancyGrid(PAPER_GRID), scans, quick)
     usual_rate = _rate(OccupancyGrid(), scans, quick)
@@ -231,15 +231,15 @@ _RUN = 6000  # scans in 20 min
 def online(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows for each world, as they come."""
     for name in _QUICK if quick else _WORLDS:
-        floor = floors(worlds, name)[0]
-        poses = tour(floor.world, floor.starts[0], 0.25, 8 if quick else 40, 0)
-        drive = Drive(floor.world)
+        there = floor(name, worlds)
+        poses = tour(there.world, there.starts[0], 0.25, 8 if quick else 40, 0)
+        drive = Drive(there.world)
         drive.run(poses)
         milliseconds = 1e3 * np.array(drive.ledger.seconds[_WARM_UP:])[:_RUN]
         tenth = len(milliseconds) // 10
         graph = drive.builder.map
-        batch = final_map(drive, floor.starts[0])
-        there, back = agreement(graph, batch, 0.5)
+        batch = final_map(drive, there.starts[0])
+        near, back = agreement(graph, batch, 0.5)
         yield from [
             Row(name, f'{len(poses)} scans', '', None),
             at_most('  update, median', float(np.median(milliseconds)), 2.0, 'ms'),
@@ -249,7 +249,7 @@ def online(worlds: Path, quick: bool) -> Iterator[Row]:
                 float(np.median(milliseconds[-tenth:]) / np.median(milliseconds[:tenth])),
                 1.2,
             ),
-            at_least('  share of nodes within 0.5 m of a node of the batch map', there, 0.95),
+            at_least('  share of nodes within 0.5 m of a node of the batch map', near, 0.95),
             at_least('  share of nodes of the batch map within 0.5 m of a node', back, 0.95),
             Row(
                 '  loops',

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from benchmarks.buildings import BuildingConfig, generate_building
 from benchmarks.rows import Row, at_least, at_most
-from benchmarks.worlds import Floor, floors
+from benchmarks.worlds import Floor, floor, floors
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.paths import LONG_PATH_M, route_band
 from thinmap_ros.core.planning.wavefront import (
@@ -60,9 +60,9 @@ def goals(worlds: Path, quick: bool) -> Iterator[Row]:
     rng = np.random.default_rng(0)
     tally = _GoalTally()
     chosen = floors(worlds, 'kth/50052751' if quick else '')
-    for floor in chosen:
+    for each in chosen:
         for _ in range(-(-(_GOALS_QUICK if quick else _GOALS) // len(chosen))):
-            _try_goal(floor, read_map(floor.path), rng, tally)
+            _try_goal(each, read_map(each.path), rng, tally)
     yield Row('goals', f'{tally.reachable + tally.unreachable}')
     yield at_least(
         '  reachable goals with a path, share', tally.reached / max(tally.reachable, 1), 1.0
@@ -152,8 +152,7 @@ class _Tally:
 def long_paths(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows of some floors and a generated building."""
     for name in _FLOORS:
-        for floor in floors(worlds, name):
-            yield from _measure(name, read_map(floor.path), quick)
+        yield from _measure(name, read_map(floor(name, worlds).path), quick)
     if not quick:
         building = generate_building(_BUILDING, BuildingConfig(area_m2=_BUILDING_M2))
         name = f'generated building {_BUILDING}, {_BUILDING_M2:.0f} m2'

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.rows import Row, at_least, at_most
 from benchmarks.speed.mapping import tour
-from benchmarks.worlds import floors
+from benchmarks.worlds import floor
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.ekf_slam.feature_map import AssociationConfig
@@ -200,13 +200,13 @@ def matching(worlds: Path, quick: bool) -> Iterator[Row]:
 
 def _cases(worlds: Path, name: str, goals: int) -> Iterator[_Case]:
     """Places along a tour of a floor."""
-    floor = floors(worlds, name)[0]
-    poses = tour(floor.world, floor.starts[0], 0.25, goals, 0)
+    there = floor(name, worlds)
+    poses = tour(there.world, there.starts[0], 0.25, goals, 0)
     laser = LaserScanner(LaserScannerConfig(range_max_m=_RANGE_M), 0)
     for at in range(_BEFORE * _APART, len(poses), _EVERY):
         around = [poses[at - k * _APART] for k in range(_BEFORE, 0, -1)]
-        before = [(laser.scan(floor.world, T, 0), T) for T in around]
-        yield _Case(before, laser.scan(floor.world, poses[at], 0), poses[at])
+        before = [(laser.scan(there.world, T, 0), T) for T in around]
+        yield _Case(before, laser.scan(there.world, poses[at], 0), poses[at])
 
 
 def _measure(

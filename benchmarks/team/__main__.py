@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.rows import add_record, markdown, read_records
-from benchmarks.worlds import WORLDS, Floor, floors
+from benchmarks.worlds import WORLDS, Floor, floor
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
 from thinmap_ros.sim.other_robots import starts_side_by_side
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.team.radio import Trouble
+from thinmap_ros.tools import cli
 
 _SPEED_M_S = 0.5
 _LIMIT_S = 5000.0
@@ -134,26 +135,27 @@ def _mean(values: list[float]) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Run the cases in the worlds, and print the table."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(prog='benchmarks.team', description=__doc__)
-    parser.add_argument('worlds', nargs='*', help=f'names (default: {" ".join(_WORLDS)})')
+    default = f'names (default: {" ".join(_WORLDS)})'
+    parser.add_argument('worlds', nargs='*', default=_WORLDS, help=default)
     parser.add_argument('-o', '--output', type=Path, required=True, help='CSV file')
     parser.add_argument(
         '--cases', nargs='+', choices=CASES, default=CASES, help='some of the cases'
     )
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
     parser.add_argument('--folder', type=Path, default=WORLDS, help='folder with worlds.json')
-    arguments = parser.parse_args()
-    known = {floor.name: floor for floor in floors(arguments.folder)}
-    wanted = arguments.worlds or list(_WORLDS)
-    if missing := set(wanted) - known.keys():
-        parser.error(f'unknown world {sorted(missing)[0]!r}: expected some of {", ".join(known)}')
+    cli.run(_run, parser)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    """Run the cases in the worlds, and print the table."""
     done = {(r['case'], r['world'], r['seed']) for r in read_records(arguments.output)}
-    for world in wanted:
+    for world in arguments.worlds:
         for case in arguments.cases:
             if (case, world, str(arguments.seed)) in done:
                 continue
-            figures = CASES[case].run(known[world], arguments.seed)
+            figures = CASES[case].run(floor(world, arguments.folder), arguments.seed)
             record = {'case': case, 'world': world, 'seed': arguments.seed, **figures}
             add_record(arguments.output, record)
             print(record, flush=True)

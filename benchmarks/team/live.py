@@ -34,7 +34,7 @@ from std_msgs.msg import UInt32
 
 from benchmarks.node_processes import Processes, placed_at
 from benchmarks.rows import add_record
-from benchmarks.worlds import WORLDS, floors
+from benchmarks.worlds import WORLDS, floor
 from thinmap_msgs.msg import ExplorationStatus, JoinStatus, MapTiles, TeamClaim, TileRequest
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, ThinmapError
@@ -42,8 +42,6 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import MapReceiver
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.ros_domains import use_free_domain
-from thinmap_ros.files import package_data
-from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.maps import received_map, received_update
 from thinmap_ros.sim.coverage import ObservableCells, observable_cells
@@ -427,14 +425,14 @@ def main() -> None:
         use_free_domain()
     rclpy.init()
     for name in arguments.worlds:
-        world, path = _world(arguments.folder, name)
+        there = floor(name, arguments.folder)
         for seed in range(arguments.seed, arguments.seed + arguments.runs):
             rng = np.random.default_rng(seed)
-            starts = _starts(world, arguments.robots, rng)
+            starts = _starts(there.world, arguments.robots, rng)
             setting = Setting(
                 name,
-                path,
-                world,
+                there.path,
+                there.world,
                 starts,
                 map_poses(starts),
                 not arguments.unknown_starts,
@@ -449,15 +447,6 @@ def main() -> None:
             add_record(arguments.output, record)
             print(record, flush=True)
     rclpy.shutdown()
-
-
-def _world(folder: Path, name: str) -> tuple[World, Path]:
-    """The floor of that name in a folder, or the world of the package."""
-    floor = next((each for each in floors(folder) if each.name == name), None)
-    if floor is not None:
-        return floor.world, floor.path
-    path = package_data.world_path(name)
-    return World.from_patch(*read_world(path)), path
 
 
 def _starts(world: World, robots: int, rng: np.random.Generator) -> list[Array]:

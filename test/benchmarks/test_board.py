@@ -10,8 +10,9 @@ import pytest
 from benchmarks.scoreboard import __main__ as program
 from benchmarks.scoreboard.board import WORLDS, board_cases, board_rows, board_table, cases_of
 from benchmarks.scoreboard.cases import BuildingCase, DriveCase, LogCase, LoopCase
-from benchmarks.scoreboard.measure import LASERS, record_drive, world_of
+from benchmarks.scoreboard.measure import LASERS, record_drive
 from benchmarks.scoreboard.recordings import RecordedSimulation, read_recording
+from benchmarks.worlds import floor
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.exploration_run import explore
@@ -27,7 +28,8 @@ def lab(tmp_path_factory):
     """World, start, and the first 25 s of an exploration in a file."""
     folder = tmp_path_factory.mktemp('lab')
     numbers = record_drive('lab', folder, folder / 'lab.npz', 25.0)
-    return *world_of('lab', folder), folder / 'lab.npz', numbers
+    there = floor('lab', folder)
+    return there.world, there.starts[0], folder / 'lab.npz', numbers
 
 
 def driven(simulation):
@@ -93,7 +95,7 @@ def test_all_that_is_asked_is_measured(shared_data):
     assert sum(case.laser != 'lms200' for case in loops) == 6
     for case in cases:
         if isinstance(case, DriveCase | LoopCase):
-            world_of(case.world, shared_data / 'worlds')
+            floor(case.world, shared_data / 'worlds')
     covered = set()
     for row in board_rows():
         own = cases_of(row, names)
@@ -252,5 +254,5 @@ def test_what_the_board_cannot_do_is_one_line(small_board, monkeypatch, capsys):
     monkeypatch.setattr(program, 'board_cases', lambda logs: cases)
     assert called(*words, '--only', 'drive*') == 2
     error = capsys.readouterr().err
-    assert 'no world kth/nowhere' in error
+    assert "world 'kth/nowhere': expected a file" in error
     assert 'Traceback' not in error
