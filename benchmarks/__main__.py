@@ -5,42 +5,14 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import days, place_belief, release
-from benchmarks.graphs import floors
-from benchmarks.rows import Row, show
-from benchmarks.speed import (
-    global_localization,
-    growth,
-    mapping,
-    node_load,
-    planning,
-    slam,
-)
+from benchmarks import release
+from benchmarks.catalogue import BENCHMARKS
+from benchmarks.rows import show
 from benchmarks.time_and_memory import machine
 from benchmarks.worlds import WORLDS
 from thinmap_ros.evaluation.parallel_jobs import write_provenance
-
-_ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
-    'thinning': mapping.thinning,
-    'mapping': mapping.mapping,
-    'graphs': floors.graphs,
-    'compactness': floors.compactness,
-    'voronoi': floors.voronoi,
-    'online': mapping.online,
-    'nodes': node_load.run,
-    'localization': global_localization.run,
-    'matching': slam.matching,
-    'planning': planning.goals,
-    'long_paths': planning.long_paths,
-    'slam': slam.ekf_step,
-    'pose_graph': slam.pose_graph,
-    'growth': growth.run,
-    'days': days.run,
-    'place_belief': place_belief.run,
-}
 
 
 def main() -> None:
@@ -52,7 +24,7 @@ def main() -> None:
         prog='benchmarks',
         description='Benchmarks of the core. `benchmarks release --help`: all pages of results',
     )
-    parser.add_argument('names', nargs='*', choices=_ALL, help='default: all')
+    parser.add_argument('names', nargs='*', choices=BENCHMARKS, help='default: all')
     parser.add_argument(
         '--quick', action='store_true', help='fewer worlds, pairs and scans: a minute or two'
     )
@@ -65,9 +37,9 @@ def main() -> None:
         help='folder for the results: NAME.csv each, machine.csv and provenance.txt',
     )
     arguments = parser.parse_args()
-    for name in arguments.names or _ALL:
+    for name in arguments.names or BENCHMARKS:
         print(f'-- {name}')
-        rows = _ALL[name](arguments.worlds, arguments.quick)
+        rows = BENCHMARKS[name].rows(arguments.worlds, arguments.quick)
         show(rows, arguments.csv and arguments.csv / f'{name}.csv')
     if arguments.csv:
         show(machine(), arguments.csv / 'machine.csv')

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from fnmatch import fnmatch
 from pathlib import Path
 
+from benchmarks.catalogue import BENCHMARKS
 from benchmarks.charts import DOCS
 from benchmarks.kidnapped.cases import ROWS
 from benchmarks.scoreboard.board import KTH, WORLDS
@@ -28,24 +29,7 @@ _LIMIT_FACTOR = 4  # of the expected time: a slower or busier machine
 _MIN_LIMIT = 5
 _DUNGEONS = ('d1115', 'd114', 'd1573', 'd2191', 'd2555', 'd2720', 'd3088', 'd3486')
 _SMALL_FLOORS = ('kth/50052751', 'kth/50052748')
-# Expected minutes of the benchmarks of `python -m benchmarks`, and of rows of benchmarks.kidnapped.
-_SPEED = {
-    'thinning': 2,
-    'mapping': 1,
-    'graphs': 4,
-    'compactness': 2,
-    'voronoi': 3,
-    'online': 3,
-    'nodes': 6,
-    'localization': 4,
-    'matching': 2,
-    'planning': 2,
-    'long_paths': 5,
-    'slam': 2,
-    'pose_graph': 2,
-    'growth': 25,
-}
-_LOCALIZATION_MINUTES = 5
+_LOCALIZATION_MINUTES = 5  # of each row of benchmarks.kidnapped
 
 
 @dataclass(frozen=True)
@@ -101,8 +85,9 @@ def _slam(folders: Folders) -> list[Step]:
 def _speed(folders: Folders) -> list[Step]:
     worlds = ('--worlds', folders.data / 'worlds', '--csv', folders.out / 'speed')
     return [
-        Step(f'speed.{name}', _python('benchmarks', name, *worlds), minutes)
-        for name, minutes in _SPEED.items()
+        Step(f'speed.{each.name}', _python('benchmarks', each.name, *worlds), each.minutes)
+        for each in BENCHMARKS.values()
+        if each.minutes
     ]
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_origin, get_type_hints
 
 from thinmap_ros.evaluation.outcome import Table
 from thinmap_ros.evaluation.parallel_jobs import write_provenance
@@ -14,6 +14,7 @@ from thinmap_ros.files.safe import write_text
 COLUMNS = ('what', 'value', 'target', 'verdict')
 VERDICTS = {True: 'ok', False: 'MISSED', None: ''}
 Written = dict[str, str]  # a record as it is in a file
+AnyCase = TypeVar('AnyCase')
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,24 @@ def read_records(path: Path) -> list[Written]:
         return []
     with path.open(encoding='utf-8', newline='') as file:
         return list(csv.DictReader(file))
+
+
+def read_cases(path: Path, kind: type[AnyCase]) -> list[AnyCase]:
+    """Records of a CSV file as dataclasses; an empty cell is the default of its field.
+
+    Cells of bool are yes, those of tuples are words.
+    """
+    kinds = get_type_hints(kind)
+    return [
+        kind(**{name: _cell(text, kinds[name]) for name, text in record.items() if text})
+        for record in read_records(path)
+    ]
+
+
+def _cell(text: str, kind: Any) -> Any:
+    if get_origin(kind) is tuple:
+        return tuple(text.split())
+    return text == 'yes' if kind is bool else kind(text)
 
 
 def add_record(path: Path, record: dict[str, Any]) -> None:

@@ -3,7 +3,8 @@
 import math
 import signal
 from collections.abc import Callable
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -11,7 +12,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from benchmarks.faults.kinds import KILL, STOP, Fault
+from benchmarks.faults.kinds import STOP, Fault
 from benchmarks.faults.observer import Observer
 from benchmarks.node_processes import NODES, Processes
 from thinmap_ros.core.se2 import Array
@@ -22,83 +23,20 @@ _CARRIED_M = 1.5
 _PLACES = 100  # that are tried, in a world that may be smaller
 
 
-class Cause(Protocol):
-    """A fault of one kind: begun, ended after its duration, and what it found wrong by then."""
-
-    def begin(self) -> None:
-        """Begin the fault."""
-
-    def is_done(self) -> bool:
-        """Whether it may end; called again and again."""
-
-    def end(self) -> list[str]:
-        """End the fault; returns what must not happen, in words."""
+def _nothing() -> None:
+    """Neither begins nor ends anything."""
 
 
-class StreamCause:
-    """The relay falsifies messages."""
+@dataclass(frozen=True)
+class Cause:
+    """What begins a fault and, after its duration and as soon as it may, ends it.
 
-    def __init__(self, fault: Fault, observer: Observer) -> None:
-        self._fault = fault
-        self._observer = observer
+    end: returns what must not happen, in words, where it can tell.
+    """
 
-    def begin(self) -> None:
-        """Begin the fault."""
-        self._observer.order(begin=self._fault.kind.name, seed=self._fault.seed)
-
-    def is_done(self) -> bool:
-        """Whether it may end."""
-        return True
-
-    def end(self) -> list[str]:
-        """End the fault."""
-        self._observer.order(end=True)
-        return []
-
-
-class Stopped:
-    """A node computes nothing for a while."""
-
-    def __init__(self, node: str, processes: Processes) -> None:
-        self._node = node
-        self._processes = processes
-
-    def begin(self) -> None:
-        """Stop the process."""
-        self._processes.send(self._node, signal.SIGSTOP)
-
-    def is_done(self) -> bool:
-        """Whether it may end."""
-        return True
-
-    def end(self) -> list[str]:
-        """Let it continue."""
-        self._processes.send(self._node, signal.SIGCONT)
-        return []
-
-
-class Killed:
-    """A node is killed and started again. forgets: its checkpoint is removed in between."""
-
-    def __init__(self, node: str, processes: Processes, forgets: bool = False) -> None:
-        self._node = node
-        self._processes = processes
-        self._forgets = forgets
-
-    def begin(self) -> None:
-        """Kill the process."""
-        self._processes.kill(self._node)
-
-    def is_done(self) -> bool:
-        """Whether it may end."""
-        return True
-
-    def end(self) -> list[str]:
-        """Start it again."""
-        if self._forgets:
-            self._processes.forget(self._node)
-        self._processes.start_node(self._node)
-        return []
+    begin: Callable[[], None] = _nothing
+    end: Callable[[], list[str] | None] = _nothing
+    may_end: Callable[[], bool] = lambda: True
 
 
 class Request:
@@ -121,54 +59,18 @@ class Request:
         self._node.destroy_client(self._client)
 
 
-class Asked:
-    """A peer asks a node for something that it must do, or must refuse."""
+def _asked(request: Request, judge: Callable[[Any], list[str]]) -> Cause:
+    """A peer asks a node for something that it must do, or must refuse.
 
-    def __init__(self, ask: Callable[[], Request], judge: Callable[[Any], list[str]]) -> None:
-        """judge: what is wrong with a response, in words; None: there was none."""
-        self._ask = ask
-        self._judge = judge
-        self._request: Request | None = None
+    judge: what is wrong with a response, in words; None: there was none.
+    """
 
-    def begin(self) -> None:
-        """Ask."""
-        self._request = self._ask()
+    def end() -> list[str]:
+        answer = request.answer()
+        request.close()
+        return judge(answer)
 
-    def is_done(self) -> bool:
-        """Whether there is an answer."""
-        return self._request is not None and self._request.answer() is not None
-
-    def end(self) -> list[str]:
-        """Judge the answer."""
-        if self._request is None:
-            return []
-        answer = self._request.answer()
-        self._request.close()
-        return self._judge(answer)
-
-
-class Carried:
-    """The robot is kidnapped; its wheels do not turn."""
-
-    def __init__(self, seed: int, world: World, observer: Observer) -> None:
-        self._seed = seed
-        self._world = world
-        self._observer = observer
-
-    def begin(self) -> None:
-        """Put it elsewhere."""
-        place = self._observer.track.place
-        place = self._world.start if place is None else place
-        rng = np.random.default_rng(self._seed)
-        self._observer.teleport(place_apart(self._world, place, rng))
-
-    def is_done(self) -> bool:
-        """Whether it may end."""
-        return True
-
-    def end(self) -> list[str]:
-        """It stays there."""
-        return []
+    return Cause(end=end, may_end=lambda: request.answer() is not None)
 
 
 def place_apart(world: World, place: Array, rng: np.random.Generator) -> Array:
@@ -179,14 +81,6 @@ def place_apart(world: World, place: Array, rng: np.random.Generator) -> Array:
             break
         found = random_start(world, rng)
     return found
-
-
-def sim_time_request(node: Node, name: str) -> Request:
-    """Ask a node of the run to leave simulated time, which all others keep."""
-    value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=False)
-    parameter = Parameter(name='use_sim_time', value=value)
-    request = SetParameters.Request(parameters=[parameter])
-    return Request(node, SetParameters, f'{name}/set_parameters', request)
 
 
 def sim_time_faults(name: str, response: Any) -> list[str]:
@@ -206,21 +100,42 @@ def reset_faults(response: Any) -> list[str]:
 def cause_of(fault: Fault, world: World, processes: Processes, observer: Observer) -> Cause:
     """What begins and ends a fault."""
     kind = fault.kind
+    node = kind.node
     if kind.signal == STOP:
-        return Stopped(kind.node, processes)
-    if kind.signal == KILL or kind.name == 'forget_localizer':
-        return Killed(kind.node, processes, forgets=kind.signal != KILL)
-    if kind.name == 'reset_localizer':
-        return Asked(
-            lambda: Request(observer.node, Trigger, 'localizer/reset', Trigger.Request()),
-            reset_faults,
+        return Cause(
+            lambda: processes.send(node, signal.SIGSTOP),
+            lambda: processes.send(node, signal.SIGCONT),
         )
+    if kind.is_killed:
+
+        def start() -> None:
+            if kind.forgets:
+                processes.forget(node)
+            processes.start_node(node)
+
+        return Cause(lambda: processes.kill(node), start)
+    if kind.name == 'reset_localizer':
+        reset = Request(observer.node, Trigger, 'localizer/reset', Trigger.Request())
+        return _asked(reset, reset_faults)
     if kind.name == 'use_sim_time':
         name = NODES[fault.seed % len(NODES)]
-        return Asked(
-            lambda: sim_time_request(observer.node, name),
-            lambda response: sim_time_faults(name, response),
-        )
+        return _asked(_sim_time_request(observer.node, name), lambda r: sim_time_faults(name, r))
     if kind.name == 'carried_off':
-        return Carried(fault.seed, world, observer)
-    return StreamCause(fault, observer)
+        return Cause(lambda: _carry_off(fault.seed, world, observer))
+    return Cause(
+        lambda: observer.order(begin=kind.name, seed=fault.seed), lambda: observer.order(end=True)
+    )
+
+
+def _sim_time_request(node: Node, name: str) -> Request:
+    """Ask a node of the run to leave simulated time, which all others keep."""
+    value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=False)
+    parameter = Parameter(name='use_sim_time', value=value)
+    request = SetParameters.Request(parameters=[parameter])
+    return Request(node, SetParameters, f'{name}/set_parameters', request)
+
+
+def _carry_off(seed: int, world: World, observer: Observer) -> None:
+    """Put the robot elsewhere; its wheels do not turn."""
+    place = world.start if observer.track.place is None else observer.track.place
+    observer.teleport(place_apart(world, place, np.random.default_rng(seed)))

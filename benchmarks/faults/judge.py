@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.faults.kinds import WRONG_S, Fault
+from benchmarks.faults.kinds import Fault, Kind
 from benchmarks.faults.track import Drawn, Located
+from benchmarks.rows import markdown
 
 ERROR_M = 0.1
 
@@ -20,7 +21,7 @@ class PoseWatch:
     worst_m: largest error of a pose that counts as known.
     """
 
-    limit_s: float = WRONG_S
+    limit_s: float = Kind.wrong_s
     since_s: float | None = None
     worst_m: float = 0.0
     longest_s: float = 0.0
@@ -134,21 +135,16 @@ def uncounted(
 _HEAD = ('fault', 'count', 'violations', 'worst error m', 'most driven m', 'recovery s')
 
 
-def _row(name: str, records: Sequence[Record]) -> tuple[str, ...]:
+def _row(name: str, records: Sequence[Record]) -> tuple[object, ...]:
     recoveries = [r.recovered_s for r in records if r.recovered_s is not None]
     return (
         name,
-        str(len(records)),
-        str(sum(bool(r.violations()) for r in records)),
+        len(records),
+        sum(bool(r.violations()) for r in records),
         f'{max(r.pose.worst_m for r in records):.2f}',
         f'{max(r.driven_m for r in records):.2f}',
         f'{max(recoveries):.0f}' if recoveries else '-',
     )
-
-
-def _padded(text: str, width: int) -> str:
-    """Texts to the left, numbers to the right."""
-    return text.rjust(width) if text[0].isdigit() else text.ljust(width)
 
 
 def line(record: Record) -> str:
@@ -163,12 +159,13 @@ def line(record: Record) -> str:
 def table(records: Sequence[Record]) -> str:
     """A line for each kind of fault, and one for each violation."""
     names = sorted({record.name for record in records})
-    rows = [_HEAD, *(_row(name, [r for r in records if r.name == name]) for name in names)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(_HEAD))]
-    lines = ['  '.join(map(_padded, row, widths)) for row in rows]
-    for record in records:
-        lines += [f'{record.name} at {record.time_s:.1f} s: {text}' for text in record.violations()]
-    return '\n'.join(lines)
+    rows = [_row(name, [r for r in records if r.name == name]) for name in names]
+    found = [
+        f'{record.name} at {record.time_s:.1f} s: {text}'
+        for record in records
+        for text in record.violations()
+    ]
+    return '\n'.join([markdown(_HEAD, rows), *found])
 
 
 def write_json(path: Path, records: Sequence[Record], run: dict[str, Any]) -> None:

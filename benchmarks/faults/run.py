@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.faults.causes import Killed, cause_of
+from benchmarks.faults.causes import cause_of
 from benchmarks.faults.judge import Counts, Passed, PoseWatch, Record, uncounted
 from benchmarks.faults.kinds import Fault
 from benchmarks.faults.observer import Observer
@@ -136,9 +136,9 @@ class FaultRun:
         before = self._observer.moving_commands
         self._spin_until(lambda: track.time_s > end_s)
         self._record.commands = self._observer.moving_commands - before
-        self._spin_until(lambda: cause.is_done() or track.time_s > end_s + _ANSWER_S)
-        self._record.others += cause.end()
-        if isinstance(cause, Killed):
+        self._spin_until(lambda: cause.may_end() or track.time_s > end_s + _ANSWER_S)
+        self._record.others += cause.end() or []
+        if fault.kind.is_killed:
             self._await_start(fault.kind.node)
         self._record.driven_m = track.travelled_m - self._begun_m
 

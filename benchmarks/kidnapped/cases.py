@@ -1,8 +1,9 @@
 """Which robots are switched on where: the rows of docs/results/localization.md, case by case."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,6 @@ _STEP_SCANS = 3  # a step of the laboratory's experiment: at 0.5 m/s and 5 Hz, u
 _WAY_M = 40.0
 _TWIN_WAY_M = 30.0
 _FOREIGN_WAY_M = 20.0
-_AT_A_TIME = 5  # drives in a world, before its map makes way for the next one's
 _CARRIED_S = 150.0
 _LIMIT_S = 300.0
 _SHIFT_M = (-12.34, 56.785)
@@ -48,22 +48,9 @@ class Setting:
     log: Path
 
 
-def paper(_: Setting) -> Iterator[Case]:
-    """The paper's experiment: the laboratory, from its start, 11 steps."""
-    for seed in range(20):
-        yield Case(f'{seed}', partial(_in_lab, seed, 11, 'paper'))
-
-
-def lab(_: Setting) -> Iterator[Case]:
-    """The laboratory, 500 random starts, 15 steps."""
-    for seed in range(500):
-        yield Case(f'{seed}', partial(_in_lab, seed, 15, 'lab'))
-
-
-def voronoi(_: Setting) -> Iterator[Case]:
-    """The first of these again, with the nodes of a Voronoi diagram in the map."""
-    for seed in range(500):
-        yield Case(f'{seed}', partial(_in_lab, seed, 15, 'voronoi'))
+def _in_the_lab(_: Setting, row: str, seeds: int, steps: int) -> Iterator[Case]:
+    for seed in range(seeds):
+        yield Case(f'{seed}', partial(_in_lab, seed, steps, row))
 
 
 def _in_lab(seed: int, steps: int, row: str) -> Record:
@@ -77,95 +64,66 @@ def _in_lab(seed: int, steps: int, row: str) -> Record:
     return search(finder, random_drive(world, start, seed), every=_STEP_SCANS, steps=steps)
 
 
-def kth(setting: Setting) -> Iterator[Case]:
-    """Real floors, 100 random starts each, 40 m of way."""
-    yield from _floor_by_floor(setting, _in_building, 100, _AT_A_TIME, 'kth/')
+@dataclass(frozen=True)
+class _Kind:
+    """What the drives of a row have in common, beside the floors.
+
+    stream: of the random starts; laser: a name of LASERS; finer: cells so many times smaller, in
+    another frame; is_driven: in the map of a drive, as another robot that starts where that was.
+    """
+
+    stream: int
+    laser: str = ''
+    finer: int = 1
+    is_driven: bool = False
+
+    @property
+    def shift_m(self) -> tuple[float, float]:
+        """Where the frame of the map is, seen from that of the world."""
+        return _SHIFT_M if self.finer > 1 else (0.0, 0.0)
 
 
-def dungeon(setting: Setting) -> Iterator[Case]:
-    """Dungeons, 100 random starts each, 40 m of way."""
-    yield from _floor_by_floor(setting, _in_building, 100, _AT_A_TIME, 'dungeon/')
-
-
-def _floor_by_floor(
-    setting: Setting,
-    run: Callable[[Path, str, int], Record],
-    drives: int,
-    at_a_time: int,
-    part: str = '',
+def _in_buildings(
+    setting: Setting, kinds: Sequence[_Kind], part: str = '', drives: int = 20, at_a_time: int = 2
 ) -> Iterator[Case]:
     """So many drives in each world, some at a time: a row that is cut off has been everywhere."""
     for first in range(0, drives, at_a_time):
-        for each in floors(setting.worlds, part):
+        for each, kind in product(floors(setting.worlds, part), kinds):
             for number in range(first, first + at_a_time):
-                yield Case(f'{each.name} {number}', partial(run, setting.worlds, each.name, number))
+                head = f'{kind.laser}: ' if kind.laser else ''
+                run = partial(_in_building, setting.worlds, each.name, number, kind)
+                yield Case(f'{head}{each.name} {number}', run)
 
 
-def _in_building(folder: Path, name: str, number: int) -> Record:
+def _in_building(folder: Path, name: str, number: int, kind: _Kind) -> Record:
     world = floor(name, folder).world
-    laser = _FULL
-    start = random_start(world, np.random.default_rng([2, number]))
-    return search(
-        fresh(_finder(folder, name, '', 1)), random_drive(world, start, number, laser=laser), _WAY_M
-    )
+    finder = fresh(_finder(folder, name, kind))
+    within = _standing(finder, world) if kind.is_driven else None
+    start = random_start(world, np.random.default_rng([kind.stream, number]), within)
+    drive = random_drive(world, start, number, within, laser=LASERS.get(kind.laser, _FULL))
+    return search(finder, drive, _WAY_M, shift_m=kind.shift_m)
 
 
 @lru_cache(maxsize=1)
-def _finder(
-    folder: Path, name: str, laser: str, finer: int, driven: bool = False
-) -> GlobalLocalization:
+def _finder(folder: Path, name: str, kind: _Kind) -> GlobalLocalization:
     """A search that is ready to begin in a world's map."""
     world = floor(name, folder).world
-    kind = LASERS.get(laser, _FULL)
-    shift = _SHIFT_M if finer > 1 else (0.0, 0.0)
-    known = trials.driven_map(world, kind) if driven else trials.shifted_map(world, finer, shift)
+    laser = LASERS.get(kind.laser, _FULL)
+    if kind.is_driven:
+        known = trials.driven_map(world, laser)
+    else:
+        known = trials.shifted_map(world, kind.finer, kind.shift_m)
     start = random_start(world, np.random.default_rng(0))
-    return prepared(known, next(random_drive(world, start, 0, laser=kind)), seed=1)
+    return prepared(known, next(random_drive(world, start, 0, laser=laser)), seed=1)
 
 
-def lasers(setting: Setting) -> Iterator[Case]:
-    """Other lasers than the usual one, in all worlds."""
-    for first in range(0, 20, 2):
-        for each in floors(setting.worlds):
-            for laser in LASERS:
-                for number in range(first, first + 2):
-                    run = partial(_with_laser, setting.worlds, each.name, laser, number)
-                    yield Case(f'{laser}: {each.name} {number}', run)
-
-
-def _with_laser(folder: Path, name: str, laser: str, number: int) -> Record:
-    world = floor(name, folder).world
-    start = random_start(world, np.random.default_rng([3, number]))
-    drive = random_drive(world, start, number, laser=LASERS[laser])
-    return search(fresh(_finder(folder, name, laser, 1)), drive, _WAY_M)
-
-
-def fine(setting: Setting) -> Iterator[Case]:
-    """The same worlds in maps with cells of half the size, and in another frame."""
-    yield from _floor_by_floor(setting, _in_fine_map, 20, 2)
-
-
-def _in_fine_map(folder: Path, name: str, number: int) -> Record:
-    world = floor(name, folder).world
-    drive = random_drive(world, random_start(world, np.random.default_rng([2, number])), number)
-    return search(fresh(_finder(folder, name, '', 2)), drive, _WAY_M, shift_m=_SHIFT_M)
-
-
-def driven(setting: Setting) -> Iterator[Case]:
-    """Maps made on a drive of 400 m, at exact poses; other robots start where that one was."""
-    yield from _floor_by_floor(setting, _in_driven_map, 20, 2)
-
-
-def _in_driven_map(folder: Path, name: str, number: int) -> Record:
-    world = floor(name, folder).world
-    finder = fresh(_finder(folder, name, '', 1, driven=True))
+def _standing(finder: GlobalLocalization, world: World) -> np.ndarray:
+    """Cells (H, W) of a world where the robot of a search can stand."""
     within = np.zeros(world.occupied.shape, dtype=np.bool_)
-    cells = world.frame.cells_of(
-        finder.places.frame.centres_of(finder.places.standing.astype(np.int64))
-    )
-    within[cells[:, 0], cells[:, 1]] = True
-    start = random_start(world, np.random.default_rng([4, number]), within)
-    return search(finder, random_drive(world, start, number, within), _WAY_M)
+    places = finder.places
+    standing = places.frame.centres_of(places.standing.astype(np.int64))
+    within[tuple(world.frame.cells_of(standing).T)] = True
+    return within
 
 
 def twins(_: Setting) -> Iterator[Case]:
@@ -212,7 +170,7 @@ def _elsewhere(folder: Path, mapped: str, driven_in: str) -> Record:
 
 @lru_cache(maxsize=1)
 def _map_of(folder: Path, name: str) -> Map:
-    return trials.shifted_map(floor(name, folder).world, 1, (0.0, 0.0))
+    return trials.shifted_map(floor(name, folder).world)
 
 
 def kidnapped(setting: Setting) -> Iterator[Case]:
@@ -264,20 +222,17 @@ def _in_log_map(setting: Setting, name: str) -> Record:
 
 
 ROWS: dict[str, Callable[[Setting], Iterator[Case]]] = {
-    row.__name__: row
-    for row in (
-        paper,
-        lab,
-        voronoi,
-        kth,
-        dungeon,
-        twins,
-        foreign,
-        foreign_log,
-        kidnapped,
-        halves,
-        lasers,
-        fine,
-        driven,
-    )
+    'paper': partial(_in_the_lab, row='paper', seeds=20, steps=11),
+    'lab': partial(_in_the_lab, row='lab', seeds=500, steps=15),
+    'voronoi': partial(_in_the_lab, row='voronoi', seeds=500, steps=15),
+    'kth': partial(_in_buildings, kinds=[_Kind(2)], part='kth/', drives=100, at_a_time=5),
+    'dungeon': partial(_in_buildings, kinds=[_Kind(2)], part='dungeon/', drives=100, at_a_time=5),
+    'twins': twins,
+    'foreign': foreign,
+    'foreign_log': foreign_log,
+    'kidnapped': kidnapped,
+    'halves': halves,
+    'lasers': partial(_in_buildings, kinds=[_Kind(3, laser) for laser in LASERS]),
+    'fine': partial(_in_buildings, kinds=[_Kind(2, finer=2)]),
+    'driven': partial(_in_buildings, kinds=[_Kind(4, is_driven=True)]),
 }

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from benchmarks.charts import BAD, OURS, Mark, Panel, chart_path, draw, page_program, picture
-from benchmarks.kidnapped.summary import by_group, summary
+from benchmarks.kidnapped.summary import SECTIONS, by_group, summary
 from benchmarks.rows import Row, Written, markdown, read_records
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.parallel_jobs import provenance
@@ -35,26 +35,6 @@ No other program has been run on these drives, so the chart compares the section
 
 [Speed](speed.md) has the times of the parts of a step and the memory of a map.
 """
-# In this order, the title of each.
-_ABOUT = {
-    'paper': 'Experiment of the topological map paper: laboratory, map of twelve stops, '
-    'start at (2 m, 2 m, 270 deg), 20 seeds, 11 steps of up to 0.3 m',
-    'lab': 'Laboratory, random starts, 15 steps of up to 0.3 m',
-    'voronoi': 'Laboratory, with the nodes of a Voronoi diagram in the map',
-    'kth': 'Real floors of a university, random starts',
-    'dungeon': 'Random worlds of 50 x 50 m, random starts',
-    'twins': 'Equal rooms, and a floor with a symmetry of 180 degrees; at most 30 m',
-    'foreign': 'Robot in another building than that of the map; at most 20 m',
-    'foreign_log': 'Real robot (Intel log) with maps of other buildings, and robots in these with '
-    'the map of the log; at most 20 m',
-    'kidnapped': 'Kidnapped robot during exploration with SLAM',
-    'halves': 'Halves of a real log (Intel): map of the first half, start in the second half. A '
-    'start is in the map if the map contains 70 % of the beams and agrees with 80 % of these',
-    'lasers': 'Other lasers',
-    'fine': 'Maps with half the cell size, in another frame',
-    'driven': 'Maps from a drive of 400 m, with unobserved areas; starts in the free space of the '
-    'map',
-}
 _GROUP_COLUMNS = (
     'world or laser',
     'drives',
@@ -64,7 +44,6 @@ _GROUP_COLUMNS = (
     'distance (m), median',
     'maximum',
 )
-_DIVIDED = ('kth', 'dungeon', 'lasers', 'fine', 'driven')
 
 
 def write(folder: Path, docs: Path) -> Path:
@@ -79,18 +58,11 @@ def page(folder: Path) -> str:
     """Text of the page: a section for each file."""
     caption = 'Correct and false localizations in the sections of this page.'
     parts = [_HEAD.format(provenance=provenance(folder), chart=picture(_CHART, caption))]
-    for name, about in _ABOUT.items():
-        records = read_records(folder / f'{name}.csv')
-        if records:
-            parts += section(about, list(summary(name, records)))
-            parts += _groups(records) if name in _DIVIDED else []
+    for name, records in _records(folder).items():
+        rows = [(row.what, row.value) for row in summary(name, records)]
+        parts += [f'## {SECTIONS[name].title}\n', markdown(('quantity', 'value'), rows), '']
+        parts += _groups(records) if SECTIONS[name].is_divided else []
     return '\n'.join(parts)
-
-
-def section(title: str, rows: list[Row]) -> list[str]:
-    """Title and table of a section."""
-    cells = [(row.what, row.value) for row in rows]
-    return [f'## {title}\n', markdown(('quantity', 'value'), cells), '']
 
 
 def sections(folder: Path) -> dict[str, list[Row]]:
@@ -98,16 +70,18 @@ def sections(folder: Path) -> dict[str, list[Row]]:
 
     Raises InputError where there is none.
     """
-    found = {}
-    for name, about in _ABOUT.items():
-        records = read_records(folder / f'{name}.csv')
-        if records:
-            found[about] = list(summary(name, records))
+    found = _records(folder).items()
     if not found:
         raise InputError(
             f'{folder}: no results of python -m benchmarks.kidnapped: expected ROW.csv'
         )
-    return found
+    return {SECTIONS[name].title: list(summary(name, records)) for name, records in found}
+
+
+def _records(folder: Path) -> dict[str, list[Written]]:
+    """Records of each section with a file, by name."""
+    found = {name: read_records(folder / f'{name}.csv') for name in SECTIONS}
+    return {name: records for name, records in found.items() if records}
 
 
 _KEYS = (('correct', OURS, True), ('false', BAD, True))

@@ -2,19 +2,40 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from benchmarks.kidnapped.trials import is_in_map
-from benchmarks.rows import Row, Written, at_least, at_most
+from benchmarks.rows import Row, Written, at_least, at_most, read_cases
 
 _SCANS = 30
 _NOTICED_S = 5.0
 
 
+@dataclass(frozen=True)
+class Section:
+    """A section of the page, with the drives of a row: a line of sections.csv.
+
+    correct, wrong: targets, percent; steps: of their median, 0 for none; is_divided: by worlds.
+    """
+
+    name: str
+    title: str
+    correct: float = 0.0
+    wrong: float = 0.0
+    steps: float = 0.0
+    is_divided: bool = False
+
+
+_FILE = Path(__file__).with_name('sections.csv')
+SECTIONS = {each.name: each for each in read_cases(_FILE, Section)}
+
+
 def summary(row: str, records: list[Written]) -> Iterator[Row]:
     """Rows that summarize the cases of a row."""
-    yield from _SUMMARIES[row](records)
+    yield from _SPECIAL[row](records) if row in _SPECIAL else _outcomes(records, SECTIONS[row])
 
 
 def by_group(records: list[Written]) -> dict[str, list[Written]]:
@@ -34,27 +55,22 @@ def percent(some: int, of: int) -> float:
     return 100.0 * some / max(of, 1)
 
 
-def outcomes(
-    records: list[Written], right: float, wrong: float, steps: float | None = None
-) -> Iterator[Row]:
-    """Rows of drives that end with the localization; right, wrong: targets, percent.
-
-    steps: target of their median.
-    """
+def _outcomes(records: list[Written], section: Section) -> Iterator[Row]:
+    """Rows of drives that end with the localization."""
     count = len(records)
     counts = {
         word: sum(record['outcome'] == word for record in records)
         for word in ('right', 'wrong', 'open')
     }
     yield Row('drives', f'{count}')
-    yield at_least('correct localizations (%)', percent(counts['right'], count), right)
-    yield at_most('false localizations (%)', percent(counts['wrong'], count), wrong)
+    yield at_least('correct localizations (%)', percent(counts['right'], count), section.correct)
+    yield at_most('false localizations (%)', percent(counts['wrong'], count), section.wrong)
     yield Row(
         'correct, false, not localized', f'{counts["right"]}, {counts["wrong"]}, {counts["open"]}'
     )
     taken = [float(record['steps']) for record in records]
-    if steps is not None:
-        yield at_most('steps, median', float(np.median(taken)), steps)
+    if section.steps:
+        yield at_most('steps, median', float(np.median(taken)), section.steps)
     for what, values in (
         ('steps', taken),
         ('distance (m)', [float(record['way_m']) for record in records]),
@@ -132,20 +148,10 @@ def _halves(records: list[Written]) -> Iterator[Row]:
     yield at_most('false localizations (%)', percent(wrong, len(records)), 1.0)
 
 
-def _usual(records: list[Written]) -> Iterator[Row]:
-    yield from outcomes(records, 97.0, 0.5)
-
-
-_Summary = Callable[[list[Written]], Iterator[Row]]
-_WORLDS = ('kth', 'dungeon', 'lasers', 'fine', 'driven')
-_SUMMARIES: dict[str, _Summary] = {
-    'paper': lambda records: outcomes(records, 100.0, 0.0),
-    'lab': lambda records: outcomes(records, 99.0, 0.0, 6.0),
-    'voronoi': lambda records: outcomes(records, 99.0, 0.0, 6.0),
+_SPECIAL: dict[str, Callable[[list[Written]], Iterator[Row]]] = {
     'twins': _twins,
     'foreign': _foreign,
     'foreign_log': _foreign,
     'kidnapped': _kidnapped,
     'halves': _halves,
-    **dict.fromkeys(_WORLDS, _usual),
 }

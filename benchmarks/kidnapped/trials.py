@@ -22,15 +22,12 @@ from thinmap_ros.core.places.global_localizer import (
 )
 from thinmap_ros.core.places.likelihood import Judge
 from thinmap_ros.core.places.place_database import calibrate, observe
-from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, wrap
-from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.evaluation.trajectory_errors import between_paths
 from thinmap_ros.experiments.drives import Source, grid_of
-from thinmap_ros.logs.log import OdometryEvent
-from thinmap_ros.logs.readers.carmen import CarmenLog
+from thinmap_ros.logs.reading import open_log, paired_scans
 from thinmap_ros.pipeline import Pipeline
 from thinmap_ros.sim.drives import DriveSample, random_drive, random_start, world_to_grid
 from thinmap_ros.sim.laser import LaserScannerConfig
@@ -69,7 +66,7 @@ def voronoi_lab_map() -> Map:
     return Map(lab_map().patch, build_voronoi(lab_map().patch))
 
 
-def shifted_map(world: World, finer: int, shift_m: tuple[float, float]) -> Map:
+def shifted_map(world: World, finer: int = 1, shift_m: tuple[float, float] = (0.0, 0.0)) -> Map:
     """A world itself as a map, in cells so many times finer, in a frame moved by this much."""
     patch = world_to_grid(world)
     cells = np.repeat(np.repeat(patch.cells, finer, axis=0), finer, axis=1)
@@ -306,7 +303,7 @@ def is_in_map(record: dict[str, str]) -> bool:
 
 @lru_cache(maxsize=1)
 def _halves(log: Path) -> _Halves:
-    pairs = _pairs(log)
+    pairs = list(paired_scans(open_log(log)))
     half = len(pairs) // 2
     pipeline = Pipeline()
     for scan, T_odom_base in pairs[:half]:
@@ -321,15 +318,3 @@ def _halves(log: Path) -> _Halves:
     return _Halves(
         [DriveSample(*pair, T) for pair, T in zip(pairs, poses, strict=True)], half, known
     )
-
-
-def _pairs(log: Path) -> list[tuple[Scan, Array]]:
-    """Scans with their odometry poses."""
-    pairing = ScanOdometrySynchronizer()
-    pairs = []
-    for event in CarmenLog(log).events():
-        if isinstance(event, OdometryEvent):
-            pairs += pairing.add_odometry(event.stamp_ns, event.T_odom_base)
-        else:
-            pairs += pairing.add_scan(event.scan)
-    return pairs

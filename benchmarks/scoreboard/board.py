@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.rows import markdown, read_records
+from benchmarks.rows import markdown, read_cases
 from benchmarks.scoreboard.cases import (
     BUILDINGS,
     ROBOTS,
@@ -40,20 +40,15 @@ Found = Sequence[Numbers]
 
 @dataclass(frozen=True)
 class Row:
-    """Target for some cases, as in targets.csv."""
+    """Target for some cases, by patterns of their names, as in targets.csv."""
 
     title: str
-    cases: str
+    patterns: tuple[str, ...]
     key: str
     target: str
-    limits: str
+    limits: tuple[str, ...]
     text: str
-    without: str
-
-    @property
-    def patterns(self) -> list[str]:
-        """Patterns of the names of its cases."""
-        return self.cases.split()
+    without: str = ''
 
     def judge(self, found: Found) -> tuple[str, bool]:
         """Measured value, and whether the target is met, of reports: at least one.
@@ -64,8 +59,7 @@ class Row:
         if not known:
             return self.without, True
         statistics = _statistics(known, self.key)
-        words = self.limits.split()
-        limits = dict(zip(words[::2], map(float, words[1::2]), strict=True))
+        limits = dict(zip(self.limits[::2], map(float, self.limits[1::2]), strict=True))
         is_met = all(_is_met(name, statistics[name], limit) for name, limit in limits.items())
         most = f' (most: {statistics["worst_case"]})' if statistics['sum'] else ''
         return self.text.format(**statistics, most=most), is_met
@@ -73,7 +67,7 @@ class Row:
 
 def board_rows() -> list[Row]:
     """All rows of the board's table."""
-    return [Row(**record) for record in read_records(Path(__file__).with_name('targets.csv'))]
+    return read_cases(Path(__file__).with_name('targets.csv'), Row)
 
 
 def board_cases(logs: Path) -> list[Case]:

@@ -31,7 +31,7 @@ _QUICK = {'paper': 5, 'lab': 20, 'voronoi': 20, 'twins': 2, 'foreign': 4, 'dunge
 def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
     """5,000 samples against 10 observed nodes and a scan's beams, in maps of few and many nodes."""
     there = floor('kth/50052749', folder)
-    patch = shifted_map(there.world, 1, (0.0, 0.0)).patch
+    patch = shifted_map(there.world).patch
     drive_sample = next(random_drive(there.world, there.starts[0], 0))
     rng = np.random.default_rng(0)
     for count, limit in ((30, 2.0), (120, 3.0), (2000, 5.0)):

@@ -7,6 +7,7 @@ a folder of the board beside DIR, slam.
 import re
 from pathlib import Path
 
+from benchmarks.catalogue import BENCHMARKS, Benchmark
 from benchmarks.charts import OTHERS, Mark, Panel, chart_path, draw, page_program, picture
 from benchmarks.rows import markdown, read_rows
 from benchmarks.scoreboard.results_page import read_reports
@@ -30,73 +31,6 @@ of one core. With a load average far above the number of cores, times are too lo
 [SLAM](slam.md) has the time of SLAM per scan beside other programs, and
 [Targets](../development/targets.md) the targets of the project.
 """
-# In this order: title, and what is measured.
-_ABOUT = {
-    'thinning': (
-        'Thinning',
-        'A real floor, tiled to the given number of cells, against scikit-image, OpenCV (padded, '
-        'with the same result) and simpler operations on the same cells.',
-    ),
-    'mapping': ('Occupancy grid', 'Insertion of scans into the grid.'),
-    'graphs': (
-        'Topological maps of whole floors',
-        'Time against a Voronoi diagram by SciPy; drivable edges and connectivity.',
-    ),
-    'compactness': (
-        'Memory of graph and grid',
-        'Bytes of a graph and of the grid of the same floor, cells of 0.1 m: median of the floors '
-        '(minimum to maximum). A node has 17 bytes (id, kind, x, y, clearance), an edge 20 '
-        '(id, ids of its nodes, length, clearance), its path 4 and 8 for each cell. The grid has a '
-        'byte for each cell of the rectangle of known cells. Compressed: the grid as PNG, the '
-        'graph by zlib. Paper 1 claims that a topological map needs much less memory than a grid. '
-        'This holds for the uncompressed grid of a message. It does not hold for files: the PNG '
-        'image of a floor is about as small as the compressed graph without paths, and much '
-        'smaller than the one with paths.',
-    ),
-    'voronoi': (
-        'Thinning and Voronoi diagram',
-        'Whole floors, cells of 0.1 m. Both methods have the same free space and the same rules '
-        'for pruning, merging and corner nodes. Skeleton: from the free space to its lines. Graph: '
-        'from the map. Times are CPU times, sums over the floors. Paper 1 claims that thinning '
-        'needs less computation and makes additional nodes. The first claim holds. The second does '
-        'not: with equal pruning, the numbers of nodes differ by some per cent in both directions.',
-    ),
-    'online': ('Incremental topological map', 'Grid and global graph on a drive, scan by scan.'),
-    'nodes': (
-        'ROS nodes',
-        'CPU time, memory and latency of the nodes for map, graph and navigation, and the traffic '
-        'on their topics.',
-    ),
-    'localization': ('Global localization', 'Steps with 5,000 samples, and short drives.'),
-    'planning': (
-        'Wavefront planner',
-        'Paths to random goals, and the rejection of unreachable ones.',
-    ),
-    'long_paths': (
-        'Long paths',
-        'Goals at a straight-line distance of at least 20 m: A* on the graph with the wavefront in '
-        'a band around the route, against the wavefront alone.',
-    ),
-    'matching': (
-        'Scan matching',
-        'A scan against ten others from its neighbourhood: the scan matcher of the localizer, and '
-        'that of OpenKarto (package karto-scanmatcher, if installed), which renders its map again '
-        'for each match.',
-    ),
-    'slam': (
-        'EKF-SLAM',
-        'A filter step against the number of features in the map: with the features of the local '
-        'area in the state (ti), and with all features (full).',
-    ),
-    'pose_graph': (
-        'Pose graph',
-        'What an optimization takes of a scan of a drive back and forth, with matches between.',
-    ),
-    'growth': (
-        'Growth with the distance driven',
-        'Localizer, grid and graph on a long drive through a warehouse of 200 x 200 m.',
-    ),
-}
 _IN_PROVENANCE = ('processor', 'cores', 'Python')
 
 
@@ -128,23 +62,22 @@ def page(folder: Path) -> str:
             machine=f'Packages and load: {machine}.',
         )
     ]
-    for name, (title, about) in _ABOUT.items():
-        path = folder / f'{name}.csv'
-        if path.exists():
-            parts.append(f'## {title}\n\n{about} Benchmark: `{name}`.\n')
-            rows = [_indented(row)[:2] for row in read_rows(path)]
-            parts.append(markdown(('quantity', 'value'), rows))
-            parts.append('')
+    for each in _measured(folder):
+        rows = [_indented(row)[:2] for row in read_rows(folder / f'{each.name}.csv')]
+        parts.append(f'## {each.title}\n\n{each.about} Benchmark: `{each.name}`.\n')
+        parts.append(markdown(('quantity', 'value'), rows) + '\n')
     return '\n'.join(parts)
 
 
 def sections(folder: Path) -> dict[str, list[list[str]]]:
     """Rows of each benchmark of a folder (what, value, target, verdict), by the section's title."""
-    return {
-        title: read_rows(folder / f'{name}.csv')
-        for name, (title, _) in _ABOUT.items()
-        if (folder / f'{name}.csv').exists()
-    }
+    return {each.title: read_rows(folder / f'{each.name}.csv') for each in _measured(folder)}
+
+
+def _measured(folder: Path) -> list[Benchmark]:
+    """Benchmarks of the page that a folder has results of."""
+    known = (each for each in BENCHMARKS.values() if each.title)
+    return [each for each in known if (folder / f'{each.name}.csv').exists()]
 
 
 _KEYS = (('other programs', OTHERS[Origin.TEAM], True),)

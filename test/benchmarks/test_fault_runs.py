@@ -17,7 +17,7 @@ from benchmarks.faults.judge import Counts, Passed, PoseWatch, Record, uncounted
 from benchmarks.faults.kinds import KINDS, Fault, random_faults
 from benchmarks.faults.stream_faults import StreamFaults
 from benchmarks.faults.track import Drawn, Located, MapWatch, Track
-from benchmarks.node_processes import Processes
+from benchmarks.node_processes import NODES, Processes
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
@@ -33,9 +33,19 @@ def test_faults_are_the_same_for_a_seed_and_all_kinds_come_before_any_again() ->
     assert one == again != other
     assert {fault.kind.name for fault in one[: len(KINDS)]} == KINDS.keys()
     assert all(10.0 <= f.gap_s <= 30.0 for f in one)
-    assert all(f.kind.seconds[0] <= f.duration_s <= f.kind.seconds[1] for f in one)
+    assert all(f.kind.shortest_s <= f.duration_s <= f.kind.longest_s for f in one)
     only = islice(random_faults(3, ['drop_scan', 'kill_explorer']), 4)
     assert sorted(f.kind.name for f in only) == 2 * ['drop_scan'] + 2 * ['kill_explorer']
+
+
+def test_kinds_are_as_their_file_has_them() -> None:
+    assert {kind.node for kind in KINDS.values()} == {'', *NODES}
+    killed = KINDS['kill_navigator']
+    odometry = KINDS['odom_jump']
+    assert (killed.signal, killed.stop_m, killed.shortest_s) == ('kill', 0.75, 0.5)
+    assert killed.is_killed and not killed.forgets and KINDS['forget_localizer'].is_killed
+    assert (odometry.stop_m, odometry.resets) == (math.inf, False)
+    assert KINDS['clock_back'].resets and KINDS['carried_off'].wrong_s == 5.0
 
 
 def scan_msg(k, nearest_m=2.0):
@@ -341,9 +351,11 @@ def test_table_and_file_name_what_must_not_happen(tmp_path: Path) -> None:
         Record(fault, 50.0, driven_m=7.5, collisions=1),
     ]
     lines = judge.table(records).splitlines()
-    assert lines[1].split() == ['laser_inf', '2', '1', '0.00', '7.50', '6']
-    assert lines[2].split() == ['none', '1', '0', '0.00', '9.00', '-']
-    assert lines[3:] == [
+    assert lines[2:4] == [
+        '| laser_inf | 2 | 1 | 0.00 | 7.50 | 6 |',
+        '| none | 1 | 0 | 0.00 | 9.00 | - |',
+    ]
+    assert lines[4:] == [
         'laser_inf at 50.0 s: 1 collisions',
         'laser_inf at 50.0 s: drove 7.50 m, expected 2.0 m',
     ]
