@@ -12,14 +12,12 @@ from benchmarks.rows import Row, read_cases
 class Benchmark:
     """A function that yields rows, by the folder of worlds and whether it is to be quick.
 
-    minutes: that a release expects; 0: it does not run it. title, about: of its section on the page
-    Speed, which has none where they are empty.
+    title, about: of its section on the page Speed, which has none where they are empty.
     """
 
     name: str
     module: str
     function: str
-    minutes: int = 0
     title: str = ''
     about: str = ''
 

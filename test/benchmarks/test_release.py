@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.catalogue import BENCHMARKS
+from benchmarks.kidnapped.cases import ROWS
 from benchmarks.release import (
     MAX_MINUTES,
     Folders,
@@ -60,6 +62,12 @@ def test_all_steps_fit_into_the_time_and_come_after_what_they_need():
     for number, step in enumerate(ALL):
         assert set(step.needs) <= set(names[:number])
         assert step.needs or not step.name.startswith('page.')
+
+
+def test_all_that_the_pages_show_is_measured():
+    names = {step.name for step in ALL}
+    assert {f'localization.{row}' for row in ROWS} <= names
+    assert {f'speed.{each.name}' for each in BENCHMARKS.values() if each.title} <= names
 
 
 @pytest.mark.programs
