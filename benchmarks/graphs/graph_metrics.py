@@ -1,7 +1,6 @@
 """Metrics of topological maps: drivable edges, completeness, sight, agreement."""
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +8,12 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
+from benchmarks.graphs.route_measures import (
+    STRAIGHT_AND_DIAGONAL,
+    distance_m,
+    grid_links,
+    numbered,
+)
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -31,8 +36,7 @@ def hole_count(free: Mask) -> int:
 
 def clearance_m(patch: GridPatch) -> Array:
     """Distance (H, W) from the nearest occupied cell, centres, m; cells outside are occupied."""
-    distance = ndimage.distance_transform_edt(np.pad(~patch.occupied, 1))[1:-1, 1:-1]
-    return np.asarray(distance * patch.frame.resolution)
+    return distance_m(~patch.occupied, patch.frame)
 
 
 def drivable_share(patch: GridPatch, graph: TopologicalMap, radius_m: float) -> float:
@@ -85,40 +89,6 @@ def agreement(one: TopologicalMap, other: TopologicalMap, reach_m: float) -> tup
     return float((there <= reach_m).mean()), float((back <= reach_m).mean())
 
 
-class GridPaths:
-    """Shortest paths over traversable cells, with 8-connectivity."""
-
-    def __init__(self, standing: Mask) -> None:
-        self.numbers = np.full(standing.shape, -1)
-        self.cells = np.argwhere(standing)
-        self.numbers[standing] = np.arange(len(self.cells))
-        self._links = self._neighbours(standing)
-        self.parts = ndimage.label(standing, np.ones((3, 3)))[0][standing]
-
-    def lengths_from(self, number: int) -> Array:
-        """Shortest path length, in cells, from one cell to every other; inf if there is none."""
-        lengths: Array = csgraph.dijkstra(self._links, directed=False, indices=[number])[0]
-        return lengths
-
-    def _neighbours(self, standing: Mask) -> Any:
-        rows, cols = standing.shape
-        sources = []
-        targets = []
-        lengths = []
-        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            low = max(0, -right)
-            high = cols - max(0, right)
-            here = self.numbers[: rows - down, low:high]
-            there = self.numbers[down:, low + right : high + right]
-            both = (here >= 0) & (there >= 0)
-            sources.append(here[both])
-            targets.append(there[both])
-            lengths.append(np.full(int(both.sum()), math.hypot(down, right)))
-        count = len(self.cells)
-        data = np.concatenate(lengths), (np.concatenate(sources), np.concatenate(targets))
-        return sparse.csr_matrix(data, shape=(count, count))
-
-
 def completeness(
     patch: GridPatch, graph: TopologicalMap, radius_m: float, pairs: int, seed: int
 ) -> tuple[float, float]:
@@ -128,21 +98,22 @@ def completeness(
     between nodes. Its length is relative to the shortest path over cells with the same clearance.
     The mean is over all connected pairs.
     """
-    paths = GridPaths(clearance_m(patch) >= radius_m - 1e-9)
+    standing = clearance_m(patch) >= radius_m - 1e-9
+    links = grid_links(standing, STRAIGHT_AND_DIAGONAL)
+    parts = ndimage.label(standing, np.ones((3, 3)))[0][standing]
     rng = np.random.default_rng(seed)
-    sources = rng.integers(0, len(paths.cells), pairs)
-    targets = [int(rng.choice(np.flatnonzero(paths.parts == paths.parts[k]))) for k in sources]
+    sources = rng.integers(0, len(parts), pairs)
+    targets = [int(rng.choice(np.flatnonzero(parts == parts[k]))) for k in sources]
     order = list(graph.nodes)
     places = patch.frame.cells_of(np.array([graph.nodes[k].position for k in order]))
-    at_nodes = paths.numbers[places[:, 0], places[:, 1]]
+    at_nodes = numbered(standing)[places[:, 0], places[:, 1]]
     between = csgraph.dijkstra(
         _straight_lines(graph, order, patch.frame.resolution), directed=False
     )
     found = []
     best = []
     for source, target in zip(sources.tolist(), targets, strict=True):
-        from_source = paths.lengths_from(source)
-        from_target = paths.lengths_from(target)
+        from_source, from_target = csgraph.dijkstra(links, directed=False, indices=[source, target])
         first, last = (_nearest(lengths, at_nodes) for lengths in (from_source, from_target))
         lengths = (
             from_source[at_nodes[first], None]

@@ -43,7 +43,8 @@ _PART_SHARE = 0.05
 _SOURCES = 20  # random nodes, of routes to all others
 _ROUTE_M = 5.0  # shorter ways are driven over a node or two: no route is needed
 _EVERYWHERE = np.ones((3, 3), dtype=np.bool_)  # cells are joined over edges and corners
-_MOVES = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (2, -1), (1, -2))  # and back
+STRAIGHT_AND_DIAGONAL = ((0, 1), (1, 0), (1, 1), (1, -1))  # moves on a grid, and back
+_MOVES = (*STRAIGHT_AND_DIAGONAL, (1, 2), (2, 1), (2, -1), (1, -2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +108,12 @@ class RouteMeasures:
     route_worst: float
 
 
+def distance_m(cells: Mask, frame: GridFrame) -> Array:
+    """Distance (H, W) of each cell from the nearest other one; cells outside are others."""
+    away = ndimage.distance_transform_edt(np.pad(cells, 1))[1:-1, 1:-1]
+    return np.asarray(away * frame.resolution)
+
+
 class _Floor:
     """Where a robot can stand on a map, by the map alone.
 
@@ -118,8 +125,8 @@ class _Floor:
     def __init__(self, patch: GridPatch, radius_m: float) -> None:
         self.frame = patch.frame
         self.free = patch.free
-        self.clearance_m = self._distance_m(patch.free)
-        self.open_m = self._distance_m(~patch.occupied)
+        self.clearance_m = distance_m(patch.free, patch.frame)
+        self.open_m = distance_m(~patch.occupied, patch.frame)
         # Nav2's inflation layer: a cell at just the radius from an obstacle is inscribed.
         self.is_inscribed = self.open_m <= radius_m + 1e-9
         self.is_too_near = self.clearance_m < radius_m - 1e-9
@@ -130,11 +137,6 @@ class _Floor:
         is_large[0] = False
         self.is_reachable: Mask = is_large[self.part]
         self.parts = int(is_large.sum())
-
-    def _distance_m(self, cells: Mask) -> Array:
-        """Distance (H, W) of each cell from the nearest other one; cells outside are others."""
-        away = ndimage.distance_transform_edt(np.pad(cells, 1))[1:-1, 1:-1]
-        return np.asarray(away * self.frame.resolution)
 
     def parts_at(self, xy: Array) -> NDArray[np.int64]:
         """Part of the floor (N,) nearest to each of some points (N, 2)."""
@@ -259,7 +261,7 @@ def _route_ratios(floor: _Floor, graph: WrittenGraph) -> Array:
     """Lengths (N,) of routes between random nodes, relative to the shortest paths on the grid."""
     cells = np.argwhere(floor.part > 0)
     at_nodes = np.asarray(cKDTree(floor.frame.centres_of(cells)).query(graph.xy)[1])
-    paths = _grid_links(floor.part > 0)
+    paths = grid_links(floor.part > 0, _MOVES)
     count = min(_SOURCES, len(graph.xy))
     sources = np.random.default_rng(0).choice(len(graph.xy), count, replace=False)
     routes = csgraph.dijkstra(graph.links, directed=False, indices=sources)
@@ -271,14 +273,20 @@ def _route_ratios(floor: _Floor, graph: WrittenGraph) -> Array:
     return np.asarray(routes[is_route] / shortest[is_route])
 
 
-def _grid_links(cells: Mask) -> sparse.csr_matrix:
-    """Steps between cells (H, W), in cells, numbered row after row: to 16 neighbours.
+def numbered(cells: Mask) -> Cells:
+    """Numbers (H, W) of cells, row after row; -1 for others."""
+    number = np.full(cells.shape, -1)
+    number[cells] = np.arange(cells.sum())
+    return number
+
+
+def grid_links(cells: Mask, moves: Sequence[tuple[int, int]]) -> sparse.csr_matrix:
+    """Steps between cells (H, W), in cells, by their numbers; moves: to rows below, and columns.
 
     A step over two others, as a knight's move, needs both.
     """
-    number = np.full(cells.shape, -1)
-    number[cells] = np.arange(cells.sum())
-    steps = [_steps(number, down, right) for down, right in _MOVES]
+    number = numbered(cells)
+    steps = [_steps(number, down, right) for down, right in moves]
     a, b, lengths = (np.concatenate(part) for part in zip(*steps, strict=True))
     count = int(cells.sum())
     return sparse.csr_matrix((lengths, (a, b)), shape=(count, count))
