@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter
 
 from thinmap_ros.evaluation.slam_run import Origin, Range
+from thinmap_ros.files.safe import write_text
 
 OURS = '#0072B2'
 OTHERS = {Origin.TEAM: '#555555', Origin.PUBLISHED: '#E69F00'}
@@ -60,11 +61,6 @@ def span(row: str, values: Range, colour: str, is_filled: bool = True) -> Mark:
     if low == high:
         return Mark(row, low, colour, is_filled=is_filled)
     return Mark(row, 0.5 * (low + high), colour, low, high, is_filled)
-
-
-def chart_path(docs: Path, name: str) -> Path:
-    """File of the chart of a results page."""
-    return docs / 'images' / 'results' / f'{name}.svg'
 
 
 def picture(name: str, caption: str) -> str:
@@ -128,6 +124,15 @@ def _style(colour: str, is_filled: bool) -> dict[str, Any]:
     """Style of a marker: a disc, or a ring that leaves a disc at the same place visible."""
     face = colour if is_filled else 'none'
     return {'marker': 'o', 'markersize': 6 if is_filled else 9, 'markerfacecolor': face}
+
+
+def write_page(
+    path: Path, text: str, panels: Sequence[Panel], keys: Sequence[Key] = (), columns: int = 3
+) -> Path:
+    """Write a page of docs/results, and the chart of its name. Returns its path."""
+    draw(path.parents[1] / 'images' / 'results' / f'{path.stem}.svg', panels, keys, columns)
+    write_text(path, text)
+    return path
 
 
 def page_program(write: Callable[[Path, Path], Path]) -> None:

@@ -7,13 +7,13 @@ release`. The text is that of peers_page.md.
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.charts import OTHERS, OURS, Mark, Panel, chart_path, draw, page_program, picture
+from benchmarks.charts import OTHERS, OURS, Mark, Panel, page_program, picture, write_page
 from benchmarks.rows import markdown, read_records
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.results_page import made_lines, read_reports
 from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.evaluation.slam_run import INTEL, PEERS, Origin, PeerRun, runs, shown
-from thinmap_ros.files.safe import read_text, write_text
+from thinmap_ros.files.safe import read_text
 
 _CHART = 'peers'
 _COLUMNS = (
@@ -44,10 +44,7 @@ def write(folder: Path, docs: Path) -> Path:
         report.setdefault('made', provenance(folder / 'slam'))
     logs = {run.log for run in PEERS}
     ours = {r['name']: r for r in reports if r['name'] in logs and 'live_m' in r}
-    draw(chart_path(docs, _CHART), panels(ours), _KEYS)
-    path = docs / 'results' / 'peers.md'
-    write_text(path, page(ours))
-    return path
+    return write_page(docs / 'results' / f'{_CHART}.md', page(ours), panels(ours), _KEYS)
 
 
 def page(ours: dict[str, Numbers]) -> str:

@@ -2,7 +2,6 @@
 
 import csv
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_origin, get_type_hints
@@ -51,20 +50,14 @@ def at_least(what: str, value: float, limit: float, unit: str = '') -> Row:
 
 def show(rows: Iterable[Row], path: Path | None = None) -> None:
     """Print each row as soon as it is available, and optionally write them to a CSV file."""
-    with ExitStack() as stack:
-        writer = None
+    if path is not None:
+        path.unlink(missing_ok=True)
+    for row in rows:
+        verdict = VERDICTS[row.good]
+        print(f'{row.what:<58} {row.value:>16}  {row.target:<18} {verdict}', flush=True)
         if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            file = stack.enter_context(path.open('w', encoding='utf-8', newline='', buffering=1))
-            writer = csv.writer(file, lineterminator='\n')
-            writer.writerow(COLUMNS)
-        for row in rows:
-            shown = (row.what, row.value, row.target, VERDICTS[row.good])
-            print(
-                f'{row.what:<58} {row.value:>16}  {row.target:<18} {VERDICTS[row.good]}', flush=True
-            )
-            if writer is not None:
-                writer.writerow(shown)
+            cells = (row.what, row.value, row.target, verdict)
+            add_record(path, dict(zip(COLUMNS, cells, strict=True)))
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:

@@ -10,7 +10,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.charts import DOCS, OTHERS, Mark, Panel, chart_path, draw, picture
+from benchmarks.charts import DOCS, OTHERS, Mark, Panel, picture, write_page
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.parallel_jobs import provenance
@@ -22,7 +22,7 @@ from thinmap_ros.evaluation.strategy_comparison import (
     markdown,
     relative_saving,
 )
-from thinmap_ros.files.safe import read_text, write_text
+from thinmap_ros.files.safe import read_text
 
 Report = dict[str, Any]
 _CHART = 'exploration'
@@ -108,10 +108,8 @@ def write(folders: list[Path], docs: Path) -> Path:
     ]
     if not reports:
         raise InputError(f'{folders[0]}: no reports.json: expected folders of compare_exploration')
-    draw(chart_path(docs, _CHART), [panel(reports)], _KEYS)
-    path = docs / 'results' / 'exploration.md'
-    write_text(path, page(reports, reliability))
-    return path
+    path = docs / 'results' / f'{_CHART}.md'
+    return write_page(path, page(reports, reliability), [panel(reports)], _KEYS)
 
 
 def page(reports: list[Report], reliability: str = '') -> str:

@@ -6,12 +6,11 @@ Usage: python -m benchmarks.kidnapped.page DIR [DOCS_DIR].
 import re
 from pathlib import Path
 
-from benchmarks.charts import BAD, OURS, Mark, Panel, chart_path, draw, page_program, picture
+from benchmarks.charts import BAD, OURS, Mark, Panel, page_program, picture, write_page
 from benchmarks.kidnapped.summary import SECTIONS, by_group, summary
 from benchmarks.rows import Row, Written, markdown, read_records
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.parallel_jobs import provenance
-from thinmap_ros.files.safe import write_text
 
 _CHART = 'localization'
 _HEAD = """\
@@ -48,10 +47,8 @@ _GROUP_COLUMNS = (
 
 def write(folder: Path, docs: Path) -> Path:
     """Write the page of a folder of localizations, and its chart. Returns its path."""
-    draw(chart_path(docs, _CHART), [panel(sections(folder))], _KEYS)
-    path = docs / 'results' / 'localization.md'
-    write_text(path, page(folder))
-    return path
+    path = docs / 'results' / f'{_CHART}.md'
+    return write_page(path, page(folder), [panel(sections(folder))], _KEYS)
 
 
 def page(folder: Path) -> str:

@@ -12,11 +12,10 @@ from benchmarks.charts import (
     OURS,
     Mark,
     Panel,
-    chart_path,
-    draw,
     page_program,
     picture,
     span,
+    write_page,
 )
 from benchmarks.rows import markdown, read_rows
 from benchmarks.scoreboard.page import COLUMN_NOTES, FOLDER, case_tables
@@ -27,7 +26,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation import slam_run
 from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.evaluation.slam_run import CARTOGRAPHER, COMPLETE, INTEL, LAMA, Origin, shown
-from thinmap_ros.files.safe import read_text, write_text
+from thinmap_ros.files.safe import read_text
 
 _CHART = 'slam'
 _NAMES = {
@@ -134,10 +133,8 @@ def write(folder: Path, docs: Path) -> Path:
     made = provenance(folder)
     for report in reports:
         report.setdefault('made', made)
-    draw(chart_path(docs, _CHART), _panels(reports), _KEYS, columns=2)
-    path = docs / 'results' / 'slam.md'
-    write_text(path, page(reports, _stamps(folder)))
-    return path
+    text = page(reports, _stamps(folder))
+    return write_page(docs / 'results' / f'{_CHART}.md', text, _panels(reports), _KEYS, columns=2)
 
 
 def page(reports: Sequence[Numbers], stamps: Sequence[Sequence[str]] = ()) -> str:

@@ -8,13 +8,12 @@ import re
 from pathlib import Path
 
 from benchmarks.catalogue import BENCHMARKS, Benchmark
-from benchmarks.charts import OTHERS, Mark, Panel, chart_path, draw, page_program, picture
+from benchmarks.charts import OTHERS, Mark, Panel, page_program, picture, write_page
 from benchmarks.rows import markdown, read_rows
 from benchmarks.scoreboard.results_page import read_reports
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.evaluation.slam_run import INTEL, Origin, runs
-from thinmap_ros.files.safe import write_text
 
 _CHART = 'speed'
 _HEAD = """\
@@ -36,10 +35,7 @@ _IN_PROVENANCE = ('processor', 'cores', 'Python')
 
 def write(folder: Path, docs: Path) -> Path:
     """Write the page of a folder of benchmarks, and its chart. Returns its path."""
-    draw(chart_path(docs, _CHART), [panel(folder)], _KEYS)
-    path = docs / 'results' / 'speed.md'
-    write_text(path, page(folder))
-    return path
+    return write_page(docs / 'results' / f'{_CHART}.md', page(folder), [panel(folder)], _KEYS)
 
 
 def page(folder: Path) -> str:
