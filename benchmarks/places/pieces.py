@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from benchmarks.worlds import floor
-from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, Mishap, no_progress
+from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, no_progress
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
@@ -30,7 +30,6 @@ from thinmap_ros.sim.coverage import ObservableCells
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
-from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import make_strategy
 
 _GRAPH = 'graph_'
@@ -140,22 +139,15 @@ def relative_errors(
     known_poses (K, 3), query_poses (Q, 3): of all keyframes, in one frame. Of keyframes that
     are near each other by the truth.
     """
-    return overlap_errors(known.truth, query.truth, known_poses, query_poses)
-
-
-def overlap_errors(
-    known_truth: Array, query_truth: Array, known_poses: Array, query_poses: Array
-) -> Array:
-    """Errors (N,), m, as `relative_errors`, by the true poses (K, 3) and (Q, 3) of both."""
     errors = []
-    for k, T_true in enumerate(query_truth):
-        away = np.hypot(*(known_truth[:, :2] - T_true[:2]).T)
+    for k, T_true in enumerate(query.truth):
+        away = np.hypot(*(known.truth[:, :2] - T_true[:2]).T)
         if np.isnan(away).all():
             continue
         j = int(np.nanargmin(away))
         if away[j] > _NEAR_M:
             continue
-        want = se2.between(known_truth[j], T_true)
+        want = se2.between(known.truth[j], T_true)
         off = se2.between(want, se2.between(known_poses[j], query_poses[k]))
         errors.append(float(np.hypot(off[0], off[1])))
     return np.array(errors)
@@ -198,33 +190,26 @@ def make_halves(logs: Path, name: str, folder: Path) -> None:
 
 
 def make_exploration(worlds: Path, name: str, start: int, folder: Path, limit_s: float) -> None:
-    """Make the piece NAME.sSTART of an exploration from a start of a world, for so many seconds."""
+    """Make the piece NAME.sSTART of an exploration from a start of a world, for so many seconds.
+
+    With SLAM, from an origin of its own.
+    """
     piece = f'{name.replace("/", "_")}.s{start}'
     if (folder / f'{piece}.npz').exists():
         return
     there = floor(name, worlds)
-    pipeline, truth = explored(there.world, there.starts[start], start, limit_s)
-    _recorded(piece, pipeline, truth).save(folder)
-
-
-def explored(
-    world: World, start: Array, seed: int, limit_s: float, watcher: Mishap | None = None
-) -> tuple[Pipeline, dict[int, Array]]:
-    """Explore a world from a start (3,), with SLAM from an origin of its own.
-
-    watcher: of each scan. Returns the pipeline, and the true pose (3,) by the stamp of each scan.
-    """
     laser = LaserScannerConfig()
-    simulation = Simulation(world, start, PRESETS['2dx'], laser, seed)
+    simulation = Simulation(there.world, there.starts[start], PRESETS['2dx'], laser, start)
     grid = replace(PAPER_GRID, no_return_clear_range_m=laser.range_max_m)
     pipeline = Pipeline(PipelineConfig(grid=grid, scans_per_graph=SCANS_PER_GRAPH))
     controller = PathFollowerConfig(max_speed_m_s=_SPEED_M_S)
     navigator = Navigator(NavigatorConfig(controller=controller))
     strategy = make_strategy('nearest_frontier')
-    loop = ClosedLoop(simulation, pipeline, strategy, navigator, watcher)
+    loop = ClosedLoop(simulation, pipeline, strategy, navigator)
     loop.run(_NO_GOAL, limit_s, no_progress, scans_per_show=10**9)
     pipeline.localizer.optimized_trajectory()
-    return pipeline, dict(zip(loop.log.stamps_ns, loop.log.true_poses, strict=True))
+    truth = dict(zip(loop.log.stamps_ns, loop.log.true_poses, strict=True))
+    _recorded(piece, pipeline, truth).save(folder)
 
 
 def _mapped(pairs: Iterable[tuple[Scan, Array]]) -> tuple[Pipeline, dict[int, Array]]:
