@@ -33,7 +33,9 @@ def write(folder: Path, docs: Path) -> Path:
 
     Raises InputError where no result has a target.
     """
-    parts = [*_slam(folder / 'slam'), *_speed(folder / 'speed'), *_places(folder / 'localization')]
+    makers = {'slam': _slam, 'speed': _speed, 'localization': _places}
+    there = {folder / name: make for name, make in makers.items() if (folder / name).exists()}
+    parts = [part for path, make in there.items() for part in make(path)]
     if not parts:
         raise InputError(f'{folder}: no results: expected slam, speed or localization in it')
     path = docs / 'development' / 'targets.md'
@@ -42,16 +44,12 @@ def write(folder: Path, docs: Path) -> Path:
 
 
 def _slam(folder: Path) -> list[str]:
-    if not folder.exists():
-        return []
     reports = read_reports(folder)
     table = board_table(reports, [report['name'] for report in reports])
     return [f'## SLAM\n\n{made_lines(reports)}\n\n{table}']
 
 
 def _speed(folder: Path) -> list[str]:
-    if not folder.exists():
-        return []
     parts = [f'## Speed\n\n{provenance(folder)}\n']
     for title, rows in speed_sections(folder).items():
         lines = [line for line in _with_parents(rows) if line[1]]
@@ -73,8 +71,6 @@ def _with_parents(rows: list[list[str]]) -> list[_Line]:
 
 
 def _places(folder: Path) -> list[str]:
-    if not folder.exists():
-        return []
     parts = [f'## Global localization\n\n{provenance(folder)}\n']
     for title, rows in localization_sections(folder).items():
         lines = [(r.what, r.target, r.value, VERDICTS[r.good]) for r in rows if r.target]

@@ -21,11 +21,11 @@ from thinmap_ros.sim.world import World
 _GENERATED = 'building/'
 
 
-def load_case(name: str, start: int = 0) -> tuple[World, Array]:
-    """World and start (3,) of a case; a generated one has one start."""
+def load_case(name: str) -> tuple[World, Array]:
+    """World and first start (3,) of a case."""
     if not name.startswith(_GENERATED):
         there = floor(name)
-        return there.world, there.starts[start]
+        return there.world, there.starts[0]
     _, seed, area_m2 = name.split('/')
     config = BuildingConfig(
         area_m2=float(area_m2), people_per_1000_m2=0.0, moving_doors=0.0, glass_share=0.0
@@ -36,11 +36,8 @@ def load_case(name: str, start: int = 0) -> tuple[World, Array]:
 
 def generated(first_seed: int, count: int) -> list[str]:
     """Names of generated buildings of 300 to 900 m2."""
-    return [f'{_GENERATED}{seed}/{300 + 100 * (seed % 7)}' for seed in _seeds(first_seed, count)]
-
-
-def _seeds(first_seed: int, count: int) -> range:
-    return range(first_seed, first_seed + count)
+    seeds = range(first_seed, first_seed + count)
+    return [f'{_GENERATED}{seed}/{300 + 100 * (seed % 7)}' for seed in seeds]
 
 
 Mask = NDArray[np.bool_]
@@ -65,17 +62,16 @@ class Case:
     """An exploration whose candidates are recorded."""
 
     world: str
-    start: int = 0
 
     @property
     def name(self) -> str:
         """Name of the result."""
-        return f'{self.world}/{self.start}'
+        return f'{self.world}/0'
 
 
 def observe(case: Case) -> dict[str, Any]:
     """Explore a world; returns a row of COLUMNS for each candidate, now and then."""
-    world, start = load_case(case.world, case.start)
+    world, start = load_case(case.world)
     options = Options(speed_m_s=_SPEED_M_S)
     observable = robot_observable_cells(
         world, start, PRESETS[options.robot], options.laser.range_max_m

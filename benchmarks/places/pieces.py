@@ -11,26 +11,21 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from benchmarks.worlds import floor
-from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, no_progress
+from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
-from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.surface import surface_points
+from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap, flat_topology, topology_from_msg
 from thinmap_ros.logs.reading import open_log, paired_scans
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import ObservableCells
-from thinmap_ros.sim.laser import LaserScannerConfig
-from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.sim.simulation import Simulation
-from thinmap_ros.strategies import make_strategy
 
 _GRAPH = 'graph_'
 
@@ -198,14 +193,10 @@ def make_exploration(worlds: Path, name: str, start: int, folder: Path, limit_s:
     if (folder / f'{piece}.npz').exists():
         return
     there = floor(name, worlds)
-    laser = LaserScannerConfig()
-    simulation = Simulation(there.world, there.starts[start], PRESETS['2dx'], laser, start)
-    grid = replace(PAPER_GRID, no_return_clear_range_m=laser.range_max_m)
-    pipeline = Pipeline(PipelineConfig(grid=grid, scans_per_graph=SCANS_PER_GRAPH))
-    controller = PathFollowerConfig(max_speed_m_s=_SPEED_M_S)
-    navigator = Navigator(NavigatorConfig(controller=controller))
-    strategy = make_strategy('nearest_frontier')
-    loop = ClosedLoop(simulation, pipeline, strategy, navigator)
+    options = Options(strategy='nearest_frontier', seed=start, speed_m_s=_SPEED_M_S)
+    made = make_loop(there.world, there.starts[start], options)
+    pipeline = Pipeline(replace(made.pipeline.config, localizer=LocalizerConfig()))
+    loop = ClosedLoop(made.simulation, pipeline, made.strategy, made.navigator)
     loop.run(_NO_GOAL, limit_s, no_progress, scans_per_show=10**9)
     pipeline.localizer.optimized_trajectory()
     truth = dict(zip(loop.log.stamps_ns, loop.log.true_poses, strict=True))

@@ -31,31 +31,28 @@ from benchmarks.scoreboard.recordings import RecordedSimulation, read_recording
 from benchmarks.time_and_memory import forget_peak, peak_mb
 from benchmarks.worlds import floor
 from thinmap_ros.closed_loop import (
-    SCANS_PER_GRAPH,
     ClosedLoop,
-    explorer_config,
+    Options,
     ground_truth_poses,
+    make_loop,
     no_progress,
 )
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
-from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import config_with
 from thinmap_ros.core.stage import StartConfig
+from thinmap_ros.evaluation.exploration_run import observable_cells
 from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
 from thinmap_ros.experiments.slam.logs import laser_of
 from thinmap_ros.logs.reading import open_log, paired_scans
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
+from thinmap_ros.sim.coverage import ObservableCells
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.sim.simulation import Simulation
-from thinmap_ros.strategies import DEFAULT, make_strategy
 
 LASERS = {
     'lms200': LaserScannerConfig(),
@@ -283,10 +280,11 @@ def record(task: RecordTask) -> Numbers:
 def record_drive(world: str, worlds: Path, path: Path, limit_s: float = RECORDED_S) -> Numbers:
     """Record an exploration by the true pose, from a world's first start, into a file."""
     there = floor(world, worlds)
-    laser = LASERS['lms200']
-    simulation = RecordedSimulation(there.world, there.starts[0], _ROBOT, laser, _RECORDED_SEED)
-    pipeline = Pipeline(_pipeline_config(laser), ground_truth_poses(simulation))
-    loop = _closed_loop(simulation, pipeline)
+    start = there.starts[0]
+    simulation = RecordedSimulation(there.world, start, _ROBOT, LASERS['lms200'], _RECORDED_SEED)
+    made = make_loop(there.world, start, Options(speed_m_s=_SPEED_M_S))
+    pipeline = Pipeline(made.pipeline.config, ground_truth_poses(simulation))
+    loop = ClosedLoop(simulation, pipeline, made.strategy, made.navigator)
     ending = loop.run(_NOTHING, limit_s, no_progress)
     recording = simulation.recording()
     recording.write(path)
@@ -313,13 +311,14 @@ def _measure_loop(case: LoopCase, task: Task) -> Numbers:
     there = floor(case.world, task.data / 'worlds')
     world = there.world
     start = there.starts[0]
-    laser = LASERS[case.laser]
-    simulation = Simulation(world, start, _ROBOT, laser, case.seed)
+    options = Options(seed=case.seed, speed_m_s=_SPEED_M_S, laser=LASERS[case.laser])
+    made = make_loop(world, start, options)
     is_whole = case.world not in _LIMITS_S
-    goal = robot_observable_cells(world, start, _ROBOT, laser.range_max_m) if is_whole else _NOTHING
+    goal = observable_cells(world, start, options) if is_whole else _NOTHING
     rehearse()
-    pipeline = PlayedPipeline(_pipeline_config(laser, task.options, start))
-    loop = _closed_loop(simulation, pipeline)
+    localizer = config_of(task.options, start)
+    pipeline = PlayedPipeline(replace(made.pipeline.config, localizer=localizer))
+    loop = ClosedLoop(made.simulation, pipeline, made.strategy, made.navigator)
     forget_peak()
     ending = loop.run(goal, _LIMITS_S.get(case.world, _LIMIT_S), no_progress)
     played = pipeline.played
@@ -336,20 +335,3 @@ def _measure_loop(case: LoopCase, task: Task) -> Numbers:
         'distance_m': se2.path_length_m(truth),
         'time_s': played.stamps_ns[-1] / 1e9,
     }
-
-
-def _pipeline_config(
-    laser: LaserScannerConfig, options: Numbers | None = None, start: Array | None = None
-) -> PipelineConfig:
-    """As `explore_world` has it: a beam that met nothing has seen as far as this laser can."""
-    return PipelineConfig(
-        localizer=config_of(options or {}, start),
-        grid=replace(PAPER_GRID, no_return_clear_range_m=laser.range_max_m),
-        scans_per_graph=SCANS_PER_GRAPH,
-    )
-
-
-def _closed_loop(simulation: Simulation, pipeline: Pipeline) -> ClosedLoop:
-    navigator = Navigator(NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=_SPEED_M_S)))
-    strategy = make_strategy(DEFAULT, explorer_config(_ROBOT, _SPEED_M_S))
-    return ClosedLoop(simulation, pipeline, strategy, navigator)

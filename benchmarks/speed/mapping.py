@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, pose, wrap
-from thinmap_ros.core.topology.graph import Node, TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.graph import Node
 from thinmap_ros.core.topology.thinning import thin
 from thinmap_ros.core.topology.topology import TopologyBuilder, build
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
@@ -111,47 +110,38 @@ def _update(grid: OccupancyGrid, scans: list[tuple[Scan, Array]]) -> None:
         grid.add_scan(scan, T)
 
 
-WINDOW_M = WindowConfig().local_map_size_m
+_WINDOW_M = WindowConfig().local_map_size_m
 _STEP_M = 0.1  # between scans: half a metre a second at 5 Hz
 _TURN_RAD = 0.3
 _TRIES = 40
 _IN_VIEW_M = 3.0
 
 
-@dataclass
-class Ledger:
-    """Statistics of a drive: seconds of each cycle, and how many visible nodes kept their ids."""
+class _Drive:
+    """Robot, laser, grid and builder; seconds of each cycle.
 
-    seconds: list[float] = field(default_factory=list)
-    kept: int = 0
-    asked: int = 0
+    kept: visible nodes, of those asked for, that kept their ids.
+    """
 
-
-class Drive:
-    """Robot, laser, grid and builder; `run` drives along poses."""
-
-    def __init__(self, world: World, topology: TopologyConfig | None = None, seed: int = 0) -> None:
-        self.world = world
+    def __init__(self, world: World) -> None:
         self.grid = OccupancyGrid(PAPER_GRID)
-        self.builder = TopologyBuilder(topology)
-        self.ledger = Ledger()
-        self._laser = LaserScanner(LaserScannerConfig(), seed)
+        self.builder = TopologyBuilder()
+        self.seconds: list[float] = []
+        self.kept = 0
+        self.asked = 0
+        self._world = world
+        self._laser = LaserScanner(LaserScannerConfig(), 0)
 
-    def step(self, T: Array, stamp_ns: int = 0) -> None:
+    def step(self, T: Array) -> None:
         """Process one scan at a pose (3,) in grid and builder."""
-        scan = self._laser.scan(self.world, T, stamp_ns)
+        scan = self._laser.scan(self._world, T, 0)
         before = dict(self.builder.map.nodes)
         started = time.perf_counter()
         self.grid.add_scan(scan, T)
-        window = self.grid.window(T[0], T[1], WINDOW_M)
+        window = self.grid.window(T[0], T[1], _WINDOW_M)
         self.builder.update(window, T)
-        self.ledger.seconds.append(time.perf_counter() - started)
+        self.seconds.append(time.perf_counter() - started)
         self._compare(before, T)
-
-    def run(self, poses: Iterator[Array] | list[Array]) -> None:
-        """Drive along poses."""
-        for T in poses:
-            self.step(T)
 
     def _compare(self, before: dict[int, Node], T: Array) -> None:
         """Count visible nodes whose place still has a node, and how many of them kept their id."""
@@ -161,8 +151,8 @@ class Drive:
             if max(abs(node.x - T[0]), abs(node.y - T[1])) > _IN_VIEW_M:
                 continue
             still = bool((np.hypot(*(places - node.position).T) <= 0.5).any())
-            self.ledger.asked += still
-            self.ledger.kept += still and number in after
+            self.asked += still
+            self.kept += still and number in after
 
 
 def tour(world: World, start: Array, radius_m: float, goals: int, seed: int) -> list[Array]:
@@ -216,12 +206,6 @@ def _along(T: Array, path: Array) -> list[Array]:
     return poses
 
 
-def final_map(drive: Drive, start: Array | None) -> TopologicalMap:
-    """The batch map of the final grid, of all components or of that of a start."""
-    seed_xy = None if start is None else (float(start[0]), float(start[1]))
-    return build(drive.grid.known_area(), seed_xy, drive.builder.config)
-
-
 _QUICK = ('dungeon/d114',)
 _WORLDS = ('dungeon/d114', 'dungeon/d2555', 'kth/50052751', 'kth/50052748')
 _WARM_UP = 20
@@ -233,12 +217,14 @@ def online(worlds: Path, quick: bool) -> Iterator[Row]:
     for name in _QUICK if quick else _WORLDS:
         there = floor(name, worlds)
         poses = tour(there.world, there.starts[0], 0.25, 8 if quick else 40, 0)
-        drive = Drive(there.world)
-        drive.run(poses)
-        milliseconds = 1e3 * np.array(drive.ledger.seconds[_WARM_UP:])[:_RUN]
+        drive = _Drive(there.world)
+        for T in poses:
+            drive.step(T)
+        milliseconds = 1e3 * np.array(drive.seconds[_WARM_UP:])[:_RUN]
         tenth = len(milliseconds) // 10
         graph = drive.builder.map
-        batch = final_map(drive, there.starts[0])
+        x, y, _ = there.starts[0].tolist()
+        batch = build(drive.grid.known_area(), (x, y), drive.builder.config)
         near, back = agreement(graph, batch, 0.5)
         yield from [
             Row(name, f'{len(poses)} scans', '', None),
@@ -251,16 +237,11 @@ def online(worlds: Path, quick: bool) -> Iterator[Row]:
             ),
             at_least('  share of nodes within 0.5 m of a node of the batch map', near, 0.95),
             at_least('  share of nodes of the batch map within 0.5 m of a node', back, 0.95),
-            Row(
-                '  loops',
-                f'{loop_count(graph)}',
-                f'{loop_count(batch)}',
-                loop_count(graph) == loop_count(batch),
-            ),
-            _components(len(graph.components()), len(batch.components())),
+            _equal('  loops', loop_count(graph), loop_count(batch)),
+            _equal('  components', len(graph.components()), len(batch.components())),
             at_least(
                 '  share of nodes in the window that keep their ids',
-                drive.ledger.kept / max(drive.ledger.asked, 1),
+                drive.kept / max(drive.asked, 1),
                 0.99,
             ),
             at_least(
@@ -271,5 +252,5 @@ def online(worlds: Path, quick: bool) -> Iterator[Row]:
         ]
 
 
-def _components(found: int, wanted: int) -> Row:
-    return Row('  components', f'{found}', f'{wanted}', found == wanted)
+def _equal(what: str, found: int, wanted: int) -> Row:
+    return Row(what, f'{found}', f'{wanted}', found == wanted)

@@ -6,6 +6,7 @@ One process with all nodes against a process for each. Delays are those that a l
 scan to answer.
 """
 
+import math
 import tempfile
 import time
 from collections.abc import Iterator
@@ -51,16 +52,16 @@ def _measured(
         processes.start('recorder', {'use_sim_time': 'true', 'bag': folder / 'bag'})
     delays = _Listener()
     try:
-        while not delays.heard('local_topology'):
+        while 'local_topology' not in delays.heard:
             delays.listen(0.5)
         delays.listen(_SETTLE_S)
-        delays.forget()
+        delays.heard.clear()
         before = processor_s(nodes)
         delays.listen(seconds)
         share = 100.0 * (processor_s(nodes) - before) / seconds
         memory = sum(node.memory_full_info().pss for node in nodes) / 1e6
     finally:
-        delays.close()
+        delays.node.destroy_node()
         processes.close()
     yield Row(what, f'{len(delays.of("pose"))} scans')
     for name, value, limit, unit in (
@@ -81,7 +82,10 @@ def _measured(
 
 
 class _Listener:
-    """Hears scans and what comes of them; drives the robot in a circle."""
+    """Hears scans and what comes of them; drives the robot in a circle.
+
+    heard: by topic and stamp (ns), when (monotonic, s).
+    """
 
     def __init__(self) -> None:
         import rclpy
@@ -95,22 +99,22 @@ class _Listener:
             rclpy.init()
         self._rclpy = rclpy
         self._command = messages.twist_msg(0.15, 0.15)
-        self._node = rclpy.create_node('listener')
-        self._cmd_vel = self._node.create_publisher(Twist, 'cmd_vel', qos.STREAM)
-        self._heard: dict[str, dict[int, float]] = {}
+        self.node = rclpy.create_node('listener')
+        self._cmd_vel = self.node.create_publisher(Twist, 'cmd_vel', qos.STREAM)
+        self.heard: dict[str, dict[int, float]] = {}
         kinds = {
             'scan': LaserScan,
             'pose': PoseWithCovarianceStamped,
             'local_topology': TopologicalMap,
         }
         for topic, kind in kinds.items():
-            self._node.create_subscription(
+            self.node.create_subscription(
                 kind, topic, self._hears(topic, messages.stamp_ns), qos.STREAM
             )
 
     def _hears(self, topic, stamp_ns):  # type: ignore[no-untyped-def]
         def hear(message) -> None:  # type: ignore[no-untyped-def]
-            self._heard.setdefault(topic, {})[stamp_ns(message.header.stamp)] = time.monotonic()
+            self.heard.setdefault(topic, {})[stamp_ns(message.header.stamp)] = time.monotonic()
 
         return hear
 
@@ -119,30 +123,17 @@ class _Listener:
         end = time.monotonic() + seconds
         commanded = 0.0
         while time.monotonic() < end:
-            self._rclpy.spin_once(self._node, timeout_sec=0.02)
+            self._rclpy.spin_once(self.node, timeout_sec=0.02)
             if time.monotonic() - commanded > 0.1:
                 commanded = time.monotonic()
                 self._cmd_vel.publish(self._command)
 
-    def heard(self, topic: str) -> bool:
-        """Whether anything came on a topic."""
-        return topic in self._heard
-
-    def close(self) -> None:
-        """Listen no more."""
-        self._node.destroy_node()
-
-    def forget(self) -> None:
-        """Forget what was heard so far."""
-        self._heard.clear()
-
     def of(self, topic: str) -> list[float]:
         """Milliseconds from each scan to the message of its stamp."""
-        scans = self._heard.get('scan', {})
-        answers = self._heard.get(topic, {})
-        return [1e3 * (answers[ns] - at) for ns, at in scans.items() if ns in answers] or [
-            float('inf')
-        ]
+        scans = self.heard.get('scan', {})
+        answers = self.heard.get(topic, {})
+        found = [1e3 * (answers[ns] - at) for ns, at in scans.items() if ns in answers]
+        return found or [math.inf]
 
 
 def _traffic(bag: Path) -> Iterator[Row]:
