@@ -14,7 +14,6 @@ if there are any.
 """
 
 import argparse
-import csv
 import os
 import re
 import sys
@@ -29,6 +28,7 @@ import numpy as np
 from benchmarks.faults.judge import Record
 from benchmarks.faults.kinds import KINDS, random_faults
 from benchmarks.node_processes import NODES, Processes, processor_s, use_own_domain
+from benchmarks.rows import add_record
 from benchmarks.worlds import floor
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.sim.world import World
@@ -166,18 +166,18 @@ def measure(driver: Driver, nodes: Processes, arguments: argparse.Namespace, pat
     samples = Samples(columns)
     begun = time.monotonic()
     every_s = 60.0 * arguments.minutes / arguments.samples
-    with path.open('w', encoding='utf-8', newline='', buffering=1) as file:
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(columns)
-        while driver.simulated_s < 60.0 * arguments.minutes:
-            driver.spin()
-            for text in nodes.ended().values():
-                raise ThinmapError(text)
-            if not driver.poses and time.monotonic() - begun > _START_S:
-                raise ThinmapError(f'no pose came in {_START_S:.0f} s')
-            if driver.simulated_s >= every_s * (len(samples.rows) + 1):
-                samples.rows.append(sample(driver, nodes, time.monotonic() - begun))
-                writer.writerow([f'{value:.6g}' for value in samples.rows[-1]])
+    path.unlink(missing_ok=True)
+    while driver.simulated_s < 60.0 * arguments.minutes:
+        driver.spin()
+        for text in nodes.ended().values():
+            raise ThinmapError(text)
+        if not driver.poses and time.monotonic() - begun > _START_S:
+            raise ThinmapError(f'no pose came in {_START_S:.0f} s')
+        if driver.simulated_s >= every_s * (len(samples.rows) + 1):
+            row = sample(driver, nodes, time.monotonic() - begun)
+            samples.rows.append(row)
+            texts = (f'{value:.6g}' for value in row)
+            add_record(path, dict(zip(columns, texts, strict=True)))
     return samples
 
 

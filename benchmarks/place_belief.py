@@ -92,21 +92,15 @@ class _Case:
     moments: list[_Moment]
 
 
-@dataclass(frozen=True)
-class _Outcome:
-    """Scans drawn wrong, of kidnaps and of starts; paths, m, until a robot is in its map.
-
-    returned_m: after its laser was covered; begun_m: after a start that is right.
-    """
-
-    kidnapped: int = 0
-    starts: int = 0
-    returned_m: float = 0.0
-    begun_m: float = 0.0
-
-    def __str__(self) -> str:
-        wrong = f'{self.kidnapped} + {self.starts} wrong'
-        return f'{wrong}; {self.returned_m:.1f}, {self.begun_m:.1f} m'
+# What counts of each kind of case: scans drawn wrong, of kidnaps or of starts; and the path, m,
+# until a robot is in its map, after its laser was covered or after a start that is right.
+_COUNTED = {
+    'kidnap': ('kidnaps', ''),
+    'covered': ('', 'returned_m'),
+    'right': ('starts', 'begun_m'),
+    'start': ('starts', ''),
+}
+_TEXT = '{kidnaps} + {starts} wrong; {returned_m:.1f}, {begun_m:.1f} m'
 
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
@@ -118,17 +112,18 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
     workers = min(2, os.cpu_count() or 1)
     with ProcessPoolExecutor(workers, get_context('forkserver')) as pool:
         for (name, factor), found in zip(changes, pool.map(_tried, changes), strict=True):
-            yield Row(f'{name.strip("_")} x {factor}' if name else 'as it is', str(found))
+            yield Row(f'{name.strip("_")} x {factor}' if name else 'as it is', found)
 
 
-def _tried(change: tuple[str, float]) -> _Outcome:
+def _tried(change: tuple[str, float]) -> str:
     """The outcome of all cases with a constant times a factor."""
     cases = _cases()
+    found = {'kidnaps': 0, 'starts': 0, 'returned_m': 0.0, 'begun_m': 0.0, '': 0.0}
     with changed(*change):
-        outcome = _Outcome()
         for case in cases:
-            outcome = _added(outcome, case)
-    return outcome
+            for name, value in zip(_COUNTED[case.kind], _wrong_and_way(case), strict=True):
+                found[name] += value
+    return _TEXT.format(**found)
 
 
 @contextmanager
@@ -145,12 +140,12 @@ def changed(name: str, factor: float) -> Iterator[None]:
             setattr(module, name, before)
 
 
-def _added(outcome: _Outcome, case: _Case) -> _Outcome:
-    """The outcome with that of a case."""
+def _wrong_and_way(case: _Case) -> tuple[int, float]:
+    """Scans of a case that are drawn wrong, and the path, m, along which it was not in its map."""
     localizer = deepcopy(case.localizer)
     wrong = 0
     apart_m = case.moments[0].path_m if case.kind == 'right' else None
-    way_m = 0.0  # in which it was not in the map
+    way_m = 0.0
     for moment in case.moments:
         estimate = localizer.step(moment.scan, moment.T_odom_base)
         off = se2.between(estimate.T_map_base, moment.T_map_base)
@@ -165,13 +160,7 @@ def _added(outcome: _Outcome, case: _Case) -> _Outcome:
             break  # it is doubted
     if apart_m is not None:
         way_m += case.moments[-1].path_m - apart_m
-    if case.kind == 'kidnap':
-        return replace(outcome, kidnapped=outcome.kidnapped + wrong)
-    if case.kind == 'covered':
-        return replace(outcome, returned_m=outcome.returned_m + way_m)
-    if case.kind == 'right':
-        return replace(outcome, begun_m=outcome.begun_m + way_m, starts=outcome.starts + wrong)
-    return replace(outcome, starts=outcome.starts + wrong)
+    return wrong, way_m
 
 
 def _is_drawn(estimate: Estimate) -> bool:

@@ -1,7 +1,7 @@
 """What is seen of a live graph: poses, commands, collisions, diagnostics, state of the relay."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
@@ -48,14 +48,6 @@ class Health:
         return Counts(int(received), lost, int(self.values.get(f'dropped: {topic}: {_GAPS}', '0')))
 
 
-@dataclass
-class _RelayState:
-    """Last state of the relay."""
-
-    counts: dict[str, int] = field(default_factory=dict)
-    is_held: bool = False
-
-
 class Observer:
     """A node that listens. Others may use it as their node, too."""
 
@@ -68,7 +60,8 @@ class Observer:
         self.health: dict[str, Health] = {}
         self.collisions = 0
         self.moving_commands = 0
-        self._relay = _RelayState()
+        self.is_held = False  # time stands still
+        self._relayed: dict[str, int] = {}
         self._last_pose: tuple[int, Array] | None = None
         self._orders = self.node.create_publisher(String, 'relay_order', _DEEP)
         self._teleports = self.node.create_publisher(PoseStamped, 'sim/set_pose', qos.STREAM)
@@ -85,11 +78,6 @@ class Observer:
         self.node.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
         self.node.create_subscription(UInt32, 'collisions', self._on_collisions, qos.LATCHED)
 
-    @property
-    def is_held(self) -> bool:
-        """Whether time stands still."""
-        return self._relay.is_held
-
     def is_connected(self) -> bool:
         """Whether the relay receives orders, and the simulator places."""
         return bool(self._orders.get_subscription_count()) and bool(
@@ -98,12 +86,12 @@ class Observer:
 
     def passed(self) -> Passed:
         """Messages that the relay has passed on."""
-        counts = self._relay.counts
+        counts = self._relayed
         return Passed({t: counts.get(t, 0) for t in ('scan', 'odom')}, counts['dropped_scan'])
 
     def order(self, **values: Any) -> None:
         """Give the relay an order."""
-        self._relay.is_held = False
+        self.is_held = False
         self._orders.publish(String(data=json.dumps(values)))
 
     def teleport(self, T_world_base: Array) -> None:
@@ -163,8 +151,8 @@ class Observer:
             )
 
     def _on_relay_state(self, message: String) -> None:
-        counts = json.loads(message.data)
-        self._relay = _RelayState(counts, counts.pop('is_held'))
+        self._relayed = json.loads(message.data)
+        self.is_held = bool(self._relayed.pop('is_held'))
 
     def _on_relay_scan(self, message: String) -> None:
         stamp_ns, true_ns = json.loads(message.data)

@@ -155,13 +155,10 @@ def _sizes(patch: GridPatch, with_paths: bool) -> _Sizes:
 
 def _spread(values: list[float] | list[int], unit: str = '') -> str:
     """Median, smallest and largest value."""
-    shown = [f'{value:.0f}' if value >= 100 else f'{value:.3g}' for value in _range(values)]
+    three = (float(median(values)), float(min(values)), float(max(values)))
+    shown = [f'{value:.0f}' if value >= 100 else f'{value:.3g}' for value in three]
     text = f'{shown[0]} {unit}'.strip()
     return text if len(values) == 1 else f'{text} ({shown[1]} to {shown[2]})'
-
-
-def _range(values: list[float] | list[int]) -> tuple[float, float, float]:
-    return float(median(values)), float(min(values)), float(max(values))
 
 
 _CONFIG = TopologyConfig()
@@ -232,9 +229,11 @@ def _add_graph(
 def _rows(figures: dict[str, _Figures]) -> Iterator[Row]:
     shown: dict[str, Callable[[_Figures], str]] = {
         'nodes': lambda one: str(np.sum(one.kinds)),
-        'end, branch and corner nodes': lambda one: _joined(np.sum(one.kinds, axis=0).tolist()),
+        'end, branch and corner nodes': lambda one: ', '.join(map(str, np.sum(one.kinds, axis=0))),
         'edges': lambda one: str(sum(one.edges)),
-        'floors with the topology of the free space': _same,
+        'floors with the topology of the free space': lambda one: (
+            f'{sum(one.is_same_topology)} of {len(one.is_same_topology)}'
+        ),
         'share of drivable edges, mean and minimum': lambda one: _mean_and(one.drivable, min),
         'share of free positions in sight of a node, mean and minimum': lambda one: _mean_and(
             one.sight, min
@@ -254,14 +253,6 @@ def _rows(figures: dict[str, _Figures]) -> Iterator[Row]:
     yield at_least('  skeleton by thinning: times faster', faster, 1.0)
     faster = sum(theirs.graph_s) / sum(thinning.graph_s)
     yield at_least('  graph by thinning: times faster', faster, 1.0)
-
-
-def _same(one: _Figures) -> str:
-    return f'{sum(one.is_same_topology)} of {len(one.is_same_topology)}'
-
-
-def _joined(numbers: list[int]) -> str:
-    return ', '.join(map(str, numbers))
 
 
 def _mean_and(values: list[float], extreme: Callable[[list[float]], float]) -> str:

@@ -25,7 +25,7 @@ from thinmap_ros.core.planning.wavefront import (
     navigation_function,
     plan,
 )
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, path_length_m
 from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.experiments.drives import patch_of_world
@@ -49,10 +49,9 @@ class _GoalTally:
     refused: int = 0
     too_near: int = 0
 
-    def __post_init__(self) -> None:
-        self.ratios: list[float] = []
-        self.plan_s: list[float] = []
-        self.refuse_s: list[float] = [0.0]
+    ratios: list[float] = field(default_factory=list)
+    plan_s: list[float] = field(default_factory=list)
+    refuse_s: list[float] = field(default_factory=lambda: [0.0])
 
 
 def goals(worlds: Path, quick: bool) -> Iterator[Row]:
@@ -123,12 +122,11 @@ def _judge(
     cells = patch.frame.cells_of(path)
     least_m = float(clearance_m[cells[:, 0], cells[:, 1]].min())
     tally.too_near += least_m < radius_m - _HAIR
-    length_m = float(np.hypot(*np.diff(path, axis=0).T).sum())
     cost = np.where(clearance_m >= least_m - _HAIR, 1.0, np.inf)
     start, goal = (tuple(int(v) for v in cells[k]) for k in (0, -1))
     best_m = float(navigation_function(cost, (goal[0], goal[1]))[start]) * patch.frame.resolution
     if best_m > 1.0:
-        tally.ratios.append(length_m / best_m)
+        tally.ratios.append(path_length_m(path) / best_m)
 
 
 _FLOORS = ('kth/50052748', 'kth/50037764_PLAN1', 'dungeon/d114')
@@ -209,12 +207,10 @@ def _try(
         plan(fresh, start, goal, _CONFIG)
     tally.along_s.append(time.perf_counter() - began)
     tally.alone_s.append(alone_s)
-    tally.ratios.append(math.inf if along is None else _length(along.points) / _length(alone))
+    tally.ratios.append(
+        math.inf if along is None else path_length_m(along.points) / path_length_m(alone)
+    )
 
 
 def _times(values_ms: Array) -> str:
     return f'{np.median(values_ms):.3g} ms, {values_ms.max():.3g} ms'
-
-
-def _length(path: Array) -> float:
-    return float(np.hypot(*np.diff(path, axis=0).T).sum())
