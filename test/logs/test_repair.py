@@ -6,6 +6,7 @@ No damage causes a traceback in any program.
 import os
 import subprocess
 from bisect import bisect_right
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,27 @@ import yaml
 from fuzz.damaged_bags import CASES, run_cases, whole_bags
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.records import ChunkIndex, Message
+from mcap.records import Channel, ChunkIndex, Message
 from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 from support.forks import forked
 
+from thinmap_ros.files.safe import LOGS
 from thinmap_ros.logs import storage
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.mcap import HEAD, MAGIC, Damage, McapFile, intact_records
+from thinmap_ros.logs.mcap import (
+    HEAD,
+    MAGIC,
+    Damage,
+    McapFile,
+    Section,
+    intact_records,
+    plain_records,
+)
 from thinmap_ros.logs.readers.bag import Bag
 
 STRING = 'std_msgs/msg/String'
@@ -87,13 +98,55 @@ def test_a_topic_that_is_defined_before_its_first_message_is_read_without_a_summ
     assert len(list(bag.messages({'/said'}))) == 2 and bag.is_truncated
 
 
-def record_ends(content: bytes) -> list[int]:
+def record_ends(content: bytes | bytearray) -> list[int]:
     """Ends of the records of an undamaged file, and the file."""
     ends = [len(MAGIC)]
     while ends[-1] < len(content) - len(MAGIC):
         _, length = HEAD.unpack_from(content, ends[-1])
         ends.append(ends[-1] + HEAD.size + length)
     return [*ends, len(content)]
+
+
+def test_a_file_that_ends_among_message_indexes_keeps_the_messages_of_all_topics(
+    tmp_path: Path,
+) -> None:
+    whole = (write(tmp_path / 'bag', 5 * PER_CHUNK) / 'bag.mcap').read_bytes()
+    cut = tmp_path / 'cut.mcap'
+    for end in record_ends(whole):
+        cut.write_bytes(whole[:end])
+        said = [found for found in McapFile(cut).messages() if found[1].topic == '/said']
+        assert list(McapFile(cut).messages({'/said'})) == said
+
+
+def test_a_message_index_of_a_damaged_length_does_not_hide_what_is_before_it(
+    tmp_path: Path,
+) -> None:
+    whole = bytearray((write(tmp_path / 'bag', 5 * PER_CHUNK) / 'bag.mcap').read_bytes())
+    last = max(end for end in record_ends(whole) if whole[end : end + 1] == b'\x07')
+    whole[last + 1 : last + HEAD.size] = b'\xff' * 8
+    (tmp_path / 'damaged.mcap').write_bytes(whole[: last + 100])
+    assert len(list(McapFile(tmp_path / 'damaged.mcap').messages())) == 5 * PER_CHUNK
+
+
+def test_a_chunk_is_read_though_the_length_of_its_record_is_damaged(tmp_path: Path) -> None:
+    whole = (write(tmp_path / 'bag', PER_CHUNK) / 'bag.mcap').read_bytes()
+    at = next(end for end in record_ends(whole) if whole[end : end + 1] == b'\x06')
+    damaged = tmp_path / 'damaged.mcap'
+    with damaged.open('wb') as stream:
+        stream.write(whole[:at] + HEAD.pack(6, 2 * LOGS.chunk_bytes) + whole[at + HEAD.size :])
+        stream.truncate(3 * LOGS.chunk_bytes)  # with a hole, which takes no space
+    assert len(list(McapFile(damaged).messages())) == PER_CHUNK
+
+
+def test_a_definition_behind_a_message_shows_that_its_length_is_right() -> None:
+    builder = RecordBuilder()
+    Message(channel_id=1, log_time=3, data=b'said', publish_time=3, sequence=0).write(builder)
+    Channel(1, '/said', 'cdr', {}, 1).write(builder)
+    Message(channel_id=1, log_time=5, data=b'lost', publish_time=5, sequence=1).write(builder)
+    content = builder.end() + bytes(50)
+    records = plain_records(Section(BytesIO(content), len(content)))
+    assert [message.endswith(b'said') for message in records.contents] == [True]
+    assert records.damaged
 
 
 def test_a_file_may_grow_while_it_is_read(tmp_path: Path) -> None:

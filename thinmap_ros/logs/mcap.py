@@ -10,24 +10,21 @@ Source: https://mcap.dev/spec.
 import heapq
 import struct
 import zlib
-from array import array
 from bisect import bisect_right
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from io import BufferedReader, BytesIO, RawIOBase
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import lz4.frame
-import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Message, Schema, Statistics
 from mcap.stream_reader import StreamReader
-from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import LATEST_NS
@@ -37,10 +34,11 @@ MAGIC = b'\x89MCAP0\r\n'
 FIRST_PRIVATE_OPCODE = 0x80
 HEAD = struct.Struct('<BQ')
 _CHUNK = struct.Struct('<QQQI')
-_LENGTH = struct.Struct('<I')
+_FOOTER = struct.Struct('<QQI')
 _MESSAGE = struct.Struct('<HIQQ')
+_FOOTER_HEAD = HEAD.pack(Opcode.FOOTER, _FOOTER.size)
+_DATA_END_HEAD = HEAD.pack(Opcode.DATA_END, 4)
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-_SLICE = 2**16
 _LONGEST_NAME = 1000  # of a compression
 Definition = Schema | Channel
 
@@ -53,64 +51,28 @@ class DamagedError(Exception):
 class Records:
     """The records of a chunk, or of a range of the file without chunks.
 
-    definitions: schemas and channels; log_ns (N,), offsets (N,): the messages of the wanted
-    channels in file order, with offsets into `data`, which holds only these; count, first_ns,
-    channel_ids: number, earliest log time and channels of all messages; damaged: why records were
-    omitted, else empty.
+    definitions: schemas and channels; contents: of the messages of the wanted channels, in file
+    order; first_ns, channel_ids: earliest log time and channels of all messages; damaged: why
+    records were omitted, else empty.
     """
 
-    data: bytearray = field(default_factory=bytearray)
     definitions: list[Definition] = field(default_factory=list)
-    log_ns: 'array[int]' = field(default_factory=lambda: array('Q'))
-    offsets: 'array[int]' = field(default_factory=lambda: array('Q'))
-    count: int = 0
+    contents: list[bytes] = field(default_factory=list)
     first_ns: int = LATEST_NS
     channel_ids: set[int] = field(default_factory=set)
     damaged: str = ''
-    _is_last_kept: bool = False
-
-    def message(self, index: int) -> Message:
-        """Message by its index in `offsets`."""
-        at = self.offsets[index]
-        (_, length) = HEAD.unpack_from(self.data, at - HEAD.size)
-        channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(self.data, at)
-        content = bytes(self.data[at + _MESSAGE.size : at + length])
-        return Message(channel_id, log_ns, content, publish_ns, sequence)
-
-    def messages(self) -> Iterator[Message]:
-        """All messages in the order of the file."""
-        return (self.message(index) for index in range(len(self.offsets)))
-
-    def add_message(self, channel_id: int, log_ns: int, record: bytes) -> None:
-        """Count a message, and keep its whole record, unless that is empty."""
-        self.count += 1
-        self.first_ns = min(self.first_ns, log_ns)
-        self.channel_ids.add(channel_id)
-        self._is_last_kept = bool(record)
-        if record:
-            self.log_ns.append(log_ns)
-            self.offsets.append(len(self.data) + HEAD.size)
-            self.data += record
 
     def omit(self, reason: str) -> None:
         """Something is damaged; the first reason counts."""
         self.damaged = self.damaged or reason
 
-    def drop_last(self) -> None:
-        """Omit the last message, once."""
-        self.count = max(self.count - 1, 0)
-        if self._is_last_kept:
-            del self.log_ns[-1:]
-            del self.offsets[-1:]
-        self._is_last_kept = False
 
-
+@dataclass(eq=False)
 class Section:
     """The next bytes of a stream, at most `left`."""
 
-    def __init__(self, stream: BinaryIO, left: int) -> None:
-        self._stream = stream
-        self.left = left
+    _stream: BinaryIO
+    left: int
 
     def read(self, size: int) -> bytes:
         """Read up to `size` bytes; none at the end of the section or of the stream."""
@@ -118,16 +80,80 @@ class Section:
         self.left -= len(piece)
         return piece
 
+    read1 = read
+
+
+_UNPACK: dict[str, Callable[[Any], Any]] = {
+    '': lambda packed: packed,
+    'lz4': lz4.frame.open,
+    'zstd': lambda packed: zstandard.ZstdDecompressor().stream_reader(
+        packed, read_across_frames=True
+    ),
+}
+
+
+class _Unpacked(RawIOBase):
+    """Uncompressed bytes of a section as a stream; counts what it has read, with its checksum.
+
+    It raises DamagedError where they are more than declared, or corrupt; in truncated data (not
+    `whole`), corrupt bytes are the end.
+    """
+
+    def __init__(self, compression: str, packed: Section, declared: int, whole: bool) -> None:
+        """Raises DamagedError for an unknown compression, or if more is declared than allowed."""
+        if declared > LOGS.chunk_bytes:
+            raise DamagedError(
+                f'{declared} bytes uncompressed: expected at most {LOGS.chunk_bytes}'
+            )
+        if compression not in _UNPACK:
+            raise DamagedError(f'compression {compression[:20]!r}: expected none, lz4 or zstd')
+        self.size = 0
+        self.checksum = 0
+        self._compression = compression
+        self._source = _UNPACK[compression](packed)
+        self._declared = declared
+        self._whole = whole
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        try:
+            piece = self._source.read1(min(len(buffer), PIECE_BYTES))
+        except (EOFError, RuntimeError, zstandard.ZstdError) as error:
+            # lz4 raises EOFError where the data are truncated: their size tells.
+            if self._whole and not isinstance(error, EOFError):
+                raise DamagedError(f'{self._compression}: {_short(error)}') from error
+            return 0
+        self.size += len(piece)
+        if self.size > self._declared:
+            raise DamagedError(f'more than the declared {self._declared} bytes uncompressed')
+        self.checksum = zlib.crc32(piece, self.checksum)
+        buffer[: len(piece)] = piece
+        return len(piece)
+
+
+def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> bytes:
+    """Uncompressed bytes; of truncated data (not `whole`), those before the end.
+
+    size: declared bytes; no more is ever decompressed. Raises DamagedError if it exceeds
+    LOGS.chunk_bytes, or the data expand to more than declared.
+    """
+    return _Unpacked(compression, Section(BytesIO(data), len(data)), size, whole).readall()
+
 
 def chunk_records(content: Section, whole: bool, wanted: frozenset[int] | None = None) -> Records:
-    """Records in the content of a chunk; if it is truncated (not `whole`), those before the end.
+    """Records of a chunk; if it is truncated (not `whole`), those before the end.
 
     wanted: the channels whose messages are kept, None for all. Only these take memory: the chunk is
     unpacked in pieces. Raises DamagedError if it is corrupt or larger than LOGS.chunk_bytes.
     """
+    record_bytes = content.left - HEAD.size
+    if content.read(HEAD.size) != HEAD.pack(Opcode.CHUNK, record_bytes) and whole:
+        raise DamagedError(f'no chunk of {record_bytes} bytes')
     try:
         _, _, size, checksum = _CHUNK.unpack(content.read(_CHUNK.size))
-        (n,) = _LENGTH.unpack(content.read(_LENGTH.size))
+        (n,) = struct.unpack('<I', content.read(4))
         compression = content.read(min(n, _LONGEST_NAME)).decode('ascii')
         (length,) = struct.unpack('<Q', content.read(8))
     except (struct.error, ValueError) as error:
@@ -137,7 +163,7 @@ def chunk_records(content: Section, whole: bool, wanted: frozenset[int] | None =
     # The length of the record itself may be damaged.
     complete = content.left >= length
     content.left = min(content.left, length)
-    stream = _Unpacked(_pieces(compression, content, size, complete))
+    stream = _Unpacked(compression, content, size, complete)
     records = _records(stream, size, complete, wanted)
     if complete and stream.size != size:
         raise DamagedError(f'{stream.size} bytes uncompressed: expected {size}')
@@ -146,156 +172,53 @@ def chunk_records(content: Section, whole: bool, wanted: frozenset[int] | None =
     return records
 
 
-def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> bytes:
-    """Uncompressed bytes; of truncated data (not `whole`), those before the end.
-
-    size: declared bytes; no more is ever decompressed. Raises DamagedError if it exceeds
-    LOGS.chunk_bytes, or the data expand to more than declared.
-    """
-    result = bytearray()
-    for piece in _pieces(compression, Section(BytesIO(data), len(data)), size, whole):
-        result += piece
-    return bytes(result)
-
-
-def _pieces(compression: str, packed: Section, size: int, whole: bool) -> Iterator[bytes]:
-    """Uncompressed pieces of data; raises DamagedError as `decompress` does."""
-    if size > LOGS.chunk_bytes:
-        raise DamagedError(f'{size} bytes uncompressed: expected at most {LOGS.chunk_bytes}')
-    unpack = {'': _plain_pieces, 'lz4': _lz4_pieces, 'zstd': _zstd_pieces}.get(compression)
-    if unpack is None:
-        raise DamagedError(f'compression {compression[:20]!r}: expected none, lz4 or zstd')
-    unpacked = 0
-    try:
-        for piece in unpack(packed):
-            unpacked += len(piece)
-            if unpacked > size:
-                raise DamagedError(f'more than the declared {size} bytes uncompressed')
-            yield piece
-    except (RuntimeError, zstandard.ZstdError) as error:
-        if whole:
-            raise DamagedError(f'{compression}: {_short(error)}') from error
-
-
-def _plain_pieces(data: Section) -> Iterator[bytes]:
-    while piece := data.read(PIECE_BYTES):
-        yield piece
-
-
-def _zstd_pieces(data: Section) -> Iterator[bytes]:
-    source: Any = data  # of the methods of a stream, only `read` is used
-    reader = zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True)
-    while piece := reader.read(PIECE_BYTES):
-        yield piece
-
-
-def _lz4_pieces(data: Section) -> Iterator[bytes]:
-    unpacker: Any = lz4.frame.LZ4FrameDecompressor()
-    while packed := data.read(_SLICE):
-        yield unpacker.decompress(packed, max_length=PIECE_BYTES)
-        while not unpacker.needs_input and not unpacker.eof:
-            yield unpacker.decompress(b'', max_length=PIECE_BYTES)
-        if unpacker.eof:
-            return
-
-
 def plain_records(content: Section, wanted: frozenset[int] | None = None) -> Records:
     """Consecutive records outside of chunks, up to the end or to bytes that are no record.
 
     The message before such bytes is omitted, too: most likely its length is wrong. wanted: as in
     `chunk_records`. Raises DamagedError if there are too many definitions.
     """
-    return _records(_Unpacked(_plain_pieces(content)), content.left, True, wanted)
-
-
-class _Unpacked(RawIOBase):
-    """Pieces of bytes as a stream; counts what it has read, with its checksum."""
-
-    def __init__(self, pieces: Iterator[bytes]) -> None:
-        self.size = 0
-        self.checksum = 0
-        self._pieces = pieces
-        self._piece = memoryview(b'')
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        while not self._piece:
-            piece = next(self._pieces, None)
-            if piece is None:
-                return 0
-            self.size += len(piece)
-            self.checksum = zlib.crc32(piece, self.checksum)
-            self._piece = memoryview(piece)
-        n = min(len(buffer), len(self._piece))
-        buffer[:n] = self._piece[:n]
-        self._piece = self._piece[n:]
-        return n
+    return _records(_Unpacked('', content, content.left, True), content.left, True, wanted)
 
 
 def _records(unpacked: _Unpacked, size: int, whole: bool, wanted: frozenset[int] | None) -> Records:
     """Records of a stream of `size` bytes; in truncated data the last one may be incomplete."""
-    stream = BufferedReader(unpacked, _SLICE)
+    stream = BufferedReader(unpacked)
     found = Records()
     at = 0
-    is_record = True
-    is_complete = True
-    while is_complete and (head := stream.read(HEAD.size)):
+    message: bytes | None = None
+    is_damaged = False
+    while head := stream.read(HEAD.size):
         code, length = HEAD.unpack(head) if len(head) == HEAD.size else (Opcode.MESSAGE, size)
         is_record = code in _PLAIN or code >= FIRST_PRIVATE_OPCODE
         end = at + HEAD.size + length
-        is_complete = is_record and end <= size and _add(found, stream, head, wanted)
-        at = end if is_complete else at
-    _skip(stream, size)
-    if not is_complete and (whole or not is_record):
+        content = _content(stream, code, length, wanted) if is_record and end <= size else None
+        if content is None:
+            _skip(stream, size)
+            is_damaged = whole or not is_record
+            break
+        _add_message(found, message, wanted)
+        message = content if code == Opcode.MESSAGE else None
+        if code in (Opcode.SCHEMA, Opcode.CHANNEL):
+            _add_definition(found, code, content)
+        at = end
+    # Only what follows a message shows that its length is right.
+    _add_message(found, message, wanted, is_kept=not is_damaged)
+    if is_damaged:
         found.omit(f'no record at byte {at} of {unpacked.size}')
-        found.drop_last()
     return found
 
 
-def _add(found: Records, stream: BinaryIO, head: bytes, wanted: frozenset[int] | None) -> bool:
-    """Add the record behind a head, or why it is invalid; returns whether it is complete."""
-    code, length = HEAD.unpack(head)
-    if code == Opcode.MESSAGE and length >= _MESSAGE.size:
-        return _add_message(found, stream, head, wanted)
-    if code >= FIRST_PRIVATE_OPCODE:
-        return _skip(stream, length)
-    content = stream.read(length)
-    if len(content) < length:
-        return False
-    if code == Opcode.MESSAGE:
-        found.omit(f'message of {length} bytes: expected at least {_MESSAGE.size}')
-        return True
-    try:
-        found.definitions.append(definition(code, content))
-    except DamagedError as error:
-        found.omit(str(error))
-    if len(found.definitions) > LOGS.definitions:
-        raise DamagedError(f'more than {LOGS.definitions} schemas and channels')
-    return True
-
-
-def _add_message(
-    found: Records, stream: BinaryIO, head: bytes, wanted: frozenset[int] | None
-) -> bool:
-    fields = stream.read(_MESSAGE.size)
-    if len(fields) < _MESSAGE.size:
-        return False
-    channel_id, _, log_ns, _ = _MESSAGE.unpack(fields)
-    rest = int(HEAD.unpack(head)[1]) - _MESSAGE.size
-    record = b''
-    if wanted is None or channel_id in wanted:
-        content = stream.read(rest)
-        is_complete = len(content) == rest
-        record = head + fields + content
-    else:
-        is_complete = _skip(stream, rest)
-    if is_complete and log_ns >= LATEST_NS:
-        found.omit(f'message logged at {log_ns} ns: expected less than {LATEST_NS}')
-    elif is_complete:
-        found.add_message(channel_id, log_ns, record)
-    return is_complete
+def _content(
+    stream: BinaryIO, code: int, length: int, wanted: frozenset[int] | None
+) -> bytes | None:
+    """Content of a record that is read, and the fields of any other message; None: incomplete."""
+    is_message = code == Opcode.MESSAGE
+    needed = 0 if code >= FIRST_PRIVATE_OPCODE else length
+    content = stream.read(min(needed, _MESSAGE.size) if is_message else needed)
+    if is_message and (wanted is None or _channel_id(content) in wanted):
+        content += stream.read(length - len(content))
+    return content if _skip(stream, length - len(content)) else None
 
 
 def _skip(stream: BinaryIO, size: int) -> bool:
@@ -305,29 +228,57 @@ def _skip(stream: BinaryIO, size: int) -> bool:
     return size == 0
 
 
-def definition(code: int, content: bytes) -> Definition:
-    """Schema or channel from the content of its record. Raises DamagedError if it is invalid."""
+def _add_message(
+    found: Records, content: bytes | None, wanted: frozenset[int] | None, is_kept: bool = True
+) -> None:
+    """Add a message, if there is one, or why it is invalid."""
+    if content is None:
+        return
+    log_ns = _log_ns(content)
+    channel_id = _channel_id(content)
+    if len(content) < _MESSAGE.size:
+        found.omit(f'message of {len(content)} bytes: expected at least {_MESSAGE.size}')
+    elif log_ns >= LATEST_NS:
+        found.omit(f'message logged at {log_ns} ns: expected less than {LATEST_NS}')
+    elif is_kept:
+        found.first_ns = min(found.first_ns, log_ns)
+        found.channel_ids.add(channel_id)
+        if wanted is None or channel_id in wanted:
+            found.contents.append(content)
+
+
+def _channel_id(content: bytes) -> int:
+    return int.from_bytes(content[:2], 'little')
+
+
+def _log_ns(content: bytes) -> int:
+    return int.from_bytes(content[6:14], 'little')
+
+
+def _message(content: bytes) -> Message:
+    channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
+    return Message(channel_id, log_ns, content[_MESSAGE.size :], publish_ns, sequence)
+
+
+def _add_definition(found: Records, code: int, content: bytes) -> None:
+    """Add a schema or channel, or why it is invalid. Raises DamagedError if there are too many."""
     stream = ReadDataStream(BytesIO(content))
     builder = RecordBuilder()
     try:
         record: Definition = Schema.read(stream) if code == Opcode.SCHEMA else Channel.read(stream)
         record.write(builder)
+        # mcap accepts strings whose declared length exceeds the data.
+        if not content.startswith(builder.end()[HEAD.size :]):
+            raise ValueError(f'lengths that do not fit its {len(content)} bytes')
+        found.definitions.append(record)
     except (McapError, struct.error, ValueError) as error:
-        raise DamagedError(f'{Opcode(code).name.lower()}: {_short(error)}') from error
-    # mcap accepts strings whose declared length exceeds the data.
-    if not content.startswith(builder.end()[HEAD.size :]):
-        raise DamagedError(
-            f'{Opcode(code).name.lower()}: lengths that do not fit its {len(content)} bytes'
-        )
-    return record
+        found.omit(f'{Opcode(code).name.lower()}: {_short(error)}')
+    if len(found.definitions) > LOGS.definitions:
+        raise DamagedError(f'more than {LOGS.definitions} schemas and channels')
 
 
 def _short(error: Exception) -> str:
     return ' '.join(str(error).split())[:80] or type(error).__name__
-
-
-_FOOTER = struct.Struct('<QQI')
-_CHANNEL_ID = struct.Struct('<H')
 
 
 @dataclass
@@ -343,9 +294,9 @@ class Damage:
     def __str__(self) -> str:
         words = ['cut off'] if self.is_truncated else []
         if self.parts:
-            at, reason = next(iter(self.parts.items()))
-            n = len(self.parts)
-            count = 'a damaged part' if n == 1 else f'{n} damaged parts, the first'
+            at, reason = min(self.parts.items())
+            several = f'{len(self.parts)} damaged parts, the first'
+            count = several if len(self.parts) > 1 else 'a damaged part'
             words.append(f'{count} at byte {at}: {reason}')
         return '; '.join(words)
 
@@ -359,10 +310,13 @@ class Definitions:
     channels: dict[int, Channel] = field(default_factory=dict)
     _bytes: int = 0
 
-    def add(self, record: Definition) -> None:
-        """Add a schema or channel. Raises InputError if their total size is too large."""
-        known = self._like(record)
-        if record == known.get(record.id):
+    def add(self, record: Definition, is_earlier: bool = False) -> None:
+        """Add a schema or channel; an earlier one counts only if none of its id is known.
+
+        Raises InputError if their total size is too large.
+        """
+        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+        if record == known.get(record.id) or (is_earlier and record.id in known):
             return
         known[record.id] = record
         builder = RecordBuilder()
@@ -372,14 +326,6 @@ class Definitions:
             expected = f'expected at most {LOGS.definitions_bytes} bytes'
             raise InputError(f'{self.path}: schemas and channels: {expected}')
 
-    def add_missing(self, record: Definition) -> None:
-        """As `add`, unless there is one of this id."""
-        if record.id not in self._like(record):
-            self.add(record)
-
-    def _like(self, record: Definition) -> dict[int, Any]:
-        return self.schemas if isinstance(record, Schema) else self.channels
-
     def of(self, channel_id: int) -> tuple[Schema, Channel] | None:
         """Channel and its schema; None if one of them is unknown."""
         channel = self.channels.get(channel_id)
@@ -387,12 +333,12 @@ class Definitions:
         return None if channel is None or schema is None else (schema, channel)
 
 
-@dataclass(frozen=True)
+@dataclass
 class ChunkSpan:
     """A chunk, or a range of records outside of chunks: bytes `start` to `end` of the file.
 
     whole: it is not truncated; first_ns: log time of its earliest message; channel_ids: channels of
-    its messages, None if unknown.
+    its messages, empty if unknown.
     """
 
     start: int
@@ -400,7 +346,10 @@ class ChunkSpan:
     is_chunk: bool
     whole: bool = True
     first_ns: int = 0
-    channel_ids: frozenset[int] | None = None
+    channel_ids: set[int] = field(default_factory=set)
+
+
+_END = ChunkSpan(0, 0, False, first_ns=LATEST_NS)  # it has no messages
 
 
 @dataclass(frozen=True)
@@ -410,8 +359,8 @@ class Summary:
     message_counts: by channel; empty if they are not recorded.
     """
 
-    definitions: list[Definition]
-    blocks: list[ChunkSpan]
+    definitions: list[Definition] = field(default_factory=list)
+    spans: list[ChunkSpan] = field(default_factory=list)
     message_counts: dict[int, int] = field(default_factory=dict)
 
 
@@ -430,10 +379,10 @@ class McapFile:
         summary = summary_of(path)
         for record in summary.definitions:
             self.definitions.add(record)
-        self._chunk_spans = summary.blocks if self.definitions.channels else []
-        if not self._chunk_spans:
-            self._chunk_spans = list(_first_pass(path, summary, self.definitions, self.damage))
-        self.has_messages = bool(self._chunk_spans)
+        self._spans = summary.spans if self.definitions.channels else []
+        if not self._spans:
+            self._spans = list(_first_pass(path, summary, self.definitions, self.damage))
+        self.has_messages = bool(self._spans)
         self.message_counts = {
             channel.topic: summary.message_counts[number]
             for number, channel in self.definitions.channels.items()
@@ -448,61 +397,32 @@ class McapFile:
             if (topics is None or channel.topic in topics)
             and (known := self.definitions.of(number)) is not None
         }
-        for message in self._in_log_order(frozenset(chosen)):
+        for content in self._in_log_order(frozenset(chosen)):
+            message = _message(content)
             yield *chosen[message.channel_id], message
 
-    def _in_log_order(self, channel_ids: frozenset[int]) -> Iterator[Message]:
-        queue = _LogOrder()
-        blocks = [
-            b for b in self._chunk_spans if b.channel_ids is None or b.channel_ids & channel_ids
-        ]
+    def _in_log_order(self, channel_ids: frozenset[int]) -> Iterator[bytes]:
+        """Contents of messages; beyond `LOGS.buffered_bytes` of them, they are out of order."""
+        spans = [s for s in self._spans if not s.channel_ids or s.channel_ids & channel_ids]
+        spans.sort(key=lambda span: span.first_ns)
+        # The remaining messages of each chunk, by the log time of the first, and its number.
+        heap: list[tuple[int, int, deque[bytes]]] = []
+        held = 0
         with open_regular_file(self.path) as stream:
-            for block in sorted(blocks, key=lambda b: b.first_ns):
-                yield from queue.before(block.first_ns)
-                records = _load_intact(stream, block, channel_ids, self.damage)
-                if records is not None:
-                    queue.add(records)
-        yield from queue.before(None)
+            for number, span in enumerate([*spans, _END]):
+                while heap and (heap[0][0] < span.first_ns or held > LOGS.buffered_bytes):
+                    _, place, contents = heapq.heappop(heap)
+                    held -= len(contents[0])
+                    yield contents.popleft()
+                    _push(heap, place, contents)
+                loaded = _load(stream, span, channel_ids, self.damage).contents
+                held += sum(map(len, loaded))
+                _push(heap, number, deque(sorted(loaded, key=_log_ns)))
 
 
-class _LogOrder:
-    """Merges the messages of chunks by log time.
-
-    It buffers about `LOGS.buffered_bytes` at most: beyond that, messages are out of order.
-    """
-
-    def __init__(self) -> None:
-        self._loaded: dict[int, tuple[Records, NDArray[np.intp]]] = {}
-        self._heap: list[tuple[int, int, int]] = []
-        self._held = 0
-        self._number = 0
-
-    def add(self, records: Records) -> None:
-        """Add the records of a chunk."""
-        order = np.argsort(records.log_ns, kind='stable')
-        if order.size:
-            self._number += 1
-            self._loaded[self._number] = (records, order)
-            self._held += len(records.data)
-            heapq.heappush(self._heap, (int(records.log_ns[order[0]]), self._number, 0))
-
-    def before(self, log_ns: int | None) -> Iterator[Message]:
-        """Messages before a log time, or all remaining ones."""
-        while self._heap:
-            if not (
-                log_ns is None or self._heap[0][0] < log_ns or self._held > LOGS.buffered_bytes
-            ):
-                return
-            _, number, place = self._heap[0]
-            records, order = self._loaded[number]
-            yield records.message(int(order[place]))
-            if place + 1 < order.size:
-                following = (int(records.log_ns[order[place + 1]]), number, place + 1)
-                heapq.heapreplace(self._heap, following)
-            else:
-                heapq.heappop(self._heap)
-                del self._loaded[number]
-                self._held -= len(records.data)
+def _push(heap: list[tuple[int, int, deque[bytes]]], number: int, contents: deque[bytes]) -> None:
+    if contents:
+        heapq.heappush(heap, (_log_ns(contents[0]), number, contents))
 
 
 def intact_records(path: Path, damage: Damage) -> Iterator[Definition | Message]:
@@ -512,12 +432,11 @@ def intact_records(path: Path, damage: Damage) -> Iterator[Definition | Message]
     """
     summary = summary_of(path)
     yield from summary.definitions
-    with _opened(path) as stream:
-        for block in _chunk_spans(stream, path, summary, damage):
-            records = _load_intact(stream, block, None, damage)
-            if records is not None:
-                yield from records.definitions
-                yield from records.messages()
+    with open_regular_file(path) as stream:
+        for span in _chunk_spans(stream, path, summary, damage):
+            records = _load(stream, span, None, damage)
+            yield from records.definitions
+            yield from map(_message, records.contents)
 
 
 def _first_pass(
@@ -529,59 +448,23 @@ def _first_pass(
     has no message index; or to look for a channel that a later chunk does not define itself.
     """
     packed: list[ChunkSpan] = []
-    with _opened(path) as stream:
-        for block in _chunk_spans(stream, path, summary, damage):
-            channel_ids = _indexed_channels(stream, block)
-            if channel_ids and channel_ids <= definitions.channels.keys():
-                packed.append(block)
-                first_ns = _first_log_time(stream, block)
-                yield replace(block, first_ns=first_ns, channel_ids=channel_ids)
+    with open_regular_file(path) as stream:
+        for span in _chunk_spans(stream, path, summary, damage):
+            if span.channel_ids and span.channel_ids <= definitions.channels.keys():
+                packed.append(span)
+                yield span
                 continue
-            records = _load_intact(stream, block, frozenset(), damage)
-            if records is None:
-                continue
+            records = _load(stream, span, frozenset(), damage)
             for record in records.definitions:
                 definitions.add(record)
             # A recorder defines a channel when it subscribes, some time before the first message.
             while packed and any(definitions.of(k) is None for k in records.channel_ids):
-                earlier = _load_intact(stream, packed.pop(), frozenset(), damage)
-                for record in earlier.definitions if earlier else ():
-                    definitions.add_missing(record)
-            if records.count:
-                channel_ids = frozenset(records.channel_ids)
-                yield replace(block, first_ns=records.first_ns, channel_ids=channel_ids)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    """The opened file. Raises InputError if it does not begin with the magic bytes of MCAP."""
-    with open_regular_file(path) as stream:
-        if stream.read(len(MAGIC)) != MAGIC:
-            raise InputError(f'{path}: no MCAP file: expected it to begin with {MAGIC!r}')
-        yield stream
-
-
-def _indexed_channels(stream: BinaryIO, block: ChunkSpan) -> frozenset[int]:
-    """Channels of a chunk by the message indexes behind it; none if it has no index."""
-    channel_ids: set[int] = set()
-    at = block.end
-    while block.is_chunk and block.whole:
-        stream.seek(at)
-        head = stream.read(HEAD.size + _CHANNEL_ID.size)
-        if len(head) < HEAD.size + _CHANNEL_ID.size:
-            break
-        code, length = HEAD.unpack_from(head)
-        if code != Opcode.MESSAGE_INDEX or length < _CHANNEL_ID.size:
-            break
-        channel_ids.update(_CHANNEL_ID.unpack_from(head, HEAD.size))
-        at += HEAD.size + length
-    return frozenset(channel_ids)
-
-
-def _first_log_time(stream: BinaryIO, block: ChunkSpan) -> int:
-    """Log time of the earliest message of a chunk, as its header says."""
-    stream.seek(block.start + HEAD.size)
-    return int.from_bytes(stream.read(8), 'little')
+                for record in _load(stream, packed.pop(), frozenset(), damage).definitions:
+                    definitions.add(record, is_earlier=True)
+            if records.channel_ids:
+                span.first_ns = records.first_ns
+                span.channel_ids = records.channel_ids
+                yield span
 
 
 def _chunk_spans(
@@ -589,117 +472,128 @@ def _chunk_spans(
 ) -> Iterator[ChunkSpan]:
     """Chunk spans of a file in its order; damaged parts are added to `damage`.
 
-    After a damaged part, reading continues at the next chunk of the summary. Data that a recorder
-    has appended since are ignored.
+    The channels of a chunk are those of the message indexes behind it. After a damaged part,
+    reading continues at the next chunk of the summary. Data that a recorder has appended since are
+    ignored. Raises InputError if the file does not begin with the magic bytes of MCAP.
     """
+    if stream.read(len(MAGIC)) != MAGIC:
+        raise InputError(f'{path}: no MCAP file: expected it to begin with {MAGIC!r}')
     size = path.stat().st_size
-    chunks = sorted(block.start for block in summary.blocks)
+    chunks = sorted(span.start for span in summary.spans)
     at = len(MAGIC)
-    stretch = at
+    span: ChunkSpan | None = None
     while True:
         stream.seek(at)
-        head = stream.read(HEAD.size) if at + HEAD.size <= size else b''
-        code, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
+        head = stream.read(HEAD.size + 8) if at + HEAD.size <= size else bytes(HEAD.size)
+        code, length = HEAD.unpack_from(head)
         end = at + HEAD.size + length
-        plain = code in _PLAIN and end <= size and length <= LOGS.chunk_bytes
-        if stretch < at and (not plain or end - stretch > PIECE_BYTES):
-            yield ChunkSpan(stretch, at, is_chunk=False)
-            stretch = at
-        if (code, length) in ((Opcode.DATA_END, 4), (Opcode.FOOTER, _FOOTER.size)):
+        is_record = end <= size and (0 < code <= Opcode.DATA_END or code >= FIRST_PRIVATE_OPCODE)
+        is_plain = is_record and code in _PLAIN
+        is_index = is_record and code == Opcode.MESSAGE_INDEX
+        if span is not None and not _continues(span, end, is_plain, is_index):
+            if not is_record:
+                span.channel_ids.clear()  # further indexes may have been cut off
+            yield span
+            span = None
+        if head[: HEAD.size] in (_DATA_END_HEAD, _FOOTER_HEAD):
             stream.seek(size - len(MAGIC))
-            damage.is_truncated = (
-                stream.read() != MAGIC
-            )  # the messages are intact, the summary is not
+            # Otherwise the messages are intact, the summary is not.
+            damage.is_truncated = stream.read() != MAGIC
             return
-        if code == Opcode.CHUNK:
-            yield ChunkSpan(at, min(end, size), is_chunk=True, whole=end <= size)
-        if end <= size and (0 < code <= Opcode.DATA_END or code >= FIRST_PRIVATE_OPCODE):
-            if code in _PLAIN and not plain:
-                damage.parts[at] = f'record of {length} bytes: expected at most {LOGS.chunk_bytes}'
+        if is_record or code == Opcode.CHUNK:
+            span = _with_record(span, head, at, min(end, size), is_record)
+        if is_record:
             at = end
-            stretch = stretch if plain else at
-            continue
-        following = bisect_right(chunks, at)
-        if following == len(chunks):
-            damage.is_truncated = True
-            return
-        damage.parts.setdefault(at, 'no record')
-        at = chunks[following]
-        stretch = at
+        elif (following := bisect_right(chunks, at)) < len(chunks):
+            damage.parts.setdefault(at, 'no record')
+            at = chunks[following]
+        else:
+            break
+    if span is not None:
+        yield span
+    damage.is_truncated = True
 
 
-def _load_intact(
-    stream: BinaryIO, block: ChunkSpan, wanted: frozenset[int] | None, damage: Damage
-) -> Records | None:
-    """Records of a chunk span, without what is damaged: this is added to `damage`."""
+def _continues(span: ChunkSpan, end: int, is_plain: bool, is_index: bool) -> bool:
+    """Whether a record up to `end` continues the range of plain records, or indexes the chunk."""
+    return is_index if span.is_chunk else is_plain and end - span.start <= PIECE_BYTES
+
+
+def _with_record(
+    span: ChunkSpan | None, head: bytes, at: int, end: int, whole: bool
+) -> ChunkSpan | None:
+    """The span that a record begins, or that it is added to; None if it belongs to none."""
+    code, _ = HEAD.unpack_from(head)
+    begin = head[HEAD.size :]
+    if code == Opcode.CHUNK:
+        return ChunkSpan(at, end, True, whole, int.from_bytes(begin, 'little'))
+    if code in _PLAIN:
+        return ChunkSpan(at if span is None else span.start, end, False)
+    if code == Opcode.MESSAGE_INDEX and span is not None:
+        span.channel_ids.add(_channel_id(begin))
+    return span
+
+
+def _load(
+    stream: BinaryIO, span: ChunkSpan, wanted: frozenset[int] | None, damage: Damage
+) -> Records:
+    """Records of a chunk span, without what is damaged: this is added to `damage`.
+
+    wanted: channels, None for all.
+    """
+    stream.seek(span.start)
+    content = Section(stream, span.end - span.start)
     try:
-        records = _load(stream, block, wanted)
+        records = (
+            chunk_records(content, span.whole, wanted)
+            if span.is_chunk
+            else plain_records(content, wanted)
+        )
     except DamagedError as error:
-        damage.parts[block.start] = str(error)
-        return None
+        records = Records(damaged=str(error))
     if records.damaged:
-        damage.parts[block.start] = records.damaged
+        damage.parts[span.start] = records.damaged
     return records
-
-
-def _load(stream: BinaryIO, block: ChunkSpan, wanted: frozenset[int] | None) -> Records:
-    """Records of a chunk span; wanted: channels, None for all. Raises DamagedError."""
-    stream.seek(block.start)
-    if not block.is_chunk:
-        return plain_records(Section(stream, block.end - block.start), wanted=wanted)
-    length = block.end - block.start - HEAD.size
-    if length > LOGS.chunk_bytes:
-        raise DamagedError(f'chunk of {length} bytes: expected at most {LOGS.chunk_bytes}')
-    head = stream.read(HEAD.size)
-    if block.whole and head != HEAD.pack(Opcode.CHUNK, length):
-        raise DamagedError(f'no chunk of {length} bytes')
-    return chunk_records(Section(stream, length), block.whole, wanted)
 
 
 def summary_of(path: Path) -> Summary:
     """Summary at the end of a file; empty if it is truncated or the summary is unreadable."""
     size = path.stat().st_size
+    footer_at = size - len(MAGIC) - HEAD.size - _FOOTER.size
     with open_regular_file(path) as stream:
-        footer_at = size - len(MAGIC) - HEAD.size - _FOOTER.size
         stream.seek(max(footer_at, 0))
-        footer = stream.read()
-        if footer_at < 0 or footer[: HEAD.size] != HEAD.pack(Opcode.FOOTER, _FOOTER.size):
-            return Summary([], [])
+        footer = stream.read(HEAD.size + _FOOTER.size).ljust(HEAD.size + _FOOTER.size)
         start, _, checksum = _FOOTER.unpack_from(footer, HEAD.size)
-        if not len(MAGIC) <= start <= footer_at or footer_at - start > LOGS.summary_bytes:
-            return Summary([], [])
+        is_footer = footer.startswith(_FOOTER_HEAD) and len(MAGIC) <= start <= footer_at
+        if not is_footer or footer_at - start > LOGS.summary_bytes:
+            return Summary()
         stream.seek(start)
         content = stream.read(size - start)
+    try:
+        return _parsed_summary(content, start, checksum)
+    except (DamagedError, McapError, struct.error, ValueError):
+        return Summary()
+
+
+def _parsed_summary(content: bytes, data_end: int, checksum: int) -> Summary:
+    """The summary in the bytes from its begin to the end of the file."""
     # The checksum covers the footer up to the checksum field.
     if checksum and zlib.crc32(content[: -len(MAGIC) - 4]) != checksum:
-        return Summary([], [])
-    try:
-        return _parsed_summary(content, start)
-    except (DamagedError, McapError, struct.error, ValueError):
-        return Summary([], [])
-
-
-def _parsed_summary(content: bytes, data_end: int) -> Summary:
-    """The summary in the bytes from its begin to the end of the file."""
-    summary = Summary([], [])
+        raise DamagedError('wrong checksum')
+    summary = Summary()
     reader = StreamReader(BytesIO(content), skip_magic=True, record_size_limit=len(content))
     for record in reader.records:
         if isinstance(record, Schema | Channel):
             summary.definitions.append(record)
         elif isinstance(record, ChunkIndex):
-            summary.blocks.append(_indexed(record, data_end))
+            start = record.chunk_start_offset
+            end = start + record.chunk_length
+            if not len(MAGIC) <= start <= end - HEAD.size <= data_end - HEAD.size:
+                raise DamagedError(f'chunk at byte {start}')
+            # Writers may omit the channels of a chunk.
+            channel_ids = set(record.message_index_offsets)
+            first_ns = record.message_start_time
+            summary.spans.append(ChunkSpan(start, end, True, True, first_ns, channel_ids))
         elif isinstance(record, Statistics):
             summary.message_counts.update(record.channel_message_counts)
     return summary
-
-
-def _indexed(index: ChunkIndex, data_end: int) -> ChunkSpan:
-    end = index.chunk_start_offset + index.chunk_length
-    if not len(MAGIC) <= index.chunk_start_offset <= end - HEAD.size <= data_end - HEAD.size:
-        raise DamagedError(f'chunk at byte {index.chunk_start_offset}')
-    # Writers may omit the channels of a chunk.
-    channel_ids = frozenset(index.message_index_offsets) or None
-    first_ns = index.message_start_time
-    return ChunkSpan(
-        index.chunk_start_offset, end, True, first_ns=first_ns, channel_ids=channel_ids
-    )
