@@ -12,7 +12,7 @@ from functools import lru_cache
 from io import BytesIO
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory, TemporaryFile
-from typing import IO, Any, BinaryIO, cast
+from typing import IO, Any, BinaryIO, Literal, cast
 
 import zstandard
 from mcap.records import Channel, Schema
@@ -176,51 +176,46 @@ def _unpack(file: Path, out: IO[bytes]) -> None:
         raise InputError(f'{file}: no zstd file: {str(error)[:120]}') from error
 
 
-_ROS1 = b'#ROSBAG V'
-_SQLITE = b'SQLite format 3\0'
+Kind = Literal['mcap', 'ros1', 'sqlite', '']
+_KINDS: dict[bytes, Kind] = {
+    _MCAP: 'mcap',
+    b'#ROSBAG V': 'ros1',
+    b'SQLite format 3\0': 'sqlite',
+}
+_FOREIGN: dict[Kind, str] = {
+    'ros1': 'a ROS 1 bag',
+    'sqlite': 'an SQLite file of a rosbag2 bag',
+}
+
+
+def kind_of(path: Path) -> Kind:
+    """Kind of a file of a bag by its first bytes; empty for any other file.
+
+    Also for one that cannot be read: opening it reports the error.
+    """
+    try:
+        with open_regular_file(path) as stream:
+            begin = stream.read(16)
+    except OSError:
+        return ''
+    return next((kind for magic, kind in _KINDS.items() if begin.startswith(magic)), '')
 
 
 def refuse_foreign(path: Path, expected: str) -> None:
     """Raise InputError, with a command for conversion, for a ROS 1 bag or an SQLite file."""
-    kinds = ((is_ros1, 'a ROS 1 bag'), (is_sqlite, 'an SQLite file of a rosbag2 bag'))
-    for is_kind, name in kinds:
-        if is_kind(path):
-            convert = f'rosbags-convert --src {path} --dst {path.stem} --dst-storage mcap'
-            raise InputError(
-                f'{path}: {name}: expected {expected}: it is converted by '
-                f'`{convert} --dst-typestore ros2_jazzy`'
-            )
+    name = _FOREIGN.get(kind_of(path))
+    if name:
+        convert = f'rosbags-convert --src {path} --dst {path.stem} --dst-storage mcap'
+        raise InputError(
+            f'{path}: {name}: expected {expected}: it is converted by '
+            f'`{convert} --dst-typestore ros2_jazzy`'
+        )
 
 
 def is_bag(path: Path) -> bool:
     """Whether a path is a folder, or a file of a bag by its name or its first bytes."""
-    if path.is_dir() or path.suffix in ('.mcap', '.db3', '.bag', '.zstd'):
-        return True
-    return is_mcap(path) or is_ros1(path) or is_sqlite(path)
-
-
-def is_mcap(path: Path) -> bool:
-    """Whether a file begins with the magic bytes of MCAP."""
-    return _begin(path).startswith(_MCAP)
-
-
-def is_ros1(path: Path) -> bool:
-    """Whether a file begins as a ROS 1 bag."""
-    return _begin(path).startswith(_ROS1)
-
-
-def is_sqlite(path: Path) -> bool:
-    """Whether a file begins as an SQLite database."""
-    return _begin(path).startswith(_SQLITE)
-
-
-def _begin(path: Path) -> bytes:
-    """First bytes of a file; empty if it cannot be read: opening it reports the error."""
-    try:
-        with open_regular_file(path) as stream:
-            return stream.read(16)
-    except OSError:
-        return b''
+    is_named = path.is_dir() or path.suffix in ('.mcap', '.db3', '.bag', '.zstd')
+    return is_named or bool(kind_of(path))
 
 
 # QoS profiles in bags, stored with each topic so that players can offer the same.

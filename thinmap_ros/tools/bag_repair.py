@@ -6,7 +6,7 @@ from pathlib import Path
 from thinmap_ros.core.errors import InputError, counted
 from thinmap_ros.logs.bag_writer import temporary_bag
 from thinmap_ros.logs.repair import RepairReport, repair
-from thinmap_ros.logs.storage import bag_files, is_mcap, mcap_files_in, refuse_foreign
+from thinmap_ros.logs.storage import bag_files, kind_of, mcap_files_in, refuse_foreign
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser
 
@@ -18,7 +18,7 @@ def files_of(bag: Path) -> list[Path]:
     """
     refuse_foreign(bag, 'an MCAP file')
     files = mcap_files_in(bag) if bag.is_dir() else [bag]
-    if not files or not files[0].is_file() or not (files[0].suffix == '.mcap' or is_mcap(files[0])):
+    if not any(f.is_file() and (f.suffix == '.mcap' or kind_of(f) == 'mcap') for f in files[:1]):
         raise InputError(f'{bag}: expected an MCAP file, or a folder with MCAP files in it')
     return files
 

@@ -36,8 +36,7 @@ from thinmap_ros.logs.storage import (
     Storage,
     bag_files,
     is_bag,
-    is_ros1,
-    is_sqlite,
+    kind_of,
 )
 
 SCAN = 'sensor_msgs/msg/LaserScan'
@@ -197,9 +196,10 @@ def _type_words(field: Any) -> str:
 def _storage_of(path: Path) -> Storage:
     """Open a file of a bag. Raises InputError if it is invalid, OSError if it is no file."""
     require_regular_file(path)
-    if is_ros1(path):
+    kind = kind_of(path)
+    if kind == 'ros1':
         return Ros1Storage(path)
-    return SqliteStorage(path) if path.suffix == '.db3' or is_sqlite(path) else McapStorage(path)
+    return SqliteStorage(path) if kind == 'sqlite' or path.suffix == '.db3' else McapStorage(path)
 
 
 @dataclass

@@ -35,7 +35,7 @@ from thinmap_ros.logs.log import (
     ScanEvent,
     SkippedRecords,
 )
-from thinmap_ros.logs.storage import is_mcap, refuse_foreign
+from thinmap_ros.logs.storage import kind_of, refuse_foreign
 
 _SCAN_KEYWORDS = (b'FLASER', b'ROBOTLASER1')
 _KEYWORDS = (b'ODOM', *_SCAN_KEYWORDS)  # other lines are not read
@@ -118,7 +118,7 @@ class CarmenLog:
 
     def _lines(self) -> Iterator[tuple[int, str]]:
         refuse_foreign(self.path, 'a CARMEN log')
-        if is_mcap(self.path):
+        if kind_of(self.path) == 'mcap':
             raise InputError(f'{self.path}: an MCAP file, which is a bag: expected a CARMEN log')
         try:
             with open_unpacked(self.path) as stream:
