@@ -214,27 +214,42 @@ def _mount(links: _Links, frame: str, base_frame: str) -> Mount | None:
 
 def _connection(links: _Links, target_frame: str, source_frame: str) -> _Placement | None:
     """Placement of the source frame in the target frame, by their common ancestor."""
-    target = _ancestors(links, target_frame)
-    source = _ancestors(links, source_frame)
-    for frame, placement in source.items():
-        if frame in target:
-            return target[frame].inverse().of(placement)
-    return None
+    paths = _paths(links, target_frame, source_frame)
+    if paths is None:
+        return None
+    target, source = (_placement(links, frames) for frames in paths)
+    return target.inverse().of(source)
 
 
-def _ancestors(links: _Links, frame: str) -> dict[str, _Placement]:
-    """The frame and its ancestors, upwards, with its placement in each; a cycle ends it."""
-    frame = _without_slash(frame)
+def _placement(links: _Links, frames: list[str]) -> _Placement:
+    """Placement of the first frame in the parent of the last one."""
     placement = _Placement(np.eye(3), np.zeros(3))
-    found = {frame: placement}
+    for frame in frames:
+        placement = links[frame].placement.of(placement)
+    return placement
+
+
+def _paths(
+    links: Mapping[str, '_Link | _Edge'], target_frame: str, source_frame: str
+) -> tuple[list[str], list[str]] | None:
+    """Frames from the target, and from the source, up to below their common ancestor, if any."""
+    target = _path_to_root(links, _without_slash(target_frame))
+    source = _path_to_root(links, _without_slash(source_frame))
+    common = next((frame for frame in source if frame in target), None)
+    if common is None:
+        return None
+    return target[: target.index(common)], source[: source.index(common)]
+
+
+def _path_to_root(links: Mapping[str, '_Link | _Edge'], frame: str) -> list[str]:
+    """The frame, its parent, and so on; a cycle ends where it closes."""
+    path = [frame]
     while frame in links:
-        link = links[frame]
-        frame = link.parent
-        if frame in found:
+        frame = links[frame].parent
+        if frame in path:
             break
-        placement = link.placement.of(placement)
-        found[frame] = placement
-    return found
+        path.append(frame)
+    return path
 
 
 def _without_slash(frame: str) -> str:
@@ -341,25 +356,13 @@ class TransformBuffer:
 
     def _path(self, target_frame: str, source_frame: str) -> tuple[list[str], list[str]]:
         """Frames from the target, and from the source, up to below their common ancestor."""
-        target = self._path_to_root(_without_slash(target_frame))
-        source = self._path_to_root(_without_slash(source_frame))
-        common = next((frame for frame in source if frame in target), None)
-        if common is None:
+        paths = _paths(self._edges, target_frame, source_frame)
+        if paths is None:
             raise InputError(
                 f'no transform from {quoted(source_frame)} to {quoted(target_frame)}: '
                 f'{self._missing(target_frame, source_frame)}'
             )
-        return target[: target.index(common)], source[: source.index(common)]
-
-    def _path_to_root(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on; a cycle ends where it closes."""
-        path = [frame]
-        while frame in self._edges:
-            frame = self._edges[frame].parent
-            if frame in path:
-                break
-            path.append(frame)
-        return path
+        return paths
 
     def _chain(self, frames: list[str], ns: int) -> Array:
         """Pose of the first frame in the parent of the last one, (3,)."""
