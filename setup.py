@@ -85,6 +85,7 @@ setup(
     extras_require={
         'cluster': ['distributed'],
         'completion': ['argcomplete>=3'],
+        'notebook': ['jupyterlab', 'jupytext'],
         'viewer': ['rerun-sdk>=0.41,<0.42'],  # its interface changes with each minor version
         'web': ['segno>=1.5', 'tornado>=6.2'],
         'test': [

@@ -6,14 +6,13 @@ WORLD: a world or map_server YAML, or the name of a world of the package (defaul
 
 from argparse import ArgumentParser, RawDescriptionHelpFormatter
 
-from thinmap_ros import ExplorationOptions, World, explore, read_world, world_path
+from thinmap_ros import ExplorationOptions, explore
 
 
 def main(name: str) -> None:
     """Explore a world and print how it went."""
-    world = World.from_patch(*read_world(world_path(name)))
     options = ExplorationOptions(localization='slam', speed_m_s=0.3, seed=1)
-    loop, report = explore(world, world.start, options)
+    loop, report = explore(name, options=options)
     print(f'{report["reason"]} after {report["time"]:.0f} s and {report["distance"]:.1f} m')
     print(f'{report["coverage"]:.1%} seen, {report["collisions"]} collisions')
     print(f'{len(loop.pipeline.topology.map.nodes)} nodes in the graph')

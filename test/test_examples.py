@@ -68,8 +68,15 @@ def test_every_example_is_run_here() -> None:
 def test_slam_on_a_log_and_a_route_on_its_map(example, tmp_path: Path) -> None:
     folder = tmp_path / 'out'
     said = example('slam_on_a_log', str(ROOT / 'bags' / 'dead_end.mcap'), str(folder))
-    assert re.fullmatch(r'219 scans, 8\.\d m, \d+ nodes\n', said)
-    assert {path.name for path in folder.iterdir()} == {'map.pgm', 'map.yaml', 'route.geojson'}
+    assert re.fullmatch(
+        r'StampedPoses\(219 poses, 8\.\d m\)\nTopologicalMap\(\d+ nodes, \d+ edges\)\n', said
+    )
+    assert {path.name for path in folder.iterdir()} == {
+        'map.pgm',
+        'map.yaml',
+        'route.geojson',
+        'final.tum',
+    }
     said = example('route_graph', str(folder / 'map.yaml'), '0,0', '6,0')
     assert re.fullmatch(r'\d+ nodes, \d+ edges\n\d+\.\d m over nodes \d+(, \d+)+\n', said)
 

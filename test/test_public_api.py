@@ -1,6 +1,7 @@
 """`from thinmap_ros import ...`: the public names, without ROS."""
 
 import ast
+import inspect
 import os
 import subprocess
 import sys
@@ -8,14 +9,17 @@ from importlib import import_module
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.hidden_library import hide_ros
 
 import thinmap_ros
+from thinmap_ros.replaying import replay, write_outputs
 
 pytestmark = pytest.mark.programs
 
 ROOT = Path(__file__).resolve().parents[1]
+LOG = str(ROOT / 'bags' / 'dead_end.mcap')
 
 
 @pytest.fixture(autouse=True)
@@ -105,6 +109,118 @@ def test_what_a_notebook_shows_has_numbers_and_a_picture(tmp_path: Path) -> None
     assert (tmp_path / 'map.png').stat().st_size > 10_000
     with pytest.raises(thinmap_ros.InputError, match='plot: a int: expected a Pipeline'):
         thinmap_ros.plot(3)
+
+
+@pytest.fixture(scope='module')
+def finished() -> thinmap_ros.Pipeline:
+    """A pipeline after a log."""
+    slam = thinmap_ros.Pipeline()
+    for scan, T_odom_base in thinmap_ros.paired_scans(thinmap_ros.open_log(LOG)):
+        slam.step(scan, T_odom_base)
+    slam.finish()
+    return slam
+
+
+def test_a_trajectory_has_each_scan_live_and_final(finished, tmp_path: Path) -> None:
+    live, final = finished.trajectory
+    assert len(live.stamps_ns) == len(live.poses) == len(final.poses) == 219
+    np.testing.assert_array_equal(live.stamps_ns, final.stamps_ns)
+    np.testing.assert_allclose(live.poses[-1], [7.0, 1.88, 1.57], atol=0.05)
+    assert 0.0 < np.abs(live.poses - final.poses).max() < 0.05
+    assert repr(final) == 'StampedPoses(219 poses, 8.7 m)'
+
+
+def test_the_files_and_errors_of_a_pipeline_are_those_of_the_programs(
+    finished, tmp_path: Path
+) -> None:
+    result = replay(thinmap_ros.open_log(LOG), thinmap_ros.PipelineConfig())
+    write_outputs(result, tmp_path, 'dead end', (1.0, 1.0))
+    for kind, name in (('live', 'trajectory.tum'), ('final', 'trajectory_final.tum')):
+        thinmap_ros.write_trajectory(tmp_path / kind, getattr(finished.trajectory, kind))
+        assert (tmp_path / kind).read_text() == (tmp_path / name).read_text()
+    reference = tmp_path / 'trajectory_final.tum'
+    errors = thinmap_ros.evaluate(finished, reference)
+    assert list(errors) == ['live', 'final']
+    assert errors['final'].errors['APE, m'].max < 1e-6  # digits of a file
+    of_files = thinmap_ros.evaluate(tmp_path, str(reference))
+    assert errors['live'].errors['APE, m'].rmse == pytest.approx(
+        of_files['trajectory.tum'].errors['APE, m'].rmse, abs=1e-6
+    )
+    assert str(errors['live']).splitlines()[0].startswith('  APE, m         rmse 0.00')
+    live, final = finished.trajectory
+    (alone,) = thinmap_ros.evaluate(live, final).values()
+    assert alone.errors['APE, m'].rmse == pytest.approx(errors['live'].errors['APE, m'].rmse, 1e-3)
+
+
+def test_a_session_begins_a_new_trajectory(finished, tmp_path: Path) -> None:
+    finished.save_session(tmp_path / 'map')
+    continued = thinmap_ros.Pipeline()
+    scans = list(islice(thinmap_ros.paired_scans(thinmap_ros.open_log(LOG)), 6))
+    for number, (scan, T_odom_base) in enumerate(scans):
+        if number == 3:
+            continued.load_session(tmp_path / 'map')
+        continued.step(scan, T_odom_base)
+    live, final = continued.trajectory
+    assert live.stamps_ns.tolist() == [scan.stamp_ns for scan, _ in scans[3:]]
+    assert final.poses.shape == (3, 3)
+
+
+def test_a_picture_has_the_layers_and_the_size_that_are_asked_for(finished) -> None:
+    final = finished.trajectory.final
+    figure = thinmap_ros.plot(finished, true=final)
+    lines = {line.get_label(): line for line in figure.axes[0].lines}
+    np.testing.assert_array_equal(lines['path, estimated'].get_xydata(), final.poses[:, :2])
+    assert len(lines['path, driven'].get_xydata()) == 219
+    large = thinmap_ros.plot(finished, size_in=14.0)
+    assert large.get_size_inches()[0] == pytest.approx(figure.get_size_inches()[0] + 7.0, abs=0.1)
+    bare = thinmap_ros.plot(finished, layers=['regions', 'map'])
+    labels = {text.get_text() for text in bare.legends[0].get_texts()}
+    assert {'corridor', 'wall'} <= labels
+    assert not labels & {'path, estimated', 'edge', 'skeleton'}
+    only = thinmap_ros.plot(finished, layers='path')
+    labels = {text.get_text() for text in only.legends[0].get_texts()}
+    assert labels == {'path, estimated', 'start', 'end'}
+
+
+def test_a_grid_tells_its_size_and_what_is_known(finished) -> None:
+    grid = finished.grid
+    patch = grid.known_area()
+    rows, cols = patch.shape
+    free = int(patch.free.sum())
+    occupied = int(patch.occupied.sum())
+    size = f'{rows} x {cols} cells of 0.05 m'
+    assert repr(grid) == f'OccupancyGrid({size}, {free} free, {occupied} occupied)'
+    assert min(rows, cols, free, occupied) > 100
+
+
+def test_the_nearest_node_is_that_of_a_place_or_two_numbers(finished) -> None:
+    graph = finished.topology.map
+    assert graph.nearest_node((6.0, 3.0)) is graph.nearest_node(6.0, 3.0)
+    assert graph.nearest_node(np.array([6.0, 3.0])) is graph.nearest_node(6.0, 3.0)
+
+
+def test_a_world_of_the_package_is_explored_by_its_name() -> None:
+    options = thinmap_ros.ExplorationOptions(time_limit_s=3.0)
+    loop, report = thinmap_ros.explore('room_10x10', options=options)
+    assert report['world'] == 'room_10x10'
+    start = thinmap_ros.read_world(thinmap_ros.world_path('room_10x10'))[2]
+    np.testing.assert_allclose(loop.log.true_poses[0], start, atol=0.3)
+
+
+def test_keywords_are_shown_where_a_notebook_asks_for_them() -> None:
+    for callable_, name in (
+        (thinmap_ros.Pipeline, 'resolution_m'),
+        (thinmap_ros.ExplorationOptions, 'speed_m_s'),
+        (thinmap_ros.plot, 'layers'),
+    ):
+        assert name in inspect.signature(callable_).parameters
+
+
+def test_the_image_of_a_map_names_the_file_beside_it(tmp_path: Path) -> None:
+    thinmap_ros.write_map(tmp_path / 'room', thinmap_ros.OccupancyGrid().known_area())
+    with pytest.raises(thinmap_ros.InputError, match=r'did you mean .*room\.yaml') as raised:
+        thinmap_ros.read_map(tmp_path / 'room.pgm')
+    assert len(str(raised.value).splitlines()) == 1
 
 
 def test_paths_may_be_texts(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from thinmap_ros import (
     TopologyConfig,
     World,
     build_topology,
+    evaluate,
     explore,
     merge_maps,
     open_log,
@@ -40,6 +41,7 @@ from thinmap_ros import (
     world_path,
     write_graph,
     write_map,
+    write_trajectory,
 )
 
 FRAME = GridFrame(0.0, 0.0, 0.05)
@@ -48,11 +50,13 @@ GRAPH = build_topology(PATCH, None, TopologyConfig(robot_radius_m=0.1))
 WORLD = World.from_patch('room', PATCH, np.zeros(3))
 HERE = np.array([2.0, 2.0, 0.0])
 SCAN = scan_in(ROOM, HERE)
+POSES = (np.arange(5), np.zeros((5, 3)))
 WRONG: list[tuple[str, Callable[[], object]]] = [
     ('config = 3', lambda: Pipeline(3)),
     ("resolution_m = '5 cm'", lambda: Pipeline(resolution_m='5 cm')),
     ('resolution_m = 0', lambda: Pipeline(resolution_m=0)),
     ('max_range_m = -1', lambda: Pipeline(max_range_m=-1)),
+    ('resolution = 0.1 (did you mean resolution_m?)', lambda: Pipeline(resolution=0.1)),
     ('scan = 3', lambda: Pipeline().step(3, HERE)),
     ('T_odom_base = ', lambda: Pipeline().step(SCAN, [0.0, 0.0])),
     ("T_odom_base = 'here'", lambda: Pipeline().step(SCAN, 'here')),
@@ -67,6 +71,12 @@ WRONG: list[tuple[str, Callable[[], object]]] = [
     ("robot_radius_m = 'x'", lambda: TopologyConfig(robot_radius_m='x')),
     ('probability_threshold = None', lambda: ExplorerConfig(probability_threshold=None)),
     ('plot: a int', lambda: plot(3)),
+    ("layers: 'grap' (did you mean graph?)", lambda: plot(PATCH, layers=['grap'])),
+    ('layers: 3', lambda: plot(PATCH, layers=3)),
+    ('size_in = 0', lambda: plot(PATCH, size_in=0)),
+    ("size_in = 'big'", lambda: plot(PATCH, size_in='big')),
+    ('true = [1.0, 2.0]', lambda: plot(PATCH, true=[1.0, 2.0])),
+    ('size = 3 (did you mean size_in?)', lambda: plot(PATCH, size=3)),
     ('topology = 3', lambda: plot(PATCH, 3)),
     ('scan: could not convert', lambda: Scan.create(0, ['x'], 0.0, 0.1, 0.1, 8.0)),
     ('angles nan', lambda: Scan.create(0, [1.0], None, 0.1, 0.1, 8.0)),
@@ -84,6 +94,7 @@ WRONG: list[tuple[str, Callable[[], object]]] = [
     ('T_map_base = 3', lambda: OccupancyGrid().add_scan(SCAN, 3)),
     ('patch = 3', lambda: OccupancyGrid.from_patch(3)),
     ('path = None', lambda: read_map(None)),
+    ('x.pgm: an image', lambda: read_map('x.pgm')),
     ('path = 3', lambda: write_map(3, PATCH)),
     ('patch = 3', lambda: write_map('x', 3)),
     ("paths = 'maps'", lambda: merge_maps('maps')),
@@ -93,6 +104,8 @@ WRONG: list[tuple[str, Callable[[], object]]] = [
     ('seed_xy = 3', lambda: build_topology(PATCH, 3)),
     ('config = 0.2', lambda: build_topology(PATCH, None, 0.2)),
     ('topology = 3', lambda: shortest_path(3, 1, 2)),
+    ("x, y = 'here'", lambda: GRAPH.nearest_node('here')),
+    ("x, y = ('a', 'b')", lambda: GRAPH.nearest_node('a', 'b')),
     ('node 999: ', lambda: shortest_path(GRAPH, 999, 999)),
     ("node = '1'", lambda: shortest_path(GRAPH, '1', '2')),
     ("free = array('free'", lambda: thin('free')),
@@ -106,8 +119,11 @@ WRONG: list[tuple[str, Callable[[], object]]] = [
     ('patch = 3', lambda: World.from_patch('room', 3, np.zeros(3))),
     ('start = 3', lambda: World.from_patch('room', PATCH, 3)),
     ('world = 3', lambda: explore(3, np.zeros(3))),
+    ("world 'room_10' (did you mean room_10x10?)", lambda: explore('room_10')),
+    ('option = 3 (did you mean options?)', lambda: explore(WORLD, option=3)),
     ("start = 'here'", lambda: explore(WORLD, 'here')),
     ('config = 3', lambda: explore(WORLD, np.zeros(3), 3)),
+    ('speed = 1 (did you mean speed_m_s?)', lambda: ExplorationOptions(speed=1)),
     ("robot = 'r2d2'", lambda: ExplorationOptions(robot='r2d2')),
     ("localization = 'gps'", lambda: ExplorationOptions(localization='gps')),
     ("speed_m_s = 'fast'", lambda: ExplorationOptions(speed_m_s='fast')),
@@ -115,9 +131,26 @@ WRONG: list[tuple[str, Callable[[], object]]] = [
     ('laser = 3', lambda: ExplorationOptions(laser=3)),
     ('path = 3', lambda: read_world(3)),
     ('path = 3', lambda: world_path(3)),
+    ('trajectory = Pipeline(', lambda: write_trajectory('x.tum', Pipeline())),
+    ('trajectory = ', lambda: write_trajectory('x.tum', ([1, 2], np.zeros((3, 3))))),
+    ('path = 3', lambda: write_trajectory(3, POSES)),
+    ('run = 3', lambda: evaluate(3, POSES)),
+    ('run = ', lambda: evaluate((1, 2, 3), POSES)),
+    ('reference = 3', lambda: evaluate(POSES, 3)),
+    ('truth.txt: ', lambda: evaluate(POSES, 'truth.txt')),
+    ('live: 0 stamps', lambda: evaluate(Pipeline(), POSES)),
+    ("delta = '1'", lambda: evaluate(POSES, POSES, delta='1')),
+    ('max_difference = 1 (did you', lambda: evaluate(POSES, POSES, max_difference=1)),
 ]
 # Values that others make, and what reports errors.
-_MADE_BY_OTHERS = {'MergedMap', 'ThinmapError', 'InputError', 'ConfigError'}
+_MADE_BY_OTHERS = {
+    'MergedMap',
+    'ScanTrajectory',
+    'StampedPoses',
+    'ThinmapError',
+    'InputError',
+    'ConfigError',
+}
 # Configurations: `Config` checks all fields of all of them.
 _CONFIGS = {name for name in thinmap_ros.__all__ if name.endswith(('Config', 'LaserOptions'))}
 

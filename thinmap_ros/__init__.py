@@ -25,10 +25,12 @@ if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
     from thinmap_ros.core.topology.thinning import thin
     from thinmap_ros.core.topology.topology import build as build_topology
     from thinmap_ros.evaluation.exploration_run import explore
+    from thinmap_ros.evaluation.run_errors import evaluate
     from thinmap_ros.files.graphs import write_graph
     from thinmap_ros.files.merging import MergedMap, merge_maps
     from thinmap_ros.files.occupancy_maps import read_map, write_map
     from thinmap_ros.files.package_data import world_path
+    from thinmap_ros.files.trajectories import ScanTrajectory, StampedPoses, write_trajectory
     from thinmap_ros.files.worlds import read_world
     from thinmap_ros.logs.log import LaserOptions
     from thinmap_ros.logs.reading import open_log, paired_scans
@@ -58,11 +60,14 @@ __all__ = [
     'Pipeline',
     'PipelineConfig',
     'Scan',
+    'ScanTrajectory',
+    'StampedPoses',
     'ThinmapError',
     'TopologicalMap',
     'TopologyConfig',
     'World',
     'build_topology',
+    'evaluate',
     'explore',
     'merge_maps',
     'open_log',
@@ -76,6 +81,7 @@ __all__ = [
     'world_path',
     'write_graph',
     'write_map',
+    'write_trajectory',
 ]
 
 # The only place of the version: setup.py reads it, and a test compares the two package.xml with it.
@@ -89,6 +95,11 @@ _PLACES = {
     'EkfConfig': 'core.ekf_slam.ekf_localizer.EkfConfig',
     'plot': 'view.summary.plot',
     'Scan': 'core.scan.Scan',
+    # trajectories
+    'ScanTrajectory': 'files.trajectories.ScanTrajectory',
+    'StampedPoses': 'files.trajectories.StampedPoses',
+    'write_trajectory': 'files.trajectories.write_trajectory',
+    'evaluate': 'evaluation.run_errors.evaluate',
     # logs
     'open_log': 'logs.reading.open_log',
     'LaserConfig': 'core.scan.LaserConfig',

@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
 
+import numpy as np
+
 from thinmap_ros.core.config import Config, config_or_default, parameter, part
-from thinmap_ros.core.errors import InputError, pose_of, require_type
+from thinmap_ros.core.errors import InputError, pose_of, require_type, with_known_keywords
 from thinmap_ros.core.grid.mapper import Mapper
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
@@ -31,6 +33,7 @@ from thinmap_ros.files import sessions
 from thinmap_ros.files.occupancy_maps import warn
 from thinmap_ros.files.safe import path_of
 from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, SessionMap
+from thinmap_ros.files.trajectories import ScanTrajectory, StampedPoses
 
 
 @dataclass(frozen=True)
@@ -64,9 +67,11 @@ class Pipeline:
     `stage_seconds`: CPU time of each stage, s, a number for each time that it ran.
     `pose_source` replaces the localizer if poses are known (true poses of a simulator).
     `resolution_m` (m a cell) is short for that of `config.grid`. `max_range_m` is the usable range
-    of the laser (m), instead of that of the scans. Raises ConfigError for a value out of range.
+    of the laser (m), instead of that of the scans. Raises ConfigError for a value out of range, or
+    a name that is none of these.
     """
 
+    @with_known_keywords
     def __init__(
         self,
         config: PipelineConfig | None = None,
@@ -92,6 +97,9 @@ class Pipeline:
         self._pose_source = pose_source
         self._regions = self._new_regions()
         self._consistency = ConsistencyMonitor()
+        self._stamps_ns: list[int] = []
+        self._live: list[Array] = []
+        self._is_finished = False
 
     def __repr__(self) -> str:
         scans = len(self.stage_seconds.get('localizer', ()))
@@ -118,6 +126,25 @@ class Pipeline:
         if self._mapper.has_changed:
             self._update_topology()
         return self._topology.builder
+
+    @property
+    def trajectory(self) -> ScanTrajectory:
+        """The pose of each scan, live and final, by the stamps of the scans, in their order.
+
+        final: after all corrections so far. After `finish`, the loops that are still looked for are
+        closed for it first, as `replay` does; the map stays as it is.
+        """
+        stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
+        live = np.array(self._live).reshape(-1, 3)
+        if self._pose_source:
+            final = live
+        elif self._is_finished:
+            final = self.localizer.optimized_trajectory()
+        else:
+            final = self.localizer.corrected_trajectory()
+        return ScanTrajectory(
+            StampedPoses(stamps_ns, live), StampedPoses(stamps_ns, final[: len(live)])
+        )
 
     @property
     def warnings(self) -> list[str]:
@@ -151,6 +178,9 @@ class Pipeline:
             locate = self._pose_source or self.localizer.step
             estimate = locate(scan, T_odom_base)
             estimate = self._consistency.checked(scan, T_odom_base, estimate)
+        self._is_finished = False
+        self._stamps_ns.append(scan.stamp_ns)
+        self._live.append(estimate.T_map_base)
         with self._timed('grid'):
             is_due = self._mapper.add(self._localized(scan, estimate))
         self.refusals += self._mapper.refusals
@@ -160,12 +190,16 @@ class Pipeline:
 
     def finish(self) -> None:
         """Complete a pending correction after the last scan."""
+        self._complete()
+        self._is_finished = True
+
+    def _complete(self) -> None:
         self._mapper.complete()
         self.refusals += self._mapper.refusals
 
     def _update_topology(self) -> None:
         if self._mapper.grid.is_rerendering:
-            self.finish()
+            self._complete()
         update = self._mapper.update()
         if update.whole is not None:
             self._regions.follow(update.whole)
@@ -195,6 +229,8 @@ class Pipeline:
         builder = _graph_of(path, grid.shown.known_area(), self.config.topology)
         regions = REGIONS.load_optional(path, self._regions.config)
         self.localizer = localizer
+        self._stamps_ns = []
+        self._live = []
         self._mapper.replace(grid, keep_out)
         self._topology.replace(builder)
         self.localizer.set_topology(builder.map)
@@ -206,7 +242,7 @@ class Pipeline:
 
         All files or none, as `sessions.save_session`. Raises InputError, and OSError.
         """
-        self.finish()
+        self._complete()
         self._regions.update(self.grid.known_area())
         known = SessionMap(
             self.grid, self.topology, self._regions, self._mapper.edits, self.localizer

@@ -9,7 +9,8 @@
 # # A log in a notebook
 #
 # A recorded drive becomes a map, a picture and a graph. Two drives become one map.
-# Jupyter with jupytext opens this file as it is; `jupytext --to ipynb notebook.py` converts it.
+# `pip install '.[notebook]'` installs Jupyter and jupytext. Jupyter then opens this file as it is;
+# `jupytext --to ipynb notebook.py` converts it.
 
 # %%
 from pathlib import Path
@@ -49,8 +50,8 @@ first
 
 # %%
 graph = first.topology.map
-start = graph.nearest_node(0.0, 0.0)
-goal = graph.nearest_node(6.0, 5.0)
+start = graph.nearest_node((0.0, 0.0))
+goal = graph.nearest_node((6.0, 5.0))
 route = shortest_path(graph, start.id, goal.id)
 print(f'{route.cost_m:.1f} m over nodes {route.node_ids}')
 

@@ -9,9 +9,9 @@ fixed: they are set in Python only, and are no parameters of nodes.
 import dataclasses
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
-from thinmap_ros.core.errors import ConfigError, did_you_mean, quoted, with_article
+from thinmap_ros.core.errors import ConfigError, did_you_mean, quoted, require_known, with_article
 
 SAFE_LOWER = 'lower'
 SAFE_HIGHER = 'higher'
@@ -83,6 +83,11 @@ class Config:
 
     Raises ConfigError naming the parameter, its value and what was expected.
     """
+
+    def __new__(cls, *_given: Any, **by_name: Any) -> Self:
+        """Raises ConfigError for a name that is no field; else the object is made as always."""
+        require_known(by_name, [field.name for field in dataclasses.fields(cls) if field.init])
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):

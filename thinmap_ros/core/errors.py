@@ -1,10 +1,13 @@
 """Errors that thinmap reports to its user, and the checks that raise them."""
 
+import inspect
 import math
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from difflib import get_close_matches
+from functools import wraps
 from itertools import accumulate
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +47,31 @@ def require_type(what: str, value: object, *kinds: type) -> None:
     if not isinstance(value, kinds):
         names = ' or '.join(kind.__name__ for kind in kinds if kind is not type(None))
         raise InputError(f'{what} = {quoted(value)}: expected {with_article(names)}')
+
+
+def require_known(given: Mapping[str, object], known: Collection[str]) -> None:
+    """Raise ConfigError where a keyword of a caller is none of those that are known."""
+    for name, value in given.items():
+        if name not in known:
+            longer = [other for other in known if other.startswith(f'{name}_')]
+            meant = did_you_mean(longer[0] if longer else name, known)
+            names = quoted_names(list(known))
+            raise ConfigError(f'{name} = {quoted(value)}{meant}: expected one of {names}')
+
+
+Function = TypeVar('Function', bound=Callable[..., Any])
+
+
+def with_known_keywords(function: Function) -> Function:
+    """Decorator: a keyword that the function does not take is a ConfigError of one line."""
+    known = [name for name in inspect.signature(function).parameters if name != 'self']
+
+    @wraps(function)
+    def checked(*given: Any, **by_name: Any) -> Any:
+        require_known(by_name, known)
+        return function(*given, **by_name)
+
+    return cast(Function, checked)
 
 
 def did_you_mean(word: str, known: Iterable[str], cutoff: float = 0.6) -> str:
@@ -118,6 +146,17 @@ def pose_of(what: str, value: object) -> se2.Array:
     if pose.shape != (3,) or not se2.is_finite(pose):
         raise InputError(f'{what} = {quoted(value)}: expected x, y (m) and heading (rad), finite')
     return pose
+
+
+def place_of(what: str, value: object) -> se2.Place:
+    """A place of a caller: x and y (m), as two numbers. Raises InputError for anything else."""
+    try:
+        place = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        place = np.empty(0)
+    if place.shape != (2,) or not np.isfinite(place).all():
+        raise InputError(f'{what} = {quoted(value)}: expected x and y (m), finite')
+    return float(place[0]), float(place[1])
 
 
 def require_bounded(

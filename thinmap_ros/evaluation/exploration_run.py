@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from thinmap_ros.closed_loop import (
 )
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import config_or_default
-from thinmap_ros.core.errors import InputError, pose_of, require_type
+from thinmap_ros.core.errors import InputError, pose_of, require_type, with_known_keywords
 from thinmap_ros.core.exploration.strategy import Decision
 from thinmap_ros.core.places.active_search import ActiveSearch
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
@@ -31,6 +32,8 @@ from thinmap_ros.evaluation.exploration_metrics import (
     exploration_report,
     missing_area_report,
 )
+from thinmap_ros.files.package_data import world_path
+from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
@@ -201,18 +204,23 @@ def run_timed(
     }
 
 
+@with_known_keywords
 def explore(
-    world: World,
-    start: Array,
+    world: World | Path | str,
+    start: Array | None = None,
     options: Options | None = None,
     show: Callable[[float, float], None] = no_progress,
 ) -> tuple[ClosedLoop, dict[str, Any]]:
     """Explore a world from a start (3,); returns the finished loop and the report.
 
-    Raises InputError where it is no world or the start no pose, ConfigError for other options.
+    world: or its file, or the name of a world of the package. start: that of the world, if none is
+    given. Raises InputError where it is no world or the start no pose, ConfigError for other
+    options.
     """
+    if isinstance(world, str | Path):
+        world = World.from_patch(*read_world(world_path(world)))
     require_type('world', world, World)
-    start = pose_of('start', start)
+    start = pose_of('start', world.start if start is None else start)
     options = config_or_default(options, Options)
     census = EndNodeCensus()
     targets = TargetLog()

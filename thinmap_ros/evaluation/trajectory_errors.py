@@ -12,7 +12,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import SECOND_NS, Array, wrap
 from thinmap_ros.files.safe import read_text
-from thinmap_ros.files.trajectories import read_tum
+from thinmap_ros.files.trajectories import StampedPoses
 
 
 def between_paths(path: Array, onto: Array) -> Array:
@@ -164,33 +164,43 @@ class Comparison:
     poses: int
     errors: dict[str, Statistics]
 
+    def __str__(self) -> str:
+        rows = []
+        for name, of in self.errors.items():
+            numbers = '  '.join(f'{key} {value:.6f}' for key, value in asdict(of).items())
+            rows.append(f'  {name:14} {numbers}')
+        return '\n'.join(rows)
+
     def as_dict(self) -> dict[str, Any]:
         """Numbers by name, for JSON."""
         return {'poses': self.poses, **{name: asdict(of) for name, of in self.errors.items()}}
 
 
-def compare_with_tum(
-    path: Path, reference: Path, is_aligned: bool, max_difference_s: float, delta: int
+def compare_with_trajectory(
+    trajectory: StampedPoses,
+    reference: StampedPoses,
+    names: tuple[str, str],
+    is_aligned: bool,
+    max_difference_s: float,
+    delta: int,
 ) -> Comparison:
-    """Absolute and relative pose errors of a TUM trajectory against another one, as evo has them.
+    """Absolute and relative pose errors of a trajectory against another one, as evo has them.
 
-    is_aligned: whether the trajectory is moved onto the reference first (evo's --align), which
-    does not change relative errors. delta: poses between the two of a relative error. Raises
-    InputError where a file is invalid, or fewer than three stamps are common.
+    names: of both, for messages. is_aligned: whether the trajectory is moved onto the reference
+    first (evo's --align), which does not change relative errors. delta: poses between the two of a
+    relative error. Raises InputError where fewer than three stamps are common.
     Source: Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017.
     """
-    stamps_ns, poses = read_tum(path)
-    known_ns, truth = read_tum(reference)
     own, other = associated(
-        np.array(stamps_ns), np.array(known_ns), round(max_difference_s * SECOND_NS)
+        trajectory.stamps_ns, reference.stamps_ns, round(max_difference_s * SECOND_NS)
     )
     if len(own) < MIN_POSES or len(own) <= delta:
         raise InputError(
-            f'{path}: {len(own)} stamps within {max_difference_s:g} s of those of {reference}: '
+            f'{names[0]}: {len(own)} stamps within {max_difference_s:g} s of those of {names[1]}: '
             f'expected at least {max(MIN_POSES, delta + 1)}'
         )
-    estimate = poses[own]
-    expected = truth[other]
+    estimate = trajectory.poses[own]
+    expected = reference.poses[other]
     T = between_paths(estimate, expected) if is_aligned else np.zeros(3)
     absolute = _differences(np.array([se2.compose(T, pose) for pose in estimate]), expected)
     relative = _differences(_motions(estimate, delta), _motions(expected, delta))
@@ -205,19 +215,20 @@ def compare_with_tum(
     )
 
 
-def compare_with_relations(path: Path, relations: Path, max_difference_s: float) -> Comparison:
-    """Errors of a TUM trajectory by known relations `t1 t2 x y z roll pitch yaw` between poses.
+def compare_with_relations(
+    trajectory: StampedPoses, name: str, relations: Path, max_difference_s: float
+) -> Comparison:
+    """Errors of a trajectory by a file of relations `t1 t2 x y z roll pitch yaw` between poses.
 
-    A relation counts where both of its stamps have a pose within max_difference_s. Raises
-    InputError where a file is invalid, or no relation counts.
+    name: of the trajectory, for messages. A relation counts where both of its stamps have a pose
+    within max_difference_s. Raises InputError where the file is invalid, or no relation counts.
     """
-    stamps_ns, poses = read_tum(path)
-    times_s = np.array(stamps_ns) / SECOND_NS
-    errors = known_relation_errors(times_s, poses, relations, max_difference_s)
+    times_s = trajectory.stamps_ns / SECOND_NS
+    errors = known_relation_errors(times_s, trajectory.poses, relations, max_difference_s)
     if not len(errors.metres):
         raise InputError(
             f'{relations}: no relation whose stamps are within {max_difference_s:g} s of poses of '
-            f'{path}'
+            f'{name}'
         )
     return Comparison(
         len(errors.metres),

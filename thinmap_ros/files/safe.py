@@ -324,6 +324,7 @@ def _parse(text: str, loader: type['_BoundedLoader']) -> object:
 # Bytes near the begin of files that are given for a YAML file, and what they are.
 _BEGIN_BYTES = 64
 _IMAGE = 'an image, which a YAML file beside it names'
+_IMAGE_SUFFIXES = ('.pgm', '.png', '.bmp', '.jpg', '.jpeg')
 _FOREIGN = (
     (
         b'serialization::archive',
@@ -343,7 +344,10 @@ _FOREIGN = (
 
 
 def _foreign_kind(path: Path) -> str:
-    """What a file is that cannot be YAML; '' where it may be, or cannot be read."""
+    """What a file is that cannot be YAML, by its name or its begin; '' where it may be."""
+    if path.suffix.lower() in _IMAGE_SUFFIXES:
+        beside = path.with_suffix('.yaml')
+        return f'{_IMAGE} (did you mean {beside}?)' if beside.is_file() else _IMAGE
     try:
         with open_regular_file(path) as stream:
             begin = stream.read(_BEGIN_BYTES)

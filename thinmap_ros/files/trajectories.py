@@ -3,13 +3,56 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import SECOND_NS, Array
-from thinmap_ros.files.safe import read_text, write_text
+from thinmap_ros.files.safe import path_of, read_text, write_text
+
+
+class StampedPoses(NamedTuple):
+    """A trajectory: poses (N, 3), x and y in m and heading in rad, at stamps (N,) in ns."""
+
+    stamps_ns: NDArray[np.int64]
+    poses: Array
+
+    def __repr__(self) -> str:
+        return f'StampedPoses({len(self.poses)} poses, {se2.path_length_m(self.poses):.1f} m)'
+
+
+class ScanTrajectory(NamedTuple):
+    """The pose of each scan: live, as it was estimated then, and final, after all corrections."""
+
+    live: StampedPoses
+    final: StampedPoses
+
+
+def write_trajectory(path: Path | str, trajectory: StampedPoses) -> None:
+    """Write a trajectory, such as `slam.trajectory.final`, in TUM format.
+
+    Raises InputError where it is none, and OSError.
+    """
+    stamps_ns, poses = stamped_poses('trajectory', trajectory)
+    write_tum(path_of(path), stamps_ns.tolist(), list(poses))
+
+
+def stamped_poses(what: str, value: Any) -> StampedPoses:
+    """A trajectory of a caller. Raises InputError for anything else; what: the value's name."""
+    try:
+        stamps_ns, poses = value
+        found = StampedPoses(np.asarray(stamps_ns, np.int64), np.asarray(poses, np.float64))
+    except (TypeError, ValueError, OverflowError):
+        found = StampedPoses(np.empty(0, np.int64), np.empty(0))
+    if found.poses.shape != (*found.stamps_ns.shape, 3) or not np.isfinite(found.poses).all():
+        raise InputError(
+            f'{what} = {quoted(value)}: expected stamps (N,) in ns and poses (N, 3), as in '
+            'slam.trajectory.final'
+        )
+    return found
 
 
 def write_tum(path: Path, stamps_ns: Sequence[int], poses: Sequence[Array]) -> None:

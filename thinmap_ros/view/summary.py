@@ -8,11 +8,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError, require_type
+from thinmap_ros.core.errors import (
+    InputError,
+    did_you_mean,
+    quoted,
+    require_type,
+    with_known_keywords,
+)
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.regions import RegionKind, RegionMap
+from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions
 from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.view import palette
 from thinmap_ros.view.figures import DPI, draw_graph, draw_hidden_areas, draw_map, draw_shades
@@ -135,12 +142,15 @@ def make_figure(
     hidden: Array | None = None,
     apart: Array = _NO_POINTS,
     robots: Mapping[str, Array] | None = None,
+    size_in: float = _LAYOUT.long_in,
+    with_cells: bool = True,
 ) -> 'MapFigure':
     """A figure of map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven.
 
     regions: of the grid, in pale colours; hidden (N, 3): positions, m, and hidden area, m2, that is
     expected there; apart (N, 2): scan points of pieces of map whose place is unknown; robots: paths
-    (N, 2 or more) of several robots by name.
+    (N, 2 or more) of several robots by name; size_in: longer side of the map, inches; with_cells:
+    whether the map is drawn, and not its place alone.
     """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -148,13 +158,15 @@ def make_figure(
     from thinmap_ros.view.map_figure import MapFigure
 
     area = shown_area(patch, apart)
-    width, height = _map_inches(area)
+    width, height = _map_inches(area, size_in)
     with matplotlib.rc_context({'font.size': _LAYOUT.font_pt}):
         figure = MapFigure(dpi=_LAYOUT.dpi, layout='constrained')
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
-        axes.set_facecolor(_UNKNOWN)
-        surfaces = _draw_cells(axes, patch, regions)
+        surfaces: dict[str, str] = {}
+        if with_cells:
+            axes.set_facecolor(_UNKNOWN)
+            surfaces = _draw_cells(axes, patch, regions)
         _draw_apart(axes, apart)
         _draw_paths(axes, estimated, true)
         _draw_robots(axes, robots or {})
@@ -166,7 +178,7 @@ def make_figure(
         axes.set(
             xlabel='x (m)', ylabel='y (m)', aspect='equal', xlim=(left, right), ylim=(bottom, top)
         )
-        _draw_scale_bar(axes, right - left)
+        _draw_scale_bar(axes, right - left, height)
         figure.suptitle(shortened(title), parse_math=False)
         _draw_legend(figure, axes, surfaces, (width, height))
     return figure
@@ -206,9 +218,9 @@ def shortened(title: str) -> str:
     return line if len(line) <= most else line[: most - 1] + _ELLIPSIS
 
 
-def _map_inches(area: tuple[float, float, float, float]) -> tuple[float, float]:
+def _map_inches(area: tuple[float, float, float, float], size_in: float) -> tuple[float, float]:
     left, right, bottom, top = area
-    scale = _LAYOUT.long_in / max(right - left, top - bottom)
+    scale = size_in / max(right - left, top - bottom)
     return (right - left) * scale, (top - bottom) * scale
 
 
@@ -318,12 +330,12 @@ def _draw_robots(axes: 'Axes', robots: Mapping[str, Array]) -> None:
         axes.plot(*path[-1, :2], marker='X', markersize=9, markeredgewidth=1.2, **style)
 
 
-def _draw_scale_bar(axes: 'Axes', width_m: float) -> None:
+def _draw_scale_bar(axes: 'Axes', width_m: float, height_in: float) -> None:
     """Draw a bar of a round length above the map, at the right."""
     length = scale_bar_m(width_m)
     share = length / width_m
     style: dict[str, Any] = {'transform': axes.transAxes, 'clip_on': False}
-    above = _LAYOUT.bar_above_in / _map_inches((*axes.get_xlim(), *axes.get_ylim()))[1]
+    above = _LAYOUT.bar_above_in / height_in
     axes.plot(
         [1.0 - share, 1.0],
         [1.0 + above, 1.0 + above],
@@ -384,17 +396,80 @@ def merged_figure(path: Path, maps: Sequence[tuple[str, GridPatch, TopologicalMa
         figure.savefig(aside, format='png', metadata={'Software': None})
 
 
-def plot(shown: Any, topology: TopologicalMap | None = None, title: str = '') -> 'MapFigure':
+# What `plot` draws, the lowest first.
+LAYERS = ('map', 'regions', 'graph', 'path')
+_DEFAULT_LAYERS = ('map', 'graph', 'path')
+_LARGEST_IN = 40.0
+
+
+@with_known_keywords
+def plot(
+    shown: Any,
+    topology: TopologicalMap | None = None,
+    title: str = '',
+    *,
+    layers: Sequence[str] = _DEFAULT_LAYERS,
+    size_in: float = _LAYOUT.long_in,
+    true: Any = None,
+) -> 'MapFigure':
     """A matplotlib figure of a Pipeline, with its graph and path, or of a GridPatch with a graph.
 
-    `figure.savefig(path)` saves it; a notebook shows it. Raises InputError for anything else.
+    layers: of map, regions (rooms and corridors, on the map), graph, and path: the final poses of
+    all scans. size_in: longer side of the map, inches. true: the path driven (N, 2 or more), m, or
+    StampedPoses. `figure.savefig(path)` saves it; a notebook shows it. Raises InputError for
+    anything else.
     """
+    driven = _points_of('true', true)
+    _check_look(layers, size_in)
     if topology is not None:
         require_type('topology', topology, TopologicalMap)
+    path = _NO_POINTS
+    regions = None
     if isinstance(shown, GridPatch):
-        return make_figure(shown, topology or TopologicalMap(), title=title)
-    if not (hasattr(shown, 'grid') and hasattr(shown, 'localizer')):
+        patch = shown
+        graph = topology or TopologicalMap()
+        config = RegionConfig()
+    elif hasattr(shown, 'grid') and hasattr(shown, 'trajectory'):
+        patch = shown.grid.known_area()
+        graph = topology or shown.topology.map
+        config = RegionConfig(robot_radius_m=shown.config.topology.robot_radius_m)
+        path = shown.trajectory.final.poses
+    else:
         raise InputError(f'plot: a {type(shown).__name__}: expected a Pipeline or a GridPatch')
-    _, path = shown.localizer.keyframe_trajectory()
-    graph = topology or shown.topology.map
-    return make_figure(shown.grid.known_area(), graph, path, title=title)
+    if 'regions' in layers:
+        regions = find_regions(patch, config)
+    return make_figure(
+        patch,
+        graph if 'graph' in layers else TopologicalMap(),
+        path if 'path' in layers else _NO_POINTS,
+        driven,
+        title,
+        regions,
+        size_in=size_in,
+        with_cells='map' in layers or 'regions' in layers,
+    )
+
+
+def _points_of(what: str, value: Any) -> Array | None:
+    """Points (N, 2) of a path of a caller; None: none. Raises InputError for anything else."""
+    if value is None:
+        return None
+    try:
+        points = np.asarray(getattr(value, 'poses', value), dtype=np.float64)
+    except (TypeError, ValueError):
+        points = np.empty(0)
+    if points.ndim != 2 or points.shape[1] < 2 or not np.isfinite(points).all():
+        raise InputError(f'{what} = {quoted(value)}: expected points (N, 2) or poses (N, 3), m')
+    return points[:, :2]
+
+
+def _check_look(layers: Sequence[str], size_in: float) -> None:
+    """Raise InputError for layers that do not exist, and a size that is no size."""
+    given = [layers] if isinstance(layers, str) or not isinstance(layers, Sequence) else layers
+    for layer in given:
+        if layer not in LAYERS:
+            meant = did_you_mean(str(layer), LAYERS)
+            expected = ', '.join(LAYERS)
+            raise InputError(f'layers: {quoted(layer)}{meant}: expected some of {expected}')
+    if not isinstance(size_in, float | int) or not 1.0 <= size_in <= _LARGEST_IN:
+        raise InputError(f'size_in = {quoted(size_in)}: expected 1 to {_LARGEST_IN:g} inches')

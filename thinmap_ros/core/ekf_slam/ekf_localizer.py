@@ -170,6 +170,10 @@ class EkfLocalizer:
         """Poses (N, 3) of all steps; the filter does not correct earlier ones."""
         return np.array(self._path, dtype=np.float64).reshape(-1, 3)
 
+    def corrected_trajectory(self) -> Array:
+        """The same."""
+        return self.optimized_trajectory()
+
     def keyframe_trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (0,) and poses (0, 3): the filter does not correct earlier poses."""
         return np.empty(0, dtype=np.int64), np.empty((0, 3))

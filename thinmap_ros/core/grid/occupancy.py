@@ -225,6 +225,14 @@ class OccupancyGrid:
         self._steps = _steps(self.config)
         self._grazed = max(3, round(self.config.grazed_length_m / self.frame.resolution))
 
+    def __repr__(self) -> str:
+        known = self.known_area()
+        rows, cols = known.shape
+        free = np.count_nonzero(known.free)
+        occupied = np.count_nonzero(known.occupied)
+        size = f'{rows} x {cols} cells of {self.frame.resolution:g} m'
+        return f'OccupancyGrid({size}, {free} free, {occupied} occupied)'
+
     @staticmethod
     def from_patch(patch: GridPatch, config: OccupancyConfig | None = None) -> 'OccupancyGrid':
         """Start from a finished map, with the same cells and resolution."""

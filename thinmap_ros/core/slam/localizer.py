@@ -472,6 +472,10 @@ class Localizer:
             self._close_loops()
         return self._path.poses(self._loops.finish())
 
+    def corrected_trajectory(self) -> Array:
+        """Poses (N, 3) of all steps since the start, after the corrections so far."""
+        return self._path.poses(self._loops.keyframes.poses())
+
     def keyframe_trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (N,) in ns and optimized poses (N, 3) of the keyframe scans along the path.
 

@@ -1,6 +1,6 @@
 """The topological map as values: nodes, edges, and the same as arrays."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import errors
 from thinmap_ros.core.config import Config, parameter, robot_radius
-from thinmap_ros.core.errors import InputError, one_line_reason
+from thinmap_ros.core.errors import InputError, one_line_reason, place_of
 from thinmap_ros.core.grid.fields import SpatialHash
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, Mask
 
@@ -181,11 +181,17 @@ class TopologicalMap:
         """Ids of the nodes one edge away, each once."""
         return list(dict.fromkeys(edge.other(node_id) for edge in self.edges_at(node_id)))
 
-    def nearest_node(self, x: float, y: float) -> Node | None:
-        """The node with the smallest straight distance to a point (m, map frame).
+    def nearest_node(
+        self, x: float | Sequence[float] | Array, y: float | None = None
+    ) -> Node | None:
+        """The node with the smallest straight distance to a place (m, map frame).
 
-        None in an empty map.
+        It is given as x and y, or as one value (2,). None in an empty map. Raises InputError where
+        it is none.
         """
+        return self._nearest(*place_of('x, y', x if y is None else (x, y)))
+
+    def _nearest(self, x: float, y: float) -> Node | None:
         reach = _BUCKET_M
         while reach <= _FAR_M:
             best = min(
