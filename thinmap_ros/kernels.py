@@ -8,6 +8,7 @@ load the kernels of others, and is done once in a process.
 
 import ctypes
 import gc
+import math
 import mmap
 import sys
 import time
@@ -33,6 +34,10 @@ from thinmap_ros.jit import cache as kernel_cache
 
 _WORTH_BYTES = 4e6
 _REPORT_PERIOD_S = 5.0
+# All 184 kernels took 115 s on one core of 2026. The time that they take here counts for more once
+# there are as many.
+_USUAL_S = 0.63
+_USUAL_KERNELS = 20
 
 
 def compiler_memory_releaser(period_s: float = 3.0) -> Callable[[], None]:
@@ -114,10 +119,14 @@ def _clean_mappings(smaps: str, name: str) -> Iterator[tuple[int, int]]:
 
 
 class CompilationReport(event.Listener):
-    """Reports on stderr how many kernels are compiled: it delays the first start of a program."""
+    """Reports on stderr how long kernels are compiled: it delays the first start of a program.
+
+    Which of them the program needs is not known: all that there are is the most.
+    """
 
     def __init__(self) -> None:
         self._depth = 0
+        self._loaded = 0  # kernels that were there before the first compilation
         self._seconds = 0.0
         self._began_at = 0.0
         self._told_at = -_REPORT_PERIOD_S
@@ -132,8 +141,10 @@ class CompilationReport(event.Listener):
             self._told_at = now
             # Kernels that are compiled for further types count once.
             there = sum(1 for kernel in jit.KERNELS if kernel.signatures)
-            number = min(there + 1, len(jit.KERNELS))
-            _tell(f'compiling kernels, once ({number} of {len(jit.KERNELS)})')
+            seconds = self._seconds + now - self._began_at
+            if not seconds:
+                self._loaded = there
+            _tell(progress_text(there, there - self._loaded, seconds))
 
     def on_end(self, event: Any) -> None:
         """Handle the end of a compilation."""
@@ -148,6 +159,20 @@ class CompilationReport(event.Listener):
             where = f'cached in {kept}' if kept else 'not cached'
             _tell(f'kernels compiled in {self._seconds:.0f} s, {where}')
             self._seconds = 0.0
+
+
+def progress_text(there: int, compiled: int, seconds: float) -> str:
+    """How many kernels are there, and how long all others take, for a line of progress.
+
+    compiled: how many of them took some seconds here; the others were in the cache.
+    """
+    most = max(jit.declared_kernels(), len(jit.KERNELS))
+    each_s = (_USUAL_S * _USUAL_KERNELS + seconds) / (_USUAL_KERNELS + compiled)
+    left_s = 5 * math.ceil(each_s * (most - there) / 5.0)
+    return (
+        f'compiling kernels, once: {there} of at most {most}, about {left_s} s left if all are '
+        'needed'
+    )
 
 
 @cache
