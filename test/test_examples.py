@@ -101,6 +101,6 @@ def test_find_the_robot(example) -> None:
 
 def test_python_in_the_readme_runs(example, tmp_path: Path) -> None:
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
-    (block,) = commands.python_blocks(ROOT / 'README.md')
+    (block,) = commands.python_blocks(ROOT / 'README.md').values()
     output_of(tmp_path, '-c', block)
     assert (tmp_path / 'dead_end.geojson').exists()

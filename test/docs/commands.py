@@ -1,7 +1,8 @@
 """Command lines in the documentation.
 
 Each line of a code block is a command, and so is each code span in the text that starts like one.
-A block fenced as anything but bash is none: output, YAML, or Python, which `python_blocks` gives.
+A block fenced as anything but bash is none: output (`printed.py`), YAML, or Python, which
+`python_blocks` gives.
 `<!-- not run -->` on a line before a block or paragraph, or in front of a span, marks it.
 """
 
@@ -22,12 +23,16 @@ _CODE_INDENT = 4
 
 @dataclass(frozen=True)
 class Command:
-    """One command, its position in the document, and whether it is marked as not run."""
+    """One command, its position in the document, and whether it is marked as not run.
+
+    line: of the fence of its code block, from 1; 0 of a command in the text.
+    """
 
     document: str
     section: str
     text: str
     marked: bool
+    line: int = 0
 
 
 @dataclass
@@ -38,6 +43,7 @@ class _Part:
     is_code: bool
     marked: bool
     lines: list[str]
+    line: int
 
 
 def commands(path: Path) -> list[Command]:
@@ -46,7 +52,8 @@ def commands(path: Path) -> list[Command]:
     for part in _parts(path.read_text().splitlines()):
         lines = _of_code(part.lines) if part.is_code else _of_text(part.lines)
         for text, marked in lines:
-            found.append(Command(path.name, part.section, text, marked or part.marked))
+            is_marked = marked or part.marked
+            found.append(Command(path.name, part.section, text, is_marked, part.line))
     return found
 
 
@@ -55,9 +62,11 @@ def marks(path: Path) -> int:
     return path.read_text().count(MARK)
 
 
-def python_blocks(path: Path) -> list[str]:
-    """Blocks of a document that are fenced as Python, in order."""
-    return re.findall(rf'^{PYTHON}\n(.*?)^```$', path.read_text(), re.MULTILINE | re.DOTALL)
+def python_blocks(path: Path) -> dict[int, str]:
+    """Blocks of a document that are fenced as Python, by the lines of their fences, in order."""
+    text = path.read_text()
+    found = re.finditer(rf'^{PYTHON}\n(.*?)^```$', text, re.MULTILINE | re.DOTALL)
+    return {text[: match.start()].count('\n') + 1: match[1] for match in found}
 
 
 def _parts(lines: list[str]) -> list[_Part]:
@@ -67,11 +76,13 @@ def _parts(lines: list[str]) -> list[_Part]:
     fenced = False
     is_skipped = False
     open_part: _Part | None = None
-    for line in lines:
+    fence = 0
+    for number, line in enumerate(lines, 1):
         text = line.strip()
         if text.startswith('```'):
             fenced = not fenced
             is_skipped = fenced and text not in _FENCES
+            fence = number if fenced else 0
             open_part = None
             continue
         if is_skipped:
@@ -86,7 +97,7 @@ def _parts(lines: list[str]) -> list[_Part]:
             continue
         if open_part is None:
             is_code = fenced or line.startswith(' ' * _CODE_INDENT)
-            open_part = _Part(section, is_code, marked, [])
+            open_part = _Part(section, is_code, marked, [], fence)
             parts.append(open_part)
             marked = False
         open_part.lines.append(line)

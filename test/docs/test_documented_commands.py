@@ -2,9 +2,11 @@
 
 The commands of a page are given to bash one after the other, in a shell as `source scripts/env`
 makes it, in a folder where the files have the names that the text uses. A page that is new has to
-be named here, with what it needs beside it; its lines then run by themselves.
+be named here, with what it needs beside it; its lines then run by themselves. What a page shows as
+their output is what they print (`printed.py`).
 """
 
+import json
 import os
 import re
 import signal
@@ -22,7 +24,7 @@ from support.carmen_log import carmen_lines
 from support.ros1_bag import ros1_bag
 from support.timeouts import PATIENCE_S
 
-from docs import commands
+from docs import commands, printed
 from thinmap_ros.files import occupancy_maps, package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.log import LaserOptions
@@ -37,6 +39,16 @@ GUIDES = [
 ]
 DOCUMENTS = [ROOT / 'README.md', *GUIDES]
 COMMANDS = [command for path in DOCUMENTS for command in commands.commands(path)]
+
+# printed.Printed text below commands. test_printed.py compares the messages.
+SHOWN = {
+    path.name: [
+        block
+        for block in printed.blocks(path)
+        if not block.is_message and (block.of is None or block.of[0] == 'bash')
+    ]
+    for path in DOCUMENTS
+}
 
 # Marked in the documents, and why. No more than nine marks.
 NOT_RUN = {
@@ -84,18 +96,10 @@ HELP_ONLY = {
     'scripts/endurance': 'hours; scripts/endurance --minutes 10 is for releases',
     'scripts/experiment all': 'test/experiments/test_experiments.py runs each experiment',
 }
-_COMPARE = (
-    'thinmap compare_exploration floor_40x10 -o out/compare --speed-m-s 0.5 \\\n'
-    '  --strategies position_probability nearest_frontier'
-)
 # With a smaller input, or shortened by options that the same lines of the documents name.
 SHORTER = {
-    _COMPARE: f'{_COMPARE.replace("floor_40x10", "room_10x10")} --starts 1',
     'thinmap explore_world office -o out/office --robots 2 --speed-m-s 0.5': (
         'thinmap explore_world room_10x10 -o out/office --robots 2 --speed-m-s 0.5'
-    ),
-    'thinmap replay bags/office.mcap -o out/office': (
-        'thinmap replay bags/dead_end.mcap -o out/office'
     ),
     'scripts/experiment exploration': 'scripts/experiment exploration --from-bag bags',
 }
@@ -168,11 +172,22 @@ def kind_of(text: str) -> str:
     return 'goal' if text.startswith('ros2 action send_goal') else 'program'
 
 
+def shown_after(command: commands.Command) -> printed.Printed | None:
+    """What a page shows as the output of a command that is the only one before it."""
+    block = [c for c in COMMANDS if (c.document, c.line) == (command.document, command.line)]
+    waited_for = [c for c in block if not c.text.endswith('&')]
+    after = [shown for shown in SHOWN[command.document] if shown.of == ('bash', command.line)]
+    return after[0] if after and waited_for == [command] else None
+
+
 class Line:
     """A command of the documents, in its own bash, as in a separate terminal."""
 
-    def __init__(self, text: str, number: int, folder: Path, environment: dict[str, str]) -> None:
-        self.text = text
+    def __init__(
+        self, command: commands.Command, number: int, folder: Path, environment: dict[str, str]
+    ) -> None:
+        self.text = text = shortened(command.text)
+        self.shown = shown_after(command)
         self._log = folder / f'line{number}.txt'
         # Background jobs have their own process group and receive SIGINT, as in a terminal.
         script = f'set -m\n{text}\nstatus=$?\n[ -z "$!" ] || wait $! || exit\nexit $status'
@@ -189,6 +204,15 @@ class Line:
 
     def said(self) -> str:
         return self._log.read_text()
+
+    def has_printed_what_is_shown(self) -> bool:
+        return self.shown is None or self.shown.is_in(self.said())
+
+    def code_when_it_ends(self) -> int:
+        """Its exit code: a listener is ended by Ctrl-C, and a goal whose result is not shown."""
+        kind = kind_of(self.text)
+        ends_well = kind in ('node', 'program') or (kind == 'goal' and self.shown is not None)
+        return 0 if ends_well else signal.SIGINT
 
     def has_ended(self) -> bool:
         return self.process.poll() is not None
@@ -275,21 +299,34 @@ def shortened(text: str) -> str:
     return SHORTER.get(bare, text)
 
 
-def run_page(graph: Any, lines: list[str], place: Path, environment: dict[str, str]) -> None:
+def run_page(
+    graph: Any,
+    page: str,
+    listed: list[commands.Command],
+    place: Path,
+    environment: dict[str, str],
+) -> None:
+    """Run the commands of a page, and compare what it shows as their output with theirs."""
     health = graph.heard('/diagnostics', DiagnosticArray)
     running: list[Line] = []
+    said: dict[int, str] = {}
     try:
-        for number, text in enumerate(lines):
-            _end_namesakes(graph, running, text)
-            health.clear()
-            line = Line(shortened(text), number, place, environment)
-            running.append(line)
-            _follow(graph, line, health)
+        for command in listed:
+            _end_namesakes(graph, running, command.text)
+            while True:
+                health.clear()
+                line = Line(command, len(running), place, environment)
+                running.append(line)
+                _follow(graph, line, health)
+                if '--once' not in line.text or line.has_printed_what_is_shown():
+                    break
+            said[command.line] = said.get(command.line, '') + line.said()
         for line in running:
             if not line.has_ended():
                 line.interrupt()
-            kind = kind_of(line.text)
-            line.end(0 if kind in ('node', 'program') else signal.SIGINT)
+            line.end(line.code_when_it_ends())
+        for block in SHOWN[page]:
+            compare(block, said, place)
     finally:
         for line in running:
             if not line.has_ended():
@@ -324,10 +361,28 @@ def _follow(graph: Any, line: Line, health: list[DiagnosticArray]) -> None:
         _until(graph, line, line.has_ended, PATIENCE_S * 3.0)
         line.end(0)
         return
-    _until(graph, line, lambda: ('Feedback:' if kind == 'goal' else '\n') in line.said())
+    if kind == 'goal' and line.shown is not None:
+        _until(graph, line, line.has_ended)
+        line.end(0)
+        return
+    first = 'Feedback:' if kind == 'goal' else '\n'
+    _until(graph, line, lambda: first in line.said() and line.has_printed_what_is_shown())
     line.interrupt()
     line.end(signal.SIGINT)
     assert kind != 'goal' or line.said().endswith('Goal canceled.\n')
+
+
+def compare(block: printed.Printed, said: dict[int, str], place: Path) -> None:
+    """Check that a block is what its commands printed, or the begin of a file."""
+    if block.file:
+        content = json.loads((place / block.file).read_text())
+        assert block.is_begin_of(content), f'{block.name}: {content}'
+        return
+    assert block.of is not None
+    printed_text = said[block.of[1]]
+    assert block.is_in(printed_text), (
+        f'{block.name}: not printed: {block.missing(printed_text)}\n{printed_text}'
+    )
 
 
 def _until(
@@ -345,23 +400,33 @@ def _until(
 @pytest.mark.cpu_budget(50.0, 'each command of a page in a process of its own')
 @pytest.mark.parametrize('page', PAGES)
 def test_the_commands_of_a_page_run(graph, place, environment, page):
-    lines = [c.text for c in COMMANDS if c.document == page and not c.marked]
-    assert lines, f'{page}: no commands any more'
+    listed = [c for c in COMMANDS if c.document == page and not c.marked]
+    assert listed, f'{page}: no commands any more'
     for name, values in PAGES[page].items():
         graph.start(name, **values)
     shell = {**environment, 'ROS_DOMAIN_ID': os.environ['ROS_DOMAIN_ID']}
     shell['THINMAP_STATE_DIR'] = os.environ['THINMAP_STATE_DIR']
-    run_page(graph, lines, place, shell)
+    run_page(graph, page, listed, place, shell)
 
 
-def test_python_in_the_tutorials_runs(place):
-    blocks = [block for path in GUIDES for block in commands.python_blocks(path)]
+@pytest.mark.parametrize('path', [path for path in GUIDES if commands.python_blocks(path)])
+def test_python_in_the_tutorials_prints_what_they_show(place, path):
+    blocks = commands.python_blocks(path)
+    end = 'the end of a block'
+    program = ''.join(f'{block}\nprint({end!r})\n' for block in blocks.values())
     shell = {**os.environ, 'PYTHONPATH': f'{ROOT}:{os.environ.get("PYTHONPATH", "")}'}
-    program = [sys.executable, '-c', '\n'.join(blocks)]
-    done = subprocess.run(program, cwd=place, env=shell, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, '-c', program], cwd=place, env=shell, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
-    assert '18 to 110: 3.8 m in 39 points\n' in done.stdout
-    assert 'nothing.yaml: No such file or directory' in done.stdout
+    said = dict(zip(blocks, done.stdout.split(f'{end}\n'), strict=False))
+    shown = [block for block in printed.blocks(path) if block.of and block.of[0] == 'python']
+    for block in shown:
+        printed_text = said[block.of[1]]
+        assert block.is_in(printed_text), f'{block.name}: {printed_text}'
+        assert len(block.text.splitlines()) == len(printed_text.splitlines()), block.name
+    printing = {number for number, block in blocks.items() if 'print(' in block}
+    assert {block.of[1] for block in shown} == printing, 'each has its output below it'
 
 
 def test_no_command_is_left_out():
@@ -425,4 +490,4 @@ def test_commands_are_found_in_blocks_and_text(tmp_path):
         ('Two', 'echo v', False),
     ]
     assert commands.marks(document) == 2
-    assert commands.python_blocks(document) == ['print(1)\n']
+    assert commands.python_blocks(document) == {26: 'print(1)\n'}

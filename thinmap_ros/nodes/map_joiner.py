@@ -168,12 +168,7 @@ class MapJoinerNode(ThinmapNode):
         return publish
 
     def _report_link(self, link: MapLink, is_new: bool) -> None:
-        x, y, yaw = link.T_a_b.tolist()
-        what = f'joined with {link.a}' if is_new else f'moved in {link.a}'
-        self.get_logger().info(
-            f'{link.b} is {what}: at x {x:.2f} m, y {y:.2f} m, yaw {yaw:.3f} rad, '
-            f'{odds_text(link.log_odds)}, {link.matches} matches'
-        )
+        self.get_logger().info(link_text(link, is_new))
 
     def _report_dropped(self, links: list[MapLink]) -> None:
         for link in links:
@@ -208,6 +203,16 @@ class MapJoinerNode(ThinmapNode):
         if name not in self._team.maps and not (is_world_allowed and name == WORLD):
             known = ', '.join(sorted(self._team.maps)) or 'no map yet'
             raise InputError(f'{quoted(name)}: expected one of the maps: {known}')
+
+
+def link_text(link: MapLink, is_new: bool) -> str:
+    """Where a map lies in another, for the log."""
+    x, y, yaw = link.T_a_b.tolist()
+    what = f'joined with {link.a}' if is_new else f'moved in {link.a}'
+    return (
+        f'{link.b} is {what}: at x {x:.2f} m, y {y:.2f} m, yaw {yaw:.3f} rad, '
+        f'{odds_text(link.log_odds)}, {link.matches} matches'
+    )
 
 
 main = node_main.program(MapJoinerNode)
