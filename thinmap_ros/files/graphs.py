@@ -32,6 +32,7 @@ from thinmap_ros.core.topology.regions import Membership, Region
 from thinmap_ros.files.safe import atomic_write, path_of, write_text
 
 Writer = Callable[[Path, TopologicalMap, Membership | None], None]
+_JSON = json.JSONEncoder(allow_nan=False, separators=(',', ':'))
 _REGION = 'Polygon'  # type of the geometry of regions
 _GRAPHML_KEYS = {
     'node': ('x', 'y', 'kind', 'clearance', 'region'),
@@ -130,7 +131,7 @@ def write_geojson(
             for edge in topology.edges.values():
                 metadata[edge.id]['speed_limit'] = speed_limit.of(edge)
         for feature in _features(topology, regions, frame_id, metadata, with_paths):
-            file.write(separator + json.dumps(feature, allow_nan=False, separators=(',', ':')))
+            file.write(separator + _JSON.encode(feature))
             separator = ',\n'
         file.write('\n]}\n')
 
@@ -376,7 +377,7 @@ def _edge_region(edge: Edge, regions: Membership | None) -> dict[str, Any]:
 
 def _rounded(points: Array) -> list[list[float]]:
     """Points (N, 2), rounded to a tenth of a millimetre."""
-    return [[round(float(x), 4), round(float(y), 4)] for x, y in points]
+    return [[round(x, 4), round(y, 4)] for x, y in points.tolist()]
 
 
 _WRITERS: dict[str, Writer] = {

@@ -175,14 +175,15 @@ def _convert(path: Path, out: Path, picture: Path | None, arguments: argparse.Na
     forbidden = _masked(arguments.keep_out, patch)
     drivable = with_walls(keep_out.as_walls(patch), forbidden)
     resolution = drivable.frame.resolution
+    # Of a map of its own, whose masks go with it: the memory is for the graph.
+    found = find_regions(replace(patch), RegionConfig(robot_radius_m=arguments.robot_radius_m))
+    session = REGIONS.load_optional(str(path))
+    regions = found if session is None else session.names.named(found)
     detail_m = arguments.detail_m
     routes = build_routes(
         drivable, start, config, detail_m, arguments.node_spacing_m, arguments.allow_touching
     )
     topology = routes.map
-    found = find_regions(patch, RegionConfig(robot_radius_m=arguments.robot_radius_m))
-    session = REGIONS.load_optional(str(path))
-    regions = found if session is None else session.names.named(found)
     limit = _speed_limit(arguments.speed_limit)
     graphs.write_graph(out, topology, membership_of(topology, regions), limit)
     if picture is not None:

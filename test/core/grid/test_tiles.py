@@ -132,6 +132,21 @@ def test_the_pool_is_not_copied_and_takes_memory_where_it_is_written():
     assert 900 * tile_bytes < resident_bytes() - before < 1500 * tile_bytes
 
 
+def test_a_field_of_cells_is_set_where_tiles_exist():
+    tiles = TileStore(CELL, max_tiles=2)
+    tiles.grow_to(0, 0, 1, 1)
+    tiles.allocate(np.array([[0, 0], [1, 1]]))
+    hits = np.arange(1, 101, dtype=np.uint8).reshape(10, 10)
+    tiles.overwrite(TILE - 5, TILE - 5, hits, 'hits')
+    found = tiles.read(TILE - 5, TILE - 5, 10, 10)
+    hits[:5, 5:] = 0
+    hits[5:, :5] = 0
+    np.testing.assert_array_equal(found['hits'], hits)
+    assert not found['x'].any()
+    with pytest.raises(InputError, match='map of 3 tiles: expected 2 at most'):
+        tiles.allocate(np.array([[0, 1]]))
+
+
 LIMITED = """
 import resource
 from pathlib import Path

@@ -57,7 +57,9 @@ def masked_outside(patch: GridPatch, polygon: Array) -> GridPatch:
 
 
 def with_walls(patch: GridPatch, cells: Mask) -> GridPatch:
-    """Map with some cells (H, W) as walls."""
+    """Map with some cells (H, W) as walls; the map itself where there are none."""
+    if not cells.any():
+        return patch
     return replace(patch, cells=np.where(cells, _WALL, patch.cells))
 
 

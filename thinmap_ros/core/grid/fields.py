@@ -1,6 +1,8 @@
 """Fields over cells: connected components, distances, what is nearest; and points near a point."""
 
 import math
+from collections.abc import Iterator
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +10,31 @@ from numpy.typing import NDArray
 from thinmap_ros.core.se2 import Array, Cell, Cells, Mask
 from thinmap_ros.jit import inlined, kernel
 
-FAR = 1.0e6  # squared distance in cells if the set is empty
+FAR_CELLS = 1000  # distance if the set is empty
+_STRIP_ROWS = 32
+_Value = TypeVar('_Value', bound=np.generic)
+
+
+def strips(rows: int) -> Iterator[slice]:
+    """Slices of some rows each: NumPy copies indices that are not of 64 bits."""
+    for first in range(0, rows, _STRIP_ROWS):
+        yield slice(first, first + _STRIP_ROWS)
+
+
+def looked_up(values: NDArray[_Value], numbers: NDArray[Any]) -> NDArray[_Value]:
+    """Of each of the numbers (H, W) its value in a table (N,), from the end of it if negative."""
+    found = np.empty(numbers.shape, dtype=values.dtype)
+    for strip in strips(len(numbers)):
+        found[strip] = values[numbers[strip]]
+    return found
+
+
+def counts_of(numbers: NDArray[Any], cells: Mask, count: int) -> Cells:
+    """How many cells of a mask (H, W) have each of the numbers (H, W) below a count, (count,)."""
+    found = np.zeros(count, dtype=np.int64)
+    for strip in strips(len(numbers)):
+        found += np.bincount(numbers[strip][cells[strip]], minlength=count)
+    return found
 
 
 def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
@@ -135,27 +161,35 @@ def distance_cells(marked: Mask) -> Array:
     """Exact distance, in cells between centres, from each cell (H, W) to the nearest marked one.
 
     1000 if no cell is marked.
+    """
+    return np.asarray(np.sqrt(squared_distance(marked)))
+
+
+def squared_distance(marked: Mask, is_rim_marked: bool = False) -> NDArray[np.int32]:
+    """Squared `distance_cells` (H, W), in half the memory; is_rim_marked: as if cells outside were.
 
     Source: Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012: the
     lower envelope of parabolas, along columns and then along rows.
     """
-    return _distance(np.ascontiguousarray(marked))
+    return _squared_distance(np.ascontiguousarray(marked), is_rim_marked)
 
 
 @kernel
-def _distance(marked: Mask) -> Array:
+def _squared_distance(marked: Mask, is_rim_marked: bool) -> NDArray[np.int32]:
     rows, cols = marked.shape
-    squared = np.full((rows, cols), FAR)
+    squared = np.empty((rows, cols), dtype=np.int32)
+    outside = 0 if is_rim_marked else FAR_CELLS
     # Along columns, two sweeps count the steps from marked cells.
-    for col in range(cols):
-        steps = 1.0e3
-        for row in range(rows):
-            steps = 0.0 if marked[row, col] else min(steps + 1.0, 1.0e3)
-            squared[row, col] = steps * steps
-        steps = 1.0e3
-        for row in range(rows - 1, -1, -1):
-            steps = 0.0 if marked[row, col] else min(steps + 1.0, 1.0e3)
-            squared[row, col] = min(squared[row, col], steps * steps)
+    steps = np.full(cols, outside, dtype=np.int32)
+    for row in range(rows):
+        for col in range(cols):
+            steps[col] = 0 if marked[row, col] else min(steps[col] + 1, FAR_CELLS)
+            squared[row, col] = steps[col]
+    steps[:] = outside
+    for row in range(rows - 1, -1, -1):
+        for col in range(cols):
+            steps[col] = min(steps[col] + 1, squared[row, col])
+            squared[row, col] = steps[col] * steps[col]
     vertex = np.empty(cols, dtype=np.int64)
     border = np.empty(cols + 1)
     heights = np.empty(cols)
@@ -183,7 +217,11 @@ def _distance(marked: Mask) -> Array:
             while border[last + 1] < col:
                 last += 1
             step = col - vertex[last]
-            squared[row, col] = np.sqrt(min(step * step + heights[vertex[last]], FAR))
+            least = min(step * step + heights[vertex[last]], FAR_CELLS * FAR_CELLS)
+            if is_rim_marked:
+                rim = min(col + 1, cols - col)
+                least = min(least, rim * rim)
+            squared[row, col] = least
     return squared
 
 

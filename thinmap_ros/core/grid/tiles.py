@@ -78,16 +78,21 @@ class TileStore:
         max_extent_tiles: int = MAX_TILES,
         begins_at_origin: bool = True,
         reserved: int = 0,
+        max_tiles: int = MAX_TILES,
     ) -> None:
         """max_extent_tiles: area of the largest bounding rectangle, of which most may be empty.
 
+        max_tiles: how many of them can exist.
         begins_at_origin: the rectangle always includes the origin; else only what is stored.
         reserved: number of slots at the beginning of the pool that hold no tile.
         """
         begin = int(begins_at_origin)
         self._max_extent_tiles = max_extent_tiles
+        self._max_tiles = max_tiles
         self.directory: NDArray[np.int32] = np.full((begin, begin), NO_TILE, dtype=np.int32)
-        self.pool: NDArray[Any] = _empty_pool((TILE, TILE, *per_cell), dtype, _MIN_POOL_TILES)
+        self.pool: NDArray[Any] = _empty_pool(
+            (TILE, TILE, *per_cell), dtype, _MIN_POOL_TILES, max_tiles
+        )
         self.first_row = 0
         self.first_col = 0
         self.used = reserved
@@ -156,11 +161,11 @@ class TileStore:
         missing = np.array(list(dict.fromkeys(map(tuple, missing.tolist()))), dtype=np.int64)
         missing = missing.reshape(-1, 2)
         used = self.used + len(missing)
-        if used > MAX_TILES:
-            raise InputError(f'map of {used} tiles: expected {MAX_TILES} at most')
+        if used > self._max_tiles:
+            raise InputError(f'map of {used} tiles: expected {self._max_tiles} at most')
         if used > self.pool.shape[0]:
             least = max(used, self.used + self.used // 2)
-            longer = _empty_pool(self.pool.shape[1:], self.pool.dtype, least)
+            longer = _empty_pool(self.pool.shape[1:], self.pool.dtype, least, self._max_tiles)
             longer[: self.used] = self.pool[: self.used]
             self.pool = longer
         self.directory[missing[:, 0], missing[:, 1]] = np.arange(self.used, used)
@@ -207,10 +212,13 @@ class TileStore:
         self.allocate(tiles)
         self.overwrite(row, col, cells)
 
-    def overwrite(self, row: int, col: int, cells: NDArray[Any]) -> None:
-        """Set those of the cells (H, W, ...) from (row, col) on whose tiles exist."""
+    def overwrite(self, row: int, col: int, cells: NDArray[Any], field: str | None = None) -> None:
+        """Set those of the cells (H, W, ...) from (row, col) on whose tiles exist, or a field."""
         for stored, part in self._parts_within(row, col, *cells.shape[:2]):
-            stored[:] = cells[part]
+            if field is None:
+                stored[:] = cells[part]
+            else:
+                stored[field] = cells[part]
 
     def read_tiles(self, tiles: Cells) -> NDArray[Any]:
         """Copy of the tiles (N, 2), (row, col) in tile coordinates; 0 where no tile is."""
@@ -246,7 +254,9 @@ class TileStore:
             yield self.pool[slot, max(-top, 0) : rows - top, max(-left, 0) : cols - left], here
 
 
-def _empty_pool(tile: tuple[int, ...], dtype: DTypeLike, least: int) -> NDArray[Any]:
+def _empty_pool(
+    tile: tuple[int, ...], dtype: DTypeLike, least: int, max_tiles: int
+) -> NDArray[Any]:
     """Zeros (N, *tile) with room for the largest map.
 
     If the address space of the process is limited, or the system refuses that much: room for
@@ -254,7 +264,7 @@ def _empty_pool(tile: tuple[int, ...], dtype: DTypeLike, least: int) -> NDArray[
     """
     if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
         with suppress(OSError):
-            return _sparse_zeros((MAX_TILES, *tile), np.dtype(dtype))
+            return _sparse_zeros((max_tiles, *tile), np.dtype(dtype))
     return np.zeros((least, *tile), dtype=dtype)
 
 

@@ -168,7 +168,8 @@ class TopologicalMap:
 
     def edges_at(self, node_id: int) -> list[Edge]:
         """Edges that begin or end at a node; a loop counts once."""
-        return [self.edges[i] for i in self._edges_at[node_id]]
+        edges = self.edges
+        return [edges[i] for i in self._edges_at[node_id]]
 
     def kind_at(self, node_id: int) -> NodeKind:
         """Kind of a node by the number of ends of edges there."""
@@ -179,7 +180,7 @@ class TopologicalMap:
 
     def neighbours(self, node_id: int) -> list[int]:
         """Ids of the nodes one edge away, each once."""
-        return list(dict.fromkeys(edge.other(node_id) for edge in self.edges_at(node_id)))
+        return list(dict.fromkeys([edge.other(node_id) for edge in self.edges_at(node_id)]))
 
     def nearest_node(
         self, x: float | Sequence[float] | Array, y: float | None = None

@@ -385,9 +385,7 @@ class Registry:
             wanted |= {(cell, number) for cell in passage.corners}
         self._put_nodes(lattice, wanted - self._nodes.keys(), old_nodes, reach_m)
         self._put_passages(new, old_edges)
-        for cell in loose | kept:
-            if (cell, 0) in self._nodes:
-                self._put_vertex(lattice, cell)
+        self._put_vertices(lattice, [cell for cell in loose | kept if (cell, 0) in self._nodes])
         return True
 
     def _measured_again(self, lattice: Lattice, changes: Changes) -> dict[int, _Passage]:
@@ -434,9 +432,10 @@ class Registry:
         rows_cols = rows_and_cols(lattice, array[:, 0])
         order = np.lexsort((array[:, 1], rows_cols[:, 1], rows_cols[:, 0]))
         places = [(int(cell), int(number)) for cell, number in array[order]]
+        found = self._measured(lattice, [cell for cell, _ in places])
         nodes = [
-            self._node(0, NodeKind.CORNER if number else NodeKind.END, lattice, cell)
-            for cell, number in places
+            Node(0, NodeKind.CORNER if number else NodeKind.END, *measures)
+            for (_, number), measures in zip(places, found, strict=True)
         ]
         ids = self._continued(nodes, old, reach_m)
         for k, place in enumerate(places):
@@ -494,18 +493,21 @@ class Registry:
             self.map.put_edge(edge)
             passage.edges.append(edge.id)
 
-    def _put_vertex(self, lattice: Lattice, cell: int) -> None:
-        """Update the kind and the clearance of the node of a vertex."""
-        node_id = self._nodes[cell, 0]
-        node = self._node(node_id, self.map.kind_at(node_id), lattice, cell)
-        if node != self.map.nodes[node_id]:
-            self.map.put_node(node)
+    def _put_vertices(self, lattice: Lattice, cells: list[int]) -> None:
+        """Update the kinds and the clearances of the nodes of vertices."""
+        for cell, measures in zip(cells, self._measured(lattice, cells), strict=True):
+            node_id = self._nodes[cell, 0]
+            node = Node(node_id, self.map.kind_at(node_id), *measures)
+            if node != self.map.nodes[node_id]:
+                self.map.put_node(node)
 
-    def _node(self, node_id: int, kind: NodeKind, lattice: Lattice, cell: int) -> Node:
-        cells = np.array([cell])
-        x, y = self._frame.centres_of(rows_and_cols(lattice, cells))[0].tolist()
-        squared = float(squared_clearances(lattice, cells)[0])
-        return Node(node_id, kind, x, y, math.sqrt(squared) * self._frame.resolution)
+    def _measured(self, lattice: Lattice, cells: list[int]) -> list[tuple[float, float, float]]:
+        """x, y and clearance of cells, m."""
+        array = np.array(cells, dtype=np.int64)
+        xy = self._frame.centres_of(rows_and_cols(lattice, array))
+        clearances = np.sqrt(squared_clearances(lattice, array)) * self._frame.resolution
+        rows = zip(xy.tolist(), clearances.tolist(), strict=True)
+        return [(x, y, clearance) for (x, y), clearance in rows]
 
     def _new_id(self) -> int:
         self.next_id += 1

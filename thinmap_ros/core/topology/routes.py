@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from thinmap_ros.core.grid.fields import reachable
+from thinmap_ros.core.grid.fields import counts_of, label, looked_up, strips
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.se2 import Array, Cells, Mask, distances_from_line, path_length
@@ -19,7 +19,6 @@ from thinmap_ros.core.topology.thinning import (
     known_free,
     squared_clearance,
     standing_room,
-    true_cells,
     view_ends,
     view_from,
 )
@@ -60,8 +59,8 @@ class EditedGraph:
 
     def cell(self, node_id: int) -> tuple[int, int]:
         """Row and column of a node."""
-        row, col = self.frame.cells_of(self.map.nodes[node_id].position)[0].tolist()
-        return row, col
+        node = self.map.nodes[node_id]
+        return self.frame.cell_at(node.x, node.y)
 
     def is_clear(self, a: tuple[int, int], b: tuple[int, int]) -> bool:
         """Whether a robot can drive straight from the centre of a cell to that of another."""
@@ -128,6 +127,15 @@ def is_drivable(standing: Mask, row: int, col: int, to_row: int, to_col: int) ->
     return False
 
 
+@kernel
+def _are_drivable(standing: Mask, cells: Cells, ends: Cells) -> Mask:
+    """Of each of the cells (N, 2) whether it is drivable straight from there to its end (N, 2)."""
+    found = np.empty(len(cells), dtype=np.bool_)
+    for i in range(len(cells)):
+        found[i] = is_drivable(standing, cells[i, 0], cells[i, 1], ends[i, 0], ends[i, 1])
+    return found
+
+
 def split_parallels(graph: EditedGraph) -> None:
     """Make all edges straight, as they are driven; two between the same nodes get a corner node.
 
@@ -148,9 +156,9 @@ def split_parallels(graph: EditedGraph) -> None:
 
 def _lead_over_corner(graph: EditedGraph, edge: Edge) -> None:
     corner = edge.path[int(distances_from_line(edge.path).argmax())]
-    row, col = graph.frame.cells_of(corner)[0].tolist()
+    cell = graph.frame.cell_at(*corner.tolist())
     ends = {graph.cell(edge.a), graph.cell(edge.b)}
-    if len(ends) == 2 and all((row, col) != at and graph.is_clear((row, col), at) for at in ends):
+    if len(ends) == 2 and all(cell != at and graph.is_clear(cell, at) for at in ends):
         graph.split(edge, graph.put_node(corner))
     else:
         graph.map.drop_edge(edge.id)
@@ -211,8 +219,9 @@ def drop_rays(topology: TopologicalMap, patch: GridPatch) -> None:
         edges = topology.edges_at(number) if number in topology.nodes else []
         if number not in topology.nodes or len(edges) > 1:
             continue
-        row, col = patch.frame.cells_of(topology.nodes[number].position)[0].tolist()
-        walls, unknown = view_from(ends, row, col, reach, _DIRECTIONS)
+        node = topology.nodes[number]
+        cell = patch.frame.cell_at(node.x, node.y)
+        walls, unknown = view_from(ends, *cell, reach, _DIRECTIONS)
         if unknown > walls:
             open_ids += [edge.other(number) for edge in edges if edge.a != edge.b]
             topology.drop_node(number)
@@ -245,9 +254,9 @@ def coverage(
     """
     radius = config.robot_radius_m / patch.frame.resolution
     room = known_free(patch, config) & standing_room(column_distance(~patch.occupied), radius)
-    floor = reachable(room, true_cells(standing))
-    # Not a lattice: all of its lines may miss a narrow corridor.
-    cells = true_cells(floor)[:: max(round(_SPLIT_STEP_M / patch.frame.resolution), 1) ** 2]
+    cells = _some_of(
+        _touched(room, standing), max(round(_SPLIT_STEP_M / patch.frame.resolution), 1) ** 2
+    )
     beyond = standing_room(column_distance(~standing), radius)[cells[:, 0], cells[:, 1]]
     kept = whole.copy()
     drop_rays(kept, patch)
@@ -255,8 +264,33 @@ def coverage(
     parts += [(node.position[None], node.id in kept.nodes) for node in whole.nodes.values()]
     is_kept = np.concatenate([np.full(len(points), is_kept) for points, is_kept in parts])
     tree = cKDTree(np.concatenate([points for points, _ in parts]))
-    nearest = tree.query(patch.frame.centres_of(cells))[1]
-    return Coverage(float(beyond.mean()), float((~is_kept[nearest] & ~beyond).mean()))
+    dropped = 0
+    if not is_kept.all():
+        nearest = tree.query(patch.frame.centres_of(cells[~beyond]))[1]
+        dropped = int(np.count_nonzero(~is_kept[nearest]))
+    return Coverage(float(beyond.mean()), dropped / len(cells))
+
+
+def _touched(cells: Mask, others: Mask) -> Mask:
+    """Parts of a mask (H, W) that have a cell in common with another."""
+    labels, sizes = label(cells)
+    common = counts_of(labels, others, len(sizes))
+    common[0] = 0
+    return looked_up(common > 0, labels)
+
+
+def _some_of(cells: Mask, step: int) -> Cells:
+    """Each so manieth of the true cells (N, 2) of a mask (H, W).
+
+    Not those on a lattice: all of its lines may miss a narrow corridor.
+    """
+    found = []
+    first = 0
+    for strip in strips(len(cells)):
+        there = np.argwhere(cells[strip])
+        found.append(there[first::step] + (strip.start, 0))
+        first = (first - len(there)) % step
+    return np.concatenate(found)
 
 
 def open_rings(graph: EditedGraph, known: Mask, detail_m: float) -> None:
@@ -301,9 +335,11 @@ def _ring(graph: EditedGraph, edge: Edge, boxes: dict[int, Box], detail_m: float
             reached = cost + other.length_m
             if other.id == edge.id or other.clearance_m < edge.clearance_m:
                 continue
+            if reached >= costs.get(to, math.inf):
+                continue
             box = _joined(boxed[node_id][0], boxes[other.id])
             room_m = max(boxed[node_id][1], nodes[to].clearance_m)
-            if reached < costs.get(to, math.inf) and fits(box, detail_m + 2.0 * room_m):
+            if fits(box, detail_m + 2.0 * room_m):
                 costs[to] = reached
                 boxed[to] = (box, room_m)
                 came_by[to] = other
@@ -390,17 +426,16 @@ class Sight:
         """Leave out a node of a graph, unless fewer places would see the node nearest to them."""
         places = self._places[node.id]
         others = self._candidates(node, graph)
-        xy = np.array([(other.x, other.y) for other in others])
-        away = np.hypot(*np.moveaxis(self._xy[places][:, None] - xy, 2, 0))
-        nearest = away.argmin(axis=1)
-        seen = np.zeros(len(places), dtype=np.bool_)
-        for k in np.unique(nearest):
-            seen[nearest == k] = self._sees(others[k], places[nearest == k])
-        if seen.sum() < self._seen[places].sum():
+        points = np.array([(other.x, other.y) for other in others])
+        cells = self._frame.cells_of(points)
+        nearest, away, seen = _nearest_of(
+            self._known, self._cells[places], self._xy[places], cells, points
+        )
+        if np.count_nonzero(seen) < np.count_nonzero(self._seen[places]):
             return False
         self._seen[places] = seen
-        self._away[places] = away.min(axis=1)
-        for k in np.unique(nearest):
+        self._away[places] = away
+        for k in np.flatnonzero(np.bincount(nearest, minlength=1)).tolist():
             self._give(others[k].id, places[nearest == k])
         del self._places[node.id]
         return True
@@ -409,7 +444,7 @@ class Sight:
         """Add a node, if so some more places see the node nearest to them."""
         places, away = self._closer(node)
         seen = self._sees(node, places)
-        if seen.sum() < self._seen[places].sum() + least_gain:
+        if np.count_nonzero(seen) < np.count_nonzero(self._seen[places]) + least_gain:
             return False
         owners = np.unique(self._owner[places]).tolist()
         self._owner[places] = -1
@@ -487,19 +522,19 @@ class Sight:
         """Other nodes that may be nearest to one of the places of a node with a neighbour."""
         around = [graph.nodes[i] for i in graph.neighbours(node.id) if i != node.id]
         reach_m = float(self._away[self._places[node.id]].max(initial=0.0))
-        nearest_m = min(float(np.hypot(*(other.position - node.position))) for other in around)
+        nearest_m = min(math.dist((node.x, node.y), (other.x, other.y)) for other in around)
         found = graph.nodes_near(node.x, node.y, 2.0 * reach_m + nearest_m)
         return [other for other in found if other.id != node.id]
 
     def _closer(self, node: Node) -> tuple[Cells, Array]:
         """Indices of the places within reach to which a node is nearest, and their distances, m."""
-        cells = self._frame.cells_of(node.position)[0] // self._step
+        row, col = (index // self._step for index in self._frame.cell_at(node.x, node.y))
         reach = math.ceil(self.reach_m / (self._step * self._frame.resolution)) + 1
-        box = np.concatenate([cells - reach, cells + reach + 1])
+        box = np.array([row - reach, col - reach, row + reach + 1, col + reach + 1])
         return _closer(self._numbers, box, self._xy, self._away, node.position, self.reach_m)
 
     def _sees(self, node: Node, places: Cells) -> Mask:
-        row, col = self._frame.cells_of(node.position)[0].tolist()
+        row, col = self._frame.cell_at(node.x, node.y)
         return np.asarray(_lines_clear(self._known, row, col, self._cells[places]))
 
 
@@ -527,6 +562,28 @@ def _closer(
                 nearer[count] = distance
                 count += 1
     return found[:count].copy(), nearer[:count].copy()
+
+
+@kernel
+def _nearest_of(
+    known: Mask, cells: Cells, xy: Array, ends: Cells, points: Array
+) -> tuple[Cells, Array, Mask]:
+    """Index of the nearest of some points (M, 2) to each place, its distance, m, and if it is seen.
+
+    cells, xy (N, 2): the places; ends (M, 2): cells of the points.
+    """
+    nearest = np.zeros(len(xy), dtype=np.int64)
+    away = np.full(len(xy), np.inf)
+    seen = np.zeros(len(xy), dtype=np.bool_)
+    for i in range(len(xy)):
+        for k in range(len(points)):
+            distance = math.hypot(xy[i, 0] - points[k, 0], xy[i, 1] - points[k, 1])
+            if distance < away[i]:
+                nearest[i] = k
+                away[i] = distance
+        end = ends[nearest[i]]
+        seen[i] = line_is_clear(known, cells[i, 0], cells[i, 1], end[0], end[1])
+    return nearest, away, seen
 
 
 @kernel
@@ -572,8 +629,12 @@ def _heir(graph: EditedGraph, number: int, node_spacing_m: float, detail_m: floa
     around = [i for i in graph.map.neighbours(number) if i != number]
     is_opened = len(around) == 1 and number not in graph.ends
     is_chain = len(around) == 2 and len(graph.map.edges_at(number)) == 2
-    by_distance = sorted((math.dist(node.position, graph.map.nodes[i].position), i) for i in around)
-    for away_m, other in by_distance:
+    by_distance = []
+    for i in around:
+        other_node = graph.map.nodes[i]
+        away_m = math.dist((node.x, node.y), (other_node.x, other_node.y))
+        by_distance.append((away_m, i))
+    for away_m, other in sorted(by_distance):
         room_m = max(node_spacing_m, node.clearance_m, graph.map.nodes[other].clearance_m)
         if not (is_opened or is_chain or away_m <= room_m):
             continue
@@ -696,7 +757,7 @@ def _put_in_space(graph: EditedGraph, sight: Sight, place: int, reach_m: float) 
     node_id = graph.put_node(xy)
     cell = graph.cell(node_id)
     clear = any(
-        0.0 < math.dist(node.position, xy) <= 2.0 * reach_m
+        0.0 < math.dist((node.x, node.y), xy) <= 2.0 * reach_m
         and graph.is_clear(cell, graph.cell(node.id))
         for node in graph.map.nodes_near(float(xy[0]), float(xy[1]), 2.0 * reach_m)
     )
@@ -710,13 +771,14 @@ def cross_edges(graph: EditedGraph, reach_m: float) -> None:
     Source: Althöfer et al., "On sparse spanners of weighted graphs", 1993.
     """
     ids = list(graph.map.nodes)
-    places = np.array([node.position for node in graph.map.nodes.values()]).reshape(-1, 2)
+    places = np.array([(node.x, node.y) for node in graph.map.nodes.values()]).reshape(-1, 2)
     pairs = cKDTree(places).query_pairs(reach_m, output_type='ndarray')
+    cells = graph.frame.cells_of(places)
+    pairs = pairs[_are_drivable(graph.standing, cells[pairs[:, 0]], cells[pairs[:, 1]])]
     away_m = np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]]).T)
     for k in np.argsort(away_m, kind='stable').tolist():
         a, b = (ids[i] for i in pairs[k].tolist())
-        clear = graph.is_clear(graph.cell(a), graph.cell(b))
-        if clear and not _is_reached(graph.map, a, b, _DETOUR * float(away_m[k])):
+        if not _is_reached(graph.map, a, b, _DETOUR * float(away_m[k])):
             graph.put_straight(0, a, b)
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,15 @@ from scipy import ndimage
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.fields import distance_cells, label, root_of
+from thinmap_ros.core.grid.fields import (
+    counts_of,
+    distance_cells,
+    label,
+    looked_up,
+    root_of,
+    squared_distance,
+    strips,
+)
 from thinmap_ros.core.grid.mapper import WholeMap
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
@@ -20,13 +28,24 @@ from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.snapshot import MAX_COUNT, MAX_ID, Field
 from thinmap_ros.core.topology import regions as region_names
 from thinmap_ros.core.topology.regions import Door, Region, RegionKind, RegionMap, RegionNames
-from thinmap_ros.core.topology.thinning import VIEW_M, view_ends, view_from
+from thinmap_ros.core.topology.thinning import (
+    UNKNOWN_END,
+    VIEW_M,
+    column_distance,
+    end_of_view,
+    standing_room,
+    view_ends,
+)
 from thinmap_ros.jit import inlined, kernel
 
 Labels = NDArray[np.int32]
+Squares = NDArray[np.int32]  # squared distances, in cells
 
 # Of passages.
 _JAMB_M = 0.6  # on each side of a passage, over which a straight wall is no jamb
+# The cells around one, row after row.
+_ROWS_ROUND = np.array([-1, -1, -1, 0, 0, 1, 1, 1])
+_COLS_ROUND = np.array([-1, 0, 1, -1, 1, -1, 0, 1])
 _SQUARE = np.ones((3, 3), dtype=np.bool_)  # a cell and its eight neighbours
 _FACE_M = 0.15  # up to which a straight wall is rough
 
@@ -113,8 +132,28 @@ class Neck:
     least_cells: int
 
 
-def flood(clearance: Array, neck: Neck) -> tuple[Labels, Cells]:
-    """Basins of a clearance (H, W), m, 0 outside of the space: a watershed by merge tree.
+@dataclass(frozen=True, eq=False)
+class Clearance:
+    """Distance of each cell of a space to the nearest cell outside; the rim of the map is outside.
+
+    squared (H, W): in cells, which needs half the memory of a distance in m; 0 outside.
+    """
+
+    squared: Squares
+    resolution_m: float
+
+    @staticmethod
+    def of(space: Mask, resolution_m: float) -> 'Clearance':
+        """Clearance in a space (H, W)."""
+        return Clearance(squared_distance(~space, is_rim_marked=True), resolution_m)
+
+    def within(self, part: slice | tuple[slice, ...]) -> Array:
+        """Distances in a part of the map, m."""
+        return np.asarray(np.sqrt(self.squared[part]) * self.resolution_m)
+
+
+def flood(clearance: Clearance, neck: Neck) -> tuple[Labels, Cells]:
+    """Basins of a clearance (H, W): a watershed by merge tree.
 
     Cells are flooded from the roomiest one down. A cell beside one basin joins it; a cell beside
     two is their saddle, the widest place of the narrowest path between them: they become one basin,
@@ -125,25 +164,47 @@ def flood(clearance: Array, neck: Neck) -> tuple[Labels, Cells]:
     Source: watershed after F. Meyer, "Topographic distance and watershed lines", 1994; compared for
     maps by R. Bormann et al., "Room segmentation: survey, implementation, and analysis", ICRA 2016.
     """
-    flat = np.ascontiguousarray(clearance).ravel()
-    inside = np.flatnonzero(flat > 0.0)
-    order = inside[np.argsort(-flat[inside], kind='stable')]  # the roomiest first
+    shape = clearance.squared.shape
+    flat = clearance.squared.ravel()
+    limits = (neck.ratio, neck.widest, neck.least_cells)
     basin, parent, saddles = _flood(
-        flat, order, clearance.shape[1], neck.ratio, neck.widest, neck.least_cells
+        flat, _roomiest_first(flat), shape[1], clearance.resolution_m, *limits
     )
     number = np.zeros(len(parent) + 1, dtype=np.int32)  # the last: of cells outside
     number[:-1] = 1 + np.unique(parent, return_inverse=True)[1]
     pairs = np.sort(number[saddles[:, 1:]], axis=1)
     apart = pairs[:, 0] != pairs[:, 1]
-    labels: Labels = number[basin].reshape(clearance.shape)
+    labels = looked_up(number, basin.reshape(shape))
     return labels, np.column_stack([saddles[apart, 0], pairs[apart]])
 
 
 @kernel
+def _roomiest_first(flat: Squares) -> NDArray[np.int32]:
+    """Indices of the squared clearances (N,) above 0, the largest first, else by index."""
+    first = np.zeros(flat.max() + 2, dtype=np.int64)
+    for value in flat:
+        first[value] += 1
+    first[0] = 0
+    # From the counts to where the cells of each value begin.
+    total = 0
+    for value in range(first.size - 1, 0, -1):
+        count = first[value]
+        first[value] = total
+        total += count
+    order = np.empty(total, dtype=np.int32)
+    for at in range(flat.size):
+        if flat[at] > 0:
+            order[first[flat[at]]] = at
+            first[flat[at]] += 1
+    return order
+
+
+@kernel
 def _flood(
-    flat: Array,
-    order: Cells,
+    flat: Squares,
+    order: NDArray[np.int32],
     cols: int,
+    resolution_m: float,
     ratio: float,
     widest: float,
     least_cells: int,
@@ -152,32 +213,43 @@ def _flood(
     basin = np.full(flat.size, -1, dtype=np.int32)
     parent = np.empty(order.size, dtype=np.int64)
     peak = np.empty(order.size)
-    cells = np.zeros(order.size, dtype=np.int64)
+    cells = np.empty(order.size, dtype=np.int64)  # not zeros: few of these pages are used
     saddles = np.empty((3 * order.size, 3), dtype=np.int64)
+    steps = _ROWS_ROUND * cols + _COLS_ROUND
     count = 0
     basins = 0
     for at in order:
         best = -1  # basin beside this cell, of several merged ones their union
         uphill = -1  # basin of the neighbour with the largest clearance
-        highest = 0.0
+        highest = 0
+        last = -1  # basin of the neighbour before
         col = at % cols
-        for step in range(9):
-            to_col = col + step % 3 - 1
-            other_cell = at + (step // 3 - 1) * cols + step % 3 - 1
-            outside = not (0 <= to_col < cols and 0 <= other_cell < flat.size)
-            if outside or basin[other_cell] < 0:
+        is_inner = 0 < col < cols - 1 and cols <= at < flat.size - cols
+        for k in range(8):
+            other_cell = at + steps[k]
+            if not is_inner:
+                is_beside = 0 <= col + _COLS_ROUND[k] < cols
+                if not is_beside or not 0 <= other_cell < flat.size:
+                    continue
+            if basin[other_cell] < 0:
                 continue
             if flat[other_cell] > highest:
                 highest = flat[other_cell]
                 uphill = basin[other_cell]
-            other = root_of(parent, basin[other_cell])
+            if basin[other_cell] == last:
+                continue
+            last = basin[other_cell]
+            other = root_of(parent, last)
             if best < 0 or best == other:
                 best = other
                 continue
             low = min(peak[best], peak[other])
-            is_narrow = flat[at] < ratio * low and flat[at] <= widest
+            room = math.sqrt(flat[at]) * resolution_m
+            is_narrow = room < ratio * low and room <= widest
             if is_narrow and min(cells[best], cells[other]) >= least_cells:
-                saddles[count] = (at, best, other)
+                saddles[count, 0] = at
+                saddles[count, 1] = best
+                saddles[count, 2] = other
                 count += 1
                 continue
             parent[other] = best
@@ -186,7 +258,8 @@ def _flood(
         if best < 0:
             uphill = basins
             parent[uphill] = uphill
-            peak[uphill] = flat[at]
+            cells[uphill] = 0
+            peak[uphill] = math.sqrt(flat[at]) * resolution_m
             basins += 1
         # Up the steepest path, so that a boundary runs through its saddle.
         own = root_of(parent, uphill)
@@ -208,56 +281,68 @@ class Passage:
 
 
 def passages_at(
-    saddles: NDArray[np.int64], basins: Labels, clearance: Array, min_width_m: float
+    saddles: NDArray[np.int64], clearance: Clearance, min_width_m: float
 ) -> list[Passage]:
     """One passage for each stretch of saddles (N, 3) between the same two basins, widest first."""
-    is_saddle = np.zeros(basins.shape, dtype=np.bool_)
-    is_saddle.ravel()[saddles[:, 0]] = True
-    stretches = ndimage.label(ndimage.binary_dilation(is_saddle, _SQUARE), _SQUARE)[0].ravel()
-    widths_m = 2.0 * clearance.ravel()[saddles[:, 0]]
+    height, width = clearance.squared.shape
+    rows, cols = np.divmod(saddles[:, 0], width)
+    near = np.zeros((height + 2, width + 2), dtype=np.bool_)
+    for row, col in np.ndindex(3, 3):
+        near[rows + row, cols + col] = True
+    stretches = label(near)[0][rows + 1, cols + 1].tolist()
+    widths_m = 2.0 * (np.sqrt(clearance.squared[rows, cols]) * clearance.resolution_m)
     found: dict[tuple[int, int, int], Passage] = {}
-    for (cell, a, b), width_m in zip(saddles.tolist(), widths_m.tolist(), strict=True):
+    rows_of = zip(saddles.tolist(), widths_m.tolist(), stretches, strict=True)
+    for (cell, a, b), width_m, stretch in rows_of:
         if width_m >= min_width_m:
-            found.setdefault((int(stretches[cell]), a, b), Passage(cell, a, b, width_m))
+            found.setdefault((stretch, a, b), Passage(cell, a, b, width_m))
     return list(found.values())
 
 
-def mean_widths_m(basins: Labels, clearance: Array) -> Array:
+def mean_widths_m(basins: Labels, clearance: Clearance) -> Array:
     """Mean width of each basin as of a strip, by number from 0 (unused) on, m.
 
     Across a strip the mean clearance is a quarter of the width. At a crossing it is more in a few
     cells only, so that the largest one would call corridors that meet wide.
     """
-    sums = np.bincount(basins.ravel(), clearance.ravel())
-    return 4.0 * sums / np.maximum(np.bincount(basins.ravel()), 1)
+    count = 1 + int(basins.max(initial=0))
+    sums = np.zeros(count)
+    cells = np.zeros(count, dtype=np.int64)
+    for strip in strips(len(basins)):
+        numbers = basins[strip].ravel()
+        np.add.at(sums, numbers, clearance.within(strip).ravel())
+        cells += np.bincount(numbers, minlength=count)
+    return 4.0 * sums / np.maximum(cells, 1)
 
 
 def gets_wider(
-    passage: Passage, basins: Labels, clearance: Array, reach: int, ratio: float
+    passage: Passage, basins: Labels, clearance: Clearance, reach_m: float, ratio: float
 ) -> bool:
-    """Whether both basins are wider than a passage, by a ratio, within so many cells of it."""
+    """Whether both basins are wider than a passage, by a ratio, within a reach of it, m."""
     row, col = divmod(passage.cell, basins.shape[1])
-    rows = slice(max(row - reach, 0), row + reach + 1)
-    cols = slice(max(col - reach, 0), col + reach + 1)
+    reach = math.ceil(reach_m / clearance.resolution_m)
+    box = (slice(max(row - reach, 0), row + reach + 1), slice(max(col - reach, 0), col + reach + 1))
+    clearance_m = clearance.within(box)
     return all(
-        ratio * float(clearance[rows, cols][basins[rows, cols] == basin].max(initial=0.0))
-        > 0.5 * passage.width_m
+        ratio * float(clearance_m[basins[box] == basin].max(initial=0.0)) > 0.5 * passage.width_m
         for basin in (passage.a, passage.b)
     )
 
 
-def has_flat_jamb(passage: Passage, space: Mask, resolution_m: float) -> bool:
+def has_flat_jamb(passage: Passage, clearance: Clearance) -> bool:
     """Whether the wall at one end of a passage goes straight on to both sides of it.
 
     So it does opposite an open door's leaf or a cupboard in a corridor; a door has a wall that ends
     at both of its jambs.
     """
-    at = np.array(divmod(passage.cell, space.shape[1]))
+    resolution_m = clearance.resolution_m
+    at = np.array(divmod(passage.cell, clearance.squared.shape[1]))
     half = 0.5 * passage.width_m / resolution_m
     reach = math.ceil(half + _JAMB_M / resolution_m) + 1
     low = (at - reach).clip(0)
     high = at + reach + 1
-    walls = np.argwhere(~space[low[0] : high[0], low[1] : high[1]]) + low - at
+    near = clearance.squared[low[0] : high[0], low[1] : high[1]]
+    walls = np.argwhere(near == 0) + low - at
     if not len(walls):
         return False
     away = np.hypot(*walls.T)
@@ -287,10 +372,11 @@ def joined(
 ) -> tuple[Labels, list[Passage]]:
     """Basins joined where a passage between them is no door: regions (H, W) from 1, and doors.
 
-    A region of fewer than least_cells free cells joins a neighbour, through its widest door.
+    A region of fewer than least_cells free cells joins a neighbour, through its widest door; where
+    it has none, its cells are in no region.
     """
     number = np.arange(1 + int(basins.max(initial=0)))
-    cells = np.bincount(basins[free], minlength=len(number))
+    cells = counts_of(basins, free, len(number))
 
     def join(passage: Passage) -> None:
         low = number[passage.a]
@@ -311,7 +397,8 @@ def joined(
         for passage in passages
         if region[passage.a] != region[passage.b]
     ]
-    return region[basins], doors
+    region[cells[number] < least_cells] = 0
+    return looked_up(region, basins), doors
 
 
 def room_space(patch: GridPatch, config: RegionConfig) -> Mask:
@@ -323,13 +410,11 @@ def room_space(patch: GridPatch, config: RegionConfig) -> Mask:
     radius = config.robot_radius_m / patch.frame.resolution
     free = patch.free | _furniture(patch, config.max_furniture_m / patch.frame.resolution)
     free &= ~behind_glass(patch)
-    standing = _clearance_cells(free) > radius
-    return np.asarray(distance_cells(standing) < radius)
-
-
-def clearance_m(space: Mask, resolution_m: float) -> Array:
-    """Distance of each cell (H, W) to the nearest cell outside a space, m; the rim is outside."""
-    return _clearance_cells(space) * resolution_m
+    # Squared distances are whole numbers: this is the next one above the radius.
+    standing = standing_room(column_distance(free), math.sqrt(math.floor(radius**2) + 1))
+    margin = math.ceil(radius)  # nobody stands in the cells outside
+    apart = column_distance(np.pad(~standing, margin, constant_values=True))
+    return ~standing_room(apart, radius)[margin:-margin, margin:-margin]
 
 
 def wide_cells(clearance: Array, width_m: float, resolution_m: float) -> Mask:
@@ -341,10 +426,6 @@ def wide_cells(clearance: Array, width_m: float, resolution_m: float) -> Mask:
     if not fits.any():
         return fits
     return np.asarray(distance_cells(fits) * resolution_m < 0.5 * width_m) & (clearance > 0.0)
-
-
-def _clearance_cells(space: Mask) -> Array:
-    return distance_cells(np.pad(~space, 1, constant_values=True))[1:-1, 1:-1]
 
 
 def _furniture(patch: GridPatch, longest: float) -> Mask:
@@ -361,28 +442,52 @@ def _furniture(patch: GridPatch, longest: float) -> Mask:
             continue
         filled = ndimage.binary_fill_holes(numbers[box] == number)
         small[number] = filled.sum() >= _COMPACT * extent**2 or extent <= _LEG * longest
-    return np.asarray(small[numbers])
+    return looked_up(small, numbers)
 
 
 def behind_glass(patch: GridPatch) -> Mask:
     """Cells (H, W) that see the unknown in most directions: a laser saw them through glass."""
     resolution = patch.frame.resolution
     stride = max(1, round(_VIEW_STRIDE_M / resolution))
-    return _sees_unknown(patch.free, view_ends(patch), stride, VIEW_M / resolution)
+    reach = VIEW_M / resolution
+    ends = view_ends(replace(patch))  # whose masks go with it: the map may be large
+    side = int(reach) + 2
+    near = ndimage.binary_dilation(_any_in_squares(ends == UNKNOWN_END, side), _SQUARE)
+    return _sees_unknown(patch.free, ends, near, stride, reach)
+
+
+def _any_in_squares(cells: Mask, side: int) -> Mask:
+    """Which squares of so many cells hold a true one of a mask (H, W)."""
+    rows, cols = (np.arange(0, size, side) for size in cells.shape)
+    return np.logical_or.reduceat(np.logical_or.reduceat(cells, rows, axis=0), cols, axis=1)
 
 
 @kernel
-def _sees_unknown(free: Mask, ends: NDArray[np.uint8], stride: int, reach: float) -> Mask:
-    """Squares of a stride (H, W) whose middle is free and sees the unknown in most directions."""
+def _sees_unknown(
+    free: Mask, ends: NDArray[np.uint8], near: Mask, stride: int, reach: float
+) -> Mask:
+    """Squares of a stride (H, W) whose middle is free and sees the unknown in most directions.
+
+    near: squares of `int(reach) + 2` cells from which the unknown may be seen.
+    """
     rows, cols = free.shape
     found = np.zeros(free.shape, dtype=np.bool_)
+    side = int(reach) + 2
+    most = _VIEWS - int(_OPEN * _VIEWS) - 1  # other directions
     for row in range(stride // 2, rows, stride):
         for col in range(stride // 2, cols, stride):
-            if free[row, col]:
-                unknown = view_from(ends, row, col, reach, _VIEWS)[1]
-                top = row - stride // 2
-                left = col - stride // 2
-                found[top : top + stride, left : left + stride] = unknown > _OPEN * _VIEWS
+            if not free[row, col] or not near[row // side, col // side]:
+                continue
+            others = 0
+            for k in range(_VIEWS):
+                others += (
+                    end_of_view(ends, row, col, reach, 2.0 * math.pi * k / _VIEWS) != UNKNOWN_END
+                )
+                if others > most:
+                    break
+            top = row - stride // 2
+            left = col - stride // 2
+            found[top : top + stride, left : left + stride] = others <= most
     return found
 
 
@@ -439,12 +544,12 @@ def _ahead(row: int, col: int, heading: int) -> tuple[int, int]:
 class Segmentation:
     """Cells of a grid by region, not yet described.
 
-    labels (H, W): region of each cell from 1, 0 for none; clearance (H, W), m.
+    labels (H, W): region of each cell from 1, 0 for none.
     """
 
     patch: GridPatch
     labels: Labels
-    clearance: Array
+    clearance: Clearance
     passages: list[Passage]
 
 
@@ -458,25 +563,23 @@ def find_regions(patch: GridPatch, config: RegionConfig | None = None) -> Region
 def segment(patch: GridPatch, config: RegionConfig) -> Segmentation:
     """Divide the free space of a grid at its necks."""
     resolution = patch.frame.resolution
-    space = room_space(patch, config)
-    clearance = clearance_m(space, resolution)
+    clearance = Clearance.of(room_space(patch, config), resolution)
     least_cells = int(_MIN_AREA_M2 / resolution**2)
     seed_cells = max(1, int(_SEED * least_cells))
-    neck = Neck(config.neck_ratio, 0.5 * config.max_door_width_m, seed_cells)
-    basins, saddles = flood(clearance, neck)
-    passages = passages_at(saddles, basins, clearance, config.min_door_width_m)
-    reach = math.ceil(config.max_door_depth_m / resolution)
+    basins, saddles = flood(
+        clearance, Neck(config.neck_ratio, 0.5 * config.max_door_width_m, seed_cells)
+    )
+    passages = passages_at(saddles, clearance, config.min_door_width_m)
     widths_m = mean_widths_m(basins, clearance)
     is_door = [
         max(widths_m[p.a], widths_m[p.b]) > config.max_corridor_width_m
         or (
-            gets_wider(p, basins, clearance, reach, config.neck_ratio)
-            and not has_flat_jamb(p, space, resolution)
+            gets_wider(p, basins, clearance, config.max_door_depth_m, config.neck_ratio)
+            and not has_flat_jamb(p, clearance)
         )
         for p in passages
     ]
     labels, doors = joined(basins, passages, is_door, patch.free, least_cells)
-    labels[np.bincount(labels[patch.free], minlength=labels.max() + 1)[labels] < least_cells] = 0
     return Segmentation(patch, labels, clearance, doors)
 
 
@@ -484,18 +587,17 @@ def describe(segmentation: Segmentation, ids: NDArray[np.int64], config: RegionC
     """Kinds, areas, outlines and doors of regions; ids (R + 1,): id by number, ids[0] unused."""
     found = segmentation
     cell_m2 = found.patch.frame.resolution**2
-    free = np.where(found.patch.free, found.labels, 0)
-    areas = np.bincount(free.ravel(), minlength=len(ids)) * cell_m2
-    to_walls = clearance_m(
-        ~found.patch.occupied | (found.clearance > 0.0), found.patch.frame.resolution
+    areas = counts_of(found.labels, found.patch.free, len(ids)) * cell_m2
+    to_walls = Clearance.of(
+        ~found.patch.occupied | (found.clearance.squared > 0), found.patch.frame.resolution
     )
     regions = {}
     for number, box in enumerate(ndimage.find_objects(found.labels), 1):
         if box is None:
             continue
         own = found.labels[box] == number
-        clearance = np.where(own, found.clearance[box], 0.0)
-        if _is_corridor(np.where(own, to_walls[box], 0.0), found.patch.frame.resolution, config):
+        clearance = np.where(own, found.clearance.within(box), 0.0)
+        if _is_corridor(np.where(own, to_walls.within(box), 0.0), to_walls.resolution_m, config):
             kind = RegionKind.CORRIDOR
         else:
             is_hall = 2.0 * float(clearance.max()) >= config.min_hall_width_m
@@ -506,7 +608,7 @@ def describe(segmentation: Segmentation, ids: NDArray[np.int64], config: RegionC
             int(ids[number]), kind, x, y, float(areas[number]), _outline(found, number, box)
         )
     # The smallest type: a map keeps them for each cell.
-    labels = ids.astype(np.min_scalar_type(int(ids.max())))[found.labels]
+    labels = looked_up(ids.astype(np.min_scalar_type(int(ids.max()))), found.labels)
     return RegionMap(found.patch.frame, labels, regions, _doors(found, ids))
 
 

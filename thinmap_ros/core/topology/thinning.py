@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.config import MAX_ROBOT_RADIUS_M
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.grid.fields import label, nearest_true, reachable
+from thinmap_ros.core.grid.fields import label, looked_up, nearest_true, reachable
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
@@ -20,7 +20,7 @@ VIEW_M = 3.0  # beyond, whatever ends a view is no part of the place
 _DEPTH_M = 0.25  # less of the unknown is specks between beams, and the fringe before walls
 _BESIDE_M = 0.15  # of a wall: a hole between beams of 2 degrees at 8 m is twice as wide
 # What ends a view.
-_UNKNOWN = 1
+UNKNOWN_END = 1
 _WALL = 2
 _ISLAND_M2 = 2.0
 _ISLAND_SHARE = 0.05  # of the largest part
@@ -71,10 +71,11 @@ def beyond_radius(config: TopologyConfig, resolution: float) -> TopologyConfig:
 
 
 def known_free(patch: GridPatch, config: TopologyConfig) -> Mask:
-    """Free cells (H, W), with unknown gaps up to gap_m between them closed."""
-    states = patch.free.astype(np.uint8) + 2 * patch.unknown.astype(np.uint8)
+    """Free cells (H, W), with unknown gaps up to gap_m between them closed; not to be changed."""
     gap = int(config.max_unknown_gap_m / patch.frame.resolution + 1e-6)
-    return _close_gaps(states, gap)
+    if gap == 0:
+        return patch.free
+    return _close_gaps(patch.free.astype(np.uint8) + 2 * patch.unknown.astype(np.uint8), gap)
 
 
 def standing_room(distance: NDArray[np.int16], radius_cells: float) -> Mask:
@@ -94,10 +95,13 @@ def standing_room(distance: NDArray[np.int16], radius_cells: float) -> Mask:
 
 def without_specks(cells: Mask, smallest: float) -> Mask:
     """Cells without the parts (joined over edges and corners) of fewer than `smallest` cells."""
-    labels, sizes = label(cells)
+    return _without_small(*label(cells), smallest)
+
+
+def _without_small(labels: NDArray[np.int32], sizes: Cells, smallest: float) -> Mask:
     keep = sizes >= smallest
     keep[0] = False
-    return keep[labels]
+    return looked_up(keep, labels)
 
 
 def without_islands(standing: Mask, resolution: float) -> Mask:
@@ -105,9 +109,10 @@ def without_islands(standing: Mask, resolution: float) -> Mask:
 
     Small is below 2 m2 and below 5 % of the largest part; resolution: edge of a cell, m.
     """
-    _, sizes = label(standing)
+    labels, sizes = label(standing)
     largest = float(sizes[1:].max(initial=0))
-    return without_specks(standing, min(_ISLAND_M2 / resolution**2, _ISLAND_SHARE * largest))
+    smallest = min(_ISLAND_M2 / resolution**2, _ISLAND_SHARE * largest)
+    return _without_small(labels, sizes, smallest)
 
 
 def view_ends(patch: GridPatch) -> NDArray[np.uint8]:
@@ -124,7 +129,7 @@ def view_ends(patch: GridPatch) -> NDArray[np.uint8]:
     no_wall = np.pad(~patch.occupied, margin, constant_values=True)
     apart = standing_room(column_distance(no_wall), beside)[margin:-margin, margin:-margin]
     walls = patch.occupied | (patch.unknown & ~apart)
-    return np.where(walls, np.uint8(_WALL), _UNKNOWN * deep.astype(np.uint8))
+    return np.where(walls, np.uint8(_WALL), UNKNOWN_END * deep.astype(np.uint8))
 
 
 @kernel
@@ -139,19 +144,27 @@ def view_from(
     walls = 0
     unknown = 0
     for k in range(directions):
-        angle = 2.0 * math.pi * k / directions
-        away = 0.0
-        while away < reach:
-            r = int(math.floor(row + 0.5 + away * math.sin(angle)))
-            c = int(math.floor(col + 0.5 + away * math.cos(angle)))
-            if not (0 <= r < ends.shape[0] and 0 <= c < ends.shape[1]):
-                break
-            if ends[r, c] != 0:
-                walls += ends[r, c] == _WALL
-                unknown += ends[r, c] == _UNKNOWN
-                break
-            away += 0.5
+        end = end_of_view(ends, row, col, reach, 2.0 * math.pi * k / directions)
+        walls += end == _WALL
+        unknown += end == UNKNOWN_END
     return walls, unknown
+
+
+@inlined
+def end_of_view(ends: NDArray[np.uint8], row: int, col: int, reach: float, angle: float) -> int:
+    """What ends a view from a cell in a direction, rad, within a reach; see `view_from`."""
+    sine = math.sin(angle)
+    cosine = math.cos(angle)
+    away = 0.0
+    while away < reach:
+        r = int(math.floor(row + 0.5 + away * sine))
+        c = int(math.floor(col + 0.5 + away * cosine))
+        if not (0 <= r < ends.shape[0] and 0 <= c < ends.shape[1]):
+            break
+        if ends[r, c] != 0:
+            return int(ends[r, c])
+        away += 0.5
+    return 0
 
 
 @kernel

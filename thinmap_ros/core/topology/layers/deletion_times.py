@@ -21,6 +21,7 @@ Source: topological map paper section 2.1, steps 1 and 2.
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.grid.fields import strips
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.se2 import Cells
 from thinmap_ros.core.topology.layers.lattice import (
@@ -121,11 +122,16 @@ def _take_times(lattice: Lattice, times: NDArray[np.int16], places: Cells) -> tu
 
 def skeleton_cells(lattice: Lattice, times: NDArray[np.int16], row: int, col: int) -> Cells:
     """Cells of the skeleton by the deletion times (H, W) of all cells, the first at (row, col)."""
-    first = times[:-1, :-1]
-    square = (first > 0) & (first < KEPT) & (first == times[1:, 1:])
-    square &= (first == times[1:, :-1]) & (first == times[:-1, 1:])
-    places = np.concatenate((np.argwhere(times == KEPT), np.argwhere(square)))
-    return _kept_of(lattice, cells_at(lattice, places + (row, col)))
+    places = [np.empty((0, 2), dtype=np.int64)]
+    for strip in strips(len(times)):
+        # With the next row, for squares of 2 x 2 cells that vanish at once.
+        part = times[strip.start : strip.stop + 1]
+        first = part[:-1, :-1]
+        square = (first > 0) & (first < KEPT) & (first == part[1:, 1:])
+        square &= (first == part[1:, :-1]) & (first == part[:-1, 1:])
+        found = np.concatenate((np.argwhere(times[strip] == KEPT), np.argwhere(square)))
+        places.append(found + (row + strip.start, col))
+    return _kept_of(lattice, cells_at(lattice, np.concatenate(places)))
 
 
 @kernel

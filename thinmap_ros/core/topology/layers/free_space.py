@@ -1,7 +1,6 @@
 """Free space of the whole map, kept up to date from the cells that change."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,6 @@ from thinmap_ros.core.grid.patch import (
     OCCUPIED_AT_LEAST,
     GridPatch,
 )
-from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_PERCENT
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.se2 import Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
@@ -82,16 +80,19 @@ class FreeSpace:
         The layer is empty before. free (H, W): traversable cells; None: all where the robot fits.
         lines (H, W): cells that are thinned instead of these. Returns the cells of the skeleton.
         """
-        reach = self._reach
-        cells = np.pad(patch.cells, reach, constant_values=UNKNOWN_PERCENT)
-        known = known_free(GridPatch(patch.frame, cells), self._config)
+        known = known_free(patch, self._config)
         columns = column_distance(known)
+        fits = standing_room(columns, self._radius) if free is None else free
+        occupied = patch.cells >= OCCUPIED_AT_LEAST
+        state = np.uint8(FREE) * patch.free + np.uint8(OCCUPIED) * occupied
         self._store.add(row, col, patch.cells >= 0)
-        fits = standing_room(columns, self._radius) if free is None else np.pad(free, reach)
-        times = deletion_times(fits if lines is None else np.pad(lines, reach))
-        fields = _Fields(cells, known, fits, columns, times)
-        _write_fields(self.lattice, fields, row - reach, col - reach)
-        return skeleton_cells(self.lattice, times, row - reach, col - reach)
+        fields = {'state': state, 'known': known, 'free': fits, 'column': columns}
+        for name, values in fields.items():
+            self._store.put(name, values, row, col)
+        del occupied, state, columns, fields  # the map may be large
+        times = deletion_times(fits if lines is None else lines)
+        self._store.put('time', times, row, col)
+        return skeleton_cells(self.lattice, times, row, col)
 
     def states(self) -> tuple[Cells, NDArray[np.uint8]]:
         """Row and column (N, 2) of the tiles with known states, and these (N, TILE, TILE)."""
@@ -115,16 +116,6 @@ class FreeSpace:
         return changed, _set_free(lattice, tiles, np.ascontiguousarray(room[:, :TILE]))
 
 
-class _Fields(NamedTuple):
-    """Values (H, W) of cells; percent: as in a patch of the grid."""
-
-    percent: NDArray[np.int8]
-    known: Mask
-    free: Mask
-    column: NDArray[np.int16]
-    time: NDArray[np.int16]
-
-
 @inlined
 def _state_of(percent: int) -> int:
     if percent < 0:
@@ -132,25 +123,6 @@ def _state_of(percent: int) -> int:
     if percent <= FREE_AT_MOST:
         return FREE
     return OCCUPIED if percent >= OCCUPIED_AT_LEAST else UNKNOWN
-
-
-@kernel
-def _write_fields(lattice: Lattice, fields: _Fields, row: int, col: int) -> None:
-    """Set the cells (H, W) of tiles, the first at (row, col)."""
-    for i in range(fields.percent.shape[0]):
-        at = 0
-        for j in range(fields.percent.shape[1]):
-            if j == 0 or (col + j) % TILE == 0:
-                at = cell_at(lattice, row + i, col + j)
-            elif at > 0:
-                at += 1
-            if at > 0:
-                cell = lattice.cells[at]
-                cell['state'] = _state_of(fields.percent[i, j])
-                cell['known'] = fields.known[i, j]
-                cell['free'] = fields.free[i, j]
-                cell['column'] = fields.column[i, j]
-                cell['time'] = fields.time[i, j]
 
 
 @kernel

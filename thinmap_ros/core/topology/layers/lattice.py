@@ -34,6 +34,7 @@ ROWS = np.array([-1, -1, 0, 1, 1, 1, 0, -1], dtype=np.int64)
 COLS = np.array([0, 1, 1, 1, 0, -1, -1, -1], dtype=np.int64)
 _BITS = TILE.bit_length() - 1
 _MASK = TILE - 1
+_MOST_TILES = 3 * MAX_TILES  # the largest image of a map, and its margin
 _OFFSET = 1 << 30  # makes rows and columns positive
 _KEY_BITS = 31
 
@@ -61,7 +62,14 @@ class LatticeStore:
 
     def __init__(self, margin_cells: int) -> None:
         # The margin may reach beyond the largest grid; slot 0 is read outside of all tiles.
-        self._store = TileStore(CELL, (), 4 * MAX_TILES, begins_at_origin=False, reserved=1)
+        self._store = TileStore(
+            CELL,
+            (),
+            4 * MAX_TILES,
+            begins_at_origin=False,
+            reserved=1,
+            max_tiles=_MOST_TILES,
+        )
         self._margin = -(-margin_cells // TILE)
         self._needed: set[tuple[int, ...]] = set()
         self.view = self._view()
@@ -84,6 +92,10 @@ class LatticeStore:
         self._store.allocate(wanted)
         self._needed.update(fresh)
         self.view = self._view()
+
+    def put(self, field: str, values: NDArray[Any], row: int, col: int) -> None:
+        """Set a field of those of the cells (H, W) that exist, the first at (row, col)."""
+        self._store.overwrite(row, col, values, field)
 
     def states(self) -> tuple[Cells, NDArray[np.uint8]]:
         """Row and column (N, 2) of the tiles with known states, and these (N, TILE, TILE)."""

@@ -85,7 +85,10 @@ class SkeletonGraph:
     def update(self, lattice: Lattice, changed: Cells) -> None:
         """Flip cells (N,) of the skeleton, and trace again what they touch."""
         self.arrays = self.arrays._replace(lattice=lattice)
-        loose, open_vertices = _remove(self.arrays, changed)
+        loose = changed
+        open_vertices = changed[:0]
+        if len(self.arrays.vertices):
+            loose, open_vertices = _remove(self.arrays, changed)
         lattice.cells['kept'][changed] ^= 1
         loose = sorted_unique(loose)
         self._reserve(_most_vertices(self.arrays, loose))
