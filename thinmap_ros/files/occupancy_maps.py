@@ -1,7 +1,7 @@
 """Reads and writes map_server maps: an image and a YAML file.
 
-Images are read within limits: at most 67,108,864 pixels, a square of 410 m at 0.05 m a cell, and
-16,384 on a side, 819 m. A rotated map has at most as many cells.
+Images are read within limits: at most 268,435,456 pixels, and 16,384 on a side, 819 m at 0.05 m a
+cell. A rotated map has at most as many cells.
 """
 
 import math
@@ -71,7 +71,8 @@ def _read_cells(path: Path, shades: '_Shades') -> _ImageCells:
     """
     from PIL import Image  # imported here: most processes never read a map
 
-    # Above its own, larger limit Pillow only warns: here this is an error.
+    # Pillow's own limit is lower. Above it Pillow only warns: here this is an error.
+    Image.MAX_IMAGE_PIXELS = FILES.image_pixels
     with warnings.catch_warnings(), open_regular_file(path) as stream:
         warnings.simplefilter('error', Image.DecompressionBombWarning)
         _check_header(stream)

@@ -38,7 +38,7 @@ class FileLimits:
     yaml_levels: int = 20
     npz_bytes: int = 512 << 20  # decompressed
     npz_arrays: int = 64
-    image_pixels: int = 1 << 26  # each needs up to 40 bytes while a graph is built
+    image_pixels: int = 1 << 28  # each needs up to 24 bytes while a graph is built
     image_side: int = 1 << 14
     image_header_bytes: int = 1 << 20
     image_comments: int = 100  # of a netpbm image whose pixels are written as text
