@@ -20,7 +20,6 @@ format. A reference that ends in .tum is a trajectory; one named relations, or t
 def _work(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         check_place(arguments.json)
-    paths = trajectory_files(arguments.run)
     results = evaluate(
         arguments.run,
         arguments.reference,
@@ -28,7 +27,7 @@ def _work(arguments: argparse.Namespace) -> None:
         max_difference_s=arguments.t_max_diff,
         delta=arguments.delta,
     )
-    for path in paths:
+    for path in trajectory_files(arguments.run):
         result = results[path.name]
         print(f'{path}: {result.poses} compared with {arguments.reference}')
         print(result)
