@@ -58,11 +58,12 @@ def evaluate(
     if not max_difference_s >= 0.0 or delta < 1:
         given = f'time difference {max_difference_s:g} s, delta {delta}'
         raise InputError(f'{given}: expected no negative time, and at least 1 pose')
+    trajectories = _trajectories(run)
     path = path_of(reference) if isinstance(reference, str | Path) else None
     if path is not None and (path.name == _RELATIONS or path.suffix == f'.{_RELATIONS}'):
         return {
             key: compare_with_relations(known.trajectory, known.name, path, max_difference_s)
-            for key, known in _trajectories(run).items()
+            for key, known in trajectories.items()
         }
     if path is not None and path.suffix != '.tum':
         raise InputError(f'{path}: expected a name that ends in .tum or {_RELATIONS}')
@@ -79,7 +80,7 @@ def evaluate(
             max_difference_s,
             delta,
         )
-        for key, known in _trajectories(run).items()
+        for key, known in trajectories.items()
     }
 
 
