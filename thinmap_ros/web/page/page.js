@@ -301,6 +301,7 @@ addEventListener('keydown', (event) => {
 }, true);
 addEventListener('keydown', (event) => {
   if (event.code !== 'Escape') return;
+  find('sure').hidden = true;
   view.sketch = null;
   limit = [];
   drawn = [];
