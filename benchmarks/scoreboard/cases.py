@@ -1,5 +1,6 @@
 """What can be on the scoreboard: logs, degraded logs, drives, and explorations."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,15 +32,15 @@ NOISES = (1.0, 3.0)
 
 
 @dataclass(frozen=True)
-class _Case:
+class _Case(ABC):
     """What all cases have; run: as in `repeated`."""
 
     run: int = field(default=0, kw_only=True)
 
     @property
+    @abstractmethod
     def first(self) -> str:
         """Name of the run that is not disturbed."""
-        raise NotImplementedError
 
     @property
     def name(self) -> str:

@@ -51,6 +51,8 @@ def both(mask):
     return true_cells(mask).sum() + column_distance(mask).sum()
 
 assert both(mask) == expected
+kernels.release_compiler_pages()
+assert not kept_modules()
 """
 
 

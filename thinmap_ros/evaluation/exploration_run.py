@@ -143,9 +143,10 @@ class Kidnapping:
         at = at[np.hypot(*(at - robot.T_world_base[:2]).T) >= _CRITERIA.far_m]
         clearance_m = robot.config.radius_m + _CRITERIA.margin_m
         fits = [world.is_clear(x, y, clearance_m) for x, y in at.tolist()]
-        if not any(fits):
+        if not any(fits) or not loop.pipeline.topology.map.nodes:
             raise InputError(
-                f'--kidnap-at-s={self._at_s:g}: no mapped place is {_CRITERIA.far_m:g} m away: '
+                f'--kidnap-at-s={self._at_s:g}: no mapped place with a graph is '
+                f'{_CRITERIA.far_m:g} m away: '
                 'expected a later time'
             )
         rng = np.random.default_rng(self._seed)

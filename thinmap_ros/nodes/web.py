@@ -153,7 +153,8 @@ class WebNode(ThinmapNode):
         self._ticks = (self._ticks + 1) % _TICKS
         if not self._ticks:
             self._picture.tick()
-            self._steering.show_refusals()
+            if self._pages.open:
+                self._steering.show_refusals()
             self.diagnostics.set_state(OK, f'{counted(len(self._pages.open), "page")} open')
 
     def _announce(self, opened: server.Server) -> None:

@@ -80,15 +80,17 @@ class Processes:
 
     def stop(self, *names: str) -> None:
         """End some processes, or all: by SIGTERM, and those that run a little later by SIGKILL."""
-        ending = [self.running.pop(name) for name in names or list(self.running)]
+        ended = names or tuple(self.running)
+        ending = [self.running[name] for name in ended]
         # Unlike SIGINT it ends importing processes without a traceback.
         self._signal(ending, signal.SIGTERM)
         until = time.monotonic() + _PATIENCE_S
         while time.monotonic() < until and any(process.poll() is None for process in ending):
             time.sleep(_SLEEP_S)
         self._signal(ending, signal.SIGKILL)
-        for process in ending:
+        for name, process in zip(ended, ending, strict=True):
             process.wait()
+            del self.running[name]
 
     def _signal(self, processes: Sequence[subprocess.Popen[bytes]], number: int) -> None:
         for process in processes:
@@ -265,11 +267,10 @@ def _work(arguments: argparse.Namespace) -> None:
 
 
 def _stay(processes: Processes) -> None:
-    """Leave the pages open until Ctrl-C, or until a node ends."""
+    """Leave the pages open until Ctrl-C. Raises ThinmapError if a node exits early."""
     print('the page stays open: Ctrl-C ends it', file=sys.stderr)
     with contextlib.suppress(KeyboardInterrupt):
-        while processes.ended() is None:
-            time.sleep(_SLEEP_S)
+        _wait(processes)
 
 
 def _write_results(arguments: argparse.Namespace, world: Path, starts: Sequence[Array]) -> None:
