@@ -13,7 +13,7 @@ matplotlib.use('svg')
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from thinmap_ros.evaluation.slam_run import Origin, Range
 from thinmap_ros.files.safe import write_text
@@ -26,6 +26,7 @@ _ROW_INCHES = 0.27
 _AXIS_INCHES = 0.8
 _LEGEND_INCHES = 0.35
 _DATA_INCHES = 3.2  # width of the data of a panel, beside the names of its rows
+_SHARED_INCHES = 1.9  # where panels share those names: what lets three of them fill a page
 _LETTER_INCHES = 0.075
 
 
@@ -69,15 +70,21 @@ def picture(name: str, caption: str) -> str:
 
 
 def draw(path: Path, panels: Sequence[Panel], keys: Sequence[Key] = (), columns: int = 3) -> None:
-    """Write panels in columns, with a legend below, as an SVG file."""
+    """Write panels in columns, with a legend below, as an SVG file.
+
+    Panels of one line that have the same rows share their names.
+    """
     across = min(columns, len(panels))
     lines = math.ceil(len(panels) / across)
     rows = max(len(_rows(panel)) for panel in panels)
-    longest = max(len(row) for panel in panels for row in _rows(panel))
-    width = across * (_DATA_INCHES + _LETTER_INCHES * longest)
+    names = _LETTER_INCHES * max(len(row) for panel in panels for row in _rows(panel))
+    is_shared = lines == 1 < across and all(_rows(p) == _rows(panels[0]) for p in panels)
+    width = names + across * _SHARED_INCHES if is_shared else across * (names + _DATA_INCHES)
     height = lines * (_ROW_INCHES * rows + _AXIS_INCHES) + _LEGEND_INCHES
     with plt.rc_context({'font.size': 9, 'svg.hashsalt': 'thinmap', 'svg.fonttype': 'none'}):
-        figure, grid = plt.subplots(lines, across, figsize=(width, height), squeeze=False)
+        figure, grid = plt.subplots(
+            lines, across, figsize=(width, height), squeeze=False, sharey=is_shared
+        )
         for axes, panel in zip(grid.flat, panels, strict=False):
             _draw_panel(axes, panel)
         for axes in grid.flat[len(panels) :]:
@@ -105,6 +112,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         axes.axvline(panel.limit, color=OURS, linewidth=1.0, zorder=0)
     if panel.is_log:
         axes.set_xscale('log')
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
         axes.xaxis.set_major_formatter('{x:g}')
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_yticks(range(len(rows)), rows)

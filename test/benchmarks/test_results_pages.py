@@ -161,9 +161,12 @@ def test_a_chart_has_one_row_for_each_name(tmp_path):
     panels = [Panel('one', 'm', marks, is_log=True), Panel('two', 'm', marks, limit=2.0)]
     draw(tmp_path / 'first.svg', panels, [('a colour', OURS, True)])
     text = (tmp_path / 'first.svg').read_text()
-    assert (text.count('>a</text>'), text.count('>b</text>'), text.count('a colour')) == (2, 2, 1)
+    assert (text.count('>a</text>'), text.count('>b</text>'), text.count('a colour')) == (1, 1, 1)
     draw(tmp_path / 'second.svg', panels, [('a colour', OURS, True)])
     assert (tmp_path / 'second.svg').read_text() == text
+    draw(tmp_path / 'third.svg', [panels[0], Panel('three', 'm', [marks[0]])])
+    text = (tmp_path / 'third.svg').read_text()
+    assert (text.count('>a</text>'), text.count('>b</text>')) == (2, 1)
 
 
 def test_the_error_of_a_thinned_log_is_that_of_its_stamps(tmp_path):
