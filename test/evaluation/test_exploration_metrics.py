@@ -75,6 +75,7 @@ def test_distance_time_and_error_are_those_of_the_path():
     assert report['time'] == pytest.approx(10.0)
     assert report['pose_rmse'] == pytest.approx(0.03)
     assert report['turned_rad'] == pytest.approx(1.0)
+    assert report['error_curve'] == [[0.0, 0.03], [4.0, 0.03], [10.0, 0.03]]
     # A shift of the whole path is an error of the start, not of its shape.
     assert report['pose_rmse_aligned'] == pytest.approx(0.0, abs=1e-5)
 

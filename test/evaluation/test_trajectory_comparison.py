@@ -8,9 +8,11 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import SECOND_NS
+from thinmap_ros.evaluation import run_errors
 from thinmap_ros.evaluation.trajectory_errors import associated
 from thinmap_ros.files.trajectories import write_tum
 from thinmap_ros.tools import evaluate
+from thinmap_ros.view.plots import error_plot
 
 # What evo 1.38.1 prints: evo_ape|evo_rpe tum reference.tum trajectory.tum [-a] [-r angle_deg], of
 # relative errors with --delta 2.
@@ -79,6 +81,22 @@ def test_the_numbers_are_those_of_evo(
     }
 
 
+def test_errors_are_drawn_over_time(
+    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimate, reference = files
+    picture = tmp_path / 'errors.png'
+    assert run(monkeypatch, estimate, '--reference', reference, '--picture', picture) == 0
+    assert picture.read_bytes().startswith(b'\x89PNG')
+    (result,) = run_errors.evaluate(estimate, reference, delta=2).values()
+    assert result.curves['APE, m'][:, 0].tolist() == [
+        ns / SECOND_NS for ns in stamps_of(35, 4_000_000)
+    ]
+    assert result.curves['RPE, deg'][:, 0].tolist() == result.curves['APE, m'][2::2, 0].tolist()
+    (metres,) = error_plot({'run': result.curves}).panels[0].layers
+    assert (metres.points[0, 0], metres.label) == (0.0, 'run')
+
+
 def test_both_trajectories_of_a_run_are_compared(
     files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -119,6 +137,7 @@ def test_relations_count_where_their_stamps_have_poses(
         ('none.tum', (), 'No such file'),
         ('far.tum', ('--delta', 0), 'expected no negative time, and at least 1 pose'),
         ('far.tum', ('--t-max-diff', 'nan'), 'expected no negative time'),
+        ('far.tum', ('--picture', 'errors.pdf'), 'errors.pdf: expected a name that ends in .png'),
     ],
 )
 def test_what_cannot_be_compared_is_one_line(

@@ -1,5 +1,6 @@
 """The HTML page of a run: complete, self-contained and small."""
 
+import base64
 from html.parser import HTMLParser
 
 import numpy as np
@@ -128,6 +129,32 @@ def test_the_picture_is_part_of_the_page_and_nothing_else_is_loaded(tmp_path):
     assert set(page.addresses) - set(pictures) == {'bag', 'summary.png'}
     assert "default-src 'none'" in page.text
     assert '@import' not in page.text and 'url(' not in page.text and '<script' not in page.text
+
+
+@pytest.mark.parametrize(
+    ('curves', 'named', 'axes'),
+    [
+        ({'curve': [[0.0, 0.0, 0.1], [2.0, 1.0, 0.9]]}, 'Area seen', ('path (m)',)),
+        ({'curve': [[0.0, 0.1], [2.0, 0.9]]}, 'Area seen', ('time (s)',)),
+        (
+            {'curve': [[0.0, 0.0, 0.1]], 'error_curve': [[0.0, 0.0], [2.0, 0.03]]},
+            'Area seen and Position error',
+            ('path (m)', 'time (s)'),
+        ),
+    ],
+)
+def test_curves_are_part_of_the_page(tmp_path, curves, named, axes):
+    assert not page_of(tmp_path).addresses
+    page = page_of(tmp_path, EXPLORATION | curves)
+    assert f'alt="{named}"' in page.text
+    (address,) = page.addresses
+    text = base64.b64decode(address.removeprefix('data:image/svg+xml;base64,')).decode()
+    assert all(f'{axis}</text>' in text for axis in axes)
+    assert ('time (s)' in text) == ('time (s)' in axes)
+
+
+def test_the_true_pose_has_no_curve_of_errors(tmp_path):
+    assert not page_of(tmp_path, {'error_curve': [[0.0, 0.0], [1.0, 0.0]]}).addresses
 
 
 def test_files_have_a_line_each(tmp_path):

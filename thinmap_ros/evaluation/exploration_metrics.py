@@ -122,7 +122,7 @@ def exploration_report(
     times and distances of the first measurement of a coverage, refer to the true path, in m and s;
     None if it was not reached. `pose_rmse`, m, includes the heading error of the first scans, which
     turns the whole map; `pose_rmse_aligned` is the error of the map's shape alone. `curve`: time,
-    distance and coverage of each measurement.
+    distance and coverage of each measurement; `error_curve`: time and position error.
     """
     steps = np.hypot(*np.diff(true_poses[:, :2], axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(steps)])
@@ -153,6 +153,12 @@ def exploration_report(
                 round(float(share), 4),
             ]
             for time, share in coverage
+        ],
+        'error_curve': [
+            [round(float(time), 2), round(float(error), 4)]
+            for time, error in zip(
+                coverage[:, 0], np.interp(coverage[:, 0], times_s, errors), strict=True
+            )
         ],
     }
 

@@ -1,6 +1,6 @@
 """Trajectory errors: by known relations between poses, or after alignment with the truth."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -38,10 +38,11 @@ def aligned_rms(path: Array, truth: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class RelationErrors:
-    """Errors of the evaluated relations: m and degrees, (N,) each."""
+    """Errors of the evaluated relations, and their first stamps: m, degrees, and s, (N,) each."""
 
     metres: Array
     degrees: Array
+    times_s: Array
 
 
 def read_columns(path: Path, columns: list[int]) -> Array:
@@ -86,7 +87,7 @@ def relation_errors(
         off = se2.between(np.array(motion), se2.between(a, b))
         metres.append(float(np.hypot(off[0], off[1])))
         degrees.append(float(np.degrees(abs(wrap(float(off[2]))))))
-    return RelationErrors(np.array(metres), np.array(degrees))
+    return RelationErrors(np.array(metres), np.array(degrees), known[:, 0])
 
 
 def known_relation_errors(
@@ -101,12 +102,14 @@ def known_relation_errors(
     times = times_s[order]
     path = poses[order]
     off = []
+    stamps_s = []
     for t1, t2, *motion in known:
         a, b = (_nearest(times, t) for t in (t1, t2))
         if max(abs(times[a] - t1), abs(times[b] - t2)) <= near_s:
             off.append(se2.between(np.array(motion), se2.between(path[a], path[b])))
+            stamps_s.append(t1)
     errors = np.array(off).reshape(-1, 3)
-    return RelationErrors(np.hypot(errors[:, 0], errors[:, 1]), np.degrees(np.abs(errors[:, 2])))
+    return RelationErrors(*_metres_and_degrees(errors), np.array(stamps_s))
 
 
 def _pose_at(t: float, times: Array, path: Array, wheels: Array, near_s: float) -> Array:
@@ -157,14 +160,22 @@ class Statistics:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Comparison:
-    """Errors of a trajectory by what they are of; poses: number of compared poses or relations."""
+    """Errors of a trajectory by what they are of; poses: number of compared poses or relations.
+
+    curves: of the same errors, (N, 2): stamp, s, and error, in the order of the stamps.
+    """
 
     poses: int
-    errors: dict[str, Statistics]
+    curves: dict[str, Array] = field(repr=False)
 
-    def __str__(self) -> str:
+    @property
+    def errors(self) -> dict[str, Statistics]:
+        """Statistics of the errors."""
+        return {name: Statistics.of(curve[:, 1]) for name, curve in self.curves.items()}
+
+    def __repr__(self) -> str:
         rows = []
         for name, of in self.errors.items():
             numbers = '  '.join(f'{key} {value:.6f}' for key, value in asdict(of).items())
@@ -204,14 +215,11 @@ def compare_with_trajectory(
     T = between_paths(estimate, expected) if is_aligned else np.zeros(3)
     absolute = _differences(np.array([se2.compose(T, pose) for pose in estimate]), expected)
     relative = _differences(_motions(estimate, delta), _motions(expected, delta))
+    times_s = trajectory.stamps_ns[own] / SECOND_NS
     return Comparison(
         len(own),
-        {
-            'APE, m': Statistics.of(np.hypot(absolute[:, 0], absolute[:, 1])),
-            'APE, deg': Statistics.of(np.degrees(np.abs(absolute[:, 2]))),
-            'RPE, m': Statistics.of(np.hypot(relative[:, 0], relative[:, 1])),
-            'RPE, deg': Statistics.of(np.degrees(np.abs(relative[:, 2]))),
-        },
+        _curves('APE', times_s, *_metres_and_degrees(absolute))
+        | _curves('RPE', times_s[::delta][1:], *_metres_and_degrees(relative)),
     )
 
 
@@ -230,13 +238,19 @@ def compare_with_relations(
             f'{relations}: no relation whose stamps are within {max_difference_s:g} s of poses of '
             f'{name}'
         )
-    return Comparison(
-        len(errors.metres),
-        {
-            'relations, m': Statistics.of(errors.metres),
-            'relations, deg': Statistics.of(errors.degrees),
-        },
-    )
+    curves = _curves('relations', errors.times_s, errors.metres, errors.degrees)
+    return Comparison(len(errors.metres), curves)
+
+
+def _curves(of: str, times_s: Array, metres: Array, degrees: Array) -> dict[str, Array]:
+    order = np.argsort(times_s, kind='stable')
+    named = {f'{of}, m': metres, f'{of}, deg': degrees}
+    return {name: np.column_stack([times_s, errors])[order] for name, errors in named.items()}
+
+
+def _metres_and_degrees(differences: Array) -> tuple[Array, Array]:
+    """Lengths and absolute angles (N,) of differences of poses (N, 3)."""
+    return np.hypot(*differences[:, :2].T), np.degrees(np.abs(differences[:, 2]))
 
 
 def associated(

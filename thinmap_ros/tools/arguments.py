@@ -117,6 +117,14 @@ def check_place(path: Path) -> None:
         raise InputError(f'{path}: the folder {there} may not be written to')
 
 
+def check_picture(path: Path | None) -> None:
+    """Check that a PNG can be made at a path, if one is given. Raises InputError otherwise."""
+    if path is not None:
+        if path.suffix != '.png':
+            raise InputError(f'{path}: expected a name that ends in .png')
+        check_place(path)
+
+
 _NEEDED = ('rclpy', 'thinmap_msgs')
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 
 from thinmap_ros.evaluation.run_errors import evaluate, trajectory_files
 from thinmap_ros.evaluation.trajectory_errors import MAX_TIME_DIFFERENCE_S
-from thinmap_ros.files.safe import write_text
+from thinmap_ros.files.safe import atomic_write, write_text
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.arguments import Parser, check_place
+from thinmap_ros.tools.arguments import Parser, check_picture, check_place
+from thinmap_ros.view.plot_writer import drawn
+from thinmap_ros.view.plots import error_plot
 
 _EPILOG = """A run is a folder of replay or explore_world, whose trajectory.tum (poses of each scan
 when it came) and trajectory_final.tum (after all corrections) are compared, or a file in TUM
@@ -20,6 +22,7 @@ format. A reference that ends in .tum is a trajectory; one named relations, or t
 def _work(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         check_place(arguments.json)
+    check_picture(arguments.picture)
     results = evaluate(
         arguments.run,
         arguments.reference,
@@ -34,6 +37,10 @@ def _work(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         content = {name: result.as_dict() for name, result in results.items()}
         write_text(arguments.json, json.dumps(content, indent=2) + '\n')
+    if arguments.picture is not None:
+        plot = error_plot({name: result.curves for name, result in results.items()})
+        with atomic_write(arguments.picture) as aside:
+            aside.write_bytes(*drawn(plot, ['png']))
 
 
 def main() -> None:
@@ -59,6 +66,7 @@ def main() -> None:
         '--delta', type=int, default=1, help='poses between those of a relative error (default 1)'
     )
     parser.add_argument('--json', type=Path, help='FILE.json for all numbers')
+    parser.add_argument('--picture', type=Path, help='FILE.png: errors over time')
     cli.run(_work, parser)
 
 

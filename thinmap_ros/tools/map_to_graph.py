@@ -33,7 +33,7 @@ from thinmap_ros.files import graphs, occupancy_maps
 from thinmap_ros.files.keep_out_masks import read_mask
 from thinmap_ros.files.sessions import REGIONS, load_edits
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.arguments import Parser, check_place
+from thinmap_ros.tools.arguments import Parser, check_picture, check_place
 from thinmap_ros.view.summary import summary_figure
 
 _DEFAULTS = TopologyConfig()
@@ -251,8 +251,7 @@ def _work(arguments: argparse.Namespace) -> None:
     maps = _without_images(arguments.maps)
     default = f'{maps[0].stem}.{arguments.format}' if len(maps) == 1 else 'graphs'
     arguments.out = arguments.out or Path('out') / default
-    for path in filter(None, (arguments.out, arguments.picture)):
-        check_place(path)
+    check_place(arguments.out)
     if len(maps) == 1:
         _convert_one(maps[0], arguments)
         return
@@ -278,8 +277,7 @@ def _without_images(paths: list[Path]) -> list[Path]:
 
 def _convert_one(path: Path, arguments: argparse.Namespace) -> None:
     graphs.writer_of(arguments.out)  # report a wrong name before the work
-    if arguments.picture is not None and arguments.picture.suffix != '.png':
-        raise InputError(f'{arguments.picture}: expected a name that ends in .png')
+    check_picture(arguments.picture)
     found = _convert(path, arguments.out, arguments.picture, arguments)
     for warning in found.warnings:
         print(f'map_to_graph: warning: {path}: {warning}', file=sys.stderr)

@@ -21,7 +21,7 @@ from thinmap_ros.files.merging import (
 from thinmap_ros.files.sessions import GRID, maps_in, require_own_files, stem_of
 from thinmap_ros.logs.transforms import parse_pose
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.arguments import Parser, check_place
+from thinmap_ros.tools.arguments import Parser, check_picture, check_place
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.summary import merged_figure
 
@@ -79,13 +79,12 @@ def _merge(arguments: argparse.Namespace) -> MergedMap:
 
 
 def _work(arguments: argparse.Namespace) -> None:
-    for path in filter(None, (arguments.out, arguments.picture, arguments.ids)):
+    for path in filter(None, (arguments.out, arguments.ids)):
         check_place(Path(path))
     arguments.at = [parse_pose(given, '--at', 'X,Y,YAW') for given in arguments.at]
     require_own_files(arguments.out, GRID)  # report a wrong name before the work
     arguments.maps = [each for given in arguments.maps for each in _maps_of(given, arguments.out)]
-    if arguments.picture is not None and arguments.picture.suffix != '.png':
-        raise InputError(f'{arguments.picture}: expected a name that ends in .png')
+    check_picture(arguments.picture)
     merged = _merge(arguments)
     for line in merged.save(arguments.out):
         print(line)

@@ -3,7 +3,9 @@
 The same figure gives the same bytes.
 """
 
+from collections.abc import Iterable
 from functools import singledispatch
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,8 +43,18 @@ _SETTINGS: Any = {
 }
 
 
+FORMATS: Any = {'png': {'Software': None}, 'svg': {'Date': None}}  # no date and no version
+
+
 def write_plot(folder: Path, plot: Plot) -> None:
     """Write NAME.png and NAME.svg into a folder."""
+    for ending, picture in zip(FORMATS, drawn(plot, FORMATS), strict=True):
+        with atomic_write(folder / f'{plot.name}.{ending}') as aside:
+            aside.write_bytes(picture)
+
+
+def drawn(plot: Plot, formats: Iterable[str]) -> list[bytes]:
+    """Pictures of a plot in some of the formats."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -60,9 +72,12 @@ def write_plot(folder: Path, plot: Plot) -> None:
         for axes in figure.axes[len(plot.panels) : rows * plot.columns]:
             axes.set_visible(False)
         _add_legend(figure, plot.legend)
-        for ending, metadata in (('png', {'Software': None}), ('svg', {'Date': None})):
-            with atomic_write(folder / f'{plot.name}.{ending}') as aside:
-                figure.savefig(aside, format=ending, metadata=metadata)
+        pictures = []
+        for ending in formats:
+            picture = BytesIO()
+            figure.savefig(picture, format=ending, metadata=FORMATS[ending])
+            pictures.append(picture.getvalue())
+        return pictures
 
 
 def _add_legend(figure: 'Figure', where: str) -> None:

@@ -1,7 +1,8 @@
 """Contents of figures as plain data: panels of layers. `plot_writer` draws them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -140,3 +141,47 @@ class Plot:
 def xy(x: Array, y: Array) -> Array:
     """Points (N, 2) of x (N,) and y (N,)."""
     return np.column_stack([x, y])
+
+
+_PANEL_INCHES = (4.6, 2.6)
+_FROM_ZERO = (0.0, None, 0.0, None)
+
+
+def error_plot(trajectories: Mapping[str, Mapping[str, Array]]) -> Plot:
+    """Errors over time, a panel for each of them and a curve for each trajectory.
+
+    trajectories: by name, their errors by name and unit, (N, 2): stamp, s, and error.
+    """
+    curves = list(trajectories.values())
+    began_s = min(curve[0, 0] for errors in curves for curve in errors.values())
+    panels = []
+    for error in curves[0]:
+        of, unit = error.split(', ')
+        lines = (
+            Curve(errors[error] - (began_s, 0.0), name, k, width=1.0)
+            for k, (name, errors) in enumerate(trajectories.items())
+        )
+        panels.append(_panel(of, 'time (s)', unit, lines))
+    return Plot('errors', '', panels, columns=2, panel_inches=_PANEL_INCHES)
+
+
+def run_plot(report: Mapping[str, Any]) -> Plot | None:
+    """Coverage over the path, or over time, and position error over time, of a report.
+
+    None if the report has neither.
+    """
+    panels = []
+    if 'curve' in report:
+        *axis, share = np.array(report['curve']).T
+        along = Curve(xy(axis[-1], 100.0 * share))
+        panels.append(
+            _panel('Area seen', 'path (m)' if len(axis) > 1 else 'time (s)', '%', [along])
+        )
+    error = np.array(report.get('error_curve', np.empty((0, 2))))
+    if error[:, 1].any():  # with the true pose there is none
+        panels.append(_panel('Position error', 'time (s)', 'm', [Curve(error, colour=1)]))
+    return Plot('curves', '', panels, len(panels), _PANEL_INCHES) if panels else None
+
+
+def _panel(title: str, x_label: str, y_label: str, curves: Iterable[Curve]) -> Panel:
+    return Panel(list(curves), title, x_label, y_label, plan=False, limits=_FROM_ZERO)

@@ -14,6 +14,8 @@ from urllib.parse import quote
 
 from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2
 from thinmap_ros.files.safe import write_text
+from thinmap_ros.view.plot_writer import drawn
+from thinmap_ros.view.plots import run_plot
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -31,7 +33,8 @@ code { padding: .1em .3em; }
 pre { padding: .6rem; white-space: pre-wrap; margin: 0; }
 .picture { overflow-x: auto; }
 .picture input { position: absolute; opacity: 0; }
-.picture img { max-width: 100%; cursor: zoom-in; }
+.picture img { max-width: 100%; }
+.picture label img { cursor: zoom-in; }
 .picture input:checked + label img { max-width: none; cursor: zoom-out; }
 .picture input:focus-visible + label img { outline: 2px solid #0072B2; }
 small { color: #555; }
@@ -160,6 +163,7 @@ def write(folder: Path, title: str, report: Mapping[str, Any], command: str) -> 
     sections = [
         ('', _table(_rows(report))),
         ('', _picture(folder / _PICTURE)),
+        ('', _curves(report)),
         ('What is missing', _missing(report)),
         ('Files', _file_table(files)),
         ('Command', f'<pre>{html.escape(command)}</pre>'),
@@ -212,6 +216,16 @@ def _picture(path: Path) -> str:
         '<img alt="Map, graph and path" title="Click to enlarge"'
         f' src="data:image/png;base64,{data}"></label></p>'
     )
+
+
+def _curves(report: Mapping[str, Any]) -> str:
+    """Curves of the report; nothing if it has none."""
+    plot = run_plot(report)
+    if plot is None:
+        return ''
+    data = base64.b64encode(drawn(plot, ['svg'])[0]).decode()
+    names = ' and '.join(panel.title for panel in plot.panels)
+    return f'<p class="picture"><img alt="{names}" src="data:image/svg+xml;base64,{data}"></p>'
 
 
 def _missing(report: Mapping[str, Any]) -> str:
