@@ -19,6 +19,7 @@ Place = tuple[float, float]  # x and y, m
 # Larger coordinates are errors. Beyond 1e15 m, float64 cannot even resolve cells, and computed
 # indices lie outside of every array.
 MAX_COORDINATE_M = 1e6
+_TURN = 2.0 * math.pi
 BOUND_SIGMAS = 3.0  # an error of more standard deviations than this is not noise
 
 # Stamps are nanoseconds since 1970. Messages of ROS hold the seconds in 32 bits with a sign.
@@ -39,8 +40,8 @@ def wrap(angle: Array) -> Array: ...
 def wrap(angle: float | Array) -> float | Array:
     """Angle(s) wrapped to (-pi, pi], rad."""
     if isinstance(angle, np.ndarray):
-        return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
-    return math.pi - (math.pi - angle) % (2.0 * math.pi)
+        return np.pi - np.mod(np.pi - angle, _TURN)
+    return math.pi - (math.pi - angle) % _TURN
 
 
 def path_length_m(path: Array) -> float:
@@ -56,11 +57,13 @@ def pose(x: float, y: float, theta: float) -> Array:
 def compose(T_a_b: Array, T_b_c: Array) -> Array:
     """Pose of c in a: T_a_b o T_b_c, (3,)."""
     # Python's own numbers: one at a time they are much faster than elements of arrays.
+    # For the same reason the heading is wrapped here: some sixty poses are composed for each scan.
     x, y, theta = T_a_b.tolist()
     dx, dy, turn = T_b_c.tolist()
     c = math.cos(theta)
     s = math.sin(theta)
-    return pose(x + c * dx - s * dy, y + s * dx + c * dy, theta + turn)
+    heading = math.pi - (math.pi - (theta + turn)) % _TURN
+    return np.array([x + c * dx - s * dy, y + s * dx + c * dy, heading])
 
 
 def invert(T_a_b: Array) -> Array:
@@ -68,7 +71,7 @@ def invert(T_a_b: Array) -> Array:
     x, y, theta = T_a_b.tolist()
     c = math.cos(theta)
     s = math.sin(theta)
-    return pose(-c * x - s * y, s * x - c * y, -theta)
+    return np.array([-c * x - s * y, s * x - c * y, math.pi - (math.pi + theta) % _TURN])
 
 
 def between(T_a_b: Array, T_a_c: Array) -> Array:

@@ -77,9 +77,10 @@ class ActiveMap:
     keyframes, some in each step.
     """
 
-    def __init__(self, config: LocalMapConfig, pieces: Pieces) -> None:
+    def __init__(self, config: LocalMapConfig, loops: LoopClosure) -> None:
+        """loops: the keyframes and the pieces that they are in."""
         self._config = config
-        self._pieces = pieces
+        self._loops = loops
         self.map = LocalMap(config)
         self.refused = 0  # scans that lie too far from the others for one map
         self._loaded: Mapping[str, NDArray[Any]] | None = None
@@ -87,8 +88,8 @@ class ActiveMap:
         self._pending: list[int] = []
         self._revision = 0
 
-    def load(self, given: Mapping[str, NDArray[Any]], keyframes: int) -> None:
-        """Set the cells of a `LocalMap.state` with which every re-rendered map starts.
+    def load(self, given: Mapping[str, NDArray[Any]] | None, keyframes: int) -> None:
+        """Set the cells of a `LocalMap.state` with which every re-rendered map starts; None: none.
 
         keyframes: number of the first keyframes that these cells are made of, 0 if they are not
         known. Otherwise a corrected map is rendered from the keyframes alone.
@@ -118,58 +119,58 @@ class ActiveMap:
         self.map = LocalMap(self._config)
         self._pending = []
 
-    def rerender(self, keyframes: Sequence[Keyframe], T_map_base: Array) -> None:
+    def rerender(self, T_map_base: Array) -> None:
         """Re-render the map from the keyframes of the piece, those nearest to a pose (3,) first."""
-        self.map = self._empty(is_published=not self._pieces.is_apart)
-        places = np.array([frame.T_map_base for frame in keyframes]).reshape(-1, 3)[:, :2]
-        away = np.hypot(*(places - T_map_base[:2]).T)
-        order = np.argsort(-away).tolist()
-        first = self._first_rendered
-        self._pending = [
-            k for k in order if k >= first and self._pieces.is_here(keyframes[k].submap)
-        ]
-        self._render(keyframes, _RENDER_FIRST)
+        pieces = self._loops.pieces
+        frames = self._loops.keyframes.frames
+        self.map = self._begun(is_published=not pieces.is_apart)
+        places = np.array([frame.T_map_base for frame in frames]).reshape(-1, 3)[:, :2]
+        order = np.argsort(-np.hypot(*(places - T_map_base[:2]).T)).tolist()
+        first = self._loaded_keyframes
+        self._pending = [k for k in order if k >= first and pieces.is_here(frames[k].submap)]
+        self._render(_RENDER_FIRST)
 
-    def follow(self, keyframes: Keyframes, T_map_base: Array) -> None:
-        """Render the keyframes as they were corrected last, some in each step."""
-        if keyframes.revision != self._revision:
-            self._revision = keyframes.revision
-            self.rerender(keyframes.frames, T_map_base)
-        self._render(keyframes.frames)
+    def follow(self, T_anchor_base: Array) -> None:
+        """Render the keyframes as they were corrected last, some in each step.
 
-    def published(self, keyframes: Sequence[Keyframe]) -> LocalMap:
+        T_anchor_base (3,): pose of the robot.
+        """
+        revision = self._loops.keyframes.revision
+        if revision != self._revision:
+            self._revision = revision
+            if self._loaded_keyframes > 0:  # the loaded cells show these where they were
+                self.load(None, 0)
+            self.rerender(self._loops.anchor.pose(T_anchor_base))
+        self._render()
+
+    def published(self) -> LocalMap:
         """The local map of the published piece: rendered again while the robot is in another."""
-        if not self._pieces.is_apart:
+        pieces = self._loops.pieces
+        if not pieces.is_apart:
             return self.map
-        rendered = self._empty(is_published=True)
-        for frame in keyframes[self._first_rendered :]:
-            if self._pieces.is_published(frame.submap):
+        rendered = self._begun(is_published=True)
+        for frame in self._loops.keyframes.frames[self._loaded_keyframes :]:
+            if pieces.is_published(frame.submap):
                 with suppress(InputError):  # counted when it was added
                     rendered.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
         return rendered
 
-    def complete(self, keyframes: Sequence[Keyframe]) -> None:
+    def complete(self) -> None:
         """Render all keyframes that are pending."""
-        self._render(keyframes, len(self._pending))
+        self._render(len(self._pending))
 
-    def _render(self, keyframes: Sequence[Keyframe], count: int = 2) -> None:
+    def _render(self, count: int = 2) -> None:
         """Render up to `count` of the pending keyframes."""
         for _ in range(min(count, len(self._pending))):
-            frame = keyframes[self._pending.pop()]
+            frame = self._loops.keyframes.frames[self._pending.pop()]
             self.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
 
-    @property
-    def _first_rendered(self) -> int:
-        """Number of the first keyframe that is not in the loaded cells."""
-        return 0 if self._revision else self._loaded_keyframes
-
-    def _empty(self, is_published: bool) -> LocalMap:
-        """An empty map, or the loaded cells, as long as they follow the keyframes."""
-        empty = LocalMap(self._config)
-        is_corrected = self._loaded_keyframes > 0 and self._revision > 0
-        if is_published and self._loaded is not None and not is_corrected:
-            empty.restore(self._loaded)
-        return empty
+    def _begun(self, is_published: bool) -> LocalMap:
+        """An empty map, or one with the loaded cells."""
+        begun = LocalMap(self._config)
+        if is_published and self._loaded is not None:
+            begun.restore(self._loaded)
+        return begun
 
 
 class HeadingCorrection:
@@ -244,7 +245,7 @@ class Localizer:
         )
         self._loops.pieces.tag = checked_tag('map_tag', config.map_tag)
         self._atlas = Atlas(self._loops)
-        self._local = ActiveMap(config.local_map, self._loops.pieces)
+        self._local = ActiveMap(config.local_map, self._loops)
         self._path = KeyframeTrajectory()
 
     def adjust(self, config: LocalizerConfig) -> None:
@@ -322,16 +323,15 @@ class Localizer:
             self._tracker.belief.start_submap()  # there is nothing that could confirm the pose
         else:
             self._tracker.belief.place(is_map_given=not self.config.is_mapping)
-        self._local.rerender(self.keyframes, T_map_base)
+        self._local.rerender(T_map_base)
 
     def complete_map(self) -> None:
         """Render what a correction has left to be rendered: a map that is saved lacks nothing."""
-        self._local.complete(self.keyframes)
+        self._local.complete()
 
     def state(self) -> State:
         """The published local map as arrays by name, for `from_state`; without the pose."""
-        state = self._local.published(self.keyframes).state()
-        return {**state, **self.tag_state()}
+        return {**self._local.published().state(), **self.tag_state()}
 
     def tag_state(self) -> State:
         """The tag of the published map as an array by name; nothing where it has none."""
@@ -443,7 +443,7 @@ class Localizer:
         T_map_base = se2.compose(last.T_map_odom, T_odom_base)
         self._place(T_map_base, covariance)
         self._tracker.belief.place(not self.config.is_mapping, is_tried=False)
-        self._local.rerender(self.keyframes, T_map_base)
+        self._local.rerender(T_map_base)
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
         """Estimate the pose of a scan, given the odometry pose (3,) at its stamp; update the map.
@@ -459,9 +459,9 @@ class Localizer:
             self._add_scan(scan, points)
         elif belief.needs_submap:
             self._start_submap()  # the robot is not where it was placed
-        correction = self._close_loops()
-        self._record_pose(scan.stamp_ns)
-        return replace(self._estimate(tracked), correction=correction)
+        estimate = self._estimate(tracked, self._close_loops())
+        self._record_pose(scan.stamp_ns, estimate.T_map_base)
+        return estimate
 
     def optimized_trajectory(self) -> Array:
         """Poses (N, 3) of all steps since the start, after all corrections.
@@ -485,10 +485,9 @@ class Localizer:
 
     def known_places(self) -> Array:
         """Places (N, 2) that enclose the published map: cells, and keyframes, m."""
-        frames = self.keyframes
         is_published = self._loops.pieces.is_published
-        keyframes = [frame.T_map_base[:2] for frame in frames if is_published(frame.submap)]
-        cells = self._local.published(frames).corners()
+        keyframes = [each.T_map_base[:2] for each in self.keyframes if is_published(each.submap)]
+        cells = self._local.published().corners()
         return np.vstack([cells, np.array(keyframes).reshape(-1, 2)])
 
     def apart_points(self) -> Array:
@@ -515,7 +514,7 @@ class Localizer:
         if keyframes is not None:
             self._loops.load(keyframes)
         if given is None:
-            self._local.rerender(self.keyframes, self.pose)
+            self._local.rerender(self.pose)
         else:
             self._local.load(given, len(self.keyframes))
         self._place(start, self._tracker.slip_covariance())
@@ -536,10 +535,10 @@ class Localizer:
         track.uncertainty.place(track.T_anchor_base, covariance)
         track.belief.lose()
 
-    def _estimate(self, tracked: Tracked) -> Estimate:
+    def _estimate(self, tracked: Tracked, correction: Correction | None) -> Estimate:
         belief = self._tracker.belief
         anchor = self._loops.anchor
-        T_map_base = self.pose
+        T_map_base = anchor.pose(self._tracker.T_anchor_base)
         apart = self._atlas.apart
         is_lost = apart is not None or belief.is_lost
         match = tracked.match
@@ -548,6 +547,7 @@ class Localizer:
             self._tracker.covariance(anchor),
             se2.compose(T_map_base, se2.invert(self._tracker.prediction.T_odom_base)),
             inlier_ratio=0.0 if match is None else match.inlier_ratio,
+            correction=correction,
             is_lost=is_lost,
             apart=apart,
             is_contradicted=self.config.is_mapping and not belief.permits_mapping,
@@ -631,14 +631,14 @@ class Localizer:
         correction = self._loops.step()
         if correction is not None:
             correction = replace(correction, join=self._atlas.take_join())
-        self._local.follow(self._loops.keyframes, self.pose)
+        self._local.follow(self._tracker.T_anchor_base)
         return correction
 
-    def _record_pose(self, stamp_ns: int) -> None:
-        """Store the pose of this step relative to its keyframe."""
-        number = self._loops.keyframes.anchor
-        T_keyframe = np.zeros(3) if number < 0 else self.keyframes[number].T_map_base
-        self._path.add(stamp_ns, number, se2.between(T_keyframe, self.pose))
+    def _record_pose(self, stamp_ns: int, T_map_base: Array) -> None:
+        """Store the pose (3,) of this step relative to its keyframe."""
+        keyframes = self._loops.keyframes
+        T_keyframe = keyframes.T_map_anchor
+        self._path.add(stamp_ns, keyframes.anchor, se2.between(T_keyframe, T_map_base))
 
     def _correct_heading(self, scan: Scan) -> None:
         """Correct the heading by the wall directions if scans agree with the map."""

@@ -287,6 +287,7 @@ class Tracker:
     def __init__(self, config: LocalizerConfig) -> None:
         self._config = config
         self._matcher = Matcher(config.matching)
+        self._slip = BOUND_SIGMAS * odometry_slip(config.odometry)  # of a robot that does not move
         self.prediction = OdometryPrediction(config.odometry)
         start = se2.pose(config.initial_x_m, config.initial_y_m, config.initial_yaw_rad)
         self.T_anchor_base = start
@@ -424,8 +425,7 @@ class Tracker:
 
     def _is_stationary(self, prediction: Prediction) -> bool:
         """Whether the robot has moved by no more than the odometry noise."""
-        slip = BOUND_SIGMAS * odometry_slip(self._config.odometry)
-        is_still = self.uncertainty.is_stationary(prediction.prior, slip)
+        is_still = self.uncertainty.is_stationary(prediction.prior, self._slip)
         return prediction.motion.is_stationary and is_still
 
     def _judge_motion(self, scan: Scan, prediction: Prediction, match: Match | None) -> None:
@@ -472,8 +472,7 @@ class Tracker:
 
     def _is_at_rest(self, look: LastLook) -> bool:
         """Whether the robot has not moved since a look, but for the noise of the odometry."""
-        slip = BOUND_SIGMAS * odometry_slip(self._config.odometry)
-        return bool((np.abs(look.T_scan_base) <= slip).all())
+        return bool((np.abs(look.T_scan_base) <= self._slip).all())
 
     def _move_looks(self, moved: Array) -> None:
         """Move on by a motion (3,) since all looks."""

@@ -159,7 +159,9 @@ class Anchor:
 class Keyframes:
     """The keyframes, the edges between consecutive ones, and the trajectory relative to them.
 
-    revision: number of corrections so far.
+    revision: number of corrections so far; anchor: number of the last added or reused keyframe, -1
+    before the first; T_anchor_last (3,): the last keyframe scan relative to it, 0 unless it reuses
+    one.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
@@ -171,23 +173,20 @@ class Keyframes:
         self._buckets = SpatialHash(_BUCKET_M)
         self._path = KeyframeTrajectory()
         self.revision = 0
+        self.anchor = -1
+        self.T_anchor_last = np.zeros(3)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     @property
-    def anchor(self) -> int:
-        """Number of the last added or reused keyframe; -1 before the first."""
-        return self._path.last
+    def T_map_anchor(self) -> Array:  # noqa: N802
+        """Pose (3,) of the anchor; the origin of the map without one."""
+        return np.zeros(3) if self.anchor < 0 else self.frames[self.anchor].T_map_base
 
     def is_step(self, j: int, k: int) -> bool:
         """Whether keyframe j was the anchor of keyframe k."""
         return k < len(self.frames) and int(self.steps.ends[k - 1, 0]) == j
-
-    @property
-    def T_anchor_last(self) -> Array:  # noqa: N802
-        """Pose (3,) of the last keyframe scan relative to its keyframe: 0 unless it reuses one."""
-        return self._path.T_last
 
     def add(self, frame: Keyframe, step: Step) -> int:
         """Add a keyframe with an edge from the anchor, by its step; returns its number."""
@@ -207,7 +206,13 @@ class Keyframes:
         self._poses.append(frame.T_map_base)
         self._headings.append(frame.heading)
         self._buckets.insert(number, float(frame.T_map_base[0]), float(frame.T_map_base[1]))
-        self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
+        self._come_to(number, frame.scan.stamp_ns, np.zeros(3))
+
+    def _come_to(self, number: int, stamp_ns: int, T_anchor_last: Array) -> None:
+        """Make a keyframe the anchor of a scan at a pose (3,) relative to it."""
+        self.anchor = number
+        self.T_anchor_last = T_anchor_last
+        self._path.add(stamp_ns, number, T_anchor_last)
 
     def detach(self, numbers: Container[int]) -> None:
         """Forget the steps to keyframes from others: they do not say how these lie."""
@@ -220,7 +225,7 @@ class Keyframes:
         earlier = self.frames[number]
         self.frames[number] = replace(earlier, path_m=frame.path_m)
         offset = se2.between(earlier.T_map_base, frame.T_map_base)
-        self._path.add(frame.scan.stamp_ns, number, offset)
+        self._come_to(number, frame.scan.stamp_ns, offset)
 
     def load(self, frames: Sequence[Keyframe], steps: Sequence[Edge]) -> None:
         """Begin with saved keyframes, and the step to each but the first."""
@@ -233,7 +238,7 @@ class Keyframes:
         frame = self.frames[number]
         path_m = max(each.path_m for each in self.frames)
         self.frames[number] = replace(frame, path_m=path_m)
-        self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
+        self._come_to(number, frame.scan.stamp_ns, np.zeros(3))
 
     def headings(self, parameters: Array | None = None) -> EdgeArrays:
         """Measured headings as edges from the first keyframe, whose heading defines the map's.

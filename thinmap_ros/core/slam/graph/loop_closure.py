@@ -576,7 +576,8 @@ class LoopClosure:
         self._add_pending()
         step = replace(step, covariance=step.covariance + jump)
         step = step.turned(float(self.keyframes.T_anchor_last[2]))
-        self._pending = _Pending(frame, step, se2.between(self._T_map_anchor, frame.T_map_base))
+        T_anchor_frame = se2.between(self.keyframes.T_map_anchor, frame.T_map_base)
+        self._pending = _Pending(frame, step, T_anchor_frame)
         jumped = bool(jump.any()) and len(self.keyframes) > 0
         recent = None if jumped else self._recent_alike(frame)
         if recent is not None:
@@ -838,14 +839,8 @@ class LoopClosure:
         pending = self._pending
         if k < len(self.keyframes) or pending is None:
             return self.keyframes.frames[k]
-        T_map_base = se2.compose(self._T_map_anchor, pending.T_anchor_frame)
+        T_map_base = se2.compose(self.keyframes.T_map_anchor, pending.T_anchor_frame)
         return replace(pending.frame, T_map_base=T_map_base)
-
-    @property
-    def _T_map_anchor(self) -> Array:  # noqa: N802
-        """Pose (3,) of the anchor keyframe; the origin of the map without one."""
-        anchor = self.keyframes.anchor
-        return np.zeros(3) if anchor < 0 else self.keyframes.frames[anchor].T_map_base
 
     def _is_pending_matched(self) -> bool:
         """Whether there are pending matches of the pending keyframe."""

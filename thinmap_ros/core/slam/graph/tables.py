@@ -221,16 +221,6 @@ class KeyframeTrajectory:
         self._from_anchor.extend(T_anchor_base.tolist())
 
     @property
-    def last(self) -> int:
-        """Keyframe of the last pose; -1 without one."""
-        return self._anchors[-1] if self._anchors else -1
-
-    @property
-    def T_last(self) -> Array:  # noqa: N802
-        """The last pose (3,), relative to its keyframe; 0 without one."""
-        return np.array(self._from_anchor[-3:] or np.zeros(3))
-
-    @property
     def stamps_ns(self) -> NDArray[np.int64]:
         """Stamps (N,), ns."""
         return np.array(self._stamps, dtype=np.int64)

@@ -96,6 +96,9 @@ class LocalMap:
             TileStore(dtype, max_extent_tiles=_MAX_EXTENT_TILES, begins_at_origin=False)
             for dtype in (CELL, SURFACE)
         )
+        # Below a tile, so that only adjacent tiles are read.
+        reach = math.ceil(MAX_WALL_DISTANCE_M / self.config.resolution_m)
+        self._reach_cells = min(reach, TILE - 1)
 
     @property
     def is_empty(self) -> bool:
@@ -115,12 +118,6 @@ class LocalMap:
             self.config.resolution_m,
             self._reach_cells,
         )
-
-    @property
-    def _reach_cells(self) -> int:
-        """MAX_WALL_DISTANCE_M in cells; below a tile, so that only adjacent tiles are read."""
-        cells = math.ceil(MAX_WALL_DISTANCE_M / self.config.resolution_m)
-        return min(int(cells), TILE - 1)
 
     def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
         """Add surface points (N, 5), robot frame, of a scan at a pose (3,).
