@@ -186,20 +186,17 @@ def test_new_scans_are_shown_at_once_and_stay_shown():
     assert k > 150
 
 
-def test_a_slice_does_a_bounded_part_of_the_work(monkeypatch):
+def test_a_slice_does_a_bounded_part_of_the_work():
     """A slice renders scans of a bounded number of tiles, for any length of the drive."""
-    done = []
-    pop = rerendering._Queue.pop
-    monkeypatch.setattr(rerendering._Queue, 'pop', lambda self: done.append(pop(self)) or done[-1])
     kept = [StoredScan.of(scan, PAPER_GRID) for scan in SCANS]
     work = Rerendering(OccupancyGrid(PAPER_GRID), kept * 2, np.tile(TRUE, (2, 1)), TRUE[0])
     shown = OccupancyGrid(PAPER_GRID)
     slices = []
     while not work.is_complete:
-        before = len(done)
+        before = work._next
         work.render_slice(shown)
-        slices.append(sum(task.tiles for task in done[before:]))
-    assert len(done) == 2 * len(SCANS)
+        slices.append(sum(work._tiles[before : work._next]))
+    assert work._next == 2 * len(SCANS)
     assert max(slices) <= rerendering._TILES_PER_SLICE
     assert len(slices) < 1.2 * sum(slices) / rerendering._TILES_PER_SLICE + 1
 

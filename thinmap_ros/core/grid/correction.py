@@ -5,7 +5,7 @@ from array import array
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -37,15 +37,12 @@ _LAST_RING = 1 << 30
 Kept = TypeVar('Kept')
 
 
-@dataclass(frozen=True)
-class HistoryConfig:
-    """Which scans are stored: those some distance or angle apart, the newest of each place."""
-
-    apart_m: float = 0.25
-    apart_rad: float = 0.25
-    place_m: float = 1.0  # edge of a place
-    directions: int = 8  # robot headings that are distinguished at each place
-    scans_per_place: int = 4  # and direction: about one visit
+# Which scans are stored: those some distance or angle apart, the newest of each place.
+_APART_M = 0.25
+_APART_RAD = 0.25
+_PLACE_M = 1.0  # edge of a place
+_DIRECTIONS = 8  # robot headings that are distinguished at each place
+_SCANS_PER_PLACE = 4  # and direction: about one visit
 
 
 class CorrectedPoses(NamedTuple):
@@ -64,8 +61,7 @@ class PoseHistory(Generic[Kept]):
     in the order in which the scans were added: stamps of real robots step back now and then.
     """
 
-    def __init__(self, config: HistoryConfig | None = None) -> None:
-        self._config = config or HistoryConfig()
+    def __init__(self) -> None:
         self._stamps = array('q')
         self._poses = array('d')
         self._last_apart: dict[str, int] = {}  # by the frame of the laser
@@ -88,16 +84,14 @@ class PoseHistory(Generic[Kept]):
         if before is not None:
             last = np.array(self._poses[3 * before : 3 * before + 3])
             moved = se2.between(last, T_map_base)
-            is_near = math.hypot(moved[0], moved[1]) < self._config.apart_m
-            if is_near and abs(float(moved[2])) < self._config.apart_rad:
+            is_near = math.hypot(moved[0], moved[1]) < _APART_M
+            if is_near and abs(float(moved[2])) < _APART_RAD:
                 return
         self._last_apart[frame] = number
         self._kept[number] = (frame, kept)
-        at_place = self._at_place.setdefault(
-            (frame, int(_places_of(T_map_base[None], self._config)[0])), deque()
-        )
+        at_place = self._at_place.setdefault((frame, int(_places_of(T_map_base[None])[0])), deque())
         at_place.append(number)
-        while len(at_place) > self._config.scans_per_place:
+        while len(at_place) > _SCANS_PER_PLACE:
             del self._kept[at_place.popleft()]
 
     def _adopt(self, frame: str) -> None:
@@ -157,7 +151,7 @@ class PoseHistory(Generic[Kept]):
         """
         kept = self._kept_numbers()
         self._at_place = {}
-        places = _places_of(self._all_poses()[kept], self._config)
+        places = _places_of(self._all_poses()[kept])
         for number, place in zip(kept.tolist(), places.tolist(), strict=True):
             frame, _ = self._kept[number]
             self._at_place.setdefault((frame, place), deque()).append(number)
@@ -186,11 +180,11 @@ class PoseHistory(Generic[Kept]):
         return np.array(self._poses).reshape(-1, 3)
 
 
-def _places_of(poses: Array, config: HistoryConfig) -> NDArray[np.int64]:
+def _places_of(poses: Array) -> NDArray[np.int64]:
     """Number (N,) of the place and direction of each pose (N, 3)."""
-    turn = np.floor(poses[:, 2] % (2.0 * math.pi) / (2.0 * math.pi) * config.directions)
-    x, y = np.floor(poses[:, :2] / config.place_m).astype(np.int64).T
-    return np.asarray((x * _MAX_PLACE + y) * config.directions + turn.astype(np.int64))
+    turn = np.floor(poses[:, 2] % (2.0 * math.pi) / (2.0 * math.pi) * _DIRECTIONS)
+    x, y = np.floor(poses[:, :2] / _PLACE_M).astype(np.int64).T
+    return np.asarray((x * _MAX_PLACE + y) * _DIRECTIONS + turn.astype(np.int64))
 
 
 def _numbers_of(
@@ -312,61 +306,6 @@ class StoredScan(NamedTuple):
         return StoredScan(scan, np.array([x.min(), y.min(), x.max(), y.max()]), erasures)
 
 
-class _Task(NamedTuple):
-    """A scan to be rendered.
-
-    ring: of the nearest tile that it may touch; tiles: how many tiles it may touch.
-    """
-
-    ring: int
-    tiles: int
-    stored: StoredScan
-    T_map_base: Array
-
-
-class _Queue:
-    """The scans to be rendered: first those before the correction, then those since.
-
-    The former are stored in arrays: thousands of small objects would trigger the garbage collector.
-    """
-
-    def __init__(
-        self, scans: Sequence[StoredScan], poses: Array, rings: Cells, tile_counts: Cells
-    ) -> None:
-        """Start with scans at poses (N, 3); nearest ring (N,) and number of tiles (N,) of each."""
-        order = np.argsort(rings, kind='stable')
-        self._scans = [scans[k] for k in order.tolist()]
-        self._poses = poses[order]
-        self._rings = rings[order]
-        self._tiles = tile_counts[order]
-        self._next = 0
-        self._since: deque[_Task] = deque()
-
-    def __len__(self) -> int:
-        return len(self._scans) - self._next + len(self._since)
-
-    def append(self, stored: StoredScan, T_map_base: Array, tiles: int) -> None:
-        """Add a scan that was made since the correction."""
-        self._since.append(_Task(_LAST_RING, tiles, stored, T_map_base))
-
-    @property
-    def first(self) -> _Task:
-        """The next scan."""
-        k = self._next
-        if k == len(self._scans):
-            return self._since[0]
-        return _Task(int(self._rings[k]), int(self._tiles[k]), self._scans[k], self._poses[k])
-
-    def pop(self) -> _Task:
-        """Remove and return the next scan."""
-        task = self.first
-        if self._next == len(self._scans):
-            self._since.popleft()
-        else:
-            self._next += 1
-        return task
-
-
 class Rerendering:
     """Renders all stored scans at their corrected poses, in slices.
 
@@ -407,53 +346,63 @@ class Rerendering:
         self._complete_rings = 0
         boxes = _tile_boxes([each.extent for each in kept], poses, like.frame)
         rings = self._rings(boxes[:, 0], boxes[:, 1])
-        counts = np.prod(boxes[:, 1] - boxes[:, 0] + 1, axis=1)
-        self._queue = _Queue(kept, poses, rings, counts)
+        order = np.argsort(rings, kind='stable')
+        # In lists of their own: thousands of small objects would trigger the garbage collector.
+        self._scans = [kept[k] for k in order.tolist()]
+        self._poses = list(poses[order])
+        self._nearest: list[int] = rings[order].tolist()  # ring that each may touch
+        self._tiles: list[int] = _tile_counts(boxes[order]).tolist()  # how many each may touch
+        self._next = 0
 
     @property
     def is_complete(self) -> bool:
         """Whether all scans are rendered."""
-        return len(self._queue) == 0
+        return self._next == len(self._scans)
 
     def add_scan(self, kept: StoredScan, T_map_base: Array) -> None:
         """Add a scan that arrived meanwhile, made at a pose (3,) that is already correct."""
         with suppress(InputError):  # it is shown when all is complete
             seen = kept.scan.without_robots(T_map_base, self._mates)
             self._added.add_scan(seen, T_map_base)
-        box = _tile_boxes([kept.extent], T_map_base[None], self.grid.frame)[0]
-        tiles = int(np.prod(box[1] - box[0] + 1))
-        self._queue.append(kept, T_map_base, tiles)
+        boxes = _tile_boxes([kept.extent], T_map_base[None], self.grid.frame)
+        self._scans.append(kept)
+        self._poses.append(T_map_base)
+        self._nearest.append(_LAST_RING)
+        self._tiles += _tile_counts(boxes).tolist()
 
     def render_slice(self, shown: OccupancyGrid) -> list[str]:
         """Render some scans, and update the shown grid, unless `grid` is complete now.
 
         Returns why scans were left out whose corrected poses would make the map too large.
         """
-        scans = 0
+        first = self._next
         tiles = 0
         refusals: list[str] = []
-        while self._queue:
-            tiles += self._queue.first.tiles
-            if scans >= _SCANS_PER_SLICE and tiles > _TILES_PER_SLICE:
+        while not self.is_complete:
+            k = self._next
+            tiles += self._tiles[k]
+            if k >= first + _SCANS_PER_SLICE and tiles > _TILES_PER_SLICE:
                 break
-            task = self._queue.pop()
+            self._next += 1
             try:
-                scan = task.stored.scan
-                scan = scan.without_body(self._bodies.get(scan.frame))
-                scan = scan.without_robots(task.T_map_base, self._mates)
-                drops_out = scan.frame in self._dropping or bool(self._dropping and not scan.frame)
-                scan = replace(scan, drops_out=drops_out or scan.drops_out)
-                erased = self._erased[task.stored.erasures :]
-                add_scan_outside(self.grid, scan, task.T_map_base, erased)
+                self._render(self._scans[k], self._poses[k])
             except InputError as error:
                 refusals.append(str(error))
-            scans += 1
-        if self._queue:
+        if not self.is_complete:
             self._show_complete_rings(shown)
         return refusals
 
+    def _render(self, stored: StoredScan, T_map_base: Array) -> None:
+        """Render a scan, made at a pose (3,), as is known now of its laser and other robots."""
+        scan = stored.scan
+        scan = scan.without_body(self._bodies.get(scan.frame))
+        scan = scan.without_robots(T_map_base, self._mates)
+        drops_out = scan.frame in self._dropping or bool(self._dropping and not scan.frame)
+        scan = replace(scan, drops_out=drops_out or scan.drops_out)
+        add_scan_outside(self.grid, scan, T_map_base, self._erased[stored.erasures :])
+
     def _show_complete_rings(self, shown: OccupancyGrid) -> None:
-        complete = self._queue.first.ring
+        complete = self._nearest[self._next]
         if complete <= self._complete_rings:
             return
         places = np.unique(np.vstack([shown.tiles(), self.grid.tiles()]), axis=0)
@@ -467,6 +416,11 @@ class Rerendering:
         """Nearest ring (N,) of each box of tiles from low (N, 2) to high (N, 2), inclusive."""
         beyond = np.maximum(low - self._robot_tile, self._robot_tile - high)
         return np.asarray(np.maximum(beyond.max(axis=1), 0))
+
+
+def _tile_counts(boxes: Cells) -> Cells:
+    """Number of tiles (N,) from the first to the last of each box (N, 2, 2), inclusive."""
+    return np.asarray(np.prod(boxes[:, 1] - boxes[:, 0] + 1, axis=1))
 
 
 def _tile_boxes(extents: Sequence[Array], poses: Array, frame: GridFrame) -> Cells:
@@ -669,21 +623,19 @@ class CorrectableGrid:
         if scan.drops_out == (scan.frame in self._dropping):
             return
         self._dropping ^= {scan.frame}
-        if self._history is not None:
-            self._render_again()
+        self._render_again()
 
     def _set_body(self, scan: Scan) -> None:
         """Render the stored scans again if other beams than before end at the robot."""
         if scan.body_m is self._bodies.get(scan.frame):
             return
         self._bodies[scan.frame] = scan.body_m
-        if self._history is not None:
-            self._render_again()
+        self._render_again()
 
     def _render_again(self) -> None:
-        """Begin to render all stored scans."""
+        """Begin to render all stored scans, if there are any."""
         self._rerendering = None
-        if self._pending_ns is None:
+        if self._history is not None and self._pending_ns is None:
             self._pending_ns = self.corrected_ns
 
     def _move_open(self, before: Array | None, after: Array | None) -> None:

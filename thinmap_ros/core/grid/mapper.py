@@ -151,7 +151,8 @@ class Mapper(Stage[LocalizedScan, MapUpdate]):
         self._newest = localized
         if moved is not None:
             self._take_corrected(before_ns, moved)
-        elif is_due and self._shows_place(localized):
+        elif is_due and localized.destination is Destination.MAP and not self.grid.is_rerendering:
+            # Poses during a correction are ahead of the map.
             self._places.append(localized.T_map_base[:2])
         return is_due or moved is not None
 
@@ -189,10 +190,6 @@ class Mapper(Stage[LocalizedScan, MapUpdate]):
         """All known cells."""
         grid = self.grid
         return WholeMap(grid.shown.known_area(), grid.corrected_ns, self._previous_ns, self._moved)
-
-    def _shows_place(self, localized: LocalizedScan) -> bool:
-        """Whether a scan shows the map as it is: poses during a correction are ahead of it."""
-        return localized.destination is Destination.MAP and not self.grid.is_rerendering
 
     def _take_corrected(self, before_ns: int, moved: CorrectedPoses) -> None:
         """All of the map has been rendered again."""
