@@ -1,5 +1,7 @@
 """Cells of a local map, and the distances that they should hold."""
 
+import math
+
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
@@ -7,7 +9,9 @@ from thinmap_ros.core.slam.matching.local_map import (
     MAX_WALL_DISTANCE_M,
     MIN_HIT_RATIO,
     LocalMapConfig,
+    off_wall,
 )
+from thinmap_ros.jit import kernel
 
 CELL_M = LocalMapConfig().resolution_m
 
@@ -38,3 +42,20 @@ def nearest(cells):
     """The plain reference: distance of each cell from the nearest wall, inf beyond the reach."""
     away = distance_transform_edt(~walls_of(cells))
     return np.where(away <= REACH, away, np.inf)
+
+
+def wall_distances(local_map, points):
+    """Distances (N,) of points (N, 2), map frame, from walls, m; at most the reach."""
+    return _wall_distances(points, local_map.lattice)
+
+
+@kernel
+def _wall_distances(points, lattice):
+    found = np.full(len(points), lattice.reach * lattice.cell_m)
+    for i in range(len(points)):
+        x = points[i, 0] / lattice.cell_m - lattice.first_col
+        y = points[i, 1] / lattice.cell_m - lattice.first_row
+        _, is_near, dx, dy, _, _ = off_wall(lattice, x, y)
+        if is_near:
+            found[i] = min(found[i], lattice.cell_m * math.hypot(dx, dy))
+    return found

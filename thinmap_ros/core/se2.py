@@ -101,6 +101,12 @@ def transform_each(poses: Array, points: Array) -> Array:
     return np.column_stack([x, y])
 
 
+def compose_each(poses: Array, others: Array) -> Array:
+    """Poses (N, 3) of frames given in frames of their own, (N, 3) or (1, 3), by those (N, 3)."""
+    xy = transform_each(poses, others[:, :2])
+    return np.column_stack([xy, wrap(poses[:, 2] + others[:, 2])])
+
+
 def interpolate(T_a: Array, T_b: Array, share: float) -> Array:
     """Pose on the straight line from T_a (share 0) to T_b (share 1); the shorter rotation."""
     x, y = T_a[:2] + share * (T_b[:2] - T_a[:2])

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from support.local_map_cells import wall_distances
 from support.slam_room import BLIND, ROOM, drive, drive_round_the_block, scan_in
 
 from thinmap_ros.core import se2
@@ -73,7 +74,7 @@ def on(localizer, steps, truth, odom, rng, segments=ROOM, turn=0.1):
         step = se2.pose(0.02, 0.0, turn)
         truth = se2.compose(truth, step)
         odom = se2.compose(odom, step)
-        stamp = (localizer._tracker.prediction.stamp_ns or 0) + PERIOD_NS
+        stamp = (localizer._tracker.prediction._increments.stamp_ns or 0) + PERIOD_NS
         rows.append((truth, localizer.step(scan_in(segments, truth, rng, stamp), odom), odom))
     return rows
 
@@ -542,7 +543,7 @@ def driven_elsewhere(localizer, start, odom_before=None):
     """Estimates of a drive that starts at another place (3,) than the localizer believes."""
     rng = np.random.default_rng(5)
     before = np.zeros(3) if odom_before is None else odom_before
-    stamp_ns = localizer._tracker.prediction.stamp_ns or 0
+    stamp_ns = localizer._tracker.prediction._increments.stamp_ns or 0
     for k, (truth, odom) in enumerate(drive(300, rng, np.array(start))):
         scan = scan_in(ROOM, truth, rng, stamp_ns + (k + 1) * PERIOD_NS)
         yield truth, localizer.step(scan, se2.compose(before, odom))
@@ -943,7 +944,7 @@ def test_the_map_is_rendered_again_the_nearest_part_first(round_the_block):
 
     def known():
         """Which of the former walls are rendered again."""
-        return localizer._local.map.distances(walls) < 0.1
+        return wall_distances(localizer._local.map, walls) < 0.1
 
     localizer.set_pose(localizer.pose, 1e-4 * np.eye(3))
     assert known()[near].mean() > 0.95
@@ -993,7 +994,7 @@ def test_where_the_map_would_become_too_large_a_new_one_begins():
     for leap in range(1, 4):
         # As far as odometry can have come while only the scans were missing.
         odom = se2.compose(odom, np.array([240.0, 240.0, 0.0]))
-        stamp = localizer._tracker.prediction.stamp_ns + 1000 * PERIOD_NS
+        stamp = localizer._tracker.prediction._increments.stamp_ns + 1000 * PERIOD_NS
         scan = replace(scan_in(ROOM, truth, rng, stamp), odometry_silence_s=0.0)
         estimate = localizer.step(scan, odom)
         assert (localizer.rejected, estimate.is_lost) == ((0, False) if leap < 3 else (1, True))

@@ -38,9 +38,7 @@ class MapMotion:
 
     def moved_poses(self, poses: Array) -> Array:
         """Where poses (M, 3) in the map are afterwards."""
-        T = self._forward[_nearest(self.before, poses[:, :2])]
-        xy = se2.transform_each(T, poses[:, :2])
-        return np.column_stack([xy, se2.wrap(poses[:, 2] + T[:, 2])])
+        return se2.compose_each(self._forward[_nearest(self.before, poses[:, :2])], poses)
 
     def undone(self, points: Array, moved_as: NDArray[np.int64]) -> Array:
         """Where points (M, 2) were before; moved_as (M,): the pose as which each was moved."""

@@ -38,6 +38,8 @@ _PERCENT[_LIMIT] = UNKNOWN
 # Clamps of the occupancy probability, so that a cell that has changed is relearned soon.
 P_MIN = 0.05
 P_MAX = 0.97
+_GRAZED_M = 0.4  # of occupied cells through which a beam passes that grazes the face of a wall
+_P_SURELY_OCCUPIED = 0.9
 
 # Three neighbouring beams hit one surface if the middle range differs by less than this from the
 # range that the others predict, m.
@@ -163,9 +165,6 @@ class OccupancyConfig(Config):
         low=0.0,
         high=0.5,
     )
-    # A beam that passes through this length of occupied cells grazes the face of a wall.
-    grazed_length_m: float = 0.4
-    p_surely_occupied: float = 0.9
 
     def cleared_range_m(self, scan: Scan) -> float:
         """Range up to which the beams without return of a scan clear cells, m."""
@@ -223,7 +222,7 @@ class OccupancyGrid:
         self._beam_geometry: tuple[int, float, float] = (0, 0.0, 0.0)
         self._cosines = self._sines = np.empty(0)
         self._steps = _steps(self.config)
-        self._grazed = max(3, round(self.config.grazed_length_m / self.frame.resolution))
+        self._grazed = max(3, round(_GRAZED_M / self.frame.resolution))
 
     def __repr__(self) -> str:
         known = self.known_area()
@@ -436,7 +435,7 @@ def _steps(config: OccupancyConfig) -> NDArray[np.int16]:
     free, hit, low, high = (
         round(_SCALE * log_odds(p)) for p in (config.p_miss, config.p_hit, P_MIN, P_MAX)
     )
-    sure = min(round(_SCALE * log_odds(config.p_surely_occupied)), high)
+    sure = min(round(_SCALE * log_odds(_P_SURELY_OCCUPIED)), high)
     return np.array([free, hit, low, high, sure], dtype=np.int16)
 
 

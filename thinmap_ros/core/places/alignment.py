@@ -17,7 +17,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.piece import SAME_M, SAME_RAD, MapPiece
 from thinmap_ros.core.places.place_odds import OTHER_PLACES
 from thinmap_ros.core.places.recognition import MATCH_NOISE, PieceHypothesis, Placement
-from thinmap_ros.core.places.views import LATTICE_M, View
+from thinmap_ros.core.places.views import LATTICE_M, View, thinned
 from thinmap_ros.core.se2 import Array, inverse, propagated_covariance
 
 _CELL_M = 0.1
@@ -97,7 +97,7 @@ class _Raster:
 
     def __init__(self, patch: GridPatch) -> None:
         walls, free = (
-            _thinned(patch.frame.centres_of(np.argwhere(mask)), 0.5 * _CELL_M)
+            thinned(patch.frame.centres_of(np.argwhere(mask)), 0.5 * _CELL_M)
             for mask in _masks(patch)
         )
         points = np.vstack([walls, free])
@@ -119,14 +119,6 @@ class _Raster:
             images.append(image)
         walls, free = images
         return walls, free * (1.0 - walls)
-
-
-def _thinned(points: Array, cell_m: float) -> Array:
-    """The mean (M, 2) of the points (N, 2) in each cell of a lattice."""
-    _, owner = np.unique(np.floor(points / cell_m), axis=0, return_inverse=True)
-    owner = owner.ravel()
-    count = np.bincount(owner)
-    return np.column_stack([np.bincount(owner, points[:, i]) / count for i in (0, 1)])
 
 
 def _peaks(small: _Raster, large: _Raster, reach_m: float) -> Array:
@@ -237,7 +229,7 @@ def _whole_view(piece: MapPiece) -> View:
     patch = piece.patch
     has_room = patch.free & (distance_cells(patch.occupied) * patch.frame.resolution > _CLEAR_M)
     walls, free = (
-        _thinned(patch.frame.centres_of(np.argwhere(m)), LATTICE_M)
+        thinned(patch.frame.centres_of(np.argwhere(m)), LATTICE_M)
         for m in (patch.occupied, has_room)
     )
     middle = np.append(walls.mean(axis=0), 0.0) if len(walls) else np.zeros(3)

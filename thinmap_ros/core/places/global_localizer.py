@@ -17,7 +17,6 @@ from thinmap_ros.core.places.hypotheses import (
     candidates,
     look_at,
     looks_before,
-    moved,
 )
 from thinmap_ros.core.places.likelihood import HEADING_NOISE_RAD, Judge
 from thinmap_ros.core.places.place_database import (
@@ -314,7 +313,7 @@ class GlobalLocalization:
         noise = ODOMETRY_NOISE
         spread = (noise * way + _STANDING_NOISE[0], noise * (way + turn) + _STANDING_NOISE[1])
         self._known.move(motion, spread, self._rng)
-        self._drawn = moved(self._drawn, motion)
+        self._drawn = se2.compose_each(self._drawn, motion[None])
 
     def _search(
         self, judge: Judge, model: MissingShares, seen: Observation, T_odom_base: Array
@@ -380,7 +379,7 @@ class GlobalLocalization:
                 SearchState.SEARCHING, 'the scans show too little to tell places apart', ()
             )
         motion = np.zeros(3) if self._T_look is None else se2.between(self._T_look, T_odom_base)
-        poses = moved(known.poses, motion)
+        poses = se2.compose_each(known.poses, motion[None])
         weights = known.weights
         hypotheses = tuple(
             PoseHypothesis(poses[k], known.covariances[k], float(weights[k]), float(known.found[k]))

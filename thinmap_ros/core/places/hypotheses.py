@@ -150,8 +150,8 @@ def looks_before(
     for view in reversed(views):
         # From view to view: what odometry is off does not add up.
         back = se2.between(at, view.T_odom_base)
-        drift = _drift(back)
-        now = judge.refined(moved(now, back), view.seen, np.broadcast_to(drift, (len(now), 3, 3)))
+        drifts = np.broadcast_to(_drift(back), (len(now), 3, 3))
+        now = judge.refined(se2.compose_each(now, back[None]), view.seen, drifts)
         at = view.T_odom_base
         looks.append(look_at(model, judge, now, view.seen))
     return looks
@@ -163,15 +163,6 @@ def _drift(motion: Array) -> Array:
     turn = abs(float(motion[2]))
     position_m = ODOMETRY_NOISE * way
     return np.diag(np.square([position_m, position_m, ODOMETRY_NOISE * (way + turn)]))
-
-
-def moved(poses: Array, motion: Array) -> Array:
-    """Poses (N, 3) after a motion (3,) in the robot frame."""
-    c = np.cos(poses[:, 2])
-    s = np.sin(poses[:, 2])
-    x = poses[:, 0] + c * motion[0] - s * motion[1]
-    y = poses[:, 1] + s * motion[0] + c * motion[1]
-    return np.column_stack([x, y, se2.wrap(poses[:, 2] + motion[2])])
 
 
 # Shares of the beams that fall to either side at edges: by chance, and, as the cells of the map
@@ -256,8 +247,8 @@ class Hypotheses:
 
     def move(self, motion: Array, noise: tuple[float, float], rng: np.random.Generator) -> None:
         """Move all by odometry (3,), robot frame; samples with noise: 1 sigma, m and rad."""
-        self.poses = moved(self.poses, motion)
-        self.samples = moved(self.samples, motion)
+        self.poses = se2.compose_each(self.poses, motion[None])
+        self.samples = se2.compose_each(self.samples, motion[None])
         spread = np.array([noise[0], noise[0], noise[1]])
         self.samples += rng.normal(size=self.samples.shape) * spread
         self.covariances = self.covariances + np.diag(spread**2)

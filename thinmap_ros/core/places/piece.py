@@ -15,7 +15,7 @@ from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.places.views import PlacedScan, View, views_of
 from thinmap_ros.core.places.wall_field import WallField
 from thinmap_ros.core.scan import NO_RETURN_CLEAR_RANGE_M, Scan
-from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, wrap
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.jit import inlined, kernel
 
@@ -196,32 +196,23 @@ SAME_M = 0.5
 SAME_RAD = 0.1
 
 
-@dataclass(frozen=True)
-class Drift:
-    """Standard deviations of the relative pose of two maps: of a match, and per metre of path."""
-
-    match_m: float = 0.15
-    match_rad: float = 0.02
-    path_m: float = 0.02
-    path_rad: float = 0.003
-    sigmas: float = 3.0
-
-    def reach_m(self, path_m: float) -> float:
-        """Largest difference of a position, m."""
-        return self.sigmas * (self.match_m + self.path_m * path_m)
-
-    def reach_rad(self, path_m: float) -> float:
-        """Largest difference of a heading, rad."""
-        return self.sigmas * (self.match_rad + self.path_rad * path_m)
+# Standard deviations of the relative pose of two maps: of a match, and per metre of path.
+MATCH_M = 0.15
+MATCH_RAD = 0.02
+_PER_M = 0.02
+_RAD_PER_M = 0.003
 
 
-DRIFT = Drift()
+def drift_m(path_m: float) -> float:
+    """Largest difference of a position over a path, m."""
+    return BOUND_SIGMAS * (MATCH_M + _PER_M * path_m)
 
 
 def agree(T: Array, T_predicted: Array, path_m: float) -> bool:
     """Whether a pose (3,) is one that was predicted over a path."""
     x, y, turn = se2.between(T_predicted, T).tolist()
-    return math.hypot(x, y) < DRIFT.reach_m(path_m) and abs(turn) < DRIFT.reach_rad(path_m)
+    drift_rad = BOUND_SIGMAS * (MATCH_RAD + _RAD_PER_M * path_m)
+    return math.hypot(x, y) < drift_m(path_m) and abs(turn) < drift_rad
 
 
 def are_same(poses: Array, T: Array) -> NDArray[np.bool_]:
@@ -430,8 +421,7 @@ def _drawn(
 
 def _spaced(path: Array) -> Array:
     """Points (N, 2) along a path (K, 2), a spacing apart."""
-    steps = np.hypot(*np.diff(path, axis=0).T)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
+    along = se2.lengths_along(path)
     at = np.arange(0.0, along[-1] + 1e-9, _SPACING_M)
     return np.column_stack([np.interp(at, along, path[:, i]) for i in (0, 1)])
 

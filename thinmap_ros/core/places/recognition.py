@@ -17,13 +17,13 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.moved import MapMotion
 from thinmap_ros.core.places.piece import (
-    DRIFT,
     SAME_M,
     SAME_RAD,
     Landmarks,
     MapPiece,
     agree,
     are_same,
+    drift_m,
 )
 from thinmap_ros.core.places.place_odds import (
     JOIN_ODDS,
@@ -111,7 +111,7 @@ class ViewJudge:
 
 def _starts(T: Array, path_m: float) -> Array:
     """Poses (N, 3) from which refinements reach all that drift over a path makes possible."""
-    count = min(int(DRIFT.reach_m(path_m) / BASIN_M), _MAX_STARTS)
+    count = min(int(drift_m(path_m) / BASIN_M), _MAX_STARTS)
     steps = np.arange(-count, count + 1) * BASIN_M
     x, y = np.meshgrid(steps, steps)
     offsets = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])

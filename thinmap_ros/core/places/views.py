@@ -166,17 +166,21 @@ def _view_of(number: int, inside: Sequence[tuple[int, float, PlacedScan]]) -> Vi
     )
 
 
+def thinned(points: Array, cell_m: float) -> Array:
+    """The mean (M, 2) of the points (N, 2) in each cell of a lattice."""
+    cells = np.floor(points / cell_m).astype(np.int64)
+    _, owner = np.unique(cells @ np.array([1, 1 << 20]), return_inverse=True)
+    count = np.bincount(owner)
+    return np.column_stack([np.bincount(owner, points[:, i]) / count for i in (0, 1)])
+
+
 def _walls(frames: Sequence[PlacedScan], poses: Array) -> Array:
     """Points (N, 2) on walls, the mean of those in each cell of the lattice; poses (K, 3)."""
     clouds = []
     for frame, T in zip(frames, poses, strict=True):
         near = np.hypot(frame.points[:, 0], frame.points[:, 1]) < RANGE_M
         clouds.append(se2.transform_points(T, frame.points[near, :2]))
-    points = np.concatenate(clouds)
-    rows = np.floor(points / LATTICE_M).astype(np.int64) + round(_MAX_OFFSET_M / LATTICE_M)
-    _, owner = np.unique(rows @ np.array([1, 1 << 20]), return_inverse=True)
-    count = np.bincount(owner)
-    return np.column_stack([np.bincount(owner, points[:, i]) / count for i in (0, 1)])
+    return thinned(np.concatenate(clouds), LATTICE_M)
 
 
 def _free_places(scans: Sequence[Scan], poses: Array) -> Array:

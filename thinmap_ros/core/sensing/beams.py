@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -76,6 +76,8 @@ _JUMP_RAD = 1.5
 
 # Of scans that no laser measured.
 FROZEN = 'the same ranges while the robot moves'
+_MOVED = 0.02  # m or rad with which the ranges of any laser must have changed
+_DRIFT_PER_S = 0.02  # m or rad: a slower motion is drift of the odometry
 NO_RETURNS = 'no returns from surfaces that it has just measured'
 _MOVED_REACH = 0.9  # of range_max: a farther surface may have gone out of range
 _CONFIRMED_NS = 2 * SECOND_NS
@@ -317,69 +319,45 @@ class NoReturnRange:
         return bool(beyond <= _MAX_BEYOND * scan.ranges_m.size)
 
 
-@dataclass(frozen=True)
-class _Motion:
-    """Motion since a scan: path length (m) and rotation (rad); standing still adds nothing."""
-
-    path_m: float = 0.0
-    turn_rad: float = 0.0
-
-    def moved(self, increment: Array, seconds: float) -> '_Motion':
-        """Add an increment (3,); slower ones than a robot drives are drift of the odometry."""
-        path_m = math.hypot(increment[0], increment[1])
-        turn_rad = abs(float(increment[2]))
-        if path_m < 0.02 * seconds and turn_rad < 0.02 * seconds:
-            return self
-        return _Motion(self.path_m + path_m, self.turn_rad + turn_rad)
-
-    @property
-    def changes_ranges(self) -> bool:
-        """Whether the ranges of any laser must have changed."""
-        return self.path_m > 0.02 or self.turn_rad > 0.02
-
-
 class _FreezeDetector:
     """Ranges of a real laser are noisy: equal ones, while the robot moves, are an old scan."""
 
     def __init__(self) -> None:
         self._last: tuple[Scan, Array] | None = None
-        self._motion = _Motion()
+        self._motion = np.zeros(2)  # since the ranges are the same: path, m, and turn, rad
 
     def is_frozen(self, scan: Scan, T_odom_base: Array) -> bool:
         """Whether the ranges are those of an earlier pose; T_odom_base (3,)."""
         last = self._last
         self._last = (scan, T_odom_base)
         if last is None or not np.array_equal(last[0].ranges_m, scan.ranges_m, equal_nan=True):
-            self._motion = _Motion()
+            self._motion = np.zeros(2)
             return False
         seconds = (scan.stamp_ns - last[0].stamp_ns) / SECOND_NS
-        self._motion = self._motion.moved(se2.between(last[1], T_odom_base), seconds)
-        return self._motion.changes_ranges and int(np.count_nonzero(scan.hit)) >= MIN_HITS
+        x, y, turn = se2.between(last[1], T_odom_base).tolist()
+        motion = np.array([math.hypot(x, y), abs(turn)])
+        if (motion >= _DRIFT_PER_S * seconds).any():
+            self._motion = self._motion + motion
+        has_moved = bool((self._motion > _MOVED).any())
+        return has_moved and int(np.count_nonzero(scan.hit)) >= MIN_HITS
 
 
-@dataclass(frozen=True, eq=False)
-class _Surfaces:
-    """End points (N, 2) of the hits of a scan, odometry frame, m."""
+def _are_missed(surfaces: Array, scan: Scan, T_odom_base: Array) -> bool:
+    """Whether a scan at an odometry pose (3,) has no return from most of some points (N, 2).
 
-    points: Array = field(default_factory=lambda: np.empty((0, 2)))
-
-    @staticmethod
-    def of(scan: Scan, T_odom_base: Array) -> '_Surfaces':
-        return _Surfaces(se2.transform_points(T_odom_base, scan.points_base()))
-
-    def are_missed(self, scan: Scan, T_odom_base: Array) -> bool:
-        """Whether a scan at an odometry pose (3,) has no return from most of them."""
-        T_odom_laser = se2.compose(T_odom_base, scan.T_base_laser)
-        local = se2.transform_points(se2.invert(T_odom_laser), self.points)
-        ranges = np.hypot(local[:, 0], local[:, 1])
-        near = ranges < _MOVED_REACH * scan.range_max_m
-        bearings = np.arctan2(local[near, 1], local[near, 0]) - scan.angle_min_rad
-        step = abs(scan.angle_increment_rad)
-        ahead = bearings if scan.angle_increment_rad > 0.0 else -bearings
-        # A single beam has no increment.
-        beams = np.rint(np.mod(ahead, 2.0 * math.pi) / max(step, _MIN_STEP_RAD))
-        beams = beams[beams < scan.ranges_m.size].astype(np.int64)
-        return is_most_missed(scan, int(np.count_nonzero(scan.without_return[beams])))
+    surfaces: odometry frame, m.
+    """
+    T_odom_laser = se2.compose(T_odom_base, scan.T_base_laser)
+    local = se2.transform_points(se2.invert(T_odom_laser), surfaces)
+    ranges = np.hypot(local[:, 0], local[:, 1])
+    near = ranges < _MOVED_REACH * scan.range_max_m
+    bearings = np.arctan2(local[near, 1], local[near, 0]) - scan.angle_min_rad
+    step = abs(scan.angle_increment_rad)
+    ahead = bearings if scan.angle_increment_rad > 0.0 else -bearings
+    # A single beam has no increment.
+    beams = np.rint(np.mod(ahead, 2.0 * math.pi) / max(step, _MIN_STEP_RAD))
+    beams = beams[beams < scan.ranges_m.size].astype(np.int64)
+    return is_most_missed(scan, int(np.count_nonzero(scan.without_return[beams])))
 
 
 class BodyDetector:
@@ -503,8 +481,9 @@ class LaserMonitor:
         self._no_return = NoReturnRange()
         self._dropouts = DropoutDetector()
         self._body = BodyDetector()
-        self._trusted = _Surfaces()
-        self._previous = _Surfaces()
+        # Ends of hits (N, 2), odometry frame, m.
+        self._trusted = np.empty((0, 2))
+        self._previous = np.empty((0, 2))
         self._doubted_ns: int | None = None  # first scan of a series that agrees with itself only
 
     @property
@@ -532,12 +511,12 @@ class LaserMonitor:
         return self._body.applied(scan, T_odom_base)
 
     def _has_failed(self, scan: Scan, T_odom_base: Array) -> bool:
-        surfaces = _Surfaces.of(scan, T_odom_base)
-        is_empty = len(surfaces.points) < MIN_HITS
-        contradicts = self._trusted.are_missed(scan, T_odom_base)
+        surfaces = se2.transform_points(T_odom_base, scan.points_base())
+        is_empty = len(surfaces) < MIN_HITS
+        contradicts = _are_missed(self._trusted, scan, T_odom_base)
         contradicts |= self._doubted_ns is not None and is_empty
         if contradicts and self._doubted_ns is not None and not is_empty:
-            agrees = not self._previous.are_missed(scan, T_odom_base)
+            agrees = not _are_missed(self._previous, scan, T_odom_base)
             contradicts = not agrees or scan.stamp_ns - self._doubted_ns < _CONFIRMED_NS
             self._doubted_ns = self._doubted_ns if agrees else scan.stamp_ns
         elif contradicts:

@@ -349,29 +349,18 @@ def _solved(matrix: Array, right: Array) -> Array:
     return solution
 
 
-@dataclass(frozen=True)
-class TurnComparisonConfig:
-    """Scans that are compared, and how.
-
-    Two scans are compared with from min_turn_rad to max_turn_rad of odometry between them, within
-    max_path_m: a right angle more would be ambiguous in a square room. step_rad: between turns that
-    are tried, up to max_ratio times that of the odometry to either side; max_points: of a scan;
-    tolerance_m: difference of ranges with half the score; min_share: of the points that have to
-    be in view of both scans; min_lead: lead of the best turn over those in the other direction,
-    without which it means nothing; ratio_sigma: standard deviation of the ratio of two turns, 0.10
-    to 0.44 on the recordings of seven robots.
-    """
-
-    min_turn_rad: float = 0.15
-    max_turn_rad: float = 0.5
-    max_path_m: float = 0.5
-    step_rad: float = 0.025
-    max_ratio: float = 1.5
-    max_points: int = 120
-    tolerance_m: float = 0.1
-    min_share: float = 0.3
-    min_lead: float = 0.05
-    ratio_sigma: float = 0.5
+# Two scans are compared with so much odometry between them: a right angle more would be ambiguous
+# in a square room.
+_MIN_TURN_RAD = 0.15
+_MAX_TURN_RAD = 0.5
+_MAX_PATH_M = 0.5
+_STEP_RAD = 0.025  # between turns that are tried
+_MAX_RATIO = 1.5  # of these to the turn of the odometry, to either side
+_MAX_POINTS = 120  # of a scan
+# Difference of ranges with half the score, m, and least share of the points in view of both scans.
+_WITHIN = np.array([0.1, 0.3])
+_MIN_LEAD = 0.05  # of the best turn over those in the other direction, to mean anything
+_RATIO_SIGMA = 0.5  # of the ratio of two turns: 0.10 to 0.44 on the recordings of seven robots
 
 
 @dataclass(frozen=True)
@@ -399,15 +388,16 @@ class Turns:
             self.fourth + odometry**4,
         )
 
-    def are_opposed(self, ratio_sigma: float) -> bool:
+    @property
+    def are_opposed(self) -> bool:
         """Whether the scans turn against the odometry, by three sigmas.
 
         Their ratio is nearer to -1, of a mirrored laser, than to 0, of unrelated turns.
         """
         if self.squares == 0.0:
             return False
-        sigma = ratio_sigma * math.sqrt(self.fourth) / self.squares
-        return self.products / self.squares + 3.0 * sigma < -0.5
+        sigma = _RATIO_SIGMA * math.sqrt(self.fourth) / self.squares
+        return self.products / self.squares + BOUND_SIGMAS * sigma < -0.5
 
 
 class TurnComparison:
@@ -419,15 +409,14 @@ class TurnComparison:
     odometry's translation is applied to it, its turn is not.
     """
 
-    def __init__(self, config: TurnComparisonConfig | None = None) -> None:
-        self._config = config or TurnComparisonConfig()
+    def __init__(self) -> None:
         self.turns = Turns()
         self._reference: tuple[Scan, Array] | None = None
 
     @property
     def are_opposed(self) -> bool:
         """Whether the scans turn against the odometry."""
-        return self.turns.are_opposed(self._config.ratio_sigma)
+        return self.turns.are_opposed
 
     def add(self, scan: Scan, T_odom_base: Array) -> None:
         """Add a scan with the odometry pose (3,) at its stamp."""
@@ -440,11 +429,11 @@ class TurnComparison:
         reference, T_odom_reference = self._reference
         moved = se2.between(T_odom_reference, T_odom_base)
         turn = float(moved[2])
-        is_near = math.hypot(moved[0], moved[1]) <= self._config.max_path_m
-        if is_near and abs(turn) < self._config.min_turn_rad:
+        is_near = math.hypot(moved[0], moved[1]) <= _MAX_PATH_M
+        if is_near and abs(turn) < _MIN_TURN_RAD:
             return
         self._reference = (scan, T_odom_base)
-        if is_near and abs(turn) <= self._config.max_turn_rad:
+        if is_near and abs(turn) <= _MAX_TURN_RAD:
             found = self._turn(reference, scan, moved)
             if found is not None:
                 self.turns = self.turns.added(turn, found)
@@ -454,18 +443,16 @@ class TurnComparison:
 
         moved (3,): motion by odometry in between, robot frame.
         """
-        config = self._config
-        count = math.ceil(config.max_ratio * abs(float(moved[2])) / config.step_rad)
-        turns = config.step_rad * np.arange(-count, count + 1, dtype=np.float64)
+        count = math.ceil(_MAX_RATIO * abs(float(moved[2])) / _STEP_RAD)
+        turns = _STEP_RAD * np.arange(-count, count + 1, dtype=np.float64)
         points = reference.points_base()
-        points = points[:: -(-len(points) // config.max_points)] - moved[:2]
+        points = points[:: -(-len(points) // _MAX_POINTS)] - moved[:2]
         beams = np.array([scan.angle_min_rad, scan.angle_increment_rad])
-        within = np.array([config.tolerance_m, config.min_share])
         mount = scan.T_base_laser
-        score = _agreement(points, turns, mount, beams, scan.ranges_m, scan.hit, within)
+        score = _agreement(points, turns, mount, beams, scan.ranges_m, scan.hit, _WITHIN)
         best = int(score.argmax())
         opposite = score[:count] if best > count else score[count + 1 :]
-        if best == count or score[best] - opposite.max() < config.min_lead:
+        if best == count or score[best] - opposite.max() < _MIN_LEAD:
             return None
         return float(turns[best])
 
@@ -501,16 +488,10 @@ def _agreement(
     return score
 
 
-@dataclass(frozen=True)
-class MountLimits:
-    """Errors of the laser's pose on the robot that are reported, and at which the robot stops."""
-
-    warn_yaw_rad: float = math.radians(5.0)
-    stop_yaw_rad: float = math.radians(20.0)
-    warn_offset_m: float = 0.1
-
-
-_LIMITS = MountLimits()
+# Errors of the laser's pose on the robot that are reported, and at which the robot stops.
+_WARN_YAW_RAD = math.radians(5.0)
+_STOP_YAW_RAD = math.radians(20.0)
+_WARN_OFFSET_M = 0.1
 
 
 class ConsistencyMonitor:
@@ -587,9 +568,11 @@ class _LaserConsistency:
         """Check a scan; returns why the robot must not drive with this laser, '' for no reason."""
         if se2.is_finite(T_odom_base):
             self._turns.add(scan, T_odom_base)
-        self.warnings = dict(self._found(scan))
+        turned = max(self._by_window, key=lambda error: error.least_yaw_rad, default=None)
+        self.warnings = dict(self._found(scan, turned))
         self.reported |= self.warnings
-        return self._fault
+        is_wrong = turned is not None and turned.least_yaw_rad > _STOP_YAW_RAD
+        return _yaw_text(turned) if turned is not None and is_wrong else ''
 
     def add_motion(self, scan: Scan, T_odom_base: Array, estimate: Estimate) -> None:
         """Add a pose that neither a loop closure nor a jump of the odometry has moved."""
@@ -601,8 +584,8 @@ class _LaserConsistency:
         if self._mount_errors.add(estimate.T_map_base, information, T_odom_base, T_base_laser):
             self._by_window = self._mount_errors.estimates(T_base_laser)
 
-    def _found(self, scan: Scan) -> Iterator[tuple[str, str]]:
-        """Kind and text of each warning."""
+    def _found(self, scan: Scan, turned: MountError | None) -> Iterator[tuple[str, str]]:
+        """Kind and text of each warning; turned: the estimate that is surest of a turned laser."""
         if scan.warning:
             yield 'angles', scan.warning
         if self._turns.are_opposed:
@@ -613,29 +596,16 @@ class _LaserConsistency:
                 f'turned by {turns.odometry:.1f} rad: laser upside down or clockwise, or the yaw '
                 'of the odometry inverted?',
             )
-        turned = self._most_turned
-        if turned is not None and turned.least_yaw_rad > _LIMITS.warn_yaw_rad:
+        if turned is not None and turned.least_yaw_rad > _WARN_YAW_RAD:
             yield 'yaw', _yaw_text(turned)
         moved = max(self._by_window, key=lambda error: error.least_offset_m, default=None)
-        if moved is not None and moved.least_offset_m > _LIMITS.warn_offset_m:
+        if moved is not None and moved.least_offset_m > _WARN_OFFSET_M:
             x, y = moved.offset_m.tolist()
             yield (
                 'offset',
                 f'laser displaced by {x:.2f}, {y:.2f} m (sigma {moved.offset_sigma_m:.2f} m) from '
                 'its given pose on the robot: by turns in scans and in odometry',
             )
-
-    @property
-    def _most_turned(self) -> MountError | None:
-        """The estimate that is most certain of an error of the yaw."""
-        return max(self._by_window, key=lambda error: error.least_yaw_rad, default=None)
-
-    @property
-    def _fault(self) -> str:
-        """Why the robot must not drive with this laser; '' for no reason."""
-        turned = self._most_turned
-        is_wrong = turned is not None and turned.least_yaw_rad > _LIMITS.stop_yaw_rad
-        return _yaw_text(turned) if turned is not None and is_wrong else ''
 
 
 def _yaw_text(error: MountError) -> str:

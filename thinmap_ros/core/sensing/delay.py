@@ -13,36 +13,25 @@ from thinmap_ros.core.scan import Scan, delayed_ns
 from thinmap_ros.core.se2 import SECOND_NS, Array
 from thinmap_ros.core.stage import Estimate
 
-
-@dataclass(frozen=True)
-class DelayConfig:
-    """Delays that are tried, turns that they are estimated from, and when one is certain.
-
-    max_s, step_s: of the delays that are tried, to either side. Turns of at least min_turn_rad with
-    one of them are compared, over min_period_s, in which a turn is larger than the error of a
-    match, to max_period_s, the last `turns` of them. Their residual is at least min_sigma_rad, with
-    tails of a Student distribution of `freedom`. Residuals of neighbouring turns are correlated:
-    `independence` of them count, and the estimates without each of `blocks` parts show what that
-    leaves open. A delay is certain beyond certain_sigmas: where odometry comes
-    as seldom as scans, estimates were up to 3.4 of them off. A smaller one than least_s turns no
-    scan by more than the angle between two beams. An applied delay follows an estimate with less
-    than refined_ratio of its standard deviation.
-    """
-
-    max_s: float = 0.5
-    step_s: float = 0.005
-    min_turn_rad: float = 0.01
-    max_turn_rad: float = 2.0
-    min_period_s: float = 0.1
-    max_period_s: float = 1.5
-    turns: int = 200
-    min_sigma_rad: float = 0.003
-    freedom: float = 4.0
-    independence: float = 0.25
-    blocks: int = 8
-    certain_sigmas: float = 4.0
-    least_s: float = 0.02
-    refined_ratio: float = 0.7
+# Of the delays that are tried, to either side.
+_MAX_S = 0.5
+_STEP_S = 0.005
+_TURN_RAD = (0.01, 2.0)  # least and largest turn with one of them that is compared
+_MIN_PERIOD_S = 0.1  # over which a turn is larger than the error of a match
+_MAX_PERIOD_S = 1.5
+_TURNS = 200  # that are compared, the last ones
+# Their residual is at least this, with tails of a Student distribution of so much freedom.
+_MIN_SIGMA_RAD = 0.003
+_FREEDOM = 4.0
+# Residuals of neighbouring turns are correlated: this share of them counts, and the estimates
+# without each of some parts show what that leaves open.
+_INDEPENDENCE = 0.25
+_BLOCKS = 8
+# Beyond which a delay is certain: where odometry comes as seldom as scans, estimates were up to 3.4
+# of them off.
+_CERTAIN_SIGMAS = 4.0
+_LEAST_S = 0.02  # a smaller delay turns no scan by more than the angle between two beams
+_REFINED_RATIO = 0.7  # of the standard deviation, with which an estimate is followed
 
 
 @dataclass(frozen=True)
@@ -68,11 +57,9 @@ class DelayEstimator:
     estimates that are more certain. Matches with an odometry of another delay are forgotten.
     """
 
-    def __init__(self, config: DelayConfig | None = None) -> None:
-        self._config = config or DelayConfig()
-        config = self._config
-        count = round(config.max_s / config.step_s)
-        self._tried_s = config.step_s * np.arange(-count, count + 1, dtype=np.float64)
+    def __init__(self) -> None:
+        count = round(_MAX_S / _STEP_S)
+        self._tried_s = _STEP_S * np.arange(-count, count + 1, dtype=np.float64)
         self.applied = Delay(0.0, math.inf)
         self._given_s = 0.0
         self._forget()
@@ -109,7 +96,7 @@ class DelayEstimator:
         heading = float(estimate.T_map_base[2]) if is_matched else None
         self._waiting.append((delayed_ns(scan.stamp_ns, self._given_s), heading))
         latest_ns = odometry.latest_stamp_ns
-        ahead_ns = 2.0 * self._config.max_s * SECOND_NS
+        ahead_ns = 2.0 * _MAX_S * SECOND_NS
         if latest_ns is not None and self._waiting[0][0] > latest_ns + ahead_ns:
             self._waiting.clear()  # of a clock that was set back since
         while self._waiting and self._is_covered(self._waiting[0][0], odometry):
@@ -118,24 +105,23 @@ class DelayEstimator:
     def _forget(self) -> None:
         self._waiting: deque[tuple[int, float | None]] = deque()
         self._last: tuple[int, float] | None = None
-        self._found: deque[float] = deque(maxlen=self._config.turns)
-        self._expected: deque[Array] = deque(maxlen=self._config.turns)
+        self._found: deque[float] = deque(maxlen=_TURNS)
+        self._expected: deque[Array] = deque(maxlen=_TURNS)
         self._added = 0
 
     def _is_covered(self, stamp_ns: int, odometry: OdometryBuffer) -> bool:
         """Whether the odometry has arrived for all delays that are tried."""
         latest_ns = odometry.latest_stamp_ns
-        return latest_ns is not None and stamp_ns + self._config.max_s * SECOND_NS <= latest_ns
+        return latest_ns is not None and stamp_ns + _MAX_S * SECOND_NS <= latest_ns
 
     def _compare(self, stamp_ns: int, heading: float | None, odometry: OdometryBuffer) -> None:
         """Compare the turn since the previous scan with those of the odometry."""
-        config = self._config
         last = self._last
         since_s = 0.0 if last is None else (stamp_ns - last[0]) / SECOND_NS
-        if last is not None and heading is not None and 0.0 <= since_s < config.min_period_s:
+        if last is not None and heading is not None and 0.0 <= since_s < _MIN_PERIOD_S:
             return
         self._last = None if heading is None else (stamp_ns, heading)
-        if last is None or heading is None or not 0.0 < since_s <= config.max_period_s:
+        if last is None or heading is None or not 0.0 < since_s <= _MAX_PERIOD_S:
             return
         tried_ns = np.rint(self._tried_s * SECOND_NS).astype(np.int64)
         headings = odometry.headings(np.concatenate([last[0] - tried_ns, stamp_ns - tried_ns]))
@@ -143,7 +129,7 @@ class DelayEstimator:
             return
         before, after = headings.reshape(2, -1)
         largest = float(np.abs(after - before).max())
-        if config.min_turn_rad <= largest <= config.max_turn_rad:
+        if _TURN_RAD[0] <= largest <= _TURN_RAD[1]:
             self._add_turn(float(se2.wrap(heading - last[1])), after - before)
 
     def _add_turn(self, found: float, expected: Array) -> None:
@@ -151,24 +137,22 @@ class DelayEstimator:
         self._found.append(found)
         self._expected.append(expected)
         self._added += 1
-        blocks = self._config.blocks
-        if len(self._found) >= 2 * blocks and self._added % blocks == 0:
+        if len(self._found) >= 2 * _BLOCKS and self._added % _BLOCKS == 0:
             found_rad = np.array(self._found)
-            self._apply(estimated(found_rad, np.array(self._expected), self._tried_s, self._config))
+            self._apply(estimated(found_rad, np.array(self._expected), self._tried_s))
 
     def _apply(self, delay: Delay) -> None:
-        config = self._config
         change_s = abs(delay.seconds - self.applied.seconds)
-        is_other = change_s > max(config.certain_sigmas * delay.sigma_s, config.least_s)
+        is_other = change_s > max(_CERTAIN_SIGMAS * delay.sigma_s, _LEAST_S)
         is_known = math.isfinite(self.applied.sigma_s)
-        is_better = is_known and delay.sigma_s < config.refined_ratio * self.applied.sigma_s
+        is_better = is_known and delay.sigma_s < _REFINED_RATIO * self.applied.sigma_s
         if is_other or is_better:
             self.applied = delay
         if is_other:
             self._forget()
 
 
-def estimated(found: Array, expected: Array, tried_s: Array, config: DelayConfig) -> Delay:
+def estimated(found: Array, expected: Array, tried_s: Array) -> Delay:
     """Delay by turns (N,) of scans and those of the odometry (N, K) for all delays tried_s (K,).
 
     Each delay has a scale of the odometry of its own, of weighted least squares. The mean of the
@@ -176,15 +160,15 @@ def estimated(found: Array, expected: Array, tried_s: Array, config: DelayConfig
     the estimates without one of the parts of the drive.
     Source: Quenouille, "Notes on bias in estimation", 1956, for the latter (jackknife).
     """
-    cost = config.independence * _costs(found[:, None], expected, config)
-    parts = np.array([part.sum(axis=0) for part in np.array_split(cost, config.blocks)])
+    cost = _INDEPENDENCE * _costs(found[:, None], expected)
+    parts = np.array([part.sum(axis=0) for part in np.array_split(cost, _BLOCKS)])
     mean_s, variance = _moments(parts.sum(axis=0), tried_s)
     without = np.array([one[0] for one in _without_each(parts, tried_s)])
-    variance += (config.blocks - 1) * float(without.var())
+    variance += (_BLOCKS - 1) * float(without.var())
     return Delay(mean_s, math.sqrt(variance))
 
 
-def _costs(found: Array, expected: Array, config: DelayConfig) -> Array:
+def _costs(found: Array, expected: Array) -> Array:
     """Negative log likelihood (N, K) of each turn for each delay."""
     weights = np.ones_like(expected)
     for _ in range(_ITERATIONS):
@@ -193,9 +177,9 @@ def _costs(found: Array, expected: Array, config: DelayConfig) -> Array:
         squared = (found - scale * expected) ** 2
         # The median of the squares of a normal distribution is its variance by 2.2.
         smallest = 2.2 * float(np.median(squared, axis=0).min())
-        relative = squared / (config.freedom * max(smallest, config.min_sigma_rad**2))
+        relative = squared / (_FREEDOM * max(smallest, _MIN_SIGMA_RAD**2))
         weights = 1.0 / (1.0 + relative)
-    return np.asarray(0.5 * (config.freedom + 1.0) * np.log1p(relative))
+    return np.asarray(0.5 * (_FREEDOM + 1.0) * np.log1p(relative))
 
 
 def _without_each(parts: Array, tried_s: Array) -> Iterator[tuple[float, float]]:

@@ -9,29 +9,20 @@ from statistics import median
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, rotation
 
-
-@dataclass(frozen=True)
-class ScaleConfig:
-    """Spans of motion, and the ratios that are reported.
-
-    A span ends after span_m or span_rad by matching, beside which the errors of its ends are small.
-    Turns from turn_rad[0] to turn_rad[1] count: a larger one may be ambiguous. spans: least and
-    largest number of each kind.
-    Matches within max_sigma_m count: along a corridor they follow the odometry. common: standard
-    deviation of an error that all matches have. considerable:
-    deviation that is reported. Wheels and wheel bases are measured to some percent, which the
-    calibration of the odometry corrects. possible: other ratios are those of an odometry that does
-    not move, or of other units.
-    """
-
-    span_m: float = 0.5
-    span_rad: float = 0.3
-    turn_rad: tuple[float, float] = (0.2, 1.5)
-    spans: tuple[int, int] = (6, 50)
-    max_sigma_m: float = 0.03
-    common: float = 0.01
-    considerable: float = 0.1
-    possible: tuple[float, float] = (0.2, 5.0)
+# A span ends after so much motion by matching, beside which the errors of its ends are small.
+_SPAN_M = 0.5
+_SPAN_RAD = 0.3
+_TURN_RAD = (0.2, 1.5)  # of a span whose turn counts: a larger one may be ambiguous
+# Least and largest number of spans of each kind.
+_LEAST_SPANS = 6
+_MOST_SPANS = 50
+_MAX_SIGMA_M = 0.03  # of matches that count: along a corridor they follow the odometry
+_COMMON = 0.01  # standard deviation of an error that all matches have
+# Deviation that is reported. Wheels and wheel bases are measured to some percent, which the
+# calibration of the odometry corrects.
+_CONSIDERABLE = 0.1
+# Other ratios are those of an odometry that does not move, or of other units.
+_POSSIBLE = (0.2, 5.0)
 
 
 @dataclass(frozen=True)
@@ -50,7 +41,7 @@ class Ratio:
 
 
 def _spans() -> deque[float]:
-    return deque(maxlen=ScaleConfig.spans[1])
+    return deque(maxlen=_MOST_SPANS)
 
 
 @dataclass(eq=False)
@@ -61,7 +52,6 @@ class OdometryScale:
     many spans does not, and single slips do not change it.
     """
 
-    config: ScaleConfig = field(default_factory=ScaleConfig)
     _ratios: dict[str, deque[float]] = field(
         default_factory=lambda: {'turn': _spans(), 'distance': _spans(), 'sideways': _spans()}
     )
@@ -79,14 +69,14 @@ class OdometryScale:
 
     def add(self, T_map_base: Array, information: Array, T_odom_base: Array) -> None:
         """Add a matched pose (3,), the information (3, 3) of its scan, and the odometry (3,)."""
-        if se2.variances(information[:2, :2])[0] < self.config.max_sigma_m**-2.0:
+        if se2.variances(information[:2, :2])[0] < _MAX_SIGMA_M**-2.0:
             self.reset_span()
             return
         if self._begin is None:
             self._begin = (T_map_base, T_odom_base)
             return
         x, y, turn = found = se2.between(self._begin[0], T_map_base)
-        if math.hypot(x, y) < self.config.span_m and abs(turn) < self.config.span_rad:
+        if math.hypot(x, y) < _SPAN_M and abs(turn) < _SPAN_RAD:
             return
         self._add_span(found, se2.between(self._begin[1], T_odom_base))
         self._begin = (T_map_base, T_odom_base)
@@ -94,11 +84,10 @@ class OdometryScale:
     @property
     def values(self) -> dict[str, Ratio]:
         """The ratios that are known: of turn, distance and sideways motion."""
-        least, _ = self.config.spans
         return {
-            kind: _median(ratios, self.config.common)
+            kind: _median(ratios)
             for kind, ratios in self._ratios.items()
-            if len(ratios) >= least
+            if len(ratios) >= _LEAST_SPANS
         }
 
     @property
@@ -110,11 +99,10 @@ class OdometryScale:
 
     def _add_span(self, found: Array, odometry: Array) -> None:
         x, y, turn = found.tolist()
-        smallest, largest = self.config.turn_rad
-        if smallest <= abs(turn) <= largest:
+        if _TURN_RAD[0] <= abs(turn) <= _TURN_RAD[1]:
             self._ratios['turn'].append(float(odometry[2]) / turn)
         length = math.hypot(x, y)
-        if length < self.config.span_m:
+        if length < _SPAN_M:
             return
         # In the direction of the motion, which a wrong turn of the odometry bends.
         bent = 0.5 * (turn - float(odometry[2]))
@@ -123,19 +111,18 @@ class OdometryScale:
         self._ratios[kind].append(float(moved @ found[:2]) / length**2)
 
     def _is_wrong(self, ratio: Ratio) -> bool:
-        low, high = self.config.possible
         least = abs(ratio.value - 1.0) - BOUND_SIGMAS * ratio.sigma
-        return low < ratio.value < high and least > self.config.considerable
+        return _POSSIBLE[0] < ratio.value < _POSSIBLE[1] and least > _CONSIDERABLE
 
 
 _VERBS = {'turn': 'turns', 'distance': 'moves', 'sideways': 'moves sideways'}
 
 
-def _median(ratios: Collection[float], common: float) -> Ratio:
+def _median(ratios: Collection[float]) -> Ratio:
     """Median of ratios, with its standard deviation where they are normally distributed."""
     value = median(ratios)
     spread = 1.4826 * median(abs(ratio - value) for ratio in ratios)
-    return Ratio(value, math.hypot(1.2533 * spread / math.sqrt(len(ratios)), common))
+    return Ratio(value, math.hypot(1.2533 * spread / math.sqrt(len(ratios)), _COMMON))
 
 
 def _advice(wrong: dict[str, Ratio]) -> str:

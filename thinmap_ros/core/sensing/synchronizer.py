@@ -582,7 +582,8 @@ class InputStream:
         if self._received_ns is None:
             return ''
         silent_ns = now_ns - self._received_ns
-        usual_ns = median(self._intervals_ns) if self._is_rate_known() else 0.0
+        is_rate_known = len(self._intervals_ns) == _USUAL_INTERVALS
+        usual_ns = median(self._intervals_ns) if is_rate_known else 0.0
         is_slow = usual_ns > self._timeout_ns
         if is_slow and silent_ns <= _GAP_INTERVALS * usual_ns:
             expected_hz = SECOND_NS / self._timeout_ns
@@ -596,6 +597,3 @@ class InputStream:
             late_s = late_ns / SECOND_NS
             return f'{self._name} {late_s:.1f} s late: expected at most {expected_s:.1f} s'
         return ''
-
-    def _is_rate_known(self) -> bool:
-        return len(self._intervals_ns) == _USUAL_INTERVALS

@@ -7,7 +7,7 @@ accumulated covariance connects the two.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, ClassVar, Protocol
@@ -32,13 +32,12 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
-    Keyframes,
     SavedKeyframes,
     Step,
     heading_errors,
     with_heading,
 )
-from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, Pieces
+from thinmap_ros.core.slam.graph.loop_closure import LoopClosure
 from thinmap_ros.core.slam.graph.pose_graph import Edge, Systematic
 from thinmap_ros.core.slam.graph.reckoned import Reckoned
 from thinmap_ros.core.slam.graph.tables import KeyframeTrajectory, heading_row

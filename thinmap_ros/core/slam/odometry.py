@@ -11,6 +11,7 @@ from thinmap_ros.core.ekf_slam.features import OdometryConfig, odometry_slip, od
 from thinmap_ros.core.odometry import OdometryIncrement, OdometryIncrements
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import (
+    BOUND_SIGMAS,
     Array,
     carried,
     inverse,
@@ -26,12 +27,7 @@ from thinmap_ros.jit import kernel
 
 @dataclass(frozen=True)
 class MotionConfig(OdometryConfig):
-    """Parameters of the odometry noise, and of its adaptation to scan matching.
-
-    Besides the parameters: min_scale of the modelled variance, as good wheels slip, too; a motion
-    within stationary_sigmas of the noise floor is none; below corridor_ratio of the information
-    across a corridor, the information along it is that of a smooth one.
-    """
+    """Parameters of the odometry noise, and of its adaptation to scan matching."""
 
     noise_window: float = parameter(
         20.0,
@@ -40,9 +36,6 @@ class MotionConfig(OdometryConfig):
         low=1.0,
         high=1e4,
     )
-    min_scale: float = 1.0
-    stationary_sigmas: float = 3.0
-    corridor_ratio: float = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +52,19 @@ class MotionPrediction:
     by_calibration: Array = field(default_factory=lambda: np.zeros((3, 4)))
 
 
-def _distinctness(information: Array, corridor_ratio: float) -> Array:
+_MIN_SCALE = 1.0  # of the modelled variance: good wheels slip, too
+# Below this ratio of the information across a corridor, that along it is of a smooth one.
+_CORRIDOR_RATIO = 0.2
+
+
+def _distinctness(information: Array) -> Array:
     """Weight (2,), 0 to 1, of a scan's innovation in x and y, by its information (3, 3).
 
     Along a smooth corridor the information of a match is overconfident, and its innovation is no
     error of the odometry.
     """
     own = np.diag(information)[:2]
-    return np.asarray(np.minimum(own / max(corridor_ratio * float(own.max()), 1e-12), 1.0))
+    return np.asarray(np.minimum(own / max(_CORRIDOR_RATIO * float(own.max()), 1e-12), 1.0))
 
 
 class MotionModel:
@@ -93,7 +91,7 @@ class MotionModel:
         config = self._config
         self._expected = increment
         self._allowed = odometry_variances(increment, config) + np.diag(systematic)
-        moves = np.abs(increment) > config.stationary_sigmas * odometry_slip(config)
+        moves = np.abs(increment) > BOUND_SIGMAS * odometry_slip(config)
         return MotionPrediction(increment, np.diag(self._variances), not moves.any())
 
     def update(self, found: Array, scan_information: Array) -> None:
@@ -108,48 +106,33 @@ class MotionModel:
         beyond = np.maximum(squared - variance, 0.0)  # not explained by the noise of the scan
         share = self._share[[0, 0, 1]]
         # A larger innovation is an outlier, such as a single slip: its effect is limited.
-        change = (
-            np.minimum(beyond / self._allowed, self._config.stationary_sigmas**2 * share) - share
-        )
+        change = np.minimum(beyond / self._allowed, BOUND_SIGMAS**2 * share) - share
         change *= np.maximum(gain**2, beyond / np.maximum(squared, 1e-12))
-        change[:2] *= np.where(
-            change[:2] > 0.0, _distinctness(scan_information, self._config.corridor_ratio), 1.0
-        )
+        change[:2] *= np.where(change[:2] > 0.0, _distinctness(scan_information), 1.0)
         self._learned += 1
         rate = max(1.0 / self._config.noise_window, 1.0 / (1.0 + self._learned))
         self._share[0] += rate * 0.5 * (change[0] + change[1])
         self._share[1] += rate * change[2]
-        np.maximum(self._share, self._config.min_scale, out=self._share)
+        np.maximum(self._share, _MIN_SCALE, out=self._share)
 
     @property
     def _variances(self) -> Array:
         return np.asarray(self._allowed * self._share[[0, 0, 1]])
 
 
-_OUTLIER_SIGMAS = 3.0  # beyond which all innovations teach the same
-
-
-@dataclass(frozen=True)
-class CalibrationConfig:
-    """Noise of the calibration.
-
-    prior_sigmas: of scale, drift, turn_scale and askew before the first span; walk_sigmas: their
-    random walk per m or rad, as floor and load change. span_m, span_rad: smallest span to compare,
-    so long that the covariance of its two ends is small beside it; noise_m, noise_rad: of a span,
-    besides that of its ends and of the odometry, as errors of matches are correlated;
-    min_information: for directions without information, as in a corridor; gate_sigmas: a larger
-    innovation is wheel slip. The noise is scaled by the innovations of noise_window spans.
-    """
-
-    prior_sigmas: tuple[float, ...] = (0.02, 0.02, 0.05, 0.02)
-    walk_sigmas: tuple[float, ...] = (0.001, 0.001, 0.001, 0.0002)
-    span_m: float = 1.0
-    span_rad: float = 1.0
-    noise_m: float = 0.02
-    noise_rad: float = 0.02
-    min_information: float = 1e-2
-    gate_sigmas: float = 4.0
-    noise_window: float = 20.0
+# Of scale, drift, turn_scale and askew: before the first span, and their random walk per m or rad,
+# as floor and load change.
+_PRIOR_SIGMAS = (0.02, 0.02, 0.05, 0.02)
+_WALK_SIGMAS = (0.001, 0.001, 0.001, 0.0002)
+# Smallest span to compare, so long that the covariance of its two ends is small beside it.
+_SPAN_M = 1.0
+_SPAN_RAD = 1.0
+# Of a span, besides that of its ends and of the odometry: errors of matches are correlated.
+_SPAN_NOISE_M = 0.02
+_SPAN_NOISE_RAD = 0.02
+_MIN_INFORMATION = 1e-2  # for directions without information, as in a corridor
+_GATE_SIGMAS = 4.0  # a larger innovation is wheel slip
+_SPAN_WINDOW = 20.0  # number of spans whose innovations scale the noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,32 +159,29 @@ class OdometryCalibration:
     errors in mobile robots", 1996 (UMBmark), for the model.
     """
 
-    def __init__(self, config: CalibrationConfig | None = None) -> None:
-        self._config = config or CalibrationConfig()
-        # Estimated parameters: scale, drift in rad/m, turn_scale, askew in rad.
-        self.parameters = np.array([1.0, 0.0, 1.0, 0.0])
-        self.covariance: Array = np.diag(np.square(self._config.prior_sigmas))  # (4, 4)
-        self._spans = _Spans(self.parameters, self.covariance)
+    def __init__(self) -> None:
+        self.begin_with(np.array([1.0, 0.0, 1.0, 0.0]), np.diag(np.square(_PRIOR_SIGMAS)))
         # Of turn, length and lateral offset of a span.
-        self._noises = [_Noise(self._config.noise_window) for _ in range(3)]
-        self.applied = self.parameters  # as the map contains them
-        self._begin: _MatchedPose | None = None
+        self._noises = [_Noise() for _ in range(3)]
         self.reset_segment()
 
     def reset_segment(self) -> None:
         """Discard the current span, after a pose that is not due to matching: set or lost."""
-        self._begin = None
+        self._begin: _MatchedPose | None = None
         self._expected = np.zeros(3)
         self._by_parameters = np.zeros((3, 4))  # derivative of _expected
         self._travelled_m = self._turned_rad = 0.0
         self._random = np.zeros(2)
 
     def begin_with(self, parameters: Array, covariance: Array) -> None:
-        """Begin with parameters (4,) and covariance (4, 4) that were found before."""
+        """Begin with parameters (4,) and covariance (4, 4) that were found before.
+
+        Scale, drift in rad/m, turn_scale, askew in rad.
+        """
         self.parameters = parameters
         self.covariance = covariance
         self._spans = _Spans(parameters, covariance)
-        self.applied = parameters
+        self.applied = parameters  # as the map contains them
 
     @property
     def spans(self) -> int:
@@ -259,13 +239,11 @@ class OdometryCalibration:
         """
         if (
             self._begin is not None
-            and abs(self._travelled_m) < self._config.span_m
-            and abs(self._turned_rad) < self._config.span_rad
+            and abs(self._travelled_m) < _SPAN_M
+            and abs(self._turned_rad) < _SPAN_RAD
         ):
             return
-        covariance: Array = np.linalg.inv(by_map + self._config.min_information * np.eye(3)).astype(
-            np.float64
-        )
+        covariance: Array = np.linalg.inv(by_map + _MIN_INFORMATION * np.eye(3)).astype(np.float64)
         begin = self._begin
         if begin is not None:
             R = rotation(float(begin.T_map_base[2]))
@@ -283,27 +261,25 @@ class OdometryCalibration:
         (3, 4): what it measures of the parameters.
         """
         moved = abs(self._travelled_m) + abs(self._turned_rad)
-        self.covariance = self.covariance + np.diag(np.square(self._config.walk_sigmas)) * moved
+        self.covariance = self.covariance + np.diag(np.square(_WALK_SIGMAS)) * moved
         predicted = self.covariance
         off_turn = float(se2.wrap(float(found[2] - self._expected[2])))
-        variance = self._config.noise_rad**2 + self._random[1] + float(covariance[2, 2])
+        variance = _SPAN_NOISE_RAD**2 + self._random[1] + float(covariance[2, 2])
         self._update(off_turn, H[2], variance, self._noises[0])
         length = math.hypot(self._expected[0], self._expected[1])
-        if length > 0.5 * self._config.span_m:
+        if length > 0.5 * _SPAN_M:
             x, y = self._expected[:2] / length
             dx, dy = found[:2] - self._expected[:2]
             along = np.array([x, y])
             across = np.array([-y, x])
             variance = (
-                self._config.noise_m**2
-                + self._random[0]
-                + float(along @ covariance[:2, :2] @ along)
+                _SPAN_NOISE_M**2 + self._random[0] + float(along @ covariance[:2, :2] @ along)
             )
             self._update(x * dx + y * dy, along @ H[:2], variance, self._noises[1])
             # The lateral offset contains half of the turn error.
             aside = x * dy - y * dx - 0.5 * length * off_turn
             variance = (
-                self._config.noise_m**2
+                _SPAN_NOISE_M**2
                 + 0.25 * length**2 * self._random[1]
                 + float(across @ covariance[:2, :2] @ across)
             )
@@ -320,7 +296,7 @@ class OdometryCalibration:
         known = float(H @ along)
         variance = known + noise.scale * modelled
         noise.learn(off, known, modelled)
-        if off * off > self._config.gate_sigmas**2 * variance:
+        if off * off > _GATE_SIGMAS**2 * variance:
             return
         gain = along / variance
         self.parameters = self.parameters + gain * off
@@ -334,20 +310,18 @@ class _Noise:
     Source: Mehra, "On the identification of variances and adaptive Kalman filtering", 1970.
     """
 
-    def __init__(self, window: float) -> None:
-        """window: number of innovations that count."""
+    def __init__(self) -> None:
         self.scale = 1.0
-        self._window = window
         self._learned = 0.0  # innovations so far, by weight
 
     def learn(self, off: float, known: float, modelled: float) -> None:
         """Adapt to an innovation; variances: known, by the parameters; modelled, by the noise."""
         noise = self.scale * modelled
         beyond = max(off * off - known, 0.0) / modelled
-        outlier = _OUTLIER_SIGMAS**2 * self.scale
+        outlier = BOUND_SIGMAS**2 * self.scale
         weight = noise / (noise + known)  # what the innovation says about the noise
         self._learned += weight
-        rate = max(1.0 / self._window, 1.0 / (1.0 + self._learned))
+        rate = max(1.0 / _SPAN_WINDOW, 1.0 / (1.0 + self._learned))
         self.scale = max(self.scale + rate * weight * (min(beyond, outlier) - self.scale), 1.0)
 
 
@@ -438,11 +412,6 @@ class OdometryPrediction:
     def rejected(self) -> int:
         """Number of odometry poses with invalid values."""
         return self._increments.rejected
-
-    @property
-    def stamp_ns(self) -> int | None:
-        """Stamp of the last scan."""
-        return self._increments.stamp_ns
 
     @property
     def T_odom_base(self) -> Array:  # noqa: N802

@@ -125,17 +125,25 @@ class PlaceBelief:
     """
 
     def __init__(self, lost_threshold: float, least_fit: float) -> None:
-        self.level = 0.0
-        self._seen_through = 0.0
-        self._before_look = 0.0  # the same before the present look
-        self._opening = _Opening()
-        self._is_foreign = False  # whether the last scan may be one of another place
-        self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
-        self._trial: _Trial | None = None
         self.is_unconfirmed = False  # after a scan without a match, until one fits
+        self.adjust(lost_threshold, least_fit)
+        self.start_submap()
+
+    def _begin(self, level: float, trial: _Trial | None = None) -> None:
+        """Begin delocalized, with evidence against the map; trial: of the pose, if there is one."""
+        self.is_delocalized = True  # in a loaded map, or after set_pose, until scans fit
+        self._trial = trial
+        self.level = level
         self._carried = 0.0  # odds of a kidnapping by the last motion
         self._is_elsewhere = False  # it was kidnapped before
-        self.adjust(lost_threshold, least_fit)
+        self._end_look(0.0)
+
+    def _end_look(self, seen_through: float) -> None:
+        """Set the evidence of walls that were seen through before the present look."""
+        self._before_look = seen_through
+        self._seen_through = seen_through  # up to now
+        if seen_through == 0.0:
+            self._opening = _Opening()
 
     def adjust(self, lost_threshold: float, least_fit: float) -> None:
         """Set the evidence at which the robot is lost, and the inlier ratio of a scan that fits."""
@@ -266,13 +274,6 @@ class PlaceBelief:
             self._trial = None
         return self._trial is None
 
-    def _end_look(self, seen_through: float) -> None:
-        """Set the evidence of walls that were seen through before the present look."""
-        self._before_look = seen_through
-        self._seen_through = seen_through
-        if seen_through == 0.0:
-            self._opening = _Opening()
-
     def place(self, is_map_given: bool = False, is_tried: bool = True) -> None:
         """The pose was given: the robot is delocalized until scans fit, and looks do not deny it.
 
@@ -280,13 +281,9 @@ class PlaceBelief:
         fits. Outside of the map no scan contradicts it. is_tried: whether looks on the path may
         deny it, and the map waits for them; else one scan that fits confirms it.
         """
-        self.is_delocalized = True
-        self._carried = 0.0
-        self._is_elsewhere = False
-        self._trial = _Trial(is_guess=False, log_odds=_GIVEN) if is_tried else None
+        trial = _Trial(is_guess=False, log_odds=_GIVEN) if is_tried else None
+        self._begin(_UNCONFIRMED_EVIDENCE if is_map_given else 0.0, trial)
         self.is_unconfirmed = False
-        self.level = _UNCONFIRMED_EVIDENCE if is_map_given else 0.0
-        self._end_look(0.0)
 
     @property
     def is_start_judged(self) -> bool:
@@ -310,28 +307,17 @@ class PlaceBelief:
         is_guess: the robot may be anywhere; scans that fit on the way confirm it; is_tried: the
         pose was given, and is judged by `judge_start`.
         """
-        self.is_delocalized = True
-        self._carried = 0.0
-        self._is_elsewhere = False
-        self._trial = None if is_pose_given and not is_guess else _Trial(is_guess)
+        trial = None if is_pose_given and not is_guess else _Trial(is_guess)
         if is_tried:
-            self._trial = _Trial(is_guess=False, log_odds=_GIVEN)
-        self.level = _LOADED_EVIDENCE
+            trial = _Trial(is_guess=False, log_odds=_GIVEN)
+        self._begin(_LOADED_EVIDENCE, trial)
 
     def lose(self) -> None:
         """The robot is delocalized in the map as it is, until scans fit."""
-        self._carried = 0.0
-        self._is_elsewhere = False
-        self.is_delocalized = True
-        self.level = self._lost_evidence
-        self._end_look(0.0)
+        self._begin(self._lost_evidence)
 
     def start_submap(self) -> None:
         """Start a new local map, which no scan contradicts."""
-        self._carried = 0.0
-        self._is_elsewhere = False
-        self.level = 0.0
-        self._is_foreign = False
-        self._end_look(0.0)
-        self._trial = None
+        self._begin(0.0)
+        self._is_foreign = False  # whether the last scan may be one of another place
         self.is_delocalized = False

@@ -9,13 +9,12 @@ inference", 1999.
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from thinmap_ros.core.ekf_slam.features import Lines
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array
 from thinmap_ros.core.slam.graph.pose_graph import Systematic
 
 _QUARTER = 0.5 * math.pi
@@ -25,25 +24,15 @@ _AROUND = np.arange(-_NEAR_BINS, _NEAR_BINS + 1)
 _BESIDE = (np.arange(_BINS)[:, None] + [-1, 0, 1]) % _BINS  # each bin with its neighbours
 
 
-@dataclass(frozen=True)
-class WallCompassConfig:
-    """When walls measure the heading.
-
-    min_total_m: smallest length of wall, summed over scans, for a main direction; min_ratio:
-    smallest ratio of the walls in it; min_length_m: smallest length of wall in a scan. The heading
-    is most accurate at the start of the map: after a path of fade_m the weight of a wall is a half,
-    and never below min_weight. wall_sigma_rad: deviation of real walls from the main direction;
-    gate_sigmas, max_offset_rad: largest deviation of an inlier.
-    """
-
-    min_total_m: float = 60.0
-    min_ratio: float = 0.7
-    min_length_m: float = 1.5
-    fade_m: float = 20.0
-    min_weight: float = 0.02
-    wall_sigma_rad: float = 0.003
-    gate_sigmas: float = 3.0
-    max_offset_rad: float = 0.35
+_MIN_TOTAL_M = 60.0  # of wall, summed over scans, for a main direction
+_MIN_RATIO = 0.7  # of the walls that are in it
+_MIN_LENGTH_M = 1.5  # of wall in a scan
+# The heading is most accurate at the start of the map: after this path the weight of a wall is a
+# half, and never below the least.
+_FADE_M = 20.0
+_MIN_WEIGHT = 0.02
+_WALL_SIGMA_RAD = 0.003  # of real walls from the main direction
+_MAX_OFFSET_RAD = 0.35  # of an inlier
 
 
 class Reference(NamedTuple):
@@ -95,8 +84,7 @@ class Heading(NamedTuple):
 class WallCompass:
     """Histogram of wall lengths by direction in the map; measures the heading of a scan."""
 
-    def __init__(self, config: WallCompassConfig | None = None) -> None:
-        self._config = config or WallCompassConfig()
+    def __init__(self) -> None:
         # For each bin: weighted length of the walls (m), and its product with the mean position of
         # their directions in the bin (0 to 1).
         self._metres = np.zeros(_BINS)
@@ -111,8 +99,8 @@ class WallCompass:
         """
         at = (lines.z[:, 1] + yaw - self._turned) % _QUARTER / _QUARTER * _BINS
         bins = at.astype(np.int64)
-        fading = 1.0 / (1.0 + (path_m / self._config.fade_m) ** 2)
-        weights = lines.lengths_m * max(fading, self._config.min_weight)
+        fading = 1.0 / (1.0 + (path_m / _FADE_M) ** 2)
+        weights = lines.lengths_m * max(fading, _MIN_WEIGHT)
         share = float(weights.sum()) / max(float(self._metres.sum() + weights.sum()), 1e-9)
         self._reference = own if self._reference is None else self._reference.mean(own, share)
         np.add.at(self._metres, bins % _BINS, weights)
@@ -122,12 +110,12 @@ class WallCompass:
     def direction(self) -> float | None:
         """Main direction of the walls, rad, from 0 to a right angle; None if there is none."""
         total = float(self._metres.sum())
-        if total < self._config.min_total_m:
+        if total < _MIN_TOTAL_M:
             return None
         fullest = int(np.argmax(self._metres[_BESIDE].sum(axis=1)))
         near = (fullest + _AROUND) % _BINS
         metres = float(self._metres[near].sum())
-        if metres < self._config.min_ratio * total:
+        if metres < _MIN_RATIO * total:
             return None
         mean = (self._places[near].sum() + self._metres[near] @ _AROUND) / metres
         return (float((fullest + mean) * _QUARTER / _BINS) + self._turned) % _QUARTER
@@ -143,17 +131,16 @@ class WallCompass:
 
         None if the building has no main direction, or too few lines are inliers to it.
         """
-        config = self._config
         direction = self.direction
         lengths = lines.lengths_m
         if direction is None or self._reference is None:
             return None
         off = (lines.z[:, 1] + yaw - direction + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER
-        sigmas = np.sqrt(variance + config.wall_sigma_rad**2 + lines.covariances[:, 1, 1])
-        near = np.abs(off) < np.minimum(config.gate_sigmas * sigmas, config.max_offset_rad)
-        if lengths[near].sum() < max(config.min_ratio * lengths.sum(), config.min_length_m):
+        sigmas = np.sqrt(variance + _WALL_SIGMA_RAD**2 + lines.covariances[:, 1, 1])
+        near = np.abs(off) < np.minimum(BOUND_SIGMAS * sigmas, _MAX_OFFSET_RAD)
+        if lengths[near].sum() < max(_MIN_RATIO * lengths.sum(), _MIN_LENGTH_M):
             return None
         weights = lengths[near] / lengths[near].sum()
         seen = float(np.square(weights) @ lines.covariances[near, 1, 1])
         measured = yaw - float(weights @ off[near])
-        return Heading(measured, config.wall_sigma_rad**2 + seen, self._reference)
+        return Heading(measured, _WALL_SIGMA_RAD**2 + seen, self._reference)

@@ -11,7 +11,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.slam.graph.pose_graph import EdgeArrays, _linearise
-from thinmap_ros.core.slam.graph.reduction import ReductionConfig, needed, reduced
+from thinmap_ros.core.slam.graph.reduction import needed, reduced
 
 
 def covariance_of(saved: SavedKeyframes, place: Array) -> Array:
@@ -61,7 +61,7 @@ def test_a_place_that_is_hidden_today_keeps_its_keyframes() -> None:
     for walls in (ROOM, shut):
         first = driven(1).frames
         today = [keyframe(f.T_map_base, 30.0 + f.path_m, walls) for f in first[:5]]
-        counts.append(int(needed([*first, *today], ReductionConfig())[:5].sum()))
+        counts.append(int(needed([*first, *today])[:5].sum()))
     assert counts[0] == 1, 'the first'
     assert counts[1] == 5
 

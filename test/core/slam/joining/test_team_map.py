@@ -17,7 +17,7 @@ ROBOTS = {'/a': (1, 1), '/b': (1, 2), '/c': (1, 3), '/foreign': (3, 1)}
 def receive(team, *names):
     for name in names:
         piece = driven_piece(*ROBOTS[name]).piece
-        team.receive(name, piece.patch, piece.graph)
+        team.maps[name] = RobotMap(piece.patch, piece.graph)
 
 
 def search_all(team):
@@ -93,7 +93,7 @@ def test_a_map_that_was_corrected_takes_its_link_along():
     receive(team, '/a', '/b')
     search_all(team)
     piece = driven_piece(*ROBOTS['/b']).piece
-    team.receive('/b', moved(piece.patch, 0.5), None)
+    team.maps['/b'] = RobotMap(moved(piece.patch, 0.5))
     search_all(team)
     there = se2.compose(team.places()['/b'], np.array([0.5, 0.0, 0.0]))
     assert_at(there, '/a', '/b')
@@ -104,7 +104,7 @@ def test_a_robot_that_maps_another_place_is_separated():
     receive(team, '/a', '/b')
     search_all(team)
     piece = driven_piece(*ROBOTS['/foreign']).piece
-    team.receive('/b', moved(piece.patch, 300.0), None)
+    team.maps['/b'] = RobotMap(moved(piece.patch, 300.0))
     search = team.next_search()
     (dropped,) = team.found(search, *search.run())
     assert {dropped.a, dropped.b} == {'/a', '/b'}

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.local_map_cells import CELL_M, REACH, cells_of, nearest, read_cells, walls_of
+from support.local_map_cells import (
+    CELL_M,
+    REACH,
+    cells_of,
+    nearest,
+    read_cells,
+    wall_distances,
+    walls_of,
+)
 from support.slam_room import ROOM, map_of, on_wall, seen_in
 
 from thinmap_ros.core import se2, snapshot
@@ -73,13 +81,13 @@ def test_walls_that_vanish_are_forgotten(rng):
     for pose in AROUND_BOX:
         add_scan(local_map, ROOM, pose, rng)
     faces = np.array([[7.0, 2.5], [7.5, 3.0], [8.0, 2.6]])
-    assert (local_map.distances(faces) < CELL_M).all()
+    assert (wall_distances(local_map, faces) < CELL_M).all()
     for _ in range(5):
         for pose in AROUND_BOX:
             add_scan(local_map, WITHOUT_BOX, pose, rng)
     cells, *_ = cells_of(local_map)
     np.testing.assert_allclose(told(cells), nearest(cells), atol=0.1)
-    np.testing.assert_array_equal(local_map.distances(faces), CELL_M * REACH)
+    np.testing.assert_array_equal(wall_distances(local_map, faces), CELL_M * REACH)
 
 
 # Few cells, so that adjacent walls appear and vanish.
@@ -180,10 +188,10 @@ def test_counts_forget_and_do_not_run_over():
     cells, *_ = cells_of(local_map)
     assert 127 < cells['seen'].max() <= 255
     assert (cells['hits'] <= cells['seen']).all()
-    assert local_map.distances(point)[0] < 0.03
+    assert wall_distances(local_map, point)[0] < 0.03
     beyond = np.array([[2.025, 0.025]])
     looks = 0
-    while local_map.distances(point)[0] < 0.1:
+    while wall_distances(local_map, point)[0] < 0.1:
         add(local_map, beyond, laser, 0.0)
         looks += 1
     assert looks < 600, 'seen 600 times, forgotten sooner'
@@ -196,12 +204,12 @@ def test_a_cell_is_a_wall_while_enough_of_its_observations_are_hits():
     add(local_map, point, (0.025, 0.025), 0.0)
     for passes in range(4):
         is_wall = passes < 3
-        assert bool(local_map.distances(point)[0] < 0.01) is is_wall
+        assert bool(wall_distances(local_map, point)[0] < 0.01) is is_wall
         add(local_map, np.array([[2.025, 0.025]]), (0.025, 0.025), 0.0)
     cell = cell_at(local_map, 1.025, 0.025)
     assert (cell['hits'], cell['seen']) == (1, 5)
     add(local_map, point, (0.025, 0.025), 0.0)
-    assert local_map.distances(point)[0] < 0.01, 'it is one again'
+    assert wall_distances(local_map, point)[0] < 0.01, 'it is one again'
 
 
 @pytest.mark.parametrize('wall_m', [1.003, 1.013, 1.025, 1.041])
@@ -214,7 +222,7 @@ def test_distances_from_a_wall_are_finer_than_a_cell(wall_m):
     beside = (x / CELL_M - np.floor(x / CELL_M) - 0.5) * CELL_M
     for side in (-1.0, 1.0):
         points = np.column_stack([x.ravel(), wall_m + side * away.ravel()])
-        found = local_map.distances(points)
+        found = wall_distances(local_map, points)
         np.testing.assert_allclose(found, np.hypot(away, beside).ravel(), atol=1e-6)
 
 
@@ -228,7 +236,7 @@ def test_distances_from_a_slanted_noisy_wall(rng, angle):
     add(local_map, wall + rng.normal(0.0, 0.005, (4000, 1)) * normal, angle_rad=angle)
     away = rng.uniform(0.1, 0.4, 300)
     points = (2.0 - away)[:, None] * normal + rng.uniform(-1.0, 1.0, (300, 1)) * tangent
-    off = local_map.distances(points) - away
+    off = wall_distances(local_map, points) - away
     assert np.sqrt(np.mean(off**2)) < 0.01
 
 
@@ -291,7 +299,7 @@ def test_walls_of_an_occupancy_map_are_added(normal):
     walls = cells[walls_of(cells)]
     assert cells['hits'].sum() == cells['seen'].sum() == len(walls) == 60
     np.testing.assert_array_equal(told(cells), nearest(cells))
-    assert (local_map.distances(points[50:-50]) < CELL_M).all()
+    assert (wall_distances(local_map, points[50:-50]) < CELL_M).all()
     np.testing.assert_allclose(walls['cos2'], normal[0] ** 2 - normal[1] ** 2, atol=1e-6)
     np.testing.assert_allclose(walls['sin2'], 0.0, atol=1e-6)
     np.testing.assert_allclose(walls['face_x'], normal[0], atol=1e-6)
@@ -305,7 +313,7 @@ def test_a_corridor_of_a_kilometre_is_mapped():
     for x in range(0, 1001, 20):
         walls = [[x - 15.0, 1.2, x + 15.0, 1.2], [x - 15.0, -1.2, x + 15.0, -1.2]]
         add_scan(local_map, np.array(walls), se2.pose(float(x), 0.0, 0.0))
-    off = local_map.distances(np.array([[1.0, 1.3], [501.0, 1.3], [1001.0, 1.3]]))
+    off = wall_distances(local_map, np.array([[1.0, 1.3], [501.0, 1.3], [1001.0, 1.3]]))
     np.testing.assert_allclose(off, 0.1, atol=0.03)
 
 
@@ -337,10 +345,10 @@ def test_points_that_are_added_stay_as_they_are(rng):
 def test_far_from_all_tiles_there_is_no_wall(rng):
     far = np.array([[1e4, -1e4], [-500.0, 3.0], [5.0, 1e6]])
     local_map = LocalMap()
-    np.testing.assert_array_equal(local_map.distances(far), CELL_M * REACH)
+    np.testing.assert_array_equal(wall_distances(local_map, far), CELL_M * REACH)
     add_scan(local_map, ROOM, AROUND_BOX[0], rng)
-    np.testing.assert_array_equal(local_map.distances(far), CELL_M * REACH)
-    assert local_map.distances(np.empty((0, 2))).shape == (0,)
+    np.testing.assert_array_equal(wall_distances(local_map, far), CELL_M * REACH)
+    assert wall_distances(local_map, np.empty((0, 2))).shape == (0,)
 
 
 @pytest.mark.parametrize('corner', [(0, 0), (-1, -1), (3, -2)])
@@ -356,7 +364,7 @@ def test_walls_at_the_rim_of_a_tile_are_known_in_the_next(corner):
     np.testing.assert_array_equal(told(cells), nearest(cells))
     outwards = np.sign(points - low - 0.5 * edge_m) * [0.2, 0.2]
     expected = np.hypot(0.2, 0.2)
-    np.testing.assert_allclose(local_map.distances(points + outwards), expected, atol=0.015)
+    np.testing.assert_allclose(wall_distances(local_map, points + outwards), expected, atol=0.015)
 
 
 def test_only_tiles_along_the_beams_and_around_the_walls_take_memory():
@@ -383,7 +391,7 @@ def test_a_scan_is_put_where_the_robot_is():
         np.testing.assert_array_equal(local_map.state()[name], by_hand.state()[name])
     looked = local_map.state()['seen'].astype(int) - by_hand.state()['seen']
     assert np.count_nonzero(looked) < 0.01 * np.count_nonzero(by_hand.state()['seen'])
-    assert local_map.distances(points_map[:, :2]).max() < 1.5 * CELL_M
+    assert wall_distances(local_map, points_map[:, :2]).max() < 1.5 * CELL_M
 
 
 def test_kernels_are_what_they_are_in_plain_python(rng, monkeypatch):

@@ -667,18 +667,13 @@ class SavedKeyframes:
         kept = np.flatnonzero(is_saved).tolist()
         own_steps = [_step(steps[k - 1], frames, before, is_saved) for before, k in pairwise(kept)]
         own_edges = [edge for edge in edges if is_saved[edge.a] and is_saved[edge.b]]
-
-        def renumbered(edge: Edge) -> Edge:
-            settled = with_calibration(edge, calibration)
-            return replace(settled, a=int(numbers[edge.a]), b=int(numbers[edge.b]))
-
         return SavedKeyframes(
             [
                 _frame_with_calibration(frames[k], number + 1, calibration)
                 for number, k in enumerate(kept)
             ],
-            [renumbered(edge) for edge in own_steps],
-            [renumbered(edge) for edge in own_edges],
+            [with_calibration(edge, calibration).renumbered(numbers) for edge in own_steps],
+            [with_calibration(edge, calibration).renumbered(numbers) for edge in own_edges],
             [frames[k].scan.stamp_ns for k in kept],
         )
 

@@ -17,6 +17,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.places.place_odds import JOIN_ODDS
 from thinmap_ros.core.se2 import (
+    BOUND_SIGMAS,
     Array,
     carried,
     inverse,
@@ -419,15 +420,13 @@ _LATEST = 20
 # Of a scan that is searched for within all of the largest reach: as many again take twice as long.
 _FAR_POINTS = 45
 
+_MAX_VISITS = 3  # earlier ones with which a keyframe is matched
+_MAX_UNCERTAINTY_M = 8.0  # of a keyframe, beyond which place recognition is needed
+
 
 @dataclass(frozen=True)
 class LoopClosureConfig(Config):
-    """Parameters of loop closure.
-
-    Besides the parameters: a keyframe is matched with at most max_visits earlier visits, within
-    search_sigmas of its uncertainty and max_uncertainty_m, beyond which place recognition is
-    needed.
-    """
+    """Parameters of loop closure."""
 
     search_radius_m: float = parameter(
         2.0,
@@ -458,13 +457,10 @@ class LoopClosureConfig(Config):
         low=10.0,
         high=1e12,
     )
-    max_visits: int = 3
-    search_sigmas: float = 3.0
-    max_uncertainty_m: float = 8.0
 
     def reach_m(self, sigma: float) -> float:
         """Radius (m) in which keyframes are matched, for a position of uncertainty sigma, m."""
-        return self.search_radius_m + min(self.search_sigmas * sigma, self.max_uncertainty_m)
+        return self.search_radius_m + min(BOUND_SIGMAS * sigma, _MAX_UNCERTAINTY_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -621,7 +617,7 @@ class LoopClosure:
             path_m = frames[near[i]].path_m
             if all(abs(path_m - frames[job.j].path_m) > AGAIN_M for job in found):
                 found.append(_Job(near[i], len(frames), covariances[i]))
-        return found[: self._config.max_visits]
+        return found[:_MAX_VISITS]
 
     def _is_earlier(self, j: int, here: Keyframe) -> bool:
         if j == self.keyframes.anchor:  # of another submap: the step is measured again
@@ -797,8 +793,7 @@ class LoopClosure:
         smooth hall, and those beside them do, too: in a ring of 670 m with a hall of which the
         laser saw no wall, four such matches closed the loop 5 m beside its place.
         """
-        reach_m = self._config.search_sigmas * se2.sigma_m(covariance)
-        return reach_m > self._config.max_uncertainty_m
+        return BOUND_SIGMAS * se2.sigma_m(covariance) > _MAX_UNCERTAINTY_M
 
     def _confirm(self, edge: Edge) -> None:
         """Record that the maps of both visits agree here: reuse the keyframe, or add the edge."""

@@ -251,22 +251,11 @@ def _substitute(first: Indices, rows: Indices, blocks: Array, x: Array) -> None:
             x[j, i] /= root[i, i]
 
 
-@dataclass(frozen=True)
-class OptimizerConfig:
-    """Graduated non-convexity of robust edges.
-
-    large: squared error, in sigmas, at which a robust edge has a quarter of its weight; narrowing:
-    factor by which the width of the loss decreases in each iteration; settled: a smaller step (m
-    and rad) ends the optimization, as do max_iterations.
-    """
-
-    large: float = 16.0
-    narrowing: float = 2.0
-    settled: float = 1e-5
-    max_iterations: int = 30
-
-
-_CONFIG = OptimizerConfig()
+# Of graduated non-convexity.
+_LARGE = 16.0  # squared error, in sigmas, at which a robust edge has a quarter of its weight
+_NARROWING = 2.0  # factor by which the width of the loss decreases in each iteration
+_SETTLED = 1e-5  # m and rad: a smaller step ends the optimization
+_MAX_ITERATIONS = 30
 
 # Work of a slice, in products of blocks: 2 ms on a desktop processor. An iteration of a graph of
 # up to 2,000 keyframes is one slice.
@@ -319,6 +308,10 @@ class Edge:
         """The edge between keyframes with other numbers."""
         return replace(self, a=self.a + by_a, b=self.b + by_b)
 
+    def renumbered(self, numbers: Indices) -> 'Edge':
+        """The edge between keyframes with numbers (N,), by those that they had."""
+        return replace(self, a=int(numbers[self.a]), b=int(numbers[self.b]))
+
     def weight_at(self, T_a_b: Array) -> float:
         """The weight, 0 to 1, that the robust loss leaves it at a relative pose (3,)."""
         if not self.robust:
@@ -326,7 +319,7 @@ class Edge:
         off = self.T_a_b - T_a_b
         off[2] = wrap(float(off[2]))
         squared = float(off @ self.information @ off)
-        return float((1.0 + squared / _CONFIG.large) ** -2)
+        return float((1.0 + squared / _LARGE) ** -2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,7 +364,7 @@ class EdgeArrays:
         """The edges as the poses (N, 3) have them, with the robust weights that they have there."""
         e, _, _ = _linearise(poses, self.a, self.b, self.T_a_b)
         squared = _squared(e, self.information)
-        weight = np.where(self.robust, (1.0 + squared / _CONFIG.large) ** -2, 1.0)
+        weight = np.where(self.robust, (1.0 + squared / _LARGE) ** -2, 1.0)
         information = weight[:, None, None] * self.information
         return replace(self, T_a_b=self.T_a_b + e, information=information)
 
@@ -400,11 +393,11 @@ def rounds(poses: Array, edges: EdgeArrays) -> Iterator[Array]:
         equations.pattern  # noqa: B018  # found once, in a slice of its own
         yield poses
     width: float | None = None
-    for _ in range(_CONFIG.max_iterations):
+    for _ in range(_MAX_ITERATIONS):
         e, by_a, by_b = _linearise(poses, edges.a, edges.b, edges.T_a_b)
         squared = _squared(e, edges.information)
-        width = 2.0 * float(squared.max()) if width is None else width / _CONFIG.narrowing
-        scale = np.where(edges.robust, (1.0 + squared / max(width, _CONFIG.large)) ** -2, 1.0)
+        width = 2.0 * float(squared.max()) if width is None else width / _NARROWING
+        scale = np.where(edges.robust, (1.0 + squared / max(width, _LARGE)) ** -2, 1.0)
         gradient, factor = equations.at(e, by_a, by_b, edges.information, scale)
         left = _SLICE - _PER_EDGE * len(edges)
         while not factor.is_complete:
@@ -416,7 +409,7 @@ def rounds(poses: Array, edges: EdgeArrays) -> Iterator[Array]:
         poses[1:] += step
         poses[:, 2] = wrap(poses[:, 2])
         yield poses
-        if width <= _CONFIG.large and np.abs(step).max() < _CONFIG.settled:
+        if width <= _LARGE and np.abs(step).max() < _SETTLED:
             break
 
 

@@ -38,11 +38,6 @@ class Search:
     reach_m: float
     reach_rad: float
 
-    @property
-    def volume(self) -> float:
-        """Volume of all poses that were searched, m m rad."""
-        return 4.0 * self.reach_m**2 * 2.0 * self.reach_rad
-
 
 @dataclass(frozen=True, eq=False)
 class _Look:
@@ -63,7 +58,8 @@ def look_log_ratio(off: Array, covariance: Array, search: Search) -> float:
     turn = math.exp(-0.5 * float(off[2]) ** 2 / float(covariance[2, 2]))
     turn /= math.sqrt(2.0 * math.pi * float(covariance[2, 2]))
     elsewhere = 1.0 - _ALIGNED + _ALIGNED * turn * 2.0 * search.reach_rad
-    likelihood = (1.0 - _CAREFUL) * density * search.volume / elsewhere + _CAREFUL
+    volume = 4.0 * search.reach_m**2 * 2.0 * search.reach_rad  # of all poses that were searched
+    likelihood = (1.0 - _CAREFUL) * density * volume / elsewhere + _CAREFUL
     return min(math.log(_FITS_HERE / _FITS_ELSEWHERE * likelihood), _MOST_OF_A_LOOK)
 
 

@@ -28,24 +28,17 @@ _RANGE_M = 12.0
 _HALF = round(_RANGE_M / _CELL_M) + 1  # cells from a laser to the rim of what its scan shows
 
 
-@dataclass(frozen=True)
-class ReductionConfig:
-    """Which keyframes go.
-
-    nearer_m: a cell is shown as well from a place that is at most so much farther from it; share:
-    of the cells that a keyframe shows, of which later visits show as well, with which it goes.
-    """
-
-    nearer_m: float = 2.0
-    share: float = 0.85
+_NEARER_M = 2.0  # a cell is shown as well from a place that is at most so much farther from it
+# Of the cells that a keyframe shows, of which later visits show as well, with which it goes.
+_SHARE = 0.85
 
 
-def reduced(saved: SavedKeyframes, config: ReductionConfig | None = None) -> SavedKeyframes:
+def reduced(saved: SavedKeyframes) -> SavedKeyframes:
     """The keyframes without those of which later visits show the place as well.
 
     The kept keyframes have their poses, covariances, and a graph of their own.
     """
-    is_kept = needed(saved.frames, config or ReductionConfig())
+    is_kept = needed(saved.frames)
     # Nothing but its edges between visits says where a keyframe is that was come to unknowingly.
     variances = np.array([_variance(inverse(step.information)) for step in saved.steps])
     is_kept[1:] |= variances > _UNKNOWN_M2
@@ -59,13 +52,13 @@ def reduced(saved: SavedKeyframes, config: ReductionConfig | None = None) -> Sav
             replace(frame, scan=replace(frame.scan, stamp_ns=number + 1))
             for number, frame in enumerate(saved.frames[k] for k in kept)
         ],
-        [_renumbered(step, numbers) for step in _kept_steps(saved.steps, is_kept)],
-        [_renumbered(edge, numbers) for edge in _kept_edges(saved, is_kept)],
+        [step.renumbered(numbers) for step in _kept_steps(saved.steps, is_kept)],
+        [edge.renumbered(numbers) for edge in _kept_edges(saved, is_kept)],
         stamps_ns,
     )
 
 
-def needed(frames: Sequence[Keyframe], config: ReductionConfig) -> NDArray[np.bool_]:
+def needed(frames: Sequence[Keyframe]) -> NDArray[np.bool_]:
     """Which keyframes (N,) show what no later visit shows as well.
 
     The first is one of them: the map is relative to it.
@@ -78,7 +71,7 @@ def needed(frames: Sequence[Keyframe], config: ReductionConfig) -> NDArray[np.bo
         while visits and visits[0][0] > path_m + AGAIN_M:
             nearest.add(visits.popleft()[1])
         shown = _Shown.of(frames[k])
-        is_kept[k] = k == 0 or nearest.share(shown, config.nearer_m) < config.share
+        is_kept[k] = k == 0 or nearest.share(shown) < _SHARE
         if is_kept[k]:
             visits.append((path_m, shown))
     return is_kept
@@ -122,12 +115,12 @@ class _Nearest:
         window = self._window(shown)
         window[shown.cells] = np.minimum(window[shown.cells], shown.away_m[shown.cells])
 
-    def share(self, shown: _Shown, nearer_m: float) -> float:
+    def share(self, shown: _Shown) -> float:
         """Share of the cells of a scan that are shown as well; 0 of none."""
         if not shown.cells.any():
             return 0.0
         away_m = self._window(shown)[shown.cells]
-        return float(np.mean(away_m <= shown.away_m[shown.cells] + nearer_m))
+        return float(np.mean(away_m <= shown.away_m[shown.cells] + _NEARER_M))
 
     def _window(self, shown: _Shown) -> NDArray[np.float32]:
         row, col = (shown.row, shown.col) - self._first
@@ -246,7 +239,3 @@ def _fused(one: Edge, other: Edge) -> Edge:
     T[2] = wrap(float(T[2]))
     ratio = max(one.inlier_ratio, other.inlier_ratio)
     return replace(one, T_a_b=T, information=information, inlier_ratio=ratio)
-
-
-def _renumbered(edge: Edge, numbers: NDArray[np.int64]) -> Edge:
-    return replace(edge, a=int(numbers[edge.a]), b=int(numbers[edge.b]))

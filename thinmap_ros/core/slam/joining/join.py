@@ -12,7 +12,7 @@ from thinmap_ros.core.grid.correction import add_scan_outside
 from thinmap_ros.core.grid.edits import Erasure
 from thinmap_ros.core.grid.moved import MapMotion, overlaid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.places.piece import DRIFT
+from thinmap_ros.core.places.piece import MATCH_M, MATCH_RAD
 from thinmap_ros.core.places.recognition import PieceHypothesis, Placement, Recognition, decide
 from thinmap_ros.core.places.views import View
 from thinmap_ros.core.se2 import Array, inverse, propagated_covariance, rotated_covariance
@@ -35,7 +35,7 @@ from thinmap_ros.core.topology.topology import Ids, TopologyBuilder, join_topolo
 _CONFIG = LoopClosureConfig()
 
 # How far the place of a view is off at its other keyframes.
-_PRIOR = np.diag(np.square([DRIFT.match_m, DRIFT.match_m, DRIFT.match_rad]))
+_PRIOR = np.diag(np.square([MATCH_M, MATCH_M, MATCH_RAD]))
 
 # Less than of a loop: the place is known. With 0.75, errors between real halves were a fifth more.
 _MIN_INLIER_RATIO = 0.7
@@ -53,7 +53,8 @@ def placed_keyframes(
         around = [view for view in placed if view.frames[0] <= k <= view.frames[2]]
         if around:
             view = min(around, key=lambda each: abs(each.frames[1] - k))
-            yield k, _pose_by(view, hypothesis, frame)
+            T_view_frame = se2.between(view.T_piece_view, frame.T_map_base)
+            yield k, se2.compose(hypothesis.poses[view.number], T_view_frame)
 
 
 def match_keyframes(
@@ -83,11 +84,6 @@ def match_keyframes(
         T_j_base = se2.between(poses[j], base)
         information = inverse(rotated_covariance(covariance, float(T_j_base[2])))
         yield Edge(j, k, se2.compose(T_j_base, match.pose), information, robust=True)
-
-
-def _pose_by(view: View, hypothesis: PieceHypothesis, frame: Keyframe) -> Array:
-    T_view_frame = se2.between(view.T_piece_view, frame.T_map_base)
-    return se2.compose(hypothesis.poses[view.number], T_view_frame)
 
 
 def _nearest(poses: Array, T: Array) -> int | None:

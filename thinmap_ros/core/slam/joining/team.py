@@ -105,7 +105,10 @@ class TeamGraph:
         for group in _groups(names, linked):
             if len(group) > 1:
                 poses |= self._optimized(group, start)
-        present = {name: _place_of_last(bent, maps[name].poses) for name, bent in poses.items()}
+        present = {
+            name: se2.compose(bent[-1], se2.invert(maps[name].poses[-1]))  # by the last keyframe
+            for name, bent in poses.items()
+        }
         self._last = Bend(poses, present, places)
         return self._last
 
@@ -182,11 +185,6 @@ def _are_near(T_a: Array, T_b: Array) -> bool:
     """Whether two places (3,) of a map are one, which was corrected at most."""
     x, y, turn = np.abs(se2.between(T_a, T_b)).tolist()
     return bool(max(x, y) < SAME_M and turn < SAME_RAD)
-
-
-def _place_of_last(bent: Array, own: Array) -> Array:
-    """Pose (3,) of a map in the world, by the last of its keyframes (N, 3)."""
-    return se2.compose(bent[-1], se2.invert(own[-1]))
 
 
 def _are_connected(count: int, edges: Sequence[Edge]) -> bool:
@@ -452,16 +450,6 @@ class Team:
         self._searched: dict[frozenset[str], tuple[RobotMap, RobotMap]] = {}  # the oldest first
         self._separate: set[str] = set()
         self._reference = ''
-
-    def receive(
-        self,
-        name: str,
-        patch: GridPatch,
-        graph: TopologicalMap | None,
-        keyframes: RobotKeyframes | None = None,
-    ) -> None:
-        """Take the newest map of a robot."""
-        self.maps[name] = RobotMap(patch, graph, keyframes)
 
     def give(self, a: str, b: str, T_a_b: Array) -> list[MapLink]:
         """Join map b to map a, or to WORLD, at a pose (3,) that a person gives.

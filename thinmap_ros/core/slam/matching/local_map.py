@@ -131,10 +131,6 @@ class LocalMap:
         self._reach(ends_map, se2.transform_points(T_map_base, laser[None])[0])
         _add(points, laser, T_map_base, self.lattice, MIN_HIT_RATIO)
 
-    def distances(self, points_map: Array) -> Array:
-        """Distances (N,) of points (N, 2), map frame, from walls, m; at most the reach."""
-        return _distances(points_map, self.lattice)
-
     def add_walls(self, points_map: Array, normal: Array) -> None:
         """Add points (N, 2), map frame, on walls of an occupancy map with a normal (2,)."""
         if len(points_map):
@@ -303,19 +299,6 @@ def off_wall(
     hits = int(lattice.pool[slot, row & TILE_MASK, col & TILE_MASK]['hits'])
     wall = lattice.surfaces[slot, row & TILE_MASK, col & TILE_MASK]
     return is_seen, True, x - col - wall['x'], y - row - wall['y'], hits, wall
-
-
-@kernel
-def _distances(points: Array, lattice: LocalMapView) -> Array:
-    """Distances (N,) of points (N, 2) from the means of their nearest walls, m."""
-    found = np.full(len(points), lattice.reach * lattice.cell_m)
-    for i in range(len(points)):
-        x = points[i, 0] / lattice.cell_m - lattice.first_col
-        y = points[i, 1] / lattice.cell_m - lattice.first_row
-        _, is_near, dx, dy, _, _ = off_wall(lattice, x, y)
-        if is_near:
-            found[i] = min(found[i], lattice.cell_m * math.hypot(dx, dy))
-    return found
 
 
 @kernel

@@ -22,7 +22,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.tiles import NO_TILE
-from thinmap_ros.core.se2 import Array, inverse, rotated_covariance
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, inverse, rotated_covariance
 from thinmap_ros.core.slam.matching.local_map import (
     TILE_MASK,
     LocalMap,
@@ -37,8 +37,6 @@ from thinmap_ros.jit import inlined, kernel
 SLIP_SIGMAS = 10.0  # scale of the prior's loss: beyond it, wheel slip is more likely than an error
 
 FITS_SIGMAS = 2.0  # largest distance of an inlier from its wall
-
-_OFF_SIGMAS = 3.0  # smallest distance of a point that contradicts the map
 
 _HALF_WALL = 5.0  # extent of a wall to either side of a cell's hits, in cells
 
@@ -134,7 +132,7 @@ def evaluate(
         is_beyond = dx * dx + dy * dy > _HALF_WALL * _HALF_WALL
         if squared < FITS_SIGMAS * FITS_SIGMAS and not is_beyond:
             sums[2] += weight
-        elif squared > _OFF_SIGMAS * _OFF_SIGMAS or is_beyond:
+        elif squared > BOUND_SIGMAS * BOUND_SIGMAS or is_beyond:
             sums[3] += weight * is_seen
         w /= (1.0 + squared / (width * width)) * sigma * sigma
         ex = ex * cell_m
@@ -343,7 +341,17 @@ def search(
 
 MIN_POINTS = 10  # of a scan that is matched
 
-_TURNED_NODES = 20_000  # of a search of all headings
+_NODES = 1000  # of a search, at the most
+_TURNED_NODES = 20_000  # of one of all headings
+
+# Of convergence: within three sigmas of a prior that is narrower, no pose is searched.
+_BASIN_M = 0.3
+_BASIN_RAD = 0.15
+
+
+def _reach(covariance: Array) -> Array:
+    """Largest error (3,) of a pose with a covariance (3, 3), m, m, rad."""
+    return BOUND_SIGMAS * np.sqrt(np.diag(covariance))
 
 
 @dataclass(frozen=True)
@@ -351,9 +359,8 @@ class MatchingConfig(Config):
     """Parameters of scan matching.
 
     Besides the parameters: wheel_slip (m, m, rad), standard deviations of a pose after wheels have
-    slipped: how far is searched then; poses are searched within search_sigmas of the prior and
-    max_search (m, m, rad) to either side, with search_points points and at most search_nodes nodes;
-    basin (m, rad) of convergence, compared with these sigmas of the prior.
+    slipped: how far is searched then; poses are searched within three sigmas of the prior and
+    max_search (m, m, rad) to either side, with search_points points.
     """
 
     noise_m: float = parameter(
@@ -379,16 +386,13 @@ class MatchingConfig(Config):
         high=1.0,
     )
     wheel_slip: tuple[float, float, float] = (0.2, 0.2, 0.15)
-    search_sigmas: float = 3.0
     max_search: tuple[float, float, float] = (3.0, 3.0, 1.5)
     search_points: int = 90
-    search_nodes: int = 1000
-    basin: tuple[float, float] = (0.3, 0.15)
 
     def is_wide(self, covariance: Array) -> bool:
         """Whether a prior with this covariance (3, 3) reaches beyond the basin of convergence."""
-        reach = self.search_sigmas * np.sqrt(np.diag(covariance))
-        return bool(reach[:2].max() > self.basin[0] or reach[2] > self.basin[1])
+        reach = _reach(covariance)
+        return bool(reach[:2].max() > _BASIN_M or reach[2] > _BASIN_RAD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,16 +446,13 @@ class Matcher:
         scan = weighted_points(points, T_base_laser, local_map.config.resolution_m)
         information = inverse(covariance)
         match = self._refined(scan, local_map, prior, prior, information)
-        reach = self.config.search_sigmas * np.sqrt(np.diag(covariance))
         fits_badly = match.inlier_ratio < self.config.min_inlier_ratio
         if not fits_badly and not self.config.is_wide(covariance):
             return match
         if fits_badly:  # wheels may have slipped
-            reach = self.config.search_sigmas * np.sqrt(
-                np.diag(covariance) + np.square(self.config.wheel_slip)
-            )
-        half = np.minimum(reach, self.config.max_search)
-        nodes = self.config.search_nodes
+            covariance = covariance + np.diag(np.square(self.config.wheel_slip))
+        half = self.searched(covariance)
+        nodes = _NODES
         if is_turned:
             half[2] = math.pi
             nodes = _TURNED_NODES
@@ -470,8 +471,7 @@ class Matcher:
 
     def searched(self, covariance: Array) -> Array:
         """Half of the window (3,) that is searched around a prior with a covariance (3, 3)."""
-        reach = self.config.search_sigmas * np.sqrt(np.diag(covariance))
-        return np.minimum(reach, self.config.max_search)
+        return np.minimum(_reach(covariance), self.config.max_search)
 
     @property
     def _noise(self) -> tuple[float, float]:
