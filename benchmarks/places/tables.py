@@ -20,7 +20,7 @@ from benchmarks.places.pieces import (
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.places.piece import MapPiece, drawn_scans
 from thinmap_ros.core.places.recognition import JoinDecision, Recognition, decide, recognize
-from thinmap_ros.core.slam.joining.join import JoinConfig, join
+from thinmap_ros.core.slam.joining.join import join
 from thinmap_ros.core.slam.joining.pieces import SlamPiece
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.evaluation.outcome import Table
@@ -171,7 +171,7 @@ def _joined_row(known: RecordedPiece, query: RecordedPiece) -> list[Any]:
         return [f'{known.name} + {query.name}', *[None] * 11]
     is_simulated = not known.name.startswith(LOGS)
     grid = replace(PAPER_GRID, no_return_clear_range_m=LaserScannerConfig().range_max_m)
-    merged = join(first, second, decision.placement, JoinConfig(grid if is_simulated else None))
+    merged = join(first, second, decision.placement, grid if is_simulated else None)
     ended = time.process_time()
     count = len(known.frames)
     poses = merged.piece.poses

@@ -58,3 +58,27 @@ def test_variances_are_the_eigenvalues_of_a_covariance(a, b, c):
     covariance = root @ root.T
     expected = np.linalg.eigvalsh(covariance)
     np.testing.assert_allclose(se2.variances(covariance), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_many_poses_compose_as_each_does():
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [-4.0, 0.5, -2.0]])
+    others = np.array([[1.0, 0.0, 0.5], [0.2, -0.3, 1.0], [2.0, 1.0, -3.0]])
+    expected = [se2.compose(a, b) for a, b in zip(poses, others, strict=True)]
+    np.testing.assert_allclose(se2.compose_each(poses, others), expected, atol=1e-12)
+    by_one = [se2.compose(a, others[0]) for a in poses]
+    np.testing.assert_allclose(se2.compose_each(poses, others[:1]), by_one, atol=1e-12)
+
+
+def test_of_poses_that_are_near_each_other_the_first_is_kept():
+    poses = np.array(
+        [
+            [0.0, 0.0, math.pi],
+            [0.4, 0.4, -math.pi + 0.05],  # near, across half a turn
+            [0.4, 0.6, math.pi],  # farther in y
+            [0.0, 0.0, 3.0],  # turned
+            [0.1, 0.1, 3.0],
+        ]
+    )
+    assert se2.distinct(poses, 0.5, 0.1, 9) == [0, 2, 3]
+    assert se2.distinct(poses, 0.5, 0.1, 2) == [0, 2]
+    assert se2.distinct(poses[:0], 0.5, 0.1, 2) == []

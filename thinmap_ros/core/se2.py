@@ -119,6 +119,24 @@ def are_apart(T_a: Array, T_b: Array, metres: float, radians: float) -> bool:
     return math.hypot(x, y) > metres or abs(turn) > radians
 
 
+def distinct(poses: Array, apart_m: float, apart_rad: float, most: int) -> list[int]:
+    """Indices of the poses (N, 3) that are apart from all before them, at most so many.
+
+    In x or in y, or in their heading.
+    """
+    kept: list[int] = []
+    at = np.empty((most, 3))
+    for k, T in enumerate(poses):
+        off = np.abs(at[: len(kept)] - T)
+        near = (off[:, 0] <= apart_m) & (off[:, 1] <= apart_m)
+        if not (np.abs(wrap(off[near, 2])) <= apart_rad).any():
+            at[len(kept)] = T
+            kept.append(k)
+            if len(kept) == most:
+                break
+    return kept
+
+
 def bearing(a: Sequence[float] | Array, b: Sequence[float] | Array) -> float:
     """Direction of a point (x, y, ...) seen from another, rad."""
     return math.atan2(b[1] - a[1], b[0] - a[0])

@@ -38,10 +38,6 @@ class _Span(NamedTuple):
         """Number of rows or columns."""
         return self.end - self.first
 
-    def covers(self, other: '_Span') -> bool:
-        """Whether another span lies in this one."""
-        return self.first <= other.first and other.end <= self.end
-
     def covering(self, other: '_Span') -> '_Span':
         """The smallest span that holds this one, unless it is empty, and another."""
         if self.length == 0:
@@ -103,14 +99,17 @@ class TileStore:
         A side that grows gets spare room, the others do not: a long building is not wide.
         Raises InputError if the directory would exceed that of any building: then a pose is wrong.
         """
-        rows = _Span(row_a, row_b + 1)
-        cols = _Span(col_a, col_b + 1)
-        height, width = self._spans()
-        if height.covers(rows) and width.covers(cols):
+        end_row = self.first_row + self.directory.shape[0]
+        end_col = self.first_col + self.directory.shape[1]
+        is_inside = self.first_row <= row_a and self.first_col <= col_a
+        if is_inside and row_b < end_row and col_b < end_col:
             return
         farthest = max(-row_a, row_b, -col_a, col_b)
         if farthest > MAX_TILE_INDEX:
             raise InputError(f'map {farthest} tiles from its origin: expected {MAX_TILE_INDEX}')
+        rows = _Span(row_a, row_b + 1)
+        cols = _Span(col_a, col_b + 1)
+        height, width = self._spans()
         taller = height.grown_to(rows)
         wider = width.grown_to(cols)
         limit = self._max_extent_tiles

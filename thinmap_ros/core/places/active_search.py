@@ -11,7 +11,6 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_CELL
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.places.global_localizer import LIKELY, Result
-from thinmap_ros.core.places.hypotheses import distinct_indices
 from thinmap_ros.core.places.place_database import (
     Bytes,
     GlobalLocalizationConfig,
@@ -190,7 +189,7 @@ def _distinct(T_odom_base: Array, starts: Array, weights: Array) -> tuple[Array,
     """
     order = np.argsort(-weights, kind='stable')
     robots = np.array([se2.compose(T, T_odom_base) for T in starts[order]])
-    kept = order[distinct_indices(robots, _SAME_M, _SAME_RAD, _MAX_PLACES)]
+    kept = order[se2.distinct(robots, _SAME_M, _SAME_RAD, _MAX_PLACES)]
     return starts[kept], weights[kept]
 
 

@@ -156,15 +156,8 @@ def _best_of_blocks(scores: Array, block: int) -> tuple[Array, NDArray[np.int64]
 
 def _distinct(peaks: Array, count: int) -> Array:
     """The best peaks (N, 4), each of another place."""
-    kept = peaks[:0]
-    for peak in peaks[np.argsort(-peaks[:, 0], kind='stable')]:
-        is_near = (np.abs(kept[:, 1:3] - peak[1:3]) <= SAME_M).all(axis=1)
-        is_alike = np.abs(se2.wrap(kept[:, 3] - peak[3])) <= _SAME_TURN_RAD
-        if not (is_near & is_alike).any():
-            kept = np.vstack([kept, peak])
-        if len(kept) == count:
-            break
-    return kept
+    peaks = peaks[np.argsort(-peaks[:, 0], kind='stable')]
+    return peaks[se2.distinct(peaks[:, 1:], SAME_M, _SAME_TURN_RAD, count)]
 
 
 # Share of the walls that agree at the right place, at least. Measured: at right places of homes and

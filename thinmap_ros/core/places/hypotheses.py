@@ -55,7 +55,7 @@ def candidates(
     counts += SILENT_COUNTS * silent
     good = counts >= counts.max() - _BELOW_BEST * len(seen.ranges_m)
     poses = poses[good][np.argsort(-counts[good], kind='stable')]
-    found = poses[distinct_indices(poses, _SAME_M, _SAME_RAD, _MAX_HYPOTHESES)]
+    found = poses[se2.distinct(poses, _SAME_M, _SAME_RAD, _MAX_HYPOTHESES)]
     return found, complete and len(found) < _MAX_HYPOTHESES
 
 
@@ -74,22 +74,6 @@ def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> 
     order = np.argsort(-(counts + rng.random(len(counts))), kind='stable')[:_MAX_SPOTS]
     turns = headings[order] * (2.0 * np.pi / DIRECTIONS)
     return np.column_stack([places.spots[spots[order]], turns]), len(counts) <= _MAX_SPOTS
-
-
-def distinct_indices(poses: Array, apart_m: float, apart_rad: float, most: int) -> list[int]:
-    """Indices of the first of each group of poses (N, 3) near each other, at most so many."""
-    kept: list[int] = []
-    at = np.empty((most, 3))
-    for k, T in enumerate(poses):
-        others = at[: len(kept)]
-        near = (np.abs(others[:, 0] - T[0]) < apart_m) & (np.abs(others[:, 1] - T[1]) < apart_m)
-        turned = np.abs(se2.wrap(others[near, 2] - T[2]))
-        if not (turned < apart_rad).any():
-            at[len(kept)] = T
-            kept.append(k)
-            if len(kept) == most:
-                break
-    return kept
 
 
 def missed_beams(judged: tuple[Array, Array], beams: int) -> Array:
@@ -299,7 +283,7 @@ class Hypotheses:
         logs = self.log_weights
         order = self.order()
         order = order[logs[order] > _MIN_LOG_WEIGHT]
-        kept = order[distinct_indices(self.poses[order], _SAME_M, _SAME_RAD, _MAX_HYPOTHESES)]
+        kept = order[se2.distinct(self.poses[order], _SAME_M, _SAME_RAD, _MAX_HYPOTHESES)]
         if len(kept) == len(self) == int(self.owners.max(initial=-1)) + 1:
             return
         renumbered = np.full(len(self.poses), -1)

@@ -15,7 +15,7 @@ from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.places.views import PlacedScan, View, views_of
 from thinmap_ros.core.places.wall_field import WallField
 from thinmap_ros.core.scan import NO_RETURN_CLEAR_RANGE_M, Scan
-from thinmap_ros.core.se2 import BOUND_SIGMAS, Array, wrap
+from thinmap_ros.core.se2 import BOUND_SIGMAS, Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.jit import inlined, kernel
 
@@ -259,16 +259,9 @@ class ConstellationIndex:
 def _peaks(poses: Array, weights: Array) -> Array:
     """Weighted means (N, 3) of the bins of poses that have the most votes with their neighbours."""
     votes, means = _counted(poses, weights)
-    kept = np.empty((0, 3))
-    for T in means[np.argsort(-votes, kind='stable')]:
-        off = np.abs(kept - T)
-        turn = np.abs(wrap(off[:, 2])) * _HEADING_BINS / (2.0 * math.pi)
-        if np.any((off[:, :2].max(axis=1) <= SAME_M) & (turn <= 2.0)):
-            continue
-        kept = np.vstack([kept, T])
-        if len(kept) == _CANDIDATES:
-            break
-    return kept
+    means = means[np.argsort(-votes, kind='stable')]
+    two_bins = 4.0 * math.pi / _HEADING_BINS
+    return means[se2.distinct(means, SAME_M, two_bins, _CANDIDATES)]
 
 
 def _counted(poses: Array, weights: Array) -> tuple[Array, Array]:
@@ -358,19 +351,9 @@ class MapPiece:
         if not len(poses):
             return poses
         rough, fits = self.field.refined_widely(view, poses)
-        kept = _distinct(rough[np.argsort(-fits, kind='stable')], count)
-        return np.array([self.field.refined(view, T)[0] for T in kept])
-
-
-def _distinct(poses: Array, count: int) -> Array:
-    """The first poses (N, 3) that differ from all before them."""
-    kept = poses[:0]
-    for T in poses:
-        if not are_same(kept, T).any():
-            kept = np.vstack([kept, T])
-        if len(kept) == count:
-            break
-    return kept
+        rough = rough[np.argsort(-fits, kind='stable')]
+        kept = se2.distinct(rough, SAME_M, SAME_RAD, count)
+        return np.array([self.field.refined(view, T)[0] for T in rough[kept]])
 
 
 # Of drawn scans.

@@ -45,14 +45,6 @@ class Reference(NamedTuple):
     variance: float
     systematic: Systematic
 
-    def turn(self, parameters: Array) -> float:
-        """Turn (rad) of the direction with parameters (N, 4), by the number of spans."""
-        return float(self.systematic.change(parameters)[2])
-
-    def calibrated(self, parameters: Array) -> 'Reference':
-        """The reference of the direction after that turn."""
-        return self._replace(systematic=self.systematic.calibrated(parameters))
-
     def mean(self, other: 'Reference', weight: float) -> 'Reference':
         """Weighted mean with another one; weight: of the other, 0 to 1."""
         a = self.systematic
@@ -123,8 +115,9 @@ class WallCompass:
     def calibrate(self, parameters: Array) -> None:
         """Turn the main direction as parameters (N, 4) of the calibration have it."""
         if self._reference is not None:
-            self._turned += self._reference.turn(parameters)
-            self._reference = self._reference.calibrated(parameters)
+            share = self._reference.systematic
+            self._turned += float(share.change(parameters)[2])
+            self._reference = self._reference._replace(systematic=share.calibrated(parameters))
 
     def read(self, lines: Lines, yaw: float, variance: float) -> Heading | None:
         """Measure the heading of a scan by its lines, given a prior yaw (rad) and its variance.

@@ -7,11 +7,11 @@ from support.driven_pieces import driven_piece, true_transform
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.places.recognition import recognize
-from thinmap_ros.core.slam.joining.join import JoinConfig, join, match_keyframes, placed_keyframes
+from thinmap_ros.core.slam.joining.join import join, match_keyframes, placed_keyframes
 from thinmap_ros.core.slam.joining.pieces import SlamPiece
 from thinmap_ros.core.topology.graph import NodeKind
 
-CONFIG = JoinConfig(OccupancyConfig(no_return_clear_range_m=8.0))
+CONFIG = OccupancyConfig(no_return_clear_range_m=8.0)
 DRIFT = 0.01  # m of error per metre of path
 
 

@@ -29,7 +29,6 @@ from thinmap_ros.core.slam.joining.pieces import GrowingPiece, SlamPiece
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import MIN_POINTS, Matcher, MatchingConfig
 from thinmap_ros.core.stage import Apart, Join
-from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.topology import Ids, TopologyBuilder, join_topologies, moved_map
 
 _CONFIG = LoopClosureConfig()
@@ -295,16 +294,9 @@ def rigid_transform(first: SlamPiece, second: SlamPiece, T: Array, links: Sequen
 def refined(first: SlamPiece, second: SlamPiece, T: Array) -> tuple[Array, int]:
     """Pose T_first_second (3,) near a given one by matches of all keyframes, and their number."""
     priors = [(k, se2.compose(T, own)) for k, own in enumerate(second.poses)]
-    near = [(k, prior) for k, prior in priors if _is_near(first, prior)]
+    near = [(k, prior) for k, prior in priors if first.patch.contains(prior[None, :2])[0]]
     links = rigid_links(first, second, near)
     return rigid_transform(first, second, T, links), len(links)
-
-
-def _is_near(piece: SlamPiece, T: Array) -> bool:
-    """Whether the known cells of a piece enclose a pose (3,)."""
-    row, col = piece.patch.frame.cells_of(T[None, :2])[0].tolist()
-    rows, cols = piece.patch.shape
-    return bool(0 <= row < rows and 0 <= col < cols)
 
 
 def _between_bodies(link: Edge, first: SlamPiece, second: SlamPiece) -> Edge:
@@ -315,14 +307,6 @@ def _between_bodies(link: Edge, first: SlamPiece, second: SlamPiece) -> Edge:
     covariance = rotated_covariance(inverse(link.information), float(T_first_a[2]))
     covariance = propagated_covariance(covariance, T_first_second[:2] - T_first_b[:2])
     return Edge(0, 1, T_first_second, inverse(covariance), robust=True)
-
-
-@dataclass(frozen=True, eq=False)
-class JoinConfig:
-    """Configurations of the joined grid and topological map."""
-
-    grid: OccupancyConfig | None = None
-    topology: TopologyConfig | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,25 +328,29 @@ class JoinedMap:
 
 
 def join(
-    first: SlamPiece, second: SlamPiece, placement: Placement, config: JoinConfig | None = None
+    first: SlamPiece, second: SlamPiece, placement: Placement, grid: OccupancyConfig | None = None
 ) -> JoinedMap:
     """Join two pieces, given where the second lies in the first: one graph, grid and topology.
 
+    grid: configuration of the joined one.
     If both have edges, all keyframes are optimized together, and the grid is rendered from their
     scans. Otherwise both stay rigid.
     """
-    config = config or JoinConfig()
     is_rigid = first.is_rigid or second.is_rigid
     priors = list(placed_keyframes(second.frames, second.places.views, placement.hypothesis))
     if is_rigid:
         links = rigid_links(first, second, priors)
-        return _joined_rigidly(first, second, placement.T_map_piece, links, config)
+        return _joined_rigidly(first, second, placement.T_map_piece, links, grid)
     links = found(match_keyframes(first.frames, second.frames, priors))
-    return _optimized_together(first, second, placement.T_map_piece, links, config)
+    return _optimized_together(first, second, placement.T_map_piece, links, grid)
 
 
 def _optimized_together(
-    first: SlamPiece, second: SlamPiece, T: Array, links: Sequence[Edge], config: JoinConfig
+    first: SlamPiece,
+    second: SlamPiece,
+    T: Array,
+    links: Sequence[Edge],
+    config: OccupancyConfig | None,
 ) -> JoinedMap:
     count = len(first.frames)
     poses = np.vstack([first.poses, [se2.compose(T, own) for own in second.poses]])
@@ -375,7 +363,7 @@ def _optimized_together(
     frames = _at(frames, poses)
     motions = (MapMotion(first.poses, poses[:count]), MapMotion(second.poses, poses[count:]))
     erased = _erased(first, second, motions)
-    grid = OccupancyGrid(config.grid, first.patch.frame)
+    grid = OccupancyGrid(config, first.patch.frame)
     for frame in frames:  # with its scan, but for what was erased after that was made
         later = [each.corners for each in erased if each.stamp_ns >= frame.scan.stamp_ns]
         add_scan_outside(grid, frame.scan, frame.T_map_base, later)
@@ -385,7 +373,6 @@ def _optimized_together(
         moved_map(first.graph, first.poses, poses[:count]),
         moved_map(second.graph, second.poses, poses[count:]),
         first.next_id,
-        config.topology,
     )
     edges = _all_edges(first, second, links)
     piece = SlamPiece(frames, edges, patch, topology.map, topology.next_id, erased)
@@ -435,7 +422,11 @@ def _at(frames: Sequence[Keyframe], poses: Array) -> list[Keyframe]:
 
 
 def _joined_rigidly(
-    first: SlamPiece, second: SlamPiece, T: Array, links: Sequence[Edge], config: JoinConfig
+    first: SlamPiece,
+    second: SlamPiece,
+    T: Array,
+    links: Sequence[Edge],
+    config: OccupancyConfig | None,
 ) -> JoinedMap:
     T = rigid_transform(first, second, T, links)
     motions = (MapMotion.rigid(np.zeros(3)), MapMotion.rigid(T))
@@ -445,8 +436,7 @@ def _joined_rigidly(
         moved_map(first.graph, motions[0].before, motions[0].after),
         moved_map(second.graph, motions[1].before, motions[1].after),
         first.next_id,
-        config.topology,
     )
     piece = SlamPiece.of_bare_map(patch, topology.map, topology.next_id)
-    grid = OccupancyGrid.from_patch(patch, config.grid)
+    grid = OccupancyGrid.from_patch(patch, config)
     return JoinedMap(piece, grid, topology, T, ids, len(links), motions)

@@ -378,8 +378,7 @@ def _lies_in(graph: TopologicalMap, patch: GridPatch) -> bool:
     """Whether all nodes and paths of a graph lie in the rectangle of a map."""
     points = [np.array([node.position for node in graph.nodes.values()]).reshape(-1, 2)]
     points += [edge.path for edge in graph.edges.values()]
-    cells = patch.frame.cells_of(np.vstack(points))
-    return bool(((cells >= 0) & (cells < patch.shape)).all())
+    return bool(patch.contains(np.vstack(points)).all())
 
 
 @dataclass(frozen=True, eq=False)
