@@ -417,6 +417,9 @@ def with_newest(scans: tuple[Scan, ...], scan: Scan) -> tuple[Scan, ...]:
     return (*others, scan)
 
 
+SURE_REACH = 0.9  # of range_max: a farther surface may have gone out of range
+
+
 def is_most_missed(scan: Scan, missed: int) -> bool:
     """Whether a scan has no return from most of the surfaces in range: `missed` beams have none.
 

@@ -11,6 +11,7 @@ from thinmap_ros.core.scan import (
     BODY_TOLERANCE_M,
     MIN_HITS,
     NO_RETURN_CLEAR_RANGE_M,
+    SURE_REACH,
     Scan,
     is_most_missed,
 )
@@ -79,7 +80,6 @@ FROZEN = 'the same ranges while the robot moves'
 _MOVED = 0.02  # m or rad with which the ranges of any laser must have changed
 _DRIFT_PER_S = 0.02  # m or rad: a slower motion is drift of the odometry
 NO_RETURNS = 'no returns from surfaces that it has just measured'
-_MOVED_REACH = 0.9  # of range_max: a farther surface may have gone out of range
 _CONFIRMED_NS = 2 * SECOND_NS
 
 
@@ -350,7 +350,7 @@ def _are_missed(surfaces: Array, scan: Scan, T_odom_base: Array) -> bool:
     T_odom_laser = se2.compose(T_odom_base, scan.T_base_laser)
     local = se2.transform_points(se2.invert(T_odom_laser), surfaces)
     ranges = np.hypot(local[:, 0], local[:, 1])
-    near = ranges < _MOVED_REACH * scan.range_max_m
+    near = ranges < SURE_REACH * scan.range_max_m
     bearings = np.arctan2(local[near, 1], local[near, 0]) - scan.angle_min_rad
     step = abs(scan.angle_increment_rad)
     ahead = bearings if scan.angle_increment_rad > 0.0 else -bearings

@@ -14,7 +14,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter, parameters_of, part
 from thinmap_ros.core.ekf_slam.features import LineConfig, odometry_slip
 from thinmap_ros.core.grid.tiles import NO_TILE
-from thinmap_ros.core.scan import Scan, few_beams_reason, is_most_missed
+from thinmap_ros.core.scan import SURE_REACH, Scan, few_beams_reason, is_most_missed
 from thinmap_ros.core.se2 import (
     BOUND_SIGMAS,
     Array,
@@ -94,8 +94,6 @@ _NO_RETURNS = 'no returns from walls of the map'
 # Of the walls of the local map that beams would hit, or have passed through.
 _START_LOOK_M = 1.0  # between two looks that judge a given pose
 
-_REACH = 0.9  # of range_max: a farther wall may be out of range
-
 _STEP_CELLS = 0.5
 
 _BETWEEN_CELLS = 2.0  # a way may end in a cell whose offset is longer by less than this
@@ -114,7 +112,7 @@ def misses_walls(scan: Scan, local_map: LocalMap, T_map_base: Array, covariance:
 
     T_map_base (3,) with covariance (3, 3), map frame.
     """
-    reach_m = _REACH * scan.range_max_m - BOUND_SIGMAS * se2.sigma_m(covariance)
+    reach_m = SURE_REACH * scan.range_max_m - BOUND_SIGMAS * se2.sigma_m(covariance)
     if local_map.is_empty or not reach_m > 0.0:
         return False
     T_map_laser = se2.compose(T_map_base, scan.T_base_laser)

@@ -13,19 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.places.views import passed_cells
+from thinmap_ros.core.places.views import LATTICE_M, RANGE_M, passed_cells
 from thinmap_ros.core.se2 import Array, inverse, propagated_covariance, rotated_covariance, wrap
 from thinmap_ros.core.slam.graph.keyframes import Keyframe, SavedKeyframes
 from thinmap_ros.core.slam.graph.loop_closure import AGAIN_M
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.odometry import CHI2
 
-_CELL_M = 0.2
-
 # Longer beams of 1 degree are more than a cell apart: by chance, others miss what they show.
-_RANGE_M = 12.0
-
-_HALF = round(_RANGE_M / _CELL_M) + 1  # cells from a laser to the rim of what its scan shows
+_HALF = round(RANGE_M / LATTICE_M) + 1  # cells from a laser to the rim of what its scan shows
 
 
 _NEARER_M = 2.0  # a cell is shown as well from a place that is at most so much farther from it
@@ -91,11 +87,11 @@ class _Shown:
         """Those of a keyframe, in the map frame."""
         scan = frame.scan
         x, y, yaw = se2.compose(frame.T_map_base, scan.T_base_laser).tolist()
-        col, row = np.floor(np.array([x, y]) / _CELL_M).astype(np.int64).tolist()
-        at = np.array([x - col * _CELL_M, y - row * _CELL_M, yaw])
-        ends = np.where(scan.hit, np.minimum(scan.ranges_m, _RANGE_M), np.nan)
-        cells = passed_cells(at[None], ends[None], scan.angles_rad[None], _CELL_M, _HALF)
-        centres = (np.arange(2 * _HALF) - _HALF + 0.5) * _CELL_M
+        col, row = np.floor(np.array([x, y]) / LATTICE_M).astype(np.int64).tolist()
+        at = np.array([x - col * LATTICE_M, y - row * LATTICE_M, yaw])
+        ends = np.where(scan.hit, np.minimum(scan.ranges_m, RANGE_M), np.nan)
+        cells = passed_cells(at[None], ends[None], scan.angles_rad[None], LATTICE_M, _HALF)
+        centres = (np.arange(2 * _HALF) - _HALF + 0.5) * LATTICE_M
         away_m = np.hypot(centres[None, :] - at[0], centres[:, None] - at[1])
         return _Shown(row - _HALF, col - _HALF, cells, away_m)
 
@@ -105,7 +101,7 @@ class _Nearest:
 
     def __init__(self, frames: Sequence[Keyframe]) -> None:
         places = np.array([se2.compose(f.T_map_base, f.scan.T_base_laser)[:2] for f in frames])
-        cells = np.floor(places / _CELL_M).astype(np.int64)[:, ::-1]
+        cells = np.floor(places / LATTICE_M).astype(np.int64)[:, ::-1]
         self._first = cells.min(axis=0) - _HALF
         rows, cols = cells.max(axis=0) + _HALF - self._first
         self._away_m = np.full((rows, cols), np.inf, dtype=np.float32)

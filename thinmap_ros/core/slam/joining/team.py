@@ -17,7 +17,7 @@ from thinmap_ros.core.grid.moved import MapMotion, laid_on, overlaid_bent
 from thinmap_ros.core.grid.patch import UNKNOWN, GridFrame, GridPatch
 from thinmap_ros.core.places.piece import SAME_M, SAME_RAD
 from thinmap_ros.core.places.place_odds import JOIN_ODDS
-from thinmap_ros.core.places.recognition import recognize
+from thinmap_ros.core.places.recognition import MATCH_NOISE, recognize
 from thinmap_ros.core.se2 import Array, inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized
@@ -342,8 +342,6 @@ class MapLinks:
 
 WORLD = 'world'  # a map without cells, in whose frame a person gives the poses of others
 
-_MATCHED = np.diag(np.square([0.05, 0.05, 0.01]))  # of the place of a map, by many scans
-
 _GIVEN = np.diag(np.square([0.5, 0.5, 0.1]))  # of one that a person has measured
 
 
@@ -434,7 +432,7 @@ class LinkSearch:
         T, matches = refined(self.first.piece, self.second.piece, T)
         if matches < _FEWEST_LINKS:
             return None
-        return MapLink(self.a, self.b, T, _MATCHED, log_odds, matches)
+        return MapLink(self.a, self.b, T, MATCH_NOISE, log_odds, matches)
 
 
 class Team:
@@ -571,7 +569,7 @@ def _fused(
         Layer(own.padded(own.overhang_of(patch)), _driven(maps[name], motions[name]))
         for name, own in zip(motions, moved, strict=True)
     ]
-    return fused(layers, 2.0 * math.sqrt(_MATCHED[0, 0]))
+    return fused(layers, 2.0 * math.sqrt(MATCH_NOISE[0, 0]))
 
 
 def _driven(robot: RobotMap, motion: MapMotion) -> Array:
