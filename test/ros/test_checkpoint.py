@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.files.safe import atomic_write, partial_files
-from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint, checkpoint_directory
+from thinmap_ros.ros.checkpoint import Checkpoint, checkpoint_directory
 
 STATE = {'a': np.arange(3), 'b': np.array(2.5)}
 
@@ -185,14 +185,14 @@ def test_a_file_beside_has_a_name_that_cannot_be_guessed(tmp_path: Path) -> None
 def test_a_state_that_stays_is_not_saved_again_and_is_that_of_now(folder: Path) -> None:
     file = folder / '7.robot.mapper.npz'
     states = [STATE, None]
-    periodic = PeriodicCheckpoint(Checkpoint(FakeNode(), 30.0), lambda: states[0], interval=0.0)
-    assert periodic.is_outdated and periodic.save() and not periodic.is_outdated
+    periodic = Checkpoint(FakeNode(), 30.0, lambda: states[0], interval=0.0)
+    assert periodic.is_outdated and periodic.save_if_due() and not periodic.is_outdated
     saved = file.read_bytes()
     os.utime(file, (0, 0))
     periodic.renew()
     assert time.time() - file.stat().st_mtime < 10.0 and file.read_bytes() == saved
     states.reverse()
-    assert periodic.save() and periodic.is_outdated
+    assert periodic.save_if_due() and periodic.is_outdated
     os.utime(file, (0, 0))
     periodic.renew()
     assert file.stat().st_mtime == 0.0  # nobody knows what is in it

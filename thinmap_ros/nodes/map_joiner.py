@@ -11,18 +11,16 @@ from thinmap_ros.core.slam.joining.team import WORLD, LinkSearch, MapLink, Robot
 from thinmap_ros.nodes.parts.joining import (
     JointMap,
     MapJoinerConfig,
-    Result,
     RobotMaps,
     TeamPublishers,
     Turns,
-    Worker,
     declare_initial_poses,
     odds_text,
     warn_of_confidence,
 )
 from thinmap_ros.ros import messages, node_main, parameters
 from thinmap_ros.ros.diagnostics import OK
-from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.lifecycle_node import Result, ThinmapNode, Worker
 from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.time_jumps import STEADY
 
@@ -51,7 +49,7 @@ class MapJoinerNode(ThinmapNode):
         config = self._config
         self._output = TeamPublishers(self, config.merged_map_topic, config.world_frame)
         self._robots = RobotMaps(self, config, self._on_map, self._on_other_map)
-        self._worker = Worker(_SHARE)
+        self._worker = Worker(self, _SHARE, self._on_failed)
         self._turns = Turns()
         self.reset_state()
         offer(self.create_active_service, JoinMaps, 'join_maps', self._on_join)
@@ -99,12 +97,8 @@ class MapJoinerNode(ThinmapNode):
             self._report_dropped(self._team.give(WORLD, name, pose))
 
     def _work(self) -> None:
-        """Take the result of the last job, and begin the next one."""
-        try:
-            self._worker.take_result()
-        except InputError as error:
-            self.get_logger().warning(f'maps are not merged: {error}', throttle_duration_sec=60.0)
-        if not self._worker.is_free:
+        """Begin the next job, once the last one is done."""
+        if self._worker.is_busy or self._worker.is_resting:
             return
         now_s = time.monotonic()
         ready = [_MERGE] if self._is_merge_due and now_s >= self._next_merge_s else []
@@ -118,6 +112,9 @@ class MapJoinerNode(ThinmapNode):
             search = self._team.next_search()
             if search is not None:
                 self._worker.begin(lambda: self._searched(search))
+
+    def _on_failed(self, error: Exception) -> None:
+        self.get_logger().warning(f'maps are not merged: {error}', throttle_duration_sec=60.0)
 
     def _searched(self, search: LinkSearch) -> Result:
         """Search, in the thread of the worker."""

@@ -21,6 +21,10 @@ from thinmap_ros.jit.cache import private_folder, temporary_folder
 
 _FOLDER = 'THINMAP_STATE_DIR'
 _KIND = 'checkpoint'
+# Least time between two checkpoints, in durations of the last one: however large the state, saving
+# it takes a small share of the time.
+_INTERVAL = 50.0
+_URGENT_INTERVAL = 10.0
 
 
 class Checkpoint:
@@ -29,24 +33,37 @@ class Checkpoint:
     It is in a directory that does not survive a restart of the machine, and is deleted when the
     node ends in order: a file found there was written by a node that was killed. The directory
     belongs to this user alone and is no link; otherwise no checkpoint is saved, with a warning.
+
+    is_outdated: whether the state may be another than that which was saved.
     """
 
     def __init__(
-        self, node: Node, limit_s: float, ending: str = '.npz', owner: str | None = None
+        self,
+        node: Node,
+        limit_s: float,
+        state: Callable[[], State | None] = lambda: None,
+        ending: str = '.npz',
+        owner: str | None = None,
+        interval: float = _INTERVAL,
     ) -> None:
         """limit_s: age up to which a checkpoint is loaded, s; 0: no checkpoints.
 
-        owner: full name of what it is the state of, where that is not the node.
+        state: returns what to save when it is due; None: nothing. owner: full name of what it is
+        the state of, where that is not the node. interval: between two checkpoints, in durations of
+        the last one.
         """
         self._limit_s = limit_s
         self._node = node
-        name = (owner or node.get_fully_qualified_name()).strip('/').replace('/', '.')
-        file_name = f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}{ending}'
+        self._state = state
+        self._interval = interval
+        self._saved_at_s = time.monotonic()
+        self._duration_s = 0.0
+        self.is_outdated = True
         self._path: Path | None = None
         if limit_s <= 0.0:
             return
         try:
-            self._path = checkpoint_directory() / file_name
+            self._path = checkpoint_directory() / own_file_name(node, ending, owner)
         except OSError as error:
             node.get_logger().warning(f'{error}: no checkpoint is saved')
 
@@ -80,71 +97,34 @@ class Checkpoint:
         except OSError as error:
             self._warn(f'{error.strerror}: checkpoint not saved')
 
-    def renew(self) -> None:
-        """The state that was saved is still that of now."""
-        if self._path is not None:
-            with suppress(OSError):
-                os.utime(self._path, follow_symlinks=False)
-
-    def delete(self) -> None:
-        """Delete the file."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
-
-    def _warn(self, what: str) -> None:
-        self._node.get_logger().warning(f'{self._path}: {what}', throttle_duration_sec=60.0)
-
-
-class PeriodicCheckpoint:
-    """A checkpoint that is saved again and again, in a small share of the node's time.
-
-    is_outdated: whether the state may be another than that which was saved.
-    """
-
-    def __init__(
-        self,
-        file: Checkpoint,
-        state: Callable[[], State | None],
-        interval: float = 50.0,
-        urgent_interval: float = 10.0,
-    ) -> None:
-        """state: returns what to save; None: nothing.
-
-        interval: least time between two checkpoints, in durations of the last one: however large
-        the state, saving it takes a small share of the time. urgent_interval: the same of
-        checkpoints that must not wait.
-        """
-        self._interval = interval
-        self._urgent_interval = urgent_interval
-        self._file = file
-        self._state = state
-        self._saved_at_s = time.monotonic()
-        self._duration_s = 0.0
-        self.is_outdated = True
-
-    def save(self, is_urgent: bool = False) -> bool:
+    def save_if_due(self, is_urgent: bool = False) -> bool:
         """Save the state, unless the last checkpoint is too recent; returns whether it was due."""
         now_s = time.monotonic()
-        factor = self._urgent_interval if is_urgent else self._interval
-        if now_s - self._saved_at_s < factor * self._duration_s:
+        interval = _URGENT_INTERVAL if is_urgent else self._interval
+        if now_s - self._saved_at_s < interval * self._duration_s:
             return False
         state = self._state()
         self.is_outdated = state is None
         if state is not None:
-            self._file.save(state)
+            self.save(state)
         self._saved_at_s = time.monotonic()
         self._duration_s = self._saved_at_s - now_s
         return True
 
     def renew(self) -> None:
         """Tell the file that the node lives, if the state is as it was saved."""
-        if not self.is_outdated:
-            self._file.renew()
+        if self._path is not None and not self.is_outdated:
+            with suppress(OSError):
+                os.utime(self._path, follow_symlinks=False)
 
     def delete(self) -> None:
         """Delete the file."""
         self.is_outdated = True
-        self._file.delete()
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+    def _warn(self, what: str) -> None:
+        self._node.get_logger().warning(f'{self._path}: {what}', throttle_duration_sec=60.0)
 
 
 class StateStamp:
@@ -173,6 +153,12 @@ class StateStamp:
     def is_corrected_by(self, corrected_ns: int) -> bool:
         """Whether a trajectory is newer than the checkpoint; the state follows older ones."""
         return self.latest_ns is not None and corrected_ns > self._checkpoint_ns
+
+
+def own_file_name(node: Node, ending: str, owner: str | None = None) -> str:
+    """Name of a file of one node, or of another owner with a full name, on its ROS domain."""
+    name = (owner or node.get_fully_qualified_name()).strip('/').replace('/', '.')
+    return f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}{ending}'
 
 
 def checkpoint_directory() -> Path:

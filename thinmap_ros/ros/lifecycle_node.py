@@ -1,8 +1,10 @@
-"""What the nodes of a robot share: lifecycle, diagnostics, pause, reset, checkpoint, time jump."""
+"""What the nodes of a robot share: lifecycle, pause, reset, checkpoint, time jump, a worker."""
 
 import inspect
 import math
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from time import monotonic, thread_time
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
@@ -13,8 +15,9 @@ from std_srvs.srv import SetBool, Trigger
 
 from thinmap_ros.core.errors import ThinmapError, one_line_reason
 from thinmap_ros.core.snapshot import State
+from thinmap_ros.kernels import release_free_pages
 from thinmap_ros.ros import parameters
-from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint
+from thinmap_ros.ros.checkpoint import Checkpoint
 from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
 from thinmap_ros.ros.private_rclpy import RCLError
 from thinmap_ros.ros.services import offer
@@ -23,6 +26,10 @@ from thinmap_ros.ros.time_jumps import STEADY, ElapsedTime, TimeJumps
 
 _CHECKPOINT_PERIOD_S = 0.5
 _DEAR_INTERVAL = 200.0  # half a percent of the time
+_POLL_S = 0.1
+
+# Takes what long work has found, in the thread of the node.
+Result = Callable[[], None]
 
 
 class ThinmapNode(LifecycleNode):
@@ -55,7 +62,7 @@ class ThinmapNode(LifecycleNode):
         self.is_paused = False
         self.time_jumps = TimeJumps(self.get_clock())
         self.elapsed_time = ElapsedTime(self.get_clock())
-        self._checkpoints: list[PeriodicCheckpoint] = []
+        self._checkpoints: list[Checkpoint] = []
         self._checkpoint_timer: Timer | None = None
         self._activation_callbacks: list[Callable[[], None]] = []
         self._end_callbacks: list[Callable[[], None]] = []
@@ -141,12 +148,12 @@ class ThinmapNode(LifecycleNode):
         `recovery_timeout_s` ago. Where it raises a ThinmapError, as for a node that was started
         with other parameters, the node starts empty.
         """
-        file = Checkpoint(self, self._recovery_timeout_s)
-        dear = Checkpoint(self, self._recovery_timeout_s and math.inf, '.dear')
-        self._checkpoints = [
-            PeriodicCheckpoint(dear, dear_state, _DEAR_INTERVAL),
-            PeriodicCheckpoint(file, state),
-        ]
+        limit_s = self._recovery_timeout_s
+        file = Checkpoint(self, limit_s, state)
+        dear = Checkpoint(
+            self, limit_s and math.inf, dear_state, ending='.dear', interval=_DEAR_INTERVAL
+        )
+        self._checkpoints = [dear, file]
         self._checkpoint_timer = self.create_timer(
             _CHECKPOINT_PERIOD_S,
             self._save_checkpoints,
@@ -183,7 +190,7 @@ class ThinmapNode(LifecycleNode):
 
     def _save_checkpoints(self) -> None:
         outdated = [checkpoint for checkpoint in self._checkpoints if checkpoint.is_outdated]
-        are_saved = [checkpoint.save() for checkpoint in outdated]
+        are_saved = [checkpoint.save_if_due() for checkpoint in outdated]
         if all(are_saved) and self._checkpoint_timer is not None:
             self._checkpoint_timer.cancel()
 
@@ -193,7 +200,7 @@ class ThinmapNode(LifecycleNode):
 
     def checkpoint_now(self) -> bool:
         """Save a checkpoint before a change is published; returns whether there was time."""
-        saved = [checkpoint.save(is_urgent=True) for checkpoint in self._checkpoints]
+        saved = [checkpoint.save_if_due(is_urgent=True) for checkpoint in self._checkpoints]
         return bool(saved) and all(saved)
 
     def add_activation_callback(self, work: Callable[[], None]) -> None:
@@ -300,3 +307,70 @@ class ThinmapNode(LifecycleNode):
         self.is_paused = request.data
         self.diagnostics.set_paused(self.is_paused)
         return 'scans are ignored' if self.is_paused else 'scans are processed'
+
+
+class Worker:
+    """A thread for long work of a node: one thing after another, in a share of a core.
+
+    No scan waits for it. Its results are taken in the thread of the node, while that is active.
+    """
+
+    def __init__(
+        self, node: ThinmapNode, share: float, on_error: Callable[[Exception], None]
+    ) -> None:
+        """share: of the time of a core that the work may take, 0 to 1.
+
+        on_error: receives a ThinmapError or OSError of the work, in the thread of the node.
+        """
+        self._node = node
+        self._share = share
+        self._on_error = on_error
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix='worker')
+        self._job: Future[Result] | None = None
+        self._rests_until_s = 0.0
+        # Only while there is work.
+        self._poll = node.create_active_timer(_POLL_S, self._take_result, clock=STEADY)
+        self._poll.cancel()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether there is work whose result was not taken."""
+        return self._job is not None
+
+    @property
+    def is_resting(self) -> bool:
+        """Whether the last work took so long that the next has to wait."""
+        return monotonic() < self._rests_until_s
+
+    def begin(self, work: Callable[[], Result]) -> None:
+        """Begin to work, after all that was begun before."""
+        self._job = self._thread.submit(self._timed, work)
+        self._poll.reset()
+
+    def drop(self) -> None:
+        """Do not take what the present work finds."""
+        self._job = None
+
+    def _timed(self, work: Callable[[], Result]) -> Result:
+        began_s = thread_time()
+        try:
+            return work()
+        finally:
+            # Work on a large map takes, and frees, a hundred bytes a cell.
+            release_free_pages()
+            used_s = thread_time() - began_s
+            self._rests_until_s = monotonic() + used_s * (1.0 / self._share - 1.0)
+
+    def _take_result(self) -> None:
+        job = self._job
+        if job is not None and not job.done():
+            return
+        self._poll.cancel()
+        self._job = None
+        if job is None:
+            return
+        self._node.touch()
+        try:
+            job.result()()
+        except (ThinmapError, OSError) as error:
+            self._on_error(error)

@@ -111,7 +111,7 @@ class StopTopic:
         self._topic = node.resolve_topic_name(TOPIC)
         self._sources = StopSources()
         self.reason = ''  # why the robot has to stand; '': it need not
-        self._file = Checkpoint(node, math.inf, '.stop', owner=self._topic)
+        self._file = Checkpoint(node, math.inf, ending='.stop', owner=self._topic)
         self._publisher: Publisher | None = None
         self._is_protective = False
         self._releases = node.create_publisher(String, _RELEASE, qos.STREAM)

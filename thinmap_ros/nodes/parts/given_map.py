@@ -33,6 +33,7 @@ from thinmap_ros.nodes.parts.localization import (
     require_near_map,
 )
 from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros.checkpoint import own_file_name
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
 from thinmap_ros.ros.subscription import subscribe_guarded
@@ -202,8 +203,7 @@ class LastPose:
 def _default_path(node: Node) -> Path:
     chosen = os.environ.get('XDG_STATE_HOME')
     state = Path(chosen) if chosen else Path.home() / '.local' / 'state'
-    name = node.get_fully_qualified_name().strip('/').replace('/', '.')
-    return state / 'thinmap' / f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}.pose.yaml'
+    return state / 'thinmap' / own_file_name(node, '.pose.yaml')
 
 
 class LivingMap:

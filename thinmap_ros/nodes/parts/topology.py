@@ -1,12 +1,9 @@
 """Parts of the topology builder: regions with names, and the route graph."""
 
-import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from time import monotonic
-from typing import Any, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import Point
@@ -22,7 +19,7 @@ from thinmap_msgs.srv import NameRegion
 from thinmap_ros import kernels
 from thinmap_ros.core import errors
 from thinmap_ros.core.config import Config, parameter, part
-from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
+from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.grid.edits import KeepOut
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array, Cells
@@ -46,10 +43,10 @@ from thinmap_ros.core.topology.topology import (
 )
 from thinmap_ros.files.graphs import write_geojson
 from thinmap_ros.jit.cache import private_folder, temporary_folder
-from thinmap_ros.kernels import release_free_pages
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.checkpoint import own_file_name
+from thinmap_ros.ros.lifecycle_node import Result, ThinmapNode, Worker
 from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.time_jumps import STEADY
@@ -101,9 +98,6 @@ def _door_msg(door: Door, edge_ids: list[int]) -> DoorMsg:
     )
 
 
-Found = TypeVar('Found')
-
-_POLL_S = 0.1
 # Of a core, that a worker uses at most: on a map of 100 x 100 m regions take more than a second.
 _MAX_CPU_SHARE = 0.1
 
@@ -123,51 +117,12 @@ class RegionUpdatesConfig(Config):
     regions: RegionConfig = part(RegionConfig)
 
 
-class _Worker:
-    """A thread of its own for work on a map, so that no scan waits for it."""
-
-    def __init__(self, name: str) -> None:
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix=name)
-        self._rests_until_s = 0.0
-
-    @property
-    def is_resting(self) -> bool:
-        """Whether the last work took so long that the next has to wait."""
-        return monotonic() < self._rests_until_s
-
-    def submit(self, work: Callable[..., Found], *arguments: Any) -> Future[Found]:
-        """Begin to work, after all that was begun before."""
-        return self._thread.submit(self._work, work, *arguments)
-
-    def _work(self, work: Callable[..., Found], *arguments: Any) -> Found:
-        began_s = monotonic()
-        result = work(*arguments)
-        # On a large map this takes, and frees, a hundred bytes a cell.
-        release_free_pages()
-        ended_s = monotonic()
-        self._rests_until_s = ended_s + (ended_s - began_s) / _MAX_CPU_SHARE
-        return result
-
-
-class _RegionJob:
-    """Computes regions in a thread, where the map has changed since the last time."""
-
-    def __init__(self, tracker: RegionTracker) -> None:
-        self.tracker = tracker
-        self.worker = _Worker('regions')
-        self._last: GridPatch | None = None
-
-    def submit(self, patch: GridPatch) -> Future[RegionMap]:
-        """Begin to compute the regions of a grid; those of before, if no cell shows another."""
-        return self.worker.submit(self._regions_of, patch)
-
-    def _regions_of(self, patch: GridPatch) -> RegionMap:
-        before = self._last
-        self._last = patch
-        known = self.tracker.regions
-        if known is not None and before is not None and _shows_the_same(patch, before):
-            return known
-        return self.tracker.update(patch)
+def _regions_of(tracker: RegionTracker, patch: GridPatch, before: GridPatch | None) -> RegionMap:
+    """Regions of a grid; the known ones, if no cell shows another than those of before."""
+    known = tracker.regions
+    if known is not None and before is not None and _shows_the_same(patch, before):
+        return known
+    return tracker.update(patch)
 
 
 def _shows_the_same(patch: GridPatch, before: GridPatch) -> bool:
@@ -179,7 +134,8 @@ def _shows_the_same(patch: GridPatch, before: GridPatch) -> bool:
 class RegionUpdates:
     """/regions out: all regions of the newest grid, with nodes and edges in them.
 
-    Regions are computed in a thread of their own, so that no scan waits for them.
+    config: what counts as a region; tracker: the regions and their ids. Regions are computed in a
+    thread of their own, so that no scan waits for them.
     """
 
     def __init__(
@@ -194,32 +150,21 @@ class RegionUpdates:
         self._frame_id = frame_id
         self._topology = topology
         config = parameters.declare_config(node, RegionUpdatesConfig)
-        self._config = replace(config.regions, robot_radius_m=robot_radius_m)
+        self.config = replace(config.regions, robot_radius_m=robot_radius_m)
+        self._worker = Worker(node, _MAX_CPU_SHARE, partial(node.step_failed, 'regions'))
         self._published: RegionMap | None = None
         self._is_graph_newer = False
         self.reset()
         if config.region_update_period_s > 0.0:
             self._publisher = node.create_publisher(RegionArray, 'regions', qos.LATCHED)
             node.create_active_timer(config.region_update_period_s, self._begin, clock=STEADY)
-            # Only while regions are computed.
-            self._poll = node.create_active_timer(_POLL_S, self._publish_computed, clock=STEADY)
-            self._poll.cancel()
-
-    @property
-    def config(self) -> RegionConfig:
-        """What counts as a region."""
-        return self._config
-
-    @property
-    def tracker(self) -> RegionTracker:
-        """The regions and their ids."""
-        return self._job.tracker
 
     def reset(self, tracker: RegionTracker | None = None) -> None:
         """Forget the grid, and continue with the ids of a tracker; None: of none."""
-        self._job = _RegionJob(tracker or RegionTracker(self._config))
-        self._pending: Future[RegionMap] | None = None
-        self._pending_ns = 0
+        self.tracker = tracker or RegionTracker(self.config)
+        self._worker.drop()
+        self._last: GridPatch | None = None
+        self._published_ns = 0
         self._newest: tuple[int, GridPatch] | None = None
 
     def add_grid(self, stamp_ns: int, patch: GridPatch) -> None:
@@ -237,27 +182,26 @@ class RegionUpdates:
 
     def _begin(self) -> None:
         """Begin to compute the regions of the newest grid; of the same grid with a new graph."""
-        if self._pending is not None:
+        if self._worker.is_busy:
             return
-        if self._newest is not None and not self._job.worker.is_resting:
-            self._pending_ns, patch = self._newest
+        if self._newest is not None and not self._worker.is_resting:
+            stamp_ns, patch = self._newest
             self._newest = None
-            self._pending = self._job.submit(patch)
-            self._poll.reset()
+            self._worker.begin(partial(self._compute, self.tracker, stamp_ns, patch, self._last))
+            self._last = patch
         elif self._is_graph_newer and self.tracker.regions is not None:
             self._publish(self.tracker.regions)
 
-    def _publish_computed(self) -> None:
+    def _compute(
+        self, tracker: RegionTracker, stamp_ns: int, patch: GridPatch, before: GridPatch | None
+    ) -> Result:
+        """Find the regions of a grid, in the thread of the worker."""
+        regions = _regions_of(tracker, patch, before)
+        return lambda: self._publish_computed(stamp_ns, regions)
+
+    def _publish_computed(self, stamp_ns: int, regions: RegionMap) -> None:
         """Publish the regions that were computed, if they or the graph are new."""
-        if self._pending is not None and not self._pending.done():
-            return
-        self._poll.cancel()
-        if self._pending is None:
-            return
-        pending = self._pending
-        self._pending = None
-        regions = pending.result()
-        self._node.touch()
+        self._published_ns = stamp_ns
         if regions is not self._published or self._is_graph_newer:
             self._publish(regions)
 
@@ -267,7 +211,7 @@ class RegionUpdates:
         self._published = regions
         with self._node.diagnostics.time_step('regions published'):
             membership = membership_of(self._topology(), self.tracker.names.named(regions))
-            message = region_array_msg(membership, self._frame_id, self._pending_ns)
+            message = region_array_msg(membership, self._frame_id, self._published_ns)
         self._publisher.publish(message)
 
 
@@ -417,7 +361,7 @@ class RouteGraphUpdates:
         self._builder = builder
         self._config = parameters.declare_config(node, RouteGraphConfig)
         self._keep_out = KeepOut()
-        self._worker = _Worker('route graph')
+        self._worker = Worker(node, _MAX_CPU_SHARE, self._on_failed)
         self._client: Client | None = None
         self._was_ready = False
         self._pending: AnswerFuture | None = None
@@ -427,14 +371,11 @@ class RouteGraphUpdates:
             self._client = node.create_client(SetRouteGraph, _SERVICE)
             subscribe_guarded(node, KeepOutMsg, 'keep_out', self._on_keep_out, qos.LATCHED)
             node.create_active_timer(self._config.route_graph_period_s, self._update, clock=STEADY)
-            # Only while a graph is found.
-            self._poll = node.create_active_timer(_POLL_S, self._send_found, clock=STEADY)
-            self._poll.cancel()
 
     def reset(self) -> None:
         """Forget the map with its ids: the next one is another."""
         self._routes = RouteGraph(self._topology_config, self._write)
-        self._job: Future[TopologicalMap] | None = None
+        self._worker.drop()
         self._sent: TopologicalMap | None = None
         self._is_changed = False
         self._is_urgent = False
@@ -473,31 +414,26 @@ class RouteGraphUpdates:
         if not self._is_changed or not (is_ready or self._config.route_graph_path):
             return
         must_wait = self._worker.is_resting and not self._is_urgent
-        if self._job is not None or must_wait or not self._builder().map.nodes:
+        if self._worker.is_busy or must_wait or not self._builder().map.nodes:
             return
         self._is_changed = False
         self._is_urgent = False
         with self._node.diagnostics.time_step('route graph'):
             state = self._builder().state()
         is_forced = self._sent is None
-        self._job = self._worker.submit(self._routes.update, state, self._keep_out, is_forced)
-        self._poll.reset()
+        self._worker.begin(partial(self._find, self._routes, state, self._keep_out, is_forced))
 
-    def _send_found(self) -> None:
+    def _find(self, routes: RouteGraph, state: State, keep_out: KeepOut, is_forced: bool) -> Result:
+        """Find and write the route graph, in the thread of the worker."""
+        graph = routes.update(state, keep_out, is_forced)
+        return lambda: self._send_found(graph)
+
+    def _on_failed(self, error: Exception) -> None:
+        self._is_changed = True
+        self._warn(f'route graph not written: {one_line_reason(error)}')
+
+    def _send_found(self, graph: TopologicalMap) -> None:
         """Have the route server load the graph that was found, unless it has it."""
-        if self._job is not None and not self._job.done():
-            return
-        self._poll.cancel()
-        if self._job is None:
-            return
-        job = self._job
-        self._job = None
-        try:
-            graph = job.result()
-        except (ThinmapError, OSError) as error:
-            self._is_changed = True
-            self._warn(f'route graph not written: {one_line_reason(error)}')
-            return
         if not graph.edges and self._keep_out.areas:
             self._warn('no edges outside of keep-out areas: the route server keeps its last graph')
         if graph.edges and graph is not self._sent:
@@ -513,9 +449,7 @@ class RouteGraphUpdates:
     def _path(self) -> Path:
         if self._config.route_graph_path:
             return Path(self._config.route_graph_path).resolve()
-        name = self._node.get_fully_qualified_name().strip('/').replace('/', '.')
-        file_name = f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}.geojson'
-        return private_folder(temporary_folder()) / file_name
+        return private_folder(temporary_folder()) / own_file_name(self._node, '.geojson')
 
     def _send(self, client: Client, path: Path) -> None:
         if self._pending is not None:
