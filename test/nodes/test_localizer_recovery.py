@@ -12,7 +12,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.track import LocalizerConfig
-from thinmap_ros.nodes.parts.localization import Recovery, restored, saved_pose
+from thinmap_ros.nodes.parts.localization import Recovery, restored
 
 CONFIG = LocalizerConfig(initial_x_m=3.0, initial_y_m=1.2)
 KILLED_AT = 520
@@ -130,7 +130,7 @@ def test_a_checkpoint_that_is_none_is_refused_in_words(killed):
         with pytest.raises(InputError, match=name.removeprefix('newer_')):
             restored({**state, name: array}, CONFIG)
     with pytest.raises(InputError, match='stamp_ns'):
-        saved_pose({})
+        restored({}, CONFIG)
     with pytest.raises(InputError, match='local map'):
         restored(recovery.last.state(), CONFIG)
 

@@ -6,7 +6,7 @@ class itself checks relations between arrays, with the helpers below.
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,14 +61,26 @@ def validate(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]
     return checked
 
 
-def split_number(state: State, name: str) -> tuple[int, dict[str, NDArray[Any]]]:
+def split(state: State, names: Container[str]) -> tuple[State, State]:
+    """Split a state into the arrays of some names, and the others."""
+    own = {name: array for name, array in state.items() if name in names}
+    return own, {name: array for name, array in state.items() if name not in own}
+
+
+def split_prefix(state: State, prefix: str) -> tuple[State, State]:
+    """Split a state into the arrays whose names have a prefix, without it, and the others."""
+    own, rest = split(state, [name for name in state if name.startswith(prefix)])
+    return {name.removeprefix(prefix): array for name, array in own.items()}, rest
+
+
+def split_number(state: State, name: str) -> tuple[int, State]:
     """Split the state of a node into a number that is not negative, and the other arrays.
 
     Raises InputError if there is no such number.
     """
-    own = {key: array for key, array in state.items() if key == name}
+    own, rest = split(state, [name])
     number = validate(own, {name: Field(np.int64, (), 0, MAX_COUNT)}, 'state')[name]
-    return int(number), {key: array for key, array in state.items() if key != name}
+    return int(number), rest
 
 
 def text_array(text: str) -> NDArray[np.uint8]:

@@ -16,6 +16,7 @@ from thinmap_msgs.msg import (
     LineFeature,
     LineFeatureArray,
     LocalizedScan,
+    ProbabilityGrid,
     SlamStatus,
     TopologicalMap,
 )
@@ -24,7 +25,6 @@ from thinmap_ros import kernels
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import TILTED, Scan
 from thinmap_ros.core.se2 import Array
@@ -44,17 +44,12 @@ from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.files.sessions import LOCALIZER, load_localizer, save_localizer
 from thinmap_ros.logs.frames import NONE
-from thinmap_ros.nodes.parts.given_map import (
-    GivenMap,
-    InitialPoses,
-    LivingMap,
-)
+from thinmap_ros.nodes.parts.given_map import GivenMap
 from thinmap_ros.nodes.parts.localization import (
     KeyframeOutput,
     Recovery,
     require_near_map,
     restored,
-    saved_pose,
 )
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import ERROR, OK, SCALE_KEY, WARN
@@ -136,7 +131,7 @@ class _MapIds:
     is_given: whether the map was loaded, or begun by a reset, and not by the start of the node.
     """
 
-    id: int = field(default_factory=new_map_id)
+    id: int
     replaced: int = UNKNOWN
     is_given: bool = False
     _published: int = UNKNOWN
@@ -191,11 +186,13 @@ class LocalizerNode(ThinmapNode):
         kernels.localizer()
         if slam != SCAN_MATCHING:
             kernels.ekf_localizer()
-        self._map_ids: _MapIds | None = _MapIds() if self._config.is_mapping else None
+        self._map_ids = _MapIds(new_map_id() if self._config.is_mapping else UNKNOWN)
         self._begin()
         self.enable_checkpoint(self._state, self._restore, self._map_state)
-        if self._map_ids is not None:
-            LivingMap(self, self._on_living_map)
+        if self._config.is_mapping:
+            self._living = self.create_subscription(
+                ProbabilityGrid, 'grid', self._on_living_map, qos.LATCHED
+            )
         self.create_pause_service()
         self.diagnostics.add_update_callback(self._report_unpaired)
         self.diagnostics.check_sole_publisher('pose')
@@ -205,11 +202,10 @@ class LocalizerNode(ThinmapNode):
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         self._odometry.subscribe()
         self._laser_transform.subscribe(self, self._on_scan)
-        poses = InitialPoses(
-            self, self._output.map_frame, self._on_initial_pose, self._broadcaster.received
+        self._given.subscribe_to_poses(
+            self._output.map_frame, self._on_initial_pose, self._broadcaster.received
         )
-        self._given.subscribe(self._on_new_map)
-        self._given.create_interface(self._output.map_frame, poses)
+        self._given.subscribe_to_map(self._on_new_map)
         AdaptiveSubscription(self, String, 'map_tag', self._on_map_tag, qos.LATCHED)
         offer(
             self.create_service,
@@ -231,7 +227,7 @@ class LocalizerNode(ThinmapNode):
 
         The robot is at the start pose. A new map is of the storey that the robot is on.
         """
-        if self._map_ids is not None:
+        if self._config.is_mapping:
             self._map_ids.begin(is_reset=True)
         self._output.reset()
         before = self._localizer.config
@@ -241,7 +237,7 @@ class LocalizerNode(ThinmapNode):
             self._enter_storey(tag)
 
     def _begin(self) -> None:
-        self._localizer = self._given.create_localizer()
+        self._localizer = self._given.first_localizer()
         self._broadcaster.reset()
         self._odometry.reset()
         self._input = _Input()
@@ -250,26 +246,28 @@ class LocalizerNode(ThinmapNode):
 
     def _state(self) -> State | None:
         pose = self._recovery.pose_state(self._localizer)
-        is_map_missing = self._map_ids is not None and not self._recovery.is_map_saved
+        is_map_missing = self._config.is_mapping and not self._recovery.is_map_saved
         if pose is None or is_map_missing:
             return None
-        map_id = UNKNOWN if self._map_ids is None else self._map_ids.id
-        return {**pose, 'map_id': np.array(map_id)}
+        return {**pose, 'map_id': np.array(self._map_ids.id)}
 
     def _map_state(self) -> State | None:
         """What cannot be loaded again: the map, while it is made."""
-        is_lost = self._recovery.last is None
-        if self._map_ids is None or is_lost:
+        if not self._has_own_map:
             return None
         return self._recovery.map_state(self._localizer)
 
+    @property
+    def _has_own_map(self) -> bool:
+        """Whether the localizer has made a map."""
+        return self._config.is_mapping and self._recovery.last is not None
+
     def _restore(self, state: State) -> None:
         """Continue as a killed localizer would. Raises InputError for another state."""
-        last = saved_pose(state)
         map_id, own = snapshot.split_number(state, 'map_id')
-        if self._map_ids is not None:
-            self._localizer, last = restored(own, self._config)
-            self._map_ids.id = map_id
+        localizer, last = restored(own, self._config)
+        self._localizer = localizer or self._localizer
+        self._map_ids.id = map_id
         self._recovery = Recovery(last)
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
@@ -363,10 +361,21 @@ class LocalizerNode(ThinmapNode):
             self.get_logger().warning(scale)
             self._input.reported.add(SCALE_KEY)
 
-    def _on_living_map(self, map_id: int, patch: GridPatch) -> None:
-        """Continue in a map that was there before this node, rather than begin a second one."""
+    def _on_living_map(self, message: ProbabilityGrid) -> None:
+        """Continue in a map whose mapper has outlived a localizer, rather than begin another one.
+
+        Only the first grid of a known map counts.
+        """
+        if message.map_id == UNKNOWN:
+            return
+        try:
+            patch = messages.grid_from_msg(message)
+        except InputError as error:
+            self.get_logger().warning(f'grid: {error}')
+            return
+        self.destroy_subscription(self._living)
         ids = self._map_ids
-        if ids is None or map_id == ids.id or ids.is_given:
+        if message.map_id == ids.id or ids.is_given:
             return
         if not isinstance(self._config, LocalizerConfig):
             return  # a map of line features cannot be made of a grid
@@ -377,7 +386,7 @@ class LocalizerNode(ThinmapNode):
         # The robot has driven since it was at the start pose: a room may fit there by chance.
         self._localizer = Localizer.in_occupancy_map(patch, self._config, is_guess=True)
         self._recovery.awaited = None
-        ids.id = map_id
+        ids.id = message.map_id
 
     def _resume(self, scan: Scan, T_odom_base: Array) -> None:
         """Continue where the killed localizer was; at the start pose if the odometry was reset."""
@@ -391,15 +400,13 @@ class LocalizerNode(ThinmapNode):
         self.get_logger().warning('odometry was reset: starting at the initial pose')
         if scan.stamp_ns < last.stamp_ns:
             # So was the robot, with all that made the map.
-            self._localizer = self._given.create_localizer()
+            self._localizer = self._given.first_localizer()
 
     def _save(self, path: str, overwrite: bool = False) -> str:
         return f'saved {save_localizer(path, self._localizer, overwrite)}'
 
     def _save_at_end(self, path: str) -> str:
-        if self._map_ids is None or self._recovery.last is None:
-            return ''
-        return self._save(path)
+        return self._save(path) if self._has_own_map else ''
 
     def _check(self, path: str) -> str:
         return 'no map of the localizer' if self._read(path) is None else 'a map'
@@ -419,7 +426,7 @@ class LocalizerNode(ThinmapNode):
         self._localizer = loaded
         self._recovery = Recovery()
         self._given.has_loaded = True
-        if self._map_ids is not None:
+        if self._config.is_mapping:
             self._map_ids.begin(is_reset=False)
         if self._topology is not None:
             loaded.set_topology(self._topology)
@@ -453,10 +460,10 @@ class LocalizerNode(ThinmapNode):
             no_return_is_unknown=scan.drops_out,
             inlier_ratio=estimate.inlier_ratio,
             step_time_ms=step_ms,
-            **({} if self._map_ids is None else self._map_ids.published()),
+            **self._map_ids.published(),
         )
         self._output.publish_estimate(scan, estimate, features, status)
-        if self._map_ids is not None:
+        if self._config.is_mapping:
             self._output.keyframes.publish(scan.stamp_ns, self._localizer, self._map_ids.id)
 
 

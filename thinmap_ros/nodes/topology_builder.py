@@ -121,8 +121,7 @@ class TopologyBuilderNode(ThinmapNode):
     def _restore(self, state: State) -> None:
         """Continue with the graph of a killed builder. Raises InputError where it is no graph."""
         latest_ns, rest = snapshot.split_number(state, 'latest_ns')
-        regions = {name: array for name, array in rest.items() if name in REGION_FIELDS}
-        graph = {name: array for name, array in rest.items() if name not in REGION_FIELDS}
+        regions, graph = snapshot.split(rest, REGION_FIELDS)
         tracker = RegionTracker.from_state(regions, self._regions.config)
         self._topology.restore(graph)
         for restored in (self._topology.builder, tracker):

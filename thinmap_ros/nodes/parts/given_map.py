@@ -15,7 +15,7 @@ from nav2_msgs.srv import SetInitialPose
 from rclpy.node import Node
 from std_srvs.srv import Empty
 
-from thinmap_msgs.msg import ProbabilityGrid, SlamStatus
+from thinmap_msgs.msg import SlamStatus
 from thinmap_msgs.srv import LocalizeGlobally
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError, InputError, quoted
@@ -35,7 +35,7 @@ from thinmap_ros.nodes.parts.localization import (
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.checkpoint import own_file_name
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
+from thinmap_ros.ros.maps import subscribe_to_map
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.tf import TransformListener
 
@@ -206,67 +206,6 @@ def _default_path(node: Node) -> Path:
     return state / 'thinmap' / own_file_name(node, '.pose.yaml')
 
 
-class LivingMap:
-    """Subscribes to grid until there is a map of a known id, and calls `found` with both.
-
-    Its mapper has outlived the localizer.
-    """
-
-    def __init__(self, node: Node, found: Callable[[int, GridPatch], None]) -> None:
-        self._node = node
-        self._found = found
-        self._grid = node.create_subscription(ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
-
-    def _on_grid(self, message: ProbabilityGrid) -> None:
-        if message.map_id == UNKNOWN:
-            return
-        try:
-            patch = messages.grid_from_msg(message)
-        except InputError as error:
-            self._node.get_logger().warning(f'grid: {error}')
-            return
-        self._node.destroy_subscription(self._grid)
-        self._found(message.map_id, patch)
-
-
-class InitialPoses:
-    """Subscribes to initialpose; calls `process` with pose (3,) and covariance (3, 3), map frame.
-
-    Poses in other frames are transformed by the newest transforms.
-    """
-
-    def __init__(
-        self,
-        node: ThinmapNode,
-        map_frame: str,
-        process: Callable[[Array, Array], None],
-        transform_received: Callable[[Any, bool], None],
-    ) -> None:
-        """transform_received: is called with each transform, and whether it is static."""
-        self._map_frame = map_frame
-        self._process = process
-        self._transforms = TransformListener(node, transform_received)
-        subscribe_guarded(node, PoseWithCovarianceStamped, 'initialpose', self.add_pose, qos.STREAM)
-
-    def add_pose(self, message: PoseWithCovarianceStamped) -> None:
-        """Process a message. Raises InputError where it is invalid, or its frame unknown."""
-        pose = messages.pose_from_msg(message.pose.pose)
-        covariance = messages.covariance_from_msg(message)
-        frame = message.header.frame_id.lstrip('/')
-        if frame not in ('', self._map_frame):
-            T_map_frame = self._lookup(frame)
-            pose = se2.compose(T_map_frame, pose)
-            covariance = rotated_covariance(covariance, float(T_map_frame[2]))
-        self._process(pose, covariance)
-
-    def _lookup(self, frame: str) -> Array:
-        try:
-            return self._transforms.lookup(self._map_frame, frame)
-        except InputError as error:
-            expected = f'expected a frame connected to {quoted(self._map_frame)}'
-            raise InputError(f'frame {quoted(frame)}: {error}: {expected}') from error
-
-
 _WARN_PERIOD_S = 30.0
 
 
@@ -274,7 +213,7 @@ class GivenMap:
     """The given map: of a file, a session, or a topic; poses to start from, and AMCL's interface.
 
     In mode mapping, a session. config: of the next localizer; has_loaded: whether a service has
-    loaded another map.
+    loaded another map. Poses in other frames are transformed by the newest transforms.
     """
 
     def __init__(self, node: ThinmapNode, config: StartConfig) -> None:
@@ -304,7 +243,36 @@ class GivenMap:
         is_given = bool(self._session) or self.has_loaded or self._patch is not None
         return self.config.is_mapping or is_given
 
-    def subscribe(self, changed: Callable[[], None]) -> None:
+    def subscribe_to_poses(
+        self,
+        map_frame: str,
+        on_pose: Callable[[Array, Array], None],
+        transform_received: Callable[[Any, bool], None],
+    ) -> None:
+        """Subscribe to initialpose; in mode localization, offer AMCL's topics and services.
+
+        on_pose: receives pose (3,) and covariance (3, 3), map frame. transform_received: is called
+        with each transform, and whether it is static.
+        """
+        transforms = TransformListener(self._node, transform_received)
+
+        def add_pose(message: PoseWithCovarianceStamped) -> None:
+            pose = messages.pose_from_msg(message.pose.pose)
+            covariance = messages.covariance_from_msg(message)
+            frame = message.header.frame_id.lstrip('/')
+            if frame not in ('', map_frame):
+                T_map_frame = _transform_to(map_frame, frame, transforms)
+                pose = se2.compose(T_map_frame, pose)
+                covariance = rotated_covariance(covariance, float(T_map_frame[2]))
+            on_pose(pose, covariance)
+
+        subscribe_guarded(
+            self._node, PoseWithCovarianceStamped, 'initialpose', add_pose, qos.STREAM
+        )
+        if not self.config.is_mapping:
+            self._amcl = AmclInterface(self._node, map_frame, add_pose)
+
+    def subscribe_to_map(self, changed: Callable[[], None]) -> None:
         """Subscribe to topic map if the map is to come from there; changed: there is a new one."""
         if not self._is_topic:
             return
@@ -321,32 +289,35 @@ class GivenMap:
 
         subscribe_to_map(self._node, 'map', on_map)
 
-    def create_interface(self, map_frame: str, poses: InitialPoses) -> None:
-        """Offer AMCL's topics and services in mode localization."""
-        if not self.config.is_mapping:
-            self._amcl = AmclInterface(self._node, map_frame, poses.add_pose)
-
-    def create_localizer(self) -> AnyLocalizer:
+    def first_localizer(self) -> AnyLocalizer:
         """A localizer at the start pose.
 
         It is initial_pose where set, else the start pose where it is not 0, else the last pose.
         """
         self._given_covariance = None
-        config = self.config
-        if config.is_mapping:
-            return self._in_map(config)
+        if self.config.is_mapping:
+            return self.localizer_at()
         if self._settings.set_initial_pose:
-            return self._placed(self._settings.initial_pose.pose, GIVEN_COVARIANCE)
-        last = None if config.is_start_given else self._last_pose.load()
-        if last is None:
-            return self._in_map(config)
-        x, y, yaw = last.tolist()
-        self._node.get_logger().info(f'last pose: {x:.2f}, {y:.2f} m, {yaw:.2f} rad')
-        return self.create_localizer_at(last)
+            return self.localizer_at(self._settings.initial_pose.pose, GIVEN_COVARIANCE)
+        last = None if self.config.is_start_given else self._last_pose.load()
+        if last is not None:
+            x, y, yaw = last.tolist()
+            self._node.get_logger().info(f'last pose: {x:.2f}, {y:.2f} m, {yaw:.2f} rad')
+        return self.localizer_at(last)
 
-    def create_localizer_at(self, T_map_base: Array) -> AnyLocalizer:
-        """A localizer at a pose (3,); in a given map it is delocalized until scans fit."""
-        return self._in_map(config_at(self.config, T_map_base))
+    def localizer_at(
+        self, T_map_base: Array | None = None, covariance: Array | None = None
+    ) -> AnyLocalizer:
+        """A localizer in the map, at a pose (3,), None for the configured one.
+
+        covariance (3, 3): of a pose that somebody has given; without one, a localizer in a given
+        map is delocalized until scans fit. Raises InputError for a session that is broken.
+        """
+        config = self.config if T_map_base is None else config_at(self.config, T_map_base)
+        localizer = self._in_map(config)
+        if T_map_base is not None and covariance is not None:
+            localizer.set_pose(T_map_base, covariance)
+        return localizer
 
     def with_new_map(self, localizer: AnyLocalizer) -> AnyLocalizer:
         """The localizer that follows another one in a map from its topic."""
@@ -354,13 +325,17 @@ class GivenMap:
         covariance = self._given_covariance
         self._given_covariance = None
         if covariance is not None:
-            placed = self._placed(localizer.pose, covariance)
-            if self._is_near_map(placed):
+            placed = self.localizer_at(localizer.pose, covariance)
+            try:
+                require_near_map(placed.pose, placed)
                 return placed
+            except InputError as error:
+                self._node.diagnostics.message_rejected('initialpose', str(error))
+                self._node.get_logger().warning(f'initialpose: {error}')
         is_first = self._amcl is None or not self._amcl.has_published
         if is_first or (settings.set_initial_pose and settings.always_reset_initial_pose):
-            return self.create_localizer()
-        return self.create_localizer_at(localizer.pose)
+            return self.first_localizer()
+        return self.localizer_at(localizer.pose)
 
     def pose_set(self, covariance: Array) -> None:
         """A user has given a pose, with a covariance (3, 3)."""
@@ -407,17 +382,11 @@ class GivenMap:
                 return loaded
         return localizer_class(config)(config)
 
-    def _is_near_map(self, placed: AnyLocalizer) -> bool:
-        """Whether the pose that a user gave before there was a map lies near it."""
-        try:
-            require_near_map(placed.pose, placed)
-        except InputError as error:
-            self._node.diagnostics.message_rejected('initialpose', str(error))
-            self._node.get_logger().warning(f'initialpose: {error}')
-            return False
-        return True
 
-    def _placed(self, T_map_base: Array, covariance: Array) -> AnyLocalizer:
-        localizer = self.create_localizer_at(T_map_base)
-        localizer.set_pose(T_map_base, covariance)
-        return localizer
+def _transform_to(map_frame: str, frame: str, transforms: TransformListener) -> Array:
+    """T_map_frame (3,). Raises InputError with what was expected where it is unknown."""
+    try:
+        return transforms.lookup(map_frame, frame)
+    except InputError as error:
+        expected = f'expected a frame connected to {quoted(map_frame)}'
+        raise InputError(f'frame {quoted(frame)}: {error}: {expected}') from error

@@ -136,12 +136,11 @@ class Recovery:
 
     def pose_state(self, localizer: AnyLocalizer) -> State | None:
         """The last known pose, and the keyframes since the map was saved; None before the first."""
-        newest_ns = self._newest_ns
-        newer = None
-        if newest_ns and isinstance(localizer, Localizer):
-            newer = localizer.saved_keyframes(newest_ns)
         if self.last is None:
             return None
+        newer = None
+        if self._newest_ns and isinstance(localizer, Localizer):
+            newer = localizer.saved_keyframes(self._newest_ns)
         if newer is None:
             return self.last.state()
         anchor = newer.frames[-1].T_map_base
@@ -150,24 +149,28 @@ class Recovery:
         return {**relative.state(), **packed}
 
 
-def restored(state: State, config: StartConfig) -> tuple[AnyLocalizer, OdometryAnchor]:
+def restored(state: State, config: StartConfig) -> tuple[AnyLocalizer | None, OdometryAnchor]:
     """Localizer at the start pose in a saved map, and where it was in this.
 
-    Raises InputError for a state that is none of this configuration.
+    None in mode localization: the map does not change, and is given again. Raises InputError for a
+    state that is none of this configuration.
     """
-    last = saved_pose(state)
-    own = {name: array for name, array in state.items() if name not in FIELDS}
+    pose, own = snapshot.split(state, FIELDS)
+    last = OdometryAnchor.from_state(pose)
+    if not config.is_mapping:
+        return None, last
     if not isinstance(config, LocalizerConfig):
         return localizer_class(config).from_state(own, config), last
     tag, own = snapshot.split_text(own, TAG)
     config = replace(config, map_tag=tag or config.map_tag)
     if _STAMPS not in own:
         return Localizer.from_state(own, config), last
-    calibration = _calibration({n: own.pop(n) for n in [*own] if n == _CALIBRATION})
-    newer = {name: array for name, array in own.items() if name.startswith(_NEWER)}
-    keyframes = _unpacked({name: array for name, array in own.items() if name not in newer})
+    learned, own = snapshot.split(own, [_CALIBRATION])
+    calibration = _calibration(learned)
+    newer, own = snapshot.split_prefix(own, _NEWER)
+    keyframes = _unpacked(own)
     if newer:
-        tail = _unpacked({name.removeprefix(_NEWER): array for name, array in newer.items()})
+        tail = _unpacked(newer)
         if tail.stamps_ns[0] == keyframes.stamps_ns[-1]:
             keyframes = keyframes.extended(tail)
         poses = {frame.scan.stamp_ns: frame.T_map_base for frame in keyframes.frames}
@@ -175,16 +178,6 @@ def restored(state: State, config: StartConfig) -> tuple[AnyLocalizer, OdometryA
         snapshot.require(newest_ns in poses, f'keyframes: none of {newest_ns} ns', 'one')
         last = replace(last, T_map_odom=se2.compose(poses[newest_ns], last.T_map_odom))
     return Localizer.from_keyframes(keyframes, calibration, config), last
-
-
-def saved_pose(state: State) -> OdometryAnchor:
-    """Pose of a state, relative to its newest keyframe if it has any.
-
-    Raises InputError if it is invalid.
-    """
-    return OdometryAnchor.from_state(
-        {name: array for name, array in state.items() if name in FIELDS}
-    )
 
 
 def _calibration(state: State) -> Array:
@@ -200,10 +193,10 @@ def _packed(keyframes: SavedKeyframes) -> State:
 
 
 def _unpacked(state: State) -> SavedKeyframes:
-    saved = SavedKeyframes.from_state({n: array for n, array in state.items() if n != _STAMPS})
+    stamps, keyframes = snapshot.split(state, [_STAMPS])
+    saved = SavedKeyframes.from_state(keyframes)
     fields = {_STAMPS: Field(np.int64, (len(saved.frames),), 0, MAX_COUNT)}
-    own = {_STAMPS: state[_STAMPS]} if _STAMPS in state else {}
-    return saved.with_stamps(snapshot.validate(own, fields, 'keyframes')[_STAMPS].tolist())
+    return saved.with_stamps(snapshot.validate(stamps, fields, 'keyframes')[_STAMPS].tolist())
 
 
 class KeyframeOutput:
