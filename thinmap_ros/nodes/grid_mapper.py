@@ -1,14 +1,12 @@
 """The occupancy grid: each scan is added at the pose that the localizer found for it."""
 
 import pathlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from nav_msgs.msg import Path
 from nav_msgs.srv import GetMap
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.node import Node
 from rclpy.timer import Timer
 
 from thinmap_msgs.msg import LocalizedScan as LocalizedScanMsg
@@ -40,7 +38,7 @@ from thinmap_ros.ros.localized_scan import ReceivedScan, localized_scan_from_msg
 from thinmap_ros.ros.maps import FollowedMap, Origin
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
-from thinmap_ros.ros.session_services import SessionClient, save_on_exit
+from thinmap_ros.ros.session_services import SessionClient, joined, save_on_exit
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 
 _OTHER_MAP = (
@@ -59,26 +57,6 @@ class ModeConfig(Config):
         'not change.',
         choices=(MAPPING, LOCALIZATION),
     )
-
-
-@dataclass(frozen=True)
-class _Settings:
-    """Parameters of the node; mapping: whether scans change the map."""
-
-    grid: OccupancyConfig
-    output: MapOutputConfig
-    local_map_size_m: float
-    mapping: bool
-
-    @staticmethod
-    def declare(node: Node, changed: Callable[[MapOutputConfig], None]) -> '_Settings':
-        """changed: is called with another output, which can be set at run time."""
-        return _Settings(
-            grid=parameters.declare_config(node, OccupancyConfig),
-            output=parameters.declare_config(node, MapOutputConfig, changed),
-            local_map_size_m=parameters.declare_config(node, WindowConfig).local_map_size_m,
-            mapping=parameters.declare_config(node, ModeConfig).mode == MAPPING,
-        )
 
 
 class GridMapperNode(ThinmapNode):
@@ -105,8 +83,11 @@ class GridMapperNode(ThinmapNode):
 
     def __init__(self) -> None:
         super().__init__('grid_mapper', recovers=True)
-        self._settings = _Settings.declare(self, self._on_output)
-        self._output = MapPublishers(self, self._settings.output)
+        self._grid_config = parameters.declare_config(self, OccupancyConfig)
+        output = parameters.declare_config(self, MapOutputConfig, self._on_output)
+        window_m = parameters.declare_config(self, WindowConfig).local_map_size_m
+        self._is_mapping = parameters.declare_config(self, ModeConfig).mode == MAPPING
+        self._output = MapPublishers(self, output)
         self._team = TeamInScans(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
@@ -114,7 +95,7 @@ class GridMapperNode(ThinmapNode):
         parameters.reject_unknown(self)
         kernels.grid_mapper()
         self._stamp = StateStamp()
-        self._mapper = Mapper(self._settings.grid, window_m=self._settings.local_map_size_m)
+        self._mapper = Mapper(self._grid_config, window_m=window_m)
         self._editing = MapEditing(
             self,
             self._output.frame_id,
@@ -141,13 +122,10 @@ class GridMapperNode(ThinmapNode):
         self._map_timer = self._create_map_timer()
 
     def _create_map_timer(self) -> Timer:
-        return self.create_active_timer(
-            self._settings.output.map_update_interval, self._publish_map
-        )
+        return self.create_active_timer(self._output.config.map_update_interval, self._publish_map)
 
     def _on_output(self, config: MapOutputConfig) -> None:
         """Publish the map with other values or at another rate, the first at once."""
-        self._settings = replace(self._settings, output=config)
         self._output.config = config
         self.destroy_timer(self._map_timer)
         self._map_timer = self._create_map_timer()
@@ -176,9 +154,8 @@ class GridMapperNode(ThinmapNode):
         self, path: str, folder: pathlib.Path | None = None
     ) -> tuple[CorrectableGrid, KeepOut]:
         """The map of a session, or any map_server map; corrected if the session has keyframes."""
-        settings = self._settings
         report = self.get_logger().warning
-        return sessions.load_map(path, settings.grid, settings.mapping, folder, report)
+        return sessions.load_map(path, self._grid_config, self._is_mapping, folder, report)
 
     def _state(self) -> State | None:
         if self._stamp.latest_ns is None:
@@ -219,7 +196,7 @@ class GridMapperNode(ThinmapNode):
         stamp_ns = localized.scan.stamp_ns
         if self._stamp.is_restarted_by(stamp_ns):
             self.reset_state()
-        destination = localized.destination if self._settings.mapping else Destination.NOWHERE
+        destination = localized.destination if self._is_mapping else Destination.NOWHERE
         with self.diagnostics.time_step('map update'):
             self._mapper.grid.place_mates(self._team.places)
             scan = self._team.noted(localized.scan)
@@ -245,7 +222,7 @@ class GridMapperNode(ThinmapNode):
             self.reset('the localizer was reset')
             origin = followed.origin(status.map_id)
         is_other = origin is Origin.OTHER
-        self._fault = _OTHER_MAP if is_other and self._settings.mapping else ''
+        self._fault = _OTHER_MAP if is_other and self._is_mapping else ''
         if self._fault:
             self.get_logger().warning(self._fault, throttle_duration_sec=WARN_PERIOD_S)
         return not self._fault and origin is not Origin.STALE
@@ -289,12 +266,12 @@ class GridMapperNode(ThinmapNode):
         """Save the map, after all of it follows the newest correction."""
         if self._mapper.finish() is not None:
             self._publish_map()
-        shown = self._settings.output.trinary(self._mapper.whole_map().patch)
+        shown = self._output.config.trinary(self._mapper.whole_map().patch)
         grid = self._mapper.grid.shown
         return f'saved {sessions.save_grid(path, grid, shown, self._mapper.edits, overwrite)}'
 
     def _save_at_end(self, path: str) -> str:
-        is_changed = self._settings.mapping or self._editing.is_edited
+        is_changed = self._is_mapping or self._editing.is_edited
         has_map = is_changed and self._stamp.latest_ns is not None
         return self._save_grid(path) if has_map else ''
 
@@ -312,25 +289,17 @@ class GridMapperNode(ThinmapNode):
             others = await self._session_client.save(
                 folder.resolve(request.path), request.overwrite
             )
-            response.success = others.success
-            response.message = f'{response.message}; {others.message}'
+            return joined(response, others)
         return response
 
-    async def _on_load(
-        self, request: LoadMap.Request, response: LoadMap.Response
-    ) -> LoadMap.Response:
+    async def _on_load(self, request: LoadMap.Request, _: LoadMap.Response) -> LoadMap.Response:
         """Load grid and graph, or neither."""
         try:
             path = self._save_directory.resolve(request.path)
             loaded = self._load_map(path, self._save_directory.path)
-            result = await self._session_client.load(path, lambda: self._load(*loaded))
+            return await self._session_client.load(path, lambda: self._load(*loaded))
         except ThinmapError as error:
-            response.success = False
-            response.message = str(error)
-            return response
-        response.success = result.success
-        response.message = result.message
-        return response
+            return LoadMap.Response(success=False, message=str(error))
 
 
 main = node_main.program(GridMapperNode)

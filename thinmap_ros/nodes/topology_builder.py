@@ -17,7 +17,7 @@ from thinmap_ros.core.topology.segmentation import FIELDS as REGION_FIELDS
 from thinmap_ros.core.topology.segmentation import RegionTracker
 from thinmap_ros.core.topology.topology import Topology, TopologyBuilder
 from thinmap_ros.files.sessions import REGIONS, TOPOLOGY, load_topology
-from thinmap_ros.nodes.parts.topology import RegionNaming, RegionUpdates, RouteGraphUpdates
+from thinmap_ros.nodes.parts.topology import RegionUpdates, RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -59,19 +59,6 @@ class _GraphPublisher:
         return True
 
 
-class _TopologyPublishers:
-    """Publishes the topological map, and the part of it near the robot.
-
-    followed: knows the id of the map.
-    """
-
-    def __init__(self, node: Node) -> None:
-        self.frame_id = parameters.declare_map_frame(node)
-        self.local = _GraphPublisher(node, 'local_topology', self.frame_id)
-        self.map = _GraphPublisher(node, 'topology', self.frame_id)
-        self.followed = FollowedMap()
-
-
 class TopologyBuilderNode(ThinmapNode):
     """/local_grid and /grid in; /local_topology, /topology and /regions out.
 
@@ -89,17 +76,18 @@ class TopologyBuilderNode(ThinmapNode):
     def __init__(self) -> None:
         super().__init__('topology_builder', recovers=True)
         self._config = parameters.declare_config(self, TopologyConfig)
-        self._output = _TopologyPublishers(self)
+        self._frame_id = parameters.declare_map_frame(self)
+        self._local = _GraphPublisher(self, 'local_topology', self._frame_id)
+        self._published = _GraphPublisher(self, 'topology', self._frame_id)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
         save_on_exit(self, self._save_directory, TOPOLOGY, self._save_at_end)
         self._route_graph = RouteGraphUpdates(
-            self, self._output.frame_id, self._config, lambda: self._topology.builder
+            self, self._frame_id, self._config, lambda: self._topology.builder
         )
         self._regions = RegionUpdates(
-            self, self._output.frame_id, self._config.robot_radius_m, lambda: self._topology.map
+            self, self._frame_id, self._config.robot_radius_m, lambda: self._topology.map
         )
-        RegionNaming(self, self._regions)
         parameters.reject_unknown(self)
         kernels.topology_builder()
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
@@ -133,7 +121,7 @@ class TopologyBuilderNode(ThinmapNode):
 
     def reset_state(self) -> None:
         """Discard the graph, or return to the session that the node was started with."""
-        self._output.followed = FollowedMap()
+        self._followed = FollowedMap()
         self._newest_saved_id = 0
         self._topology.reset()
         self._route_graph.reset()
@@ -145,15 +133,15 @@ class TopologyBuilderNode(ThinmapNode):
             self.get_logger().info(f'loaded {self._session}: {counts}')
         else:
             self._regions.reset()
-        if self._session or self._output.map.has_published:
+        if self._session or self._published.has_published:
             self._publish(self.now_ns)
 
     def _is_of_this_map(self, message: ProbabilityGrid) -> bool:
         """Whether a grid is of the map of this graph; a graph of another map is discarded."""
-        origin = self._output.followed.origin(message.map_id)
+        origin = self._followed.origin(message.map_id)
         if origin is Origin.OTHER:
             self.reset('grid is of another map')
-            self._output.followed.origin(message.map_id)
+            self._followed.origin(message.map_id)
         return origin is not Origin.STALE
 
     def _on_local_grid(self, message: LocalGrid) -> None:
@@ -167,12 +155,12 @@ class TopologyBuilderNode(ThinmapNode):
         with self.diagnostics.time_step('graph update'):
             changed = self._topology.step(update)
         # The first one is published even if it is empty: others wait for the graph of the map.
-        if changed is not None or not self._output.map.has_published:
+        if changed is not None or not self._published.has_published:
             self._publish(stamp_ns, again=False)
         # The local map comes last: a subscriber that receives it has all results of this scan. It
         # may wait for the result of each scan (lockstep).
-        local = self._output.local
-        local.publish(self._topology.builder.local_map(), stamp_ns, again=local.has_subscribers)
+        is_heard = self._local.has_subscribers
+        self._local.publish(self._topology.builder.local_map(), stamp_ns, again=is_heard)
 
     def _on_grid(self, message: ProbabilityGrid) -> None:
         if not self._is_of_this_map(message):
@@ -189,8 +177,8 @@ class TopologyBuilderNode(ThinmapNode):
 
     def _publish(self, stamp_ns: int, again: bool = True) -> None:
         self._checkpoint_new_ids()
-        map_id = self._output.followed.id
-        if self._output.map.publish(self._topology.map, stamp_ns, map_id, again):
+        map_id = self._followed.id
+        if self._published.publish(self._topology.map, stamp_ns, map_id, again):
             self._route_graph.map_changed()
             self._regions.graph_changed()
 
@@ -228,7 +216,7 @@ class TopologyBuilderNode(ThinmapNode):
         """Replace the graph by a saved one; windows that were made before are discarded."""
         loaded, regions = self._read(path)
         self._topology.replace(loaded)
-        self._output.followed.leave()
+        self._followed.leave()
         self._regions.reset(regions)
         self._route_graph.reset()
         self._publish(self.now_ns)

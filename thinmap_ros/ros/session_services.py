@@ -4,7 +4,6 @@ It may save it at its end, too.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
@@ -94,14 +93,6 @@ def save_on_exit(
         node.create_timer(float(period_s), save_now, clock=STEADY)
 
 
-@dataclass(frozen=True)
-class PartResult:
-    """What became of one part of a session, or of all: success, and a message for the user."""
-
-    success: bool
-    message: str
-
-
 class SessionClient:
     """Asks the nodes that share a session with `node` to save or load their parts."""
 
@@ -116,20 +107,20 @@ class SessionClient:
         self._check = {part.name: client(LoadMap, 'check', part) for part in _LOADED}
         self._load = {part.name: client(LoadMap, 'load', part) for part in _LOADED}
 
-    async def save(self, path: str, overwrite: bool) -> PartResult:
+    async def save(self, path: str, overwrite: bool) -> SaveMap.Response:
         """Save the parts of all other nodes; overwrite: as in SaveMap.
 
         The part of a node that is not running is archived, as it belongs to an earlier session,
         unless saving has failed before.
         """
         stem = str(stem_of(path))
-        result = PartResult(True, '')
+        result = SaveMap.Response(success=True)
         for part in _SAVED:
             request = SaveMap.Request(path=stem, overwrite=overwrite)
-            result = _joined(result, await self._save_part(part, request, result.success))
+            result = joined(result, await self._save_part(part, request, result.success))
         return result
 
-    async def load(self, path: str, load_grid: Callable[[], None]) -> PartResult:
+    async def load(self, path: str, load_grid: Callable[[], None]) -> LoadMap.Response:
         """Load graph, grid and localizer, after each node has checked its part, or nothing.
 
         A session without a graph clears the graph of the builder.
@@ -147,35 +138,36 @@ class SessionClient:
         if not graph.success:  # the file was replaced since
             return graph
         load_grid()
-        maps = _joined(PartResult(True, 'grid loaded'), graph)
-        return _joined(maps, await self._load_part(LOCALIZER, stem))
+        maps = joined(LoadMap.Response(success=True, message='grid loaded'), graph)
+        return joined(maps, await self._load_part(LOCALIZER, stem))
 
-    async def _check_part(self, part: Part, stem: str) -> PartResult:
+    async def _check_part(self, part: Part, stem: str) -> LoadMap.Response:
         """Have a node read its part; success where it is not running."""
         client = self._check[part.name]
         answer = await call(self._node, client, LoadMap.Request(path=stem))
-        if answer is not None:
-            return PartResult(answer.success, answer.message)
-        if self._load[part.name].service_is_ready():
-            return PartResult(False, f'{client.srv_name}: not found yet: expected a moment later')
-        return PartResult(True, '')
+        if answer is None and self._load[part.name].service_is_ready():
+            later = f'{client.srv_name}: not found yet: expected a moment later'
+            return LoadMap.Response(success=False, message=later)
+        return answer or LoadMap.Response(success=True)
 
-    async def _save_part(self, part: Part, request: SaveMap.Request, archives: bool) -> PartResult:
+    async def _save_part(
+        self, part: Part, request: SaveMap.Request, archives: bool
+    ) -> SaveMap.Response:
         answer = await call(self._node, self._save[part.name], request)
         if answer is not None:
-            return PartResult(answer.success, answer.message)
+            return answer
         try:
             archived = _archived(part, request.path) if archives else ''
         except (ThinmapError, OSError) as error:
-            return PartResult(False, str(error))
+            return SaveMap.Response(success=False, message=str(error))
         absent = _absent(part)
-        return PartResult(True, f'{absent}: {archived}' if archived else absent)
+        return SaveMap.Response(
+            success=True, message=f'{absent}: {archived}' if archived else absent
+        )
 
-    async def _load_part(self, part: Part, stem: str) -> PartResult:
+    async def _load_part(self, part: Part, stem: str) -> LoadMap.Response:
         answer = await call(self._node, self._load[part.name], LoadMap.Request(path=stem))
-        if answer is None:
-            return PartResult(True, _absent(part))
-        return PartResult(answer.success, answer.message)
+        return answer or LoadMap.Response(success=True, message=_absent(part))
 
 
 def _archived(part: Part, stem: str) -> str:
@@ -187,6 +179,7 @@ def _absent(part: Part) -> str:
     return f'{part.node} is not running'
 
 
-def _joined(a: PartResult, b: PartResult) -> PartResult:
+def joined(a: Any, b: Any) -> Any:
+    """One response of two of the same service: success if both have it, and both messages."""
     message = '; '.join(message for message in (a.message, b.message) if message)
-    return PartResult(a.success and b.success, message)
+    return type(a)(success=a.success and b.success, message=message)

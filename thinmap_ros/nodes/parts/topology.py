@@ -132,7 +132,7 @@ def _shows_the_same(patch: GridPatch, before: GridPatch) -> bool:
 
 
 class RegionUpdates:
-    """/regions out: all regions of the newest grid, with nodes and edges in them.
+    """/regions out: all regions of the newest grid, with nodes and edges in them; name_region.
 
     config: what counts as a region; tracker: the regions and their ids. Regions are computed in a
     thread of their own, so that no scan waits for them.
@@ -155,6 +155,7 @@ class RegionUpdates:
         self._published: RegionMap | None = None
         self._is_graph_newer = False
         self.reset()
+        offer(node.create_active_service, NameRegion, 'name_region', self._name)
         if config.region_update_period_s > 0.0:
             self._publisher = node.create_publisher(RegionArray, 'regions', qos.LATCHED)
             node.create_active_timer(config.region_update_period_s, self._begin, clock=STEADY)
@@ -174,11 +175,6 @@ class RegionUpdates:
     def graph_changed(self) -> None:
         """The graph has other nodes or edges, which are to be published with their regions."""
         self._is_graph_newer = True
-
-    def publish_again(self) -> None:
-        """Publish the regions, if there are any: their names are others."""
-        if self.tracker.regions is not None:
-            self._publish(self.tracker.regions)
 
     def _begin(self) -> None:
         """Begin to compute the regions of the newest grid; of the same grid with a new graph."""
@@ -214,24 +210,15 @@ class RegionUpdates:
             message = region_array_msg(membership, self._frame_id, self._published_ns)
         self._publisher.publish(message)
 
-
-class RegionNaming:
-    """Service name_region: a region has a name, which stays at its place in the building."""
-
-    def __init__(self, node: ThinmapNode, regions: RegionUpdates) -> None:
-        self._node = node
-        self._regions = regions
-        offer(node.create_active_service, NameRegion, 'name_region', self._name)
-
     def _name(self, request: NameRegion.Request) -> str:
-        tracker = self._regions.tracker
-        regions = tracker.regions
+        """Give a region a name, which stays at its place in the building."""
+        regions = self.tracker.regions
         if regions is None:
             raise InputError('no regions yet: expected a map, and region_update_period_s above 0')
         name = checked_name(request.name)
         number, anchor = _anchor(regions, request)
-        tracker.names.put(regions, number, anchor, name)
-        self._regions.publish_again()
+        self.tracker.names.put(regions, number, anchor, name)
+        self._publish(regions)
         self._node.checkpoint_now()
         return f'region {number}: {name}' if name else f'region {number}: no name'
 
