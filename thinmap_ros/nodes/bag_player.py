@@ -26,23 +26,10 @@ from thinmap_ros.ros.messages import message_class
 from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.time_jumps import STEADY
 
-
-@dataclass(frozen=True)
-class _Times:
-    """Periods and delays of the player, s.
-
-    tick: between two looks for messages that are due. clock: between two messages on /clock, at
-    most. settle: from the subscription to the scans to the first message. acknowledge: wait for
-    the acknowledgement of the last messages, at most.
-    """
-
-    tick: float
-    clock: float
-    settle: float
-    acknowledge: float
-
-
-_SECONDS = _Times(tick=0.002, clock=0.02, settle=0.5, acknowledge=1.0)
+_TICK_S = 0.002  # between two looks for messages that are due
+_CLOCK_PERIOD_S = 0.02  # between two messages on /clock, at most
+_SETTLE_S = 0.5  # from the subscription to the scans to the first message
+_ACKNOWLEDGE_S = 1.0  # for the acknowledgement of the last messages, at most
 
 
 @dataclass(frozen=True)
@@ -74,24 +61,8 @@ class BagPlayerConfig(Config):
     lockstep_timeout_s: float = parameter(TIMEOUT_S, TIMEOUT_DESCRIPTION, low=0.1, high=3600.0)
 
 
-class _ClockPublisher:
-    """Publishes /clock: with each message, and at least every 20 ms while time is due."""
-
-    def __init__(self, node: Node) -> None:
-        self._topic = node.create_publisher(ClockMsg, '/clock', qos.STREAM)
-        self._last_s = 0.0
-
-    def publish(self, ns: int) -> None:
-        self._topic.publish(ClockMsg(clock=messages.time_msg(ns)))
-
-    def publish_if_due(self, ns: int, now_s: float) -> None:
-        if now_s - self._last_s > _SECONDS.clock:
-            self._last_s = now_s
-            self.publish(ns)
-
-
 class BagPlayerNode(Node):
-    """Publishes the messages of a bag at their rate and with their quality of service.
+    """Publishes the messages of a bag at their rate and with their quality of service, and /clock.
 
     Ends with the bag. Services: ~/pause (true: pause, false: continue), ~/step (while paused: up to
     and including the next scan).
@@ -109,7 +80,8 @@ class BagPlayerNode(Node):
         if self._bag.repair_hint:
             self.get_logger().warning(self._bag.repair_hint)
         self._publishers_by_topic: dict[str, Publisher] = {}
-        self._clock_publisher = _ClockPublisher(self)
+        self._time = self.create_publisher(ClockMsg, '/clock', qos.STREAM)
+        self._time_published_s = 0.0
         for topic in self._chosen():
             self._offer(topic)
         topics = set(self._publishers_by_topic)
@@ -127,12 +99,12 @@ class BagPlayerNode(Node):
         self.finished = False
         offer(self.create_service, SetBool, '~/pause', self._on_pause)
         offer(self.create_service, Trigger, '~/step', self._on_step)
-        self.create_timer(_SECONDS.tick, self._tick, clock=STEADY)
+        self.create_timer(_TICK_S, self._tick, clock=STEADY)
 
     def close(self) -> None:
         """Wait until the last messages are acknowledged, and log how many were sent."""
         for publisher in self._publishers_by_topic.values():
-            publisher.wait_for_all_acked(Duration(seconds=_SECONDS.acknowledge))
+            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_S))
         counts = sorted(self._sent.items())
         parts = ', '.join(f'{topic} {count}' for topic, count in counts) or 'nothing'
         total = counted(self._sent.total(), 'message')
@@ -197,12 +169,14 @@ class BagPlayerNode(Node):
         self._last_tick_s = now_s
         if self._start_s is None:
             # A node that subscribes to the scans discovers the other topics a moment later.
-            self._start_s = now_s + _SECONDS.settle if self._has_subscribers() else None
+            self._start_s = now_s + _SETTLE_S if self._has_subscribers() else None
         if self._start_s is None or now_s < self._start_s:
             return
         if not self._paused:
             self._play(passed_s)
-        self._clock_publisher.publish_if_due(self._playback.clock_ns, now_s)
+        if now_s - self._time_published_s > _CLOCK_PERIOD_S:
+            self._time_published_s = now_s
+            self._publish_time(self._playback.clock_ns)
         is_answered = not self._lockstep.is_waiting or self._lockstep.timed_out()
         self.finished = self._playback.finished and is_answered
 
@@ -228,7 +202,7 @@ class BagPlayerNode(Node):
         return True
 
     def _send(self, message: RawMessage) -> None:
-        self._clock_publisher.publish(message.log_ns)
+        self._publish_time(message.log_ns)
         self._publishers_by_topic[message.topic].publish(message.data)
         self._sent[message.topic] += 1
         if is_scan(message) and self._config.lockstep != NONE:
@@ -237,6 +211,9 @@ class BagPlayerNode(Node):
                 self._lockstep.scan_published(
                     messages.stamp_ns(self._bag.decode(message).header.stamp)
                 )
+
+    def _publish_time(self, ns: int) -> None:
+        self._time.publish(ClockMsg(clock=messages.time_msg(ns)))
 
     def _publish_diagnostics(self) -> None:
         is_waiting = self._start_s is None

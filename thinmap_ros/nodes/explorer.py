@@ -30,7 +30,7 @@ from thinmap_ros.nodes.parts.mission import (
     Starts,
     StrategySource,
 )
-from thinmap_ros.nodes.parts.observation import ObservationSource, RobotFrames
+from thinmap_ros.nodes.parts.observation import ObservationSource
 from thinmap_ros.nodes.parts.team_member import Progress, declare_team
 from thinmap_ros.ros import node_main, parameters
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
@@ -63,11 +63,10 @@ class ExplorerNode(ThinmapNode):
         super().__init__('explorer', recovers=True)
         self._strategies = StrategySource(self)
         self._settings = parameters.declare_config(self, ExplorationSettings)
-        frames = RobotFrames(parameters.declare_map_frame(self), LaserTransform(self))
-        self._settings.apply_base_frame(frames.laser_transform)
-        self._team = declare_team(
-            self, frames.map_frame, self._strategies.is_default, self._progress
-        )
+        map_frame = parameters.declare_map_frame(self)
+        laser = LaserTransform(self)
+        self._settings.apply_base_frame(laser)
+        self._team = declare_team(self, map_frame, self._strategies.is_default, self._progress)
         self._session = parameters.declare_session(self)
         directory = SaveDirectory(self)
         offer_saving(self, directory, EXPLORATION, self._save)
@@ -76,12 +75,12 @@ class ExplorerNode(ThinmapNode):
         kernels.explorer()
         radius_m = self._strategies.config.planner.robot_radius_m
         self._source = ObservationSource(
-            self, self._settings, frames, radius_m, self._on_observation
+            self, self._settings, map_frame, laser, radius_m, self._on_observation
         )
-        self._driver = self._make_driver(frames.map_frame)
+        self._driver = self._make_driver(map_frame)
         self._starts = Starts(self)
         self.reset_state()
-        self._output = MissionPublishers(self, frames.map_frame, self._on_resume)
+        self._output = MissionPublishers(self, map_frame, self._on_resume)
         self._goals = SingleGoalServer(
             self, Explore, ACTION, self._start, self._on_preempted, self._starts.read
         )

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
-from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import LocalizationStatus, SlamStatus, TopologicalMap
@@ -89,29 +88,6 @@ class GlobalLocalizerConfig(Config):
     map_path: str = parameter(
         '', 'map_server YAML file. Empty: map and topology are taken from their topics.'
     )
-
-
-@dataclass(frozen=True)
-class _Settings:
-    """Parameters of the search, the node, and of driving while searching."""
-
-    search: GlobalLocalizationConfig
-    node: GlobalLocalizerConfig
-    map_frame: str
-    stamped_commands: bool
-    driving: NavigatorConfig
-
-    @staticmethod
-    def declare(node: Node) -> '_Settings':
-        search = parameters.declare_config(node, GlobalLocalizationConfig)
-        own = parameters.declare_config(node, GlobalLocalizerConfig)
-        driving = NavigatorConfig(
-            planner=WavefrontConfig(robot_radius_m=search.robot_radius_m + _PATH_MARGIN_M),
-            controller=PathFollowerConfig(max_speed_m_s=own.drive_speed_m_s),
-            stop_radius_m=search.robot_radius_m + _STOP_MARGIN_M,
-        )
-        map_frame = parameters.declare_map_frame(node)
-        return _Settings(search, own, map_frame, declare_stamped(node), driving)
 
 
 class _LostDetector:
@@ -235,57 +211,6 @@ class _SearchDriver:
         )
 
 
-class _LocalizationPublishers:
-    """Publishes the status of the search, its samples, and the pose that was found."""
-
-    def __init__(self, node: Node, map_frame: str) -> None:
-        self._node = node
-        self._frame = map_frame
-        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'initialpose', qos.STREAM)
-        self._samples = node.create_publisher(PoseArray, 'localization_samples', qos.LATCHED)
-        self._status = node.create_publisher(LocalizationStatus, 'localization_status', qos.LATCHED)
-        self._samples_ns = -_SAMPLES_PERIOD_NS
-
-    def publish_state(self, state: int, reason: str) -> None:
-        """Publish a state without candidates, at the present time."""
-        header = messages.header(self._frame, self._node.get_clock().now().nanoseconds)
-        self._publish_status(LocalizationStatus(header=header, state=state, reason=reason))
-
-    def publish_result(self, stamp_ns: int, result: Result) -> None:
-        """Publish a result at a scan's stamp, with its pose if it has one."""
-        self._publish_status(
-            LocalizationStatus(
-                header=messages.header(self._frame, stamp_ns),
-                state=_STATES[result.state],
-                reason=result.reason,
-                hypotheses=[messages.pose_msg(found.T_map_base) for found in result.hypotheses],
-                weights=[found.weight for found in result.hypotheses],
-                inlier_ratios=[found.explained for found in result.hypotheses],
-            )
-        )
-        if result.pose is not None:
-            pose = result.pose
-            self._pose.publish(
-                messages.pose_with_covariance_msg(
-                    pose.T_map_base, pose.covariance, self._frame, stamp_ns
-                )
-            )
-            self._node.get_logger().info(f'localized: {result.reason}')
-
-    def publish_samples(self, stamp_ns: int, samples: Array) -> None:
-        """Publish the samples (N, 3), at most once a second: it takes longer than a step."""
-        if not 0 <= stamp_ns - self._samples_ns < _SAMPLES_PERIOD_NS:
-            self._samples_ns = stamp_ns
-            poses = [messages.pose_msg(T) for T in samples]
-            header = messages.header(self._frame, stamp_ns)
-            self._samples.publish(PoseArray(header=header, poses=poses))
-
-    def _publish_status(self, status: LocalizationStatus) -> None:
-        self._status.publish(status)
-        if status.state == LocalizationStatus.WAITING:
-            self._node.get_logger().warning(status.reason, throttle_duration_sec=WARN_PERIOD_S)
-
-
 class GlobalLocalizerNode(ThinmapNode):
     """/scan, /odom, /map and /topology in.
 
@@ -296,24 +221,30 @@ class GlobalLocalizerNode(ThinmapNode):
 
     def __init__(self) -> None:
         super().__init__('global_localizer')
-        self._settings = _Settings.declare(self)
+        self._search = parameters.declare_config(self, GlobalLocalizationConfig)
+        self._config = parameters.declare_config(self, GlobalLocalizerConfig)
+        self._map_frame = parameters.declare_map_frame(self)
+        is_stamped = declare_stamped(self)
         self._laser_transform = LaserTransform(self)
         base_frame = self._laser_transform.base_frame
         self._odometry = OdometrySource(self, base_frame, self._on_odometry)
         parameters.reject_unknown(self)
         self._patch: GridPatch | None = None
         self._topology: Topology | None = None
-        if self._settings.node.map_path:
-            file = Path(self._settings.node.map_path)
+        if self._config.map_path:
+            file = Path(self._config.map_path)
             self._patch = occupancy_maps.read_map(file, report=self.get_logger().warning)
             self._topology = build(self._patch, None, TopologyConfig())
         kernels.global_localizer()
-        if self._settings.node.drive:
+        if self._config.drive:
             kernels.active_search()
-        self._output = _LocalizationPublishers(self, self._settings.map_frame)
-        self._driver = self._create_driver()
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, 'initialpose', qos.STREAM)
+        self._samples = self.create_publisher(PoseArray, 'localization_samples', qos.LATCHED)
+        self._samples_ns = -_SAMPLES_PERIOD_NS
+        self._status = self.create_publisher(LocalizationStatus, 'localization_status', qos.LATCHED)
+        self._driver = self._create_driver(is_stamped)
         self.reset_state()
-        if not self._settings.node.map_path:
+        if not self._config.map_path:
             subscribe_to_map(self, 'map', self._on_map)
             subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
@@ -322,12 +253,11 @@ class GlobalLocalizerNode(ThinmapNode):
         offer(self.create_active_service, LocalizeGlobally, 'localize_globally', self._on_request)
         self.create_active_timer(1.0, self._report_missing_inputs)
 
-    def _create_driver(self) -> _SearchDriver:
+    def _create_driver(self, is_stamped: bool) -> _SearchDriver:
         topics = self._laser_transform.scan_topics
-        if not self._settings.node.drive:
+        if not self._config.drive:
             return _SearchDriver(self.elapsed_time, topics, None)
-        base_frame = self._laser_transform.base_frame
-        velocity = VelocityPublisher(self, base_frame, self._settings.stamped_commands)
+        velocity = VelocityPublisher(self, self._laser_transform.base_frame, is_stamped)
         self.create_active_timer(CONTROL_PERIOD_S, lambda: self._driver.step())
         driver = _SearchDriver(self.elapsed_time, topics, velocity)
         StopTopic(self, driver.hold)
@@ -336,8 +266,8 @@ class GlobalLocalizerNode(ThinmapNode):
     def reset_state(self) -> None:
         """Discard the search and all inputs but the map."""
         self._localization: GlobalLocalization | None = None
-        self._is_requested = self._settings.node.start_automatically
-        self._lost = _LostDetector(round(1e9 * self._settings.node.lost_timeout_s))
+        self._is_requested = self._config.start_automatically
+        self._lost = _LostDetector(round(1e9 * self._config.lost_timeout_s))
         self._pairing = ScanOdometrySynchronizer()
         self._odometry.reset()
         self._received: set[str] = set()
@@ -362,7 +292,7 @@ class GlobalLocalizerNode(ThinmapNode):
         """Start when the localizer reports that it is lost (kidnapped robot)."""
         is_lost = messages.is_lost(message) and not self._is_requested
         is_kidnapped = self._lost.update(messages.stamp_ns(message.header.stamp), is_lost)
-        if is_kidnapped and self._settings.node.start_automatically:
+        if is_kidnapped and self._config.start_automatically:
             self.get_logger().info('the localizer is lost: searching the whole map')
             self._start(clear=True)
 
@@ -402,8 +332,8 @@ class GlobalLocalizerNode(ThinmapNode):
                 with self.diagnostics.time_step('global localization'):
                     result = localization.step(scan, T_odom_base)
                 self._driver.add_result(result, T_odom_base)
-                self._output.publish_samples(scan.stamp_ns, localization.samples)
-                self._output.publish_result(scan.stamp_ns, result)
+                self._publish_samples(scan.stamp_ns, localization.samples)
+                self._publish_result(scan.stamp_ns, result)
                 if result.pose is not None:
                     self._finish(scan.stamp_ns)
 
@@ -418,19 +348,17 @@ class GlobalLocalizerNode(ThinmapNode):
         """The search under way, or a new one; None while the map is missing or unusable."""
         if self._localization is not None or self._patch is None or self._topology is None:
             return self._localization
-        settings = self._settings
         try:
             localization = GlobalLocalization(
-                self._patch, self._topology, settings.search, settings.node.seed
+                self._patch, self._topology, self._search, self._config.seed
             )
         except InputError as error:
-            self._output.publish_state(LocalizationStatus.WAITING, str(error))
+            self._publish_state(LocalizationStatus.WAITING, str(error))
             return None
         self._localization = localization
-        if settings.node.drive:
-            self._driver.search = ActiveSearch(
-                localization.places, settings.search, settings.driving
-            )
+        if self._config.drive:
+            driving = _driving(self._search.robot_radius_m, self._config.drive_speed_m_s)
+            self._driver.search = ActiveSearch(localization.places, self._search, driving)
         return localization
 
     def _missing(self) -> str:
@@ -444,9 +372,57 @@ class GlobalLocalizerNode(ThinmapNode):
     def _report_missing_inputs(self) -> None:
         missing = self._missing()
         if not self._is_requested:
-            self._output.publish_state(LocalizationStatus.IDLE, 'no request')
+            self._publish_state(LocalizationStatus.IDLE, 'no request')
         elif missing:
-            self._output.publish_state(LocalizationStatus.WAITING, f'waits for {missing}')
+            self._publish_state(LocalizationStatus.WAITING, f'waits for {missing}')
+
+    def _publish_state(self, state: int, reason: str) -> None:
+        """Publish a state without candidates, at the present time."""
+        header = messages.header(self._map_frame, self.now_ns)
+        self._publish_status(LocalizationStatus(header=header, state=state, reason=reason))
+
+    def _publish_result(self, stamp_ns: int, result: Result) -> None:
+        """Publish a result at a scan's stamp, with its pose if it has one."""
+        self._publish_status(
+            LocalizationStatus(
+                header=messages.header(self._map_frame, stamp_ns),
+                state=_STATES[result.state],
+                reason=result.reason,
+                hypotheses=[messages.pose_msg(found.T_map_base) for found in result.hypotheses],
+                weights=[found.weight for found in result.hypotheses],
+                inlier_ratios=[found.explained for found in result.hypotheses],
+            )
+        )
+        pose = result.pose
+        if pose is not None:
+            self._pose.publish(
+                messages.pose_with_covariance_msg(
+                    pose.T_map_base, pose.covariance, self._map_frame, stamp_ns
+                )
+            )
+            self.get_logger().info(f'localized: {result.reason}')
+
+    def _publish_samples(self, stamp_ns: int, samples: Array) -> None:
+        """Publish the samples (N, 3), at most once a second: it takes longer than a step."""
+        if not 0 <= stamp_ns - self._samples_ns < _SAMPLES_PERIOD_NS:
+            self._samples_ns = stamp_ns
+            poses = [messages.pose_msg(T) for T in samples]
+            header = messages.header(self._map_frame, stamp_ns)
+            self._samples.publish(PoseArray(header=header, poses=poses))
+
+    def _publish_status(self, status: LocalizationStatus) -> None:
+        self._status.publish(status)
+        if status.state == LocalizationStatus.WAITING:
+            self.get_logger().warning(status.reason, throttle_duration_sec=WARN_PERIOD_S)
+
+
+def _driving(robot_radius_m: float, speed_m_s: float) -> NavigatorConfig:
+    """How a robot is driven while it searches."""
+    return NavigatorConfig(
+        planner=WavefrontConfig(robot_radius_m=robot_radius_m + _PATH_MARGIN_M),
+        controller=PathFollowerConfig(max_speed_m_s=speed_m_s),
+        stop_radius_m=robot_radius_m + _STOP_MARGIN_M,
+    )
 
 
 main = node_main.program(GlobalLocalizerNode)

@@ -74,7 +74,6 @@ class _NavigatorPublishers:
         self._plan = node.create_publisher(Path, 'plan', qos.LATCHED)
         self._published_path: Array | None = None
         self.is_moving = False  # by the last command
-        self._stop_topic: StopTopic | None = None
 
     def command(self, v: float, w: float) -> None:
         self.velocity.publish(v, w)
@@ -100,15 +99,6 @@ class _NavigatorPublishers:
             self.command(0.0, 0.0)
             return True
         return False
-
-    def add_stop(self, topic: StopTopic) -> None:
-        """Protective stops are published on a topic."""
-        self._stop_topic = topic
-
-    def protect(self) -> None:
-        """Begin a protective stop, which lasts until it is released."""
-        assert self._stop_topic is not None
-        self._stop_topic.hold()
 
     def plan(self, path: Array | None) -> None:
         """Publish a path (K, 2), unless it is the one that was published last."""
@@ -169,7 +159,7 @@ class NavigatorNode(ThinmapNode):
         # As in Nav2, a goal from RViz is one of the action: its status is public.
         self._own_client = ActionClient(self, NavigateToPose, 'navigate_to_pose')
         self._check_inputs()
-        self._output.add_stop(StopTopic(self, self._on_stop))
+        self._stop_topic = StopTopic(self, self._on_stop)
         self._timer = self.create_active_timer(CONTROL_PERIOD_S, self._control)
         self.create_active_timer(_LOOK_PERIOD_S, self._look, clock=STEADY)
 
@@ -346,7 +336,7 @@ class NavigatorNode(ThinmapNode):
         self._navigator.reset_velocity()
         if self._config.resume_after_stop or not self._output.is_moving:
             return Command(0.0, 0.0, 'blocked', reason)
-        self._output.protect()
+        self._stop_topic.hold()
         return Command(0.0, 0.0, 'failed', f'{reason} until it is released: ~/release_stop')
 
     def _publish_feedback(self, speed_m_s: float) -> None:

@@ -1,12 +1,15 @@
 """A page in the browser: shows map and robot, and steers it."""
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMsg
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import (
@@ -115,20 +118,22 @@ class WebNode(ThinmapNode):
     def _subscribe(self) -> None:
         picture = self._picture
         subscribe_to_map(self, 'map', picture.grid)
-        subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         self._laser.subscribe(self, self._on_scan)
-        subscribe_guarded(self, PathMsg, 'trajectory', self._on_trajectory, qos.LATCHED)
-        subscribe_guarded(self, PathMsg, 'plan', picture.plan, qos.LATCHED)
-        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
-        subscribe_guarded(self, RegionArray, 'regions', picture.regions, qos.LATCHED)
-        subscribe_guarded(self, KeepOut, 'keep_out', picture.keep_out, qos.LATCHED)
-        subscribe_guarded(self, EndNodeArray, 'end_nodes', picture.end_nodes, qos.LATCHED)
-        subscribe_guarded(self, SlamStatus, 'slam_status', picture.slam, qos.STREAM)
-        subscribe_guarded(
-            self, ExplorationStatus, 'exploration_status', picture.exploration, qos.LATCHED
-        )
-        subscribe_guarded(self, LocalizedScan, 'localized_scan', picture.localized_scan, qos.STREAM)
-        subscribe_guarded(self, DiagnosticArray, '/diagnostics', picture.diagnostics, qos.STREAM)
+        topics: list[tuple[type, str, Callable[[Any], None], QoSProfile]] = [
+            (PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM),
+            (PathMsg, 'trajectory', self._on_trajectory, qos.LATCHED),
+            (PathMsg, 'plan', picture.plan, qos.LATCHED),
+            (TopologicalMap, 'topology', self._on_topology, qos.LATCHED),
+            (RegionArray, 'regions', picture.regions, qos.LATCHED),
+            (KeepOut, 'keep_out', picture.keep_out, qos.LATCHED),
+            (EndNodeArray, 'end_nodes', picture.end_nodes, qos.LATCHED),
+            (SlamStatus, 'slam_status', picture.slam, qos.STREAM),
+            (ExplorationStatus, 'exploration_status', picture.exploration, qos.LATCHED),
+            (LocalizedScan, 'localized_scan', picture.localized_scan, qos.STREAM),
+            (DiagnosticArray, '/diagnostics', picture.diagnostics, qos.STREAM),
+        ]
+        for kind, topic, process, profile in topics:
+            subscribe_guarded(self, kind, topic, process, profile)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from_msg(message.pose.pose)

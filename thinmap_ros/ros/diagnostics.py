@@ -4,10 +4,11 @@ import math
 import re
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import monotonic, perf_counter
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -372,16 +373,17 @@ class NodeDiagnostics(MessageStatistics):
 
         Other nodes may discover both endpoints before these discover each other.
         """
-        found = {}
-        for publisher in list(self._node.publishers):
-            if publisher.topic_name not in _TOPICS_OF_EVERY_NODE:
-                name = publisher.topic_name.lstrip('/')
-                found[f'{name}: subscribers'] = _subscribers(self._node, publisher)
-        for subscription in list(self._node.subscriptions):
-            if subscription.topic_name not in _TOPICS_OF_EVERY_NODE:
-                name = subscription.topic_name.lstrip('/')
-                found[f'{name}: publishers'] = _publishers(self._node, subscription)
-        return found
+        node = self._node
+        own: list[tuple[Iterable[Any], str, Callable[[Node, Any], str]]] = [
+            (node.publishers, 'subscribers', _subscribers),
+            (node.subscriptions, 'publishers', _publishers),
+        ]
+        return {
+            f'{each.topic_name.lstrip("/")}: {others}': described(node, each)
+            for endpoints, others, described in own
+            for each in list(endpoints)
+            if each.topic_name not in _TOPICS_OF_EVERY_NODE
+        }
 
 
 def publisher_names(node: Node, topic: str) -> list[str]:

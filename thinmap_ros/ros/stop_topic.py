@@ -119,7 +119,7 @@ class StopTopic:
         offer(node.create_service, ReleaseStop, '~/release_stop', self._on_request)
         node.diagnostics.expect_topic(TOPIC)
         node.diagnostics.add_update_callback(self._refresh)
-        node.diagnostics.add_check(WARN, self._gone_sources)
+        node.diagnostics.add_check(WARN, lambda: self.reason if '(gone' in self.reason else '')
         self._restore()
         for profile in _SUBSCRIPTIONS:
             subscribe_with_gid(node, TOPIC, self._on_message, profile)
@@ -229,6 +229,3 @@ class StopTopic:
             for gid, name in self._sources.names.items()
         ]
         return f'the robot is stopped: {self._topic}: {", ".join(sorted(names))}'
-
-    def _gone_sources(self) -> str:
-        return self.reason if '(gone' in self.reason else ''

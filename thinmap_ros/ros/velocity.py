@@ -81,7 +81,7 @@ class CommandWatchdog:
 
     def __init__(
         self,
-        publish: Callable[[float, float], None],
+        publish: Callable[[float, float], object],
         on_stop: Callable[[float], None],
         timeout: CommandTimeout,
     ) -> None:
@@ -319,7 +319,7 @@ class VelocityPublisher:
         self._interruption = ''
         self._is_moving = False  # as commanded last
         self._watchdog = CommandWatchdog(
-            self._send, self._on_interruption, CommandTimeout(node.elapsed_time.is_simulated)
+            self._output.send, self._on_interruption, CommandTimeout(node.elapsed_time.is_simulated)
         )
         # A joystick or Nav2's behaviors may share the topic on purpose. A page ends what drives
         # before it publishes, as it publishes the stop.
@@ -350,9 +350,6 @@ class VelocityPublisher:
         self._interruption = ''
         self._is_moving = v != 0.0 or w != 0.0
         self._watchdog.send(v, w)
-
-    def _send(self, v: float, w: float) -> None:
-        self._output.send(v, w)
 
     def _on_failure(self) -> None:
         """Stand until the next command, which begins at rest."""

@@ -163,7 +163,8 @@ class MapInput:
         self._map_id = UNKNOWN
         self.pose_map_id = UNKNOWN
         timeouts_s = [_WARN_S, self._timeout_s] if self._timeout_s > 0.0 else [_WARN_S]
-        self._streams = [_mapper_stream(seconds) for seconds in timeouts_s]
+        timeouts_ns = [round(seconds * SECOND_NS) for seconds in timeouts_s]
+        self._streams = [InputStream('grid_mapper', ns, ns) for ns in timeouts_ns]
 
     @property
     def warning(self) -> str:
@@ -201,11 +202,6 @@ class MapInput:
     def _on_map(self, patch: GridPatch) -> None:
         if not self._has_grid:
             self._map.replace(patch)
-
-
-def _mapper_stream(timeout_s: float) -> InputStream:
-    timeout_ns = round(timeout_s * SECOND_NS)
-    return InputStream('grid_mapper', timeout_ns, timeout_ns)
 
 
 # Without a new pose the last correction of the odometry holds for a while; without odometry, the

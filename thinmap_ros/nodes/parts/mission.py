@@ -223,19 +223,10 @@ class ExplorerState:
         Raises InputError where the others are invalid.
         """
         latest_ns, rest = snapshot.split_number(state, 'latest_ns')
-        own = {name: array for name, array in rest.items() if name in _IDS}
+        own, rest = snapshot.split(rest, _IDS)
         ids = snapshot.validate(own, _IDS, 'explorer')
         goal_id = ids['goal_ids'][:1].tobytes()
-        strategy = {
-            name.removeprefix(_STRATEGY): array
-            for name, array in rest.items()
-            if name.startswith(_STRATEGY)
-        }
-        mission = {
-            name: array
-            for name, array in rest.items()
-            if name not in _IDS and not name.startswith(_STRATEGY)
-        }
+        strategy, mission = snapshot.split_prefix(rest, _STRATEGY)
         prefix = ids['drive_prefix'].tobytes()
         return ExplorerState(latest_ns, goal_id, prefix, mission, strategy)
 

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from time import monotonic
 
@@ -218,14 +218,6 @@ _SILENT_NS = 2 * SECOND_NS
 _POSE_TIMEOUT_S = 3.0
 
 
-@dataclass(frozen=True)
-class RobotFrames:
-    """Frame of the map, and the laser on the robot."""
-
-    map_frame: str
-    laser_transform: LaserTransform
-
-
 class _GridPublisher:
     """The mapper: whether there is one, and which map it publishes."""
 
@@ -299,7 +291,8 @@ class ObservationSource:
         self,
         node: ThinmapNode,
         settings: ExplorationSettings,
-        frames: RobotFrames,
+        map_frame: str,
+        laser: LaserTransform,
         robot_radius_m: float,
         on_observation: Callable[[Observation], None],
     ) -> None:
@@ -309,8 +302,8 @@ class ObservationSource:
         self._graph_config = TopologyConfig(robot_radius_m=robot_radius_m)
         self._grids = _GridPublisher(node)
         self._topologies = _TopologyPublisher(node)
-        self._view = RobotView(node, settings, frames.map_frame, frames.laser_transform)
-        self._map = ForeignMap(node, settings, frames.map_frame, self._uses_foreign_map)
+        self._view = RobotView(node, settings, map_frame, laser)
+        self._map = ForeignMap(node, settings, map_frame, self._uses_foreign_map)
         self._keep_out = KeepOut()
         self.reset()
         on_topology = self._topologies.received
@@ -318,7 +311,7 @@ class ObservationSource:
         subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(node, KeepOutMsg, 'keep_out', self._on_keep_out, qos.LATCHED)
         subscribe_guarded(node, LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
-        frames.laser_transform.subscribe(node, self._on_scan)
+        laser.subscribe(node, self._on_scan)
         node.create_active_timer(_LOOK_PERIOD_S, self._look)
 
     def reset(self) -> None:

@@ -36,7 +36,6 @@ from thinmap_ros.ros.maps import received_map, received_update, updates_topic
 from thinmap_ros.ros.services import action_servers
 from thinmap_ros.ros.velocity import TOPIC as COMMANDS
 from thinmap_ros.ros.velocity import VelocitySubscription
-from thinmap_ros.sim.laser import LaserScanner
 from thinmap_ros.sim.other_robots import starts_in, starts_side_by_side
 from thinmap_ros.sim.simulation import SensorReadings, Simulation
 from thinmap_ros.sim.world import World
@@ -165,82 +164,6 @@ class RequestedExploration:
 _COMMAND_TIMEOUT_NS = 500_000_000
 
 
-class _Publishers:
-    """Publishes what a simulated robot senses, and the ground truth."""
-
-    def __init__(self, node: Node, prefix: str, lasers: list[LaserScanner], tf: bool) -> None:
-        """prefix: of the topics of one of several robots, with a slash; ''.
-
-        tf: also publish the transforms.
-        """
-        self._scan_time_s = 1.0 / lasers[0].config.scan_rate_hz
-        self._mounts = [laser.mount for laser in lasers]
-        self._scans = {
-            mount.frame: node.create_publisher(LaserScan, f'{prefix}{mount.topic}', qos.STREAM)
-            for mount in self._mounts
-        }
-        self._odom = node.create_publisher(Odometry, f'{prefix}odom', qos.STREAM)
-        self._truth = node.create_publisher(PoseStamped, f'{prefix}ground_truth', qos.STREAM)
-        self._collisions = node.create_publisher(UInt32, f'{prefix}collisions', qos.LATCHED)
-        # Frames of several robots have the same names: each robot has transforms of its own.
-        below = prefix or '/'
-        self._tf = node.create_publisher(TFMessage, f'{below}tf', qos.STREAM)
-        self._tf_static = node.create_publisher(
-            TFMessage, f'{below}tf_static', qos.STATIC_TRANSFORMS
-        )
-        self._publish_tf = tf
-        self._last_collisions = -1
-        self._last_scans: list[LaserScan] = []
-
-    @property
-    def fewest_subscribers(self) -> int:
-        """Number of subscribers of the scans of the laser that has the fewest."""
-        return min(int(scans.get_subscription_count()) for scans in self._scans.values())
-
-    def publish_laser_poses(self) -> None:
-        if self._publish_tf:
-            transforms = [
-                messages.transform_msg(mount.T_base_laser, 'base_link', mount.frame, 0)
-                for mount in self._mounts
-            ]
-            self._tf_static.publish(TFMessage(transforms=transforms))
-
-    def publish(self, moment: SensorReadings, simulation: Simulation) -> None:
-        """Publish a moment; the scans, if there are any, come last."""
-        robot = simulation.robot
-        self._publish_odometry(moment, simulation)
-        truth = messages.pose_stamped_msg(robot.T_world_base, 'world', moment.stamp_ns)
-        self._truth.publish(truth)
-        if robot.collisions != self._last_collisions:
-            self._last_collisions = robot.collisions
-            self._collisions.publish(UInt32(data=robot.collisions))
-        if moment.scans:
-            self._last_scans = [
-                messages.scan_msg(scan, scan.frame, self._scan_time_s) for scan in moment.scans
-            ]
-            self._publish_scans()
-
-    def repeat_scan(self, simulation: Simulation) -> None:
-        """Publish the last scan again, with the present odometry."""
-        if self._last_scans:
-            self._publish_scans()
-            self._publish_odometry(simulation.read_sensors(), simulation)
-
-    def _publish_scans(self) -> None:
-        for message in self._last_scans:
-            self._scans[message.header.frame_id].publish(message)
-
-    def _publish_odometry(self, moment: SensorReadings, simulation: Simulation) -> None:
-        velocity = (simulation.robot.v, simulation.robot.w)
-        frames = ('odom', 'base_link')
-        self._odom.publish(
-            messages.odometry_msg(moment.T_odom_base, velocity, frames, moment.stamp_ns)
-        )
-        if self._publish_tf:
-            transform = messages.transform_msg(moment.T_odom_base, *frames, moment.stamp_ns)
-            self._tf.publish(TFMessage(transforms=[transform]))
-
-
 @dataclass(frozen=True)
 class _VelocityCommand:
     """A velocity command, m/s and rad/s, with the time at which it was received."""
@@ -256,7 +179,10 @@ class _VelocityCommand:
 
 
 class RobotInterface:
-    """A simulated robot on the graph; its topics begin with a prefix, '' or 'robot1/'."""
+    """A simulated robot on the graph; its topics begin with a prefix, '' or 'robot1/'.
+
+    Commands in; what the robot senses, and the ground truth, out.
+    """
 
     def __init__(
         self,
@@ -270,31 +196,84 @@ class RobotInterface:
         self._prefix = prefix
         self._simulation = simulation
         self._diagnostics = diagnostics
-        self._output = _Publishers(node, prefix, simulation.lasers, publish_tf)
+        lasers = simulation.lasers
+        self._scan_time_s = 1.0 / lasers[0].config.scan_rate_hz
+        self._mounts = [laser.mount for laser in lasers]
+        self._scans = {
+            mount.frame: node.create_publisher(LaserScan, f'{prefix}{mount.topic}', qos.STREAM)
+            for mount in self._mounts
+        }
+        self._odom = node.create_publisher(Odometry, f'{prefix}odom', qos.STREAM)
+        self._truth = node.create_publisher(PoseStamped, f'{prefix}ground_truth', qos.STREAM)
+        self._collisions = node.create_publisher(UInt32, f'{prefix}collisions', qos.LATCHED)
+        # Frames of several robots have the same names: each robot has transforms of its own.
+        below = prefix or '/'
+        self._tf = node.create_publisher(TFMessage, f'{below}tf', qos.STREAM)
+        self._tf_static = node.create_publisher(
+            TFMessage, f'{below}tf_static', qos.STATIC_TRANSFORMS
+        )
+        self._publish_tf = publish_tf
+        self._last_collisions = -1
+        self._last_scans: list[LaserScan] = []
         self._command = _VelocityCommand()
         VelocitySubscription(node, diagnostics, self._on_command, f'{prefix}{COMMANDS}')
         self._teleports = f'~/{prefix}set_pose'
         node.create_subscription(PoseStamped, self._teleports, self._on_teleport, qos.STREAM)
-        self._output.publish_laser_poses()
+        if publish_tf:
+            self._publish_laser_poses()
 
     @property
     def scan_subscribers(self) -> int:
         """Number of subscribers of the scans; of several lasers, of the one that has the fewest."""
-        return self._output.fewest_subscribers
+        return min(int(scans.get_subscription_count()) for scans in self._scans.values())
 
     def move(self) -> None:
         """Drive for one step as commanded."""
         self._simulation.move(*self._command.at(self._simulation.stamp_ns))
 
     def publish(self) -> bool:
-        """Publish the present sensor readings; returns whether there was a scan."""
+        """Publish the present sensor readings, the scans last; returns whether there was one."""
         moment = self._simulation.read_sensors()
-        self._output.publish(moment, self._simulation)
+        robot = self._simulation.robot
+        self._publish_odometry(moment)
+        truth = messages.pose_stamped_msg(robot.T_world_base, 'world', moment.stamp_ns)
+        self._truth.publish(truth)
+        if robot.collisions != self._last_collisions:
+            self._last_collisions = robot.collisions
+            self._collisions.publish(UInt32(data=robot.collisions))
+        if moment.scans:
+            self._last_scans = [
+                messages.scan_msg(scan, scan.frame, self._scan_time_s) for scan in moment.scans
+            ]
+            self._publish_scans()
         return bool(moment.scans)
 
     def repeat_scan(self) -> None:
-        """Publish the last scan again."""
-        self._output.repeat_scan(self._simulation)
+        """Publish the last scan again, with the present odometry."""
+        if self._last_scans:
+            self._publish_scans()
+            self._publish_odometry(self._simulation.read_sensors())
+
+    def _publish_laser_poses(self) -> None:
+        transforms = [
+            messages.transform_msg(mount.T_base_laser, 'base_link', mount.frame, 0)
+            for mount in self._mounts
+        ]
+        self._tf_static.publish(TFMessage(transforms=transforms))
+
+    def _publish_scans(self) -> None:
+        for message in self._last_scans:
+            self._scans[message.header.frame_id].publish(message)
+
+    def _publish_odometry(self, moment: SensorReadings) -> None:
+        robot = self._simulation.robot
+        frames = ('odom', 'base_link')
+        self._odom.publish(
+            messages.odometry_msg(moment.T_odom_base, (robot.v, robot.w), frames, moment.stamp_ns)
+        )
+        if self._publish_tf:
+            transform = messages.transform_msg(moment.T_odom_base, *frames, moment.stamp_ns)
+            self._tf.publish(TFMessage(transforms=[transform]))
 
     def _on_command(self, v: float, w: float) -> None:
         if not np.isfinite((v, w)).all():
