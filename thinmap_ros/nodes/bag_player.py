@@ -62,7 +62,7 @@ class BagPlayerConfig(Config):
 
 
 class BagPlayerNode(Node):
-    """Publishes the messages of a bag at their rate and with their quality of service, and /clock.
+    """Publishes the messages of a bag at their rate and with their quality of service.
 
     Ends with the bag. Services: ~/pause (true: pause, false: continue), ~/step (while paused: up to
     and including the next scan).

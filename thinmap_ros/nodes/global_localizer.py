@@ -1,6 +1,8 @@
 """Global localization: finds the pose of a robot anywhere in the map, on request or when lost."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
@@ -15,21 +17,18 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.places.active_search import ActiveSearch
 from thinmap_ros.core.places.global_localizer import GlobalLocalization, Result, SearchState
 from thinmap_ros.core.places.place_database import GlobalLocalizationConfig
-from thinmap_ros.core.planning.navigator import (
-    CONTROL_PERIOD_S,
-    SENSOR_DELAY_NS,
-    SENSOR_TIMEOUT_NS,
-    NavigatorConfig,
-)
+from thinmap_ros.core.planning.navigator import CONTROL_PERIOD_S, NavigatorConfig
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig
-from thinmap_ros.core.scan import Scan, with_newest
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.sensing.synchronizer import InputStream, ScanOdometrySynchronizer
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.sensing.synchronizer import ScanOdometrySynchronizer
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.core.topology.graph import TopologyConfig, topology_from_msg
 from thinmap_ros.core.topology.topology import build
 from thinmap_ros.files import occupancy_maps
+from thinmap_ros.logs.frames import NONE
+from thinmap_ros.nodes.parts.driving import RobotState
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -38,11 +37,8 @@ from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 from thinmap_ros.ros.tf import OdometrySource
-from thinmap_ros.ros.time_jumps import ElapsedTime
 from thinmap_ros.ros.velocity import VelocityPublisher, declare_stamped
 
-_SAMPLES_PERIOD_NS = 1_000_000_000
-_ODOMETRY = 'odometry'
 # Margins added to the radius of the robot: for paths, and for stops in front of obstacles.
 _PATH_MARGIN_M = 0.05
 _STOP_MARGIN_M = 0.04
@@ -120,45 +116,23 @@ class _LostDetector:
 class _SearchDriver:
     """Drives the robot to where the pose candidates can be told apart best.
 
-    search: None while there is nothing to search.
+    search: None while there is nothing to search; robot: what is known of it now.
     """
 
     def __init__(
-        self, time: ElapsedTime, scan_topics: tuple[str, ...], velocity: VelocityPublisher | None
+        self, new_robot: Callable[[], RobotState], velocity: VelocityPublisher | None
     ) -> None:
         """velocity: None for a node that does not drive."""
-        self.search: ActiveSearch | None = None
-        self._scan_topics = scan_topics
-        self._time = time
+        self._new_robot = new_robot
         self._velocity = velocity
         self._is_driving = False
         self._is_held = False
         self.reset()
 
     def reset(self) -> None:
-        """Forget scan, odometry and search."""
-        self.search = None
-        self._scans: tuple[Scan, ...] = ()
-        self._T_odom_base: Array | None = None
-        self._odometry_ns = 0
-        self._streams = {
-            name: InputStream(name, SENSOR_TIMEOUT_NS, SENSOR_DELAY_NS)
-            for name in (*self._scan_topics, _ODOMETRY)
-        }
-
-    def record(self, source: str, stamp_ns: int) -> None:
-        """A measurement of a source, a topic of scans or the odometry, was received."""
-        time = self._time
-        self._streams[source].add(stamp_ns, time.now_ns(), time.age_ns(stamp_ns))
-
-    def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
-        self._T_odom_base = T_odom_base
-        self._odometry_ns = stamp_ns
-        self.record(_ODOMETRY, stamp_ns)
-
-    def add_scan(self, scan: Scan) -> None:
-        """Add a scan; while a laser is blind, the robot does not drive."""
-        self._scans = with_newest(self._scans, scan)
+        """Forget scans, odometry and search."""
+        self.search: ActiveSearch | None = None
+        self.robot = self._new_robot()
 
     def add_result(self, result: Result, T_odom_base: Array) -> None:
         """Add the result of a step of the localization at an odometry pose (3,)."""
@@ -174,13 +148,12 @@ class _SearchDriver:
 
     def step(self) -> None:
         """Publish the next command, or stop while inputs are missing or too old."""
-        if self._is_held or self.search is None or self._T_odom_base is None:
+        robot = self.robot
+        can_drive = not (self._is_held or robot.awaited_scans or robot.stop_reason())
+        if self.search is None or robot.T_odom_base is None or not can_drive:
             self.stop()
             return
-        if not self._sees_now():
-            self.stop()
-            return
-        command = self.search.step(self._T_odom_base, self._scans, CONTROL_PERIOD_S)
+        command = self.search.step(robot.T_odom_base, robot.scans, CONTROL_PERIOD_S)
         if command.state == 'idle':
             self.stop()
             return
@@ -198,17 +171,6 @@ class _SearchDriver:
         """Stop the robot, if it was driven, before the node is gone."""
         if self._is_driving and self._velocity is not None:
             self._velocity.stop()
-
-    def _sees_now(self) -> bool:
-        """Whether no laser is blind, and all inputs are those of now."""
-        now_ns = self._time.now_ns()
-        if len(self._scans) < len(self._scan_topics) or any(each.is_blind for each in self._scans):
-            return False
-        if any(stream.fault(now_ns) for stream in self._streams.values()):
-            return False
-        return all(
-            abs(self._odometry_ns - scan.odometry_ns) <= SENSOR_TIMEOUT_NS for scan in self._scans
-        )
 
 
 class GlobalLocalizerNode(ThinmapNode):
@@ -240,7 +202,7 @@ class GlobalLocalizerNode(ThinmapNode):
             kernels.active_search()
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'initialpose', qos.STREAM)
         self._samples = self.create_publisher(PoseArray, 'localization_samples', qos.LATCHED)
-        self._samples_ns = -_SAMPLES_PERIOD_NS
+        self._samples_ns = -SECOND_NS
         self._status = self.create_publisher(LocalizationStatus, 'localization_status', qos.LATCHED)
         self._driver = self._create_driver(is_stamped)
         self.reset_state()
@@ -254,12 +216,17 @@ class GlobalLocalizerNode(ThinmapNode):
         self.create_active_timer(1.0, self._report_missing_inputs)
 
     def _create_driver(self, is_stamped: bool) -> _SearchDriver:
-        topics = self._laser_transform.scan_topics
+        new_robot = partial(
+            RobotState,
+            self.elapsed_time,
+            self._odometry.source != NONE,
+            self._laser_transform.scan_topics,
+        )
         if not self._config.drive:
-            return _SearchDriver(self.elapsed_time, topics, None)
+            return _SearchDriver(new_robot, None)
         velocity = VelocityPublisher(self, self._laser_transform.base_frame, is_stamped)
         self.create_active_timer(CONTROL_PERIOD_S, lambda: self._driver.step())
-        driver = _SearchDriver(self.elapsed_time, topics, velocity)
+        driver = _SearchDriver(new_robot, velocity)
         StopTopic(self, driver.hold)
         return driver
 
@@ -313,20 +280,19 @@ class GlobalLocalizerNode(ThinmapNode):
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         self._received.add('odom')
-        self._driver.add_odometry(stamp_ns, T_odom_base)
+        self._driver.robot.add_odometry(stamp_ns, T_odom_base)
         tilt_rad = self._odometry.tilt_rad
         self._process(self._pairing.add_odometry(stamp_ns, T_odom_base, tilt_rad))
 
     def _on_scan(self, topic: str, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(topic, message)
         self._received.add(topic)
-        self._driver.record(topic, scan.stamp_ns)
+        self._driver.robot.add_scan(scan, topic)
         self._odometry.add_scan_stamp(scan.odometry_ns)
         self._process(self._pairing.add_scan(scan))
 
     def _process(self, ready: list[tuple[Scan, Array]]) -> None:
         for scan, T_odom_base in ready:
-            self._driver.add_scan(scan)
             localization = self._create_localization() if self._is_requested else None
             if localization is not None:
                 with self.diagnostics.time_step('global localization'):
@@ -404,7 +370,7 @@ class GlobalLocalizerNode(ThinmapNode):
 
     def _publish_samples(self, stamp_ns: int, samples: Array) -> None:
         """Publish the samples (N, 3), at most once a second: it takes longer than a step."""
-        if not 0 <= stamp_ns - self._samples_ns < _SAMPLES_PERIOD_NS:
+        if not 0 <= stamp_ns - self._samples_ns < SECOND_NS:
             self._samples_ns = stamp_ns
             poses = [messages.pose_msg(T) for T in samples]
             header = messages.header(self._map_frame, stamp_ns)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Path
-from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
@@ -68,43 +67,6 @@ _HEALTH = {
     SlamStatus.LOST: (ERROR, 'lost: scans contradict the map, or have not confirmed the pose'),
     SlamStatus.NO_MAP: (ERROR, 'no map: waits for topic map; dead reckoning'),
 }
-
-
-class _PosePublishers:
-    """Publishes poses with their scan and status, line features, and corrected trajectories."""
-
-    def __init__(self, node: Node) -> None:
-        self.map_frame = parameters.declare_map_frame(node)
-        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
-        self._features = node.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
-        self._scan = node.create_publisher(LocalizedScan, 'localized_scan', qos.STREAM)
-        self._status = node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
-        self._trajectory = node.create_publisher(Path, 'trajectory', qos.LATCHED)
-        self.keyframes = KeyframeOutput(node, self.map_frame)
-        self._corrected_ns = 0
-
-    def reset(self) -> None:
-        """The poses that follow are those of another map, which has not been corrected."""
-        self._corrected_ns = 0
-
-    def publish_estimate(
-        self, scan: Scan, estimate: Estimate, features: list[Feature], status: SlamStatus
-    ) -> None:
-        """Publish an estimate; features: of the map."""
-        frame = self.map_frame
-        # At its stamp by the clock of the odometry, with which others take it on.
-        self._pose.publish(messages.estimate_msg(estimate, frame, scan.odometry_ns))
-        lines = [_feature_msg(feature) for feature in features]
-        self._features.publish(LineFeatureArray(header=status.header, features=lines))
-        self._status.publish(status)
-        self._scan.publish(localized_scan_msg(scan, estimate, status, frame, self._corrected_ns))
-
-    def publish_trajectory(self, stamp_ns: int, stamps_ns: list[int], poses: Array) -> None:
-        """Publish the corrected poses (N, 3) of the keyframes, with their stamps."""
-        self._corrected_ns = stamp_ns
-        self._trajectory.publish(
-            messages.trajectory_msg(stamps_ns, poses, self.map_frame, stamp_ns)
-        )
 
 
 @dataclass(eq=False)
@@ -169,13 +131,20 @@ class LocalizerNode(ThinmapNode):
         self._config = parameters.declare_config(
             self, config_class(slam), self._on_config, LIVE_PARAMETERS
         )
-        self._output = _PosePublishers(self)
+        self._map_frame = parameters.declare_map_frame(self)
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
+        self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
+        self._scan = self.create_publisher(LocalizedScan, 'localized_scan', qos.STREAM)
+        self._status = self.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
+        self._trajectory = self.create_publisher(Path, 'trajectory', qos.LATCHED)
+        self._keyframes = KeyframeOutput(self, self._map_frame)
+        self._corrected_ns = 0  # stamp of the last trajectory
         self._laser_transform = LaserTransform(self)
         base_frame = self._laser_transform.base_frame
         self._odometry = OdometrySource(self, base_frame, self._on_odometry)
         self._broadcaster = MapBroadcaster(
             self,
-            self._output.map_frame,
+            self._map_frame,
             self._odometry.odom_frame,
             base_frame if self._odometry.source == NONE else '',
         )
@@ -203,7 +172,7 @@ class LocalizerNode(ThinmapNode):
         self._odometry.subscribe()
         self._laser_transform.subscribe(self, self._on_scan)
         self._given.subscribe_to_poses(
-            self._output.map_frame, self._on_initial_pose, self._broadcaster.received
+            self._map_frame, self._on_initial_pose, self._broadcaster.received
         )
         self._given.subscribe_to_map(self._on_new_map)
         AdaptiveSubscription(self, String, 'map_tag', self._on_map_tag, qos.LATCHED)
@@ -229,7 +198,7 @@ class LocalizerNode(ThinmapNode):
         """
         if self._config.is_mapping:
             self._map_ids.begin(is_reset=True)
-        self._output.reset()
+        self._corrected_ns = 0
         before = self._localizer.config
         self._begin()
         tag = before.map_tag if isinstance(before, LocalizerConfig) else ''
@@ -439,15 +408,20 @@ class LocalizerNode(ThinmapNode):
         self.diagnostics.set_state(*_health(state, estimate))
         if estimate.correction is not None:
             stamps, poses = self._localizer.keyframe_trajectory()
-            self._output.publish_trajectory(scan.stamp_ns, stamps.tolist(), poses)
+            self._corrected_ns = scan.stamp_ns
+            self._trajectory.publish(
+                messages.trajectory_msg(stamps.tolist(), poses, self._map_frame, scan.stamp_ns)
+            )
             self.get_logger().info(_correction_line(estimate.correction, len(poses)))
         if state != SlamStatus.NO_MAP:
             self._broadcaster.update(estimate.T_map_odom)
         self._given.publish(scan.odometry_ns, estimate, state)
+        # At its stamp by the clock of the odometry, with which others take it on.
+        self._pose.publish(messages.estimate_msg(estimate, self._map_frame, scan.odometry_ns))
         features = self._localizer.features
         apart = estimate.apart
         status = SlamStatus(
-            header=messages.header(self._output.map_frame, scan.stamp_ns),
+            header=messages.header(self._map_frame, scan.stamp_ns),
             state=state,
             apart_m=0.0 if apart is None else apart.path_m,
             join_odds=0.0 if apart is None else apart.odds,
@@ -462,9 +436,14 @@ class LocalizerNode(ThinmapNode):
             step_time_ms=step_ms,
             **self._map_ids.published(),
         )
-        self._output.publish_estimate(scan, estimate, features, status)
+        lines = [_feature_msg(feature) for feature in features]
+        self._features.publish(LineFeatureArray(header=status.header, features=lines))
+        self._status.publish(status)
+        self._scan.publish(
+            localized_scan_msg(scan, estimate, status, self._map_frame, self._corrected_ns)
+        )
         if self._config.is_mapping:
-            self._output.keyframes.publish(scan.stamp_ns, self._localizer, self._map_ids.id)
+            self._keyframes.publish(scan.stamp_ns, self._localizer, self._map_ids.id)
 
 
 def _state_of(estimate: Estimate) -> int:

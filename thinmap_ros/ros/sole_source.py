@@ -19,8 +19,7 @@ from thinmap_ros.ros.diagnostics import WARN, NodeDiagnostics
 # was killed is on the graph for up to 20 s. A simulation may be paused for a while.
 _SILENCE_NS = 3 * SECOND_NS
 _PAUSE_NS = 30 * SECOND_NS
-_MAX_RIVALS = 8
-_MAX_FRAMES = 8
+_MAX_SOURCES = 8  # that are known at a time
 _UNKNOWN = 0.5  # periods between the expected time and that of a message, where none is known
 
 
@@ -118,7 +117,7 @@ class SoleSource:
             stream.add(number, received_ns)
             return stream
         stream = _Stream(number, received_ns)
-        self._rivals = [*self._rivals[1 - _MAX_RIVALS :], stream]
+        self._rivals = [*self._rivals[1 - _MAX_SOURCES :], stream]
         return stream
 
 
@@ -133,7 +132,7 @@ class SourceByFrame:
     def accepts(self, message: Any, info: dict[str, Any]) -> bool:
         """Whether a message with a header is to be used; info: what rclpy gives with it."""
         frame = message.header.frame_id
-        if frame not in self._sources and len(self._sources) >= _MAX_FRAMES:
+        if frame not in self._sources and len(self._sources) >= _MAX_SOURCES:
             self._sources.clear()
         source = self._sources.setdefault(frame, SoleSource(self._count_publishers))
         return source.accepts(info)

@@ -240,8 +240,8 @@ class _ScanTopic:
 class RobotState:
     """Pose and view of the robot now, and whether they are recent.
 
-    scans: the last one of each laser that is not blind; pose_fault: why the localizer does not
-    trust its pose, '' where it does.
+    scans: the last one of each laser that is not blind; T_odom_base (3,): the last odometry;
+    pose_fault: why the localizer does not trust its pose, '' where it does.
     """
 
     def __init__(
@@ -267,11 +267,11 @@ class RobotState:
         self._pose_fault = ''  # why the last pose was not used
         self._odometry = OdometryBuffer(max_gap_ns=MAX_ODOMETRY_GAP_NS)
         self._T_map_odom: Array | None = None
-        self._T_odom_base: Array | None = None
+        self.T_odom_base: Array | None = None
 
     def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         """Add the odometry, T_odom_base (3,), at a stamp."""
-        self._T_odom_base = T_odom_base
+        self.T_odom_base = T_odom_base
         self._record(self._streams['odometry'], stamp_ns)
         self._odometry.add(stamp_ns, T_odom_base)
 
@@ -293,7 +293,7 @@ class RobotState:
         # On a busy machine the last odometry is of another time than the scan.
         T_odom_base = self._odometry.interpolate(scan.odometry_ns)
         if T_odom_base is None:
-            T_odom_base = self._T_odom_base
+            T_odom_base = self.T_odom_base
         if T_odom_base is not None:
             scan = laser.monitor.checked(scan, T_odom_base)
         laser.blind_reason = scan.blind_reason
@@ -306,9 +306,14 @@ class RobotState:
             self._record(of_topic.stream, scan.odometry_ns)
 
     @property
+    def awaited_scans(self) -> list[str]:
+        """Names of the lasers without a scan yet that shows anything."""
+        return [each.name for each in self._topics.values() if each.stamp_ns is None]
+
+    @property
     def awaited(self) -> list[str]:
         """What is not received yet, and is needed to drive."""
-        found = [each.name for each in self._topics.values() if each.stamp_ns is None]
+        found = self.awaited_scans
         return found if self.pose() is not None else [*found, 'pose or odometry']
 
     @property
@@ -322,9 +327,9 @@ class RobotState:
 
     def pose(self) -> Array | None:
         """T_map_base (3,) now; None before a pose and odometry are received."""
-        if self._T_map_odom is None or self._T_odom_base is None:
+        if self._T_map_odom is None or self.T_odom_base is None:
             return None
-        return se2.compose(self._T_map_odom, self._T_odom_base)
+        return se2.compose(self._T_map_odom, self.T_odom_base)
 
     def stop_reason(self) -> str:
         """Why the robot must not drive on, the cause before its consequences; '' for no reason."""

@@ -41,6 +41,7 @@ from thinmap_ros.ros.tf import TransformListener
 
 _SAMPLES = 200
 _SHOWN = 1000  # hypotheses of the global localizer
+_WARN_PERIOD_S = 30.0
 
 
 class AmclInterface:
@@ -133,7 +134,6 @@ class AmclInterface:
         return response
 
 
-_SAVE_WARN_PERIOD_S = 60.0
 _KEYS = ('x', 'y', 'yaw')
 
 
@@ -189,7 +189,7 @@ class LastPose:
             self._node.get_logger().warning(
                 f'pose_file: {error.filename or self._path}: {error.strerror}: '
                 'last pose not saved: expected a file that can be written',
-                throttle_duration_sec=_SAVE_WARN_PERIOD_S,
+                throttle_duration_sec=_WARN_PERIOD_S,
             )
 
     def _pose_of(self, content: dict[str, object]) -> Array:
@@ -204,9 +204,6 @@ def _default_path(node: Node) -> Path:
     chosen = os.environ.get('XDG_STATE_HOME')
     state = Path(chosen) if chosen else Path.home() / '.local' / 'state'
     return state / 'thinmap' / own_file_name(node, '.pose.yaml')
-
-
-_WARN_PERIOD_S = 30.0
 
 
 class GivenMap:

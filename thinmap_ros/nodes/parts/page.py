@@ -678,8 +678,8 @@ class Steering:
             'home': self._go_home,
             'initial_pose': self._set_initial_pose,
             'explore': tasks.explore,
-            'pause': self._pause,
-            'resume': self._resume,
+            'pause': lambda: self._resume(False),
+            'resume': lambda: self._resume(True),
             'cancel': tasks.cancel_all,
             'drive': self._drive.drive,
             'save': lambda name: call('save', SaveMap.Request(path=name)),
@@ -718,13 +718,9 @@ class Steering:
         )
         self.tell(f'initial pose {x:.2f}, {y:.2f}')
 
-    def _pause(self) -> None:
-        self._publishers[_RESUME].publish(Bool(data=False))
-        self.tell('exploration paused')
-
-    def _resume(self) -> None:
-        self._publishers[_RESUME].publish(Bool(data=True))
-        self.tell('exploration continues')
+    def _resume(self, is_wanted: bool) -> None:
+        self._publishers[_RESUME].publish(Bool(data=is_wanted))
+        self.tell(f'exploration {"continues" if is_wanted else "paused"}')
 
     def _call(self, action: str, request: Any) -> None:
         def answered(future: AnswerFuture) -> None:
