@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thinmap_ros.nodes.parts.given_map import LastPose
+from thinmap_ros.nodes.parts.localization import LastPose
 
 POSE = np.array([1.25, -2.5, 0.75])
 GIVEN = 'map: office.yaml\nx: 1.25\ny: -2.5\nyaw: 0.75\n'

@@ -93,7 +93,8 @@ class DemoMonitorNode(Node):
         joined = [robot for robot in message.maps if robot.is_joined]
         if len(joined) == len(self._robots) and not self._is_joined:
             self._is_joined = True
-            self._wait_again()
+            if self._ended_s is not None:  # the map of this join is still to come
+                self._ended_s = monotonic()
 
     def _work(self) -> None:
         for robot in self._robots.values():
@@ -101,11 +102,6 @@ class DemoMonitorNode(Node):
         if self._ended_s is not None:
             patience_s = _LAST_MERGE_S if self._is_joined else _JOIN_PATIENCE_S
             self.finished = monotonic() - self._ended_s > patience_s
-
-    def _wait_again(self) -> None:
-        """A join after the last exploration: its map is still to come."""
-        if self._ended_s is not None:
-            self._ended_s = monotonic()
 
     def _show(self) -> None:
         robots = list(self._robots.values())

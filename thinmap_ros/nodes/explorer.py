@@ -37,9 +37,8 @@ from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import offer
-from thinmap_ros.ros.session_services import offer_saving, save_on_exit
+from thinmap_ros.ros.session_services import SaveDirectory, offer_saving, save_on_exit
 from thinmap_ros.ros.stop_topic import StopTopic
 
 _CHECK_PERIOD_S = 1.0
@@ -190,7 +189,7 @@ class ExplorerNode(ThinmapNode):
                 'to start one'
             )
             return
-        self._output.target.clear()
+        self._output.clear_target()
         self._publish_progress()
 
     # Inputs.
@@ -224,7 +223,7 @@ class ExplorerNode(ThinmapNode):
         self._mission.path_grew(remaining_m)
 
     def _on_drive_ended(self, success: bool, reason: str) -> None:
-        self._output.target.clear()
+        self._output.clear_target()
         self._execute(self._mission.drive_ended(success, reason))
 
     def _on_timer(self) -> None:
@@ -255,7 +254,7 @@ class ExplorerNode(ThinmapNode):
     def _execute(self, action: Action) -> None:
         """Carry out what the mission answers."""
         if isinstance(action, DriveTo):
-            self._output.target.publish(action.goal)
+            self._output.target(action.goal)
             self._driver.drive_to(action.goal)
         elif isinstance(action, Finish):
             self._finish(action)
@@ -263,7 +262,7 @@ class ExplorerNode(ThinmapNode):
 
     def _finish(self, end: Finish) -> None:
         self._driver.cancel()
-        self._output.target.clear()
+        self._output.clear_target()
         status = self._output.status(self._mission)
         self.get_logger().info(f'finished: {end.reason}')
         outcome = Outcome.SUCCEEDED if end.is_success else Outcome.ABORTED

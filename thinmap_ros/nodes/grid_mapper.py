@@ -36,9 +36,8 @@ from thinmap_ros.ros.diagnostics import ERROR
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import ReceivedScan, localized_scan_from_msg
 from thinmap_ros.ros.maps import FollowedMap, Origin
-from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
-from thinmap_ros.ros.session_services import SessionClient, joined, save_on_exit
+from thinmap_ros.ros.session_services import SaveDirectory, SessionClient, joined, save_on_exit
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 
 _OTHER_MAP = (

@@ -43,8 +43,8 @@ from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.files.sessions import LOCALIZER, load_localizer, save_localizer
 from thinmap_ros.logs.frames import NONE
-from thinmap_ros.nodes.parts.given_map import GivenMap
 from thinmap_ros.nodes.parts.localization import (
+    GivenMap,
     KeyframeOutput,
     Recovery,
     require_near_map,
@@ -56,9 +56,13 @@ from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_msg
 from thinmap_ros.ros.maps import UNKNOWN, new_map_id
-from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import offer
-from thinmap_ros.ros.session_services import offer_loading, offer_saving, save_on_exit
+from thinmap_ros.ros.session_services import (
+    SaveDirectory,
+    offer_loading,
+    offer_saving,
+    save_on_exit,
+)
 from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded
 from thinmap_ros.ros.tf import MapBroadcaster, OdometrySource
 

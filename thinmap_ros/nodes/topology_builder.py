@@ -23,8 +23,12 @@ from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import map_update_from_msg
 from thinmap_ros.ros.maps import UNKNOWN, FollowedMap, Origin
-from thinmap_ros.ros.save_directory import SaveDirectory
-from thinmap_ros.ros.session_services import offer_loading, offer_saving, save_on_exit
+from thinmap_ros.ros.session_services import (
+    SaveDirectory,
+    offer_loading,
+    offer_saving,
+    save_on_exit,
+)
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 _ID_RESERVE = 1000  # ids that a builder may have assigned after its last checkpoint

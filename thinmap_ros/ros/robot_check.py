@@ -37,7 +37,7 @@ from thinmap_ros.ros.diagnostics import (
 _MAX_DELAY_S = 1.0  # of a stamp against the clock, beyond which clocks differ
 _MIN_RATE_HZ = 2.0
 _MAX_MESSAGES = 10_000
-_SPIN_S = 0.1
+_PERIOD_S = 0.1
 _LISTENING = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -98,7 +98,7 @@ def check_robot(names: RobotNames, seconds: float, words: Sequence[str] = ()) ->
         check = RobotCheck(node, names)
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            rclpy.spin_once(node, timeout_sec=_SPIN_S)
+            rclpy.spin_once(node, timeout_sec=_PERIOD_S)
         return Checkup(list(check.findings()), check.is_simulated)
 
 
@@ -311,7 +311,6 @@ def _of_localizer(status: DiagnosticStatus) -> Finding:
 
 
 TURN_RAD_S = 0.3
-_PERIOD_S = 0.1
 _COMMANDED_S = 2.0
 _STOPS = 10  # at the end
 # A base that turns on after so long has no time-out that helps: at 0.5 m/s it drives a metre.

@@ -1,24 +1,44 @@
-"""Parts of the localizer: its parameters, recovery, keyframes and the area that it knows."""
+"""Parts of the localizer: its map, given or restored, poses in it, keyframes, AMCL's interface."""
 
+import math
+import os
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from nav2_msgs.msg import Particle, ParticleCloud
+from nav2_msgs.srv import SetInitialPose
 from rclpy.node import Node
+from std_srvs.srv import Empty
 
-from thinmap_msgs.msg import Keyframe, KeyframePoses
+from thinmap_msgs.msg import Keyframe, KeyframePoses, SlamStatus
+from thinmap_msgs.srv import LocalizeGlobally
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import Config, parameter, part
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import ConfigError, InputError, quoted
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import FIELDS, OdometryAnchor
-from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, rotated_covariance
 from thinmap_ros.core.slam.graph.keyframes import SavedKeyframes
 from thinmap_ros.core.slam.joining.messages import KeyframeSender
 from thinmap_ros.core.slam.localizer import TAG, AnyLocalizer, Localizer, localizer_class
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.snapshot import MAX_COUNT, Field, State
-from thinmap_ros.core.stage import StartConfig
-from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.maps import new_map_id
+from thinmap_ros.core.stage import Estimate, StartConfig, config_at
+from thinmap_ros.files import sessions
+from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.files.safe import read_mapping, write_text
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros.checkpoint import own_file_name
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.maps import new_map_id, subscribe_to_map
+from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.tf import TransformListener
 
 # Of a pose that a user gives: standard deviations of 0.5 m and 15 degrees, as in RViz.
 GIVEN_COVARIANCE = np.diag([0.25, 0.25, 0.0685])
@@ -244,3 +264,353 @@ class KeyframeOutput:
                     data=message.encode(),
                 )
             )
+
+
+_SAMPLES = 200
+_SHOWN = 1000  # hypotheses of the global localizer
+_WARN_PERIOD_S = 30.0
+
+
+class AmclInterface:
+    """The interface of AMCL, in mode localization: amcl_pose, particle_cloud, and services.
+
+    amcl_pose: the last known pose: none is published while the robot is lost. particle_cloud:
+    samples of the posterior; while the robot is lost, the samples of the global localizer.
+    request_nomotion_update publishes both again; scans are matched while the robot stands, too.
+    """
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        map_frame: str,
+        set_pose: Callable[[PoseWithCovarianceStamped], None],
+    ) -> None:
+        """set_pose: takes an initial pose in any frame; raises InputError."""
+        self._node = node
+        self._map_frame = map_frame
+        self._set_pose = set_pose
+        self._last: tuple[int, Estimate] | None = None
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', qos.LATCHED)
+        self._cloud = node.create_publisher(ParticleCloud, 'particle_cloud', qos.SENSOR)
+        self._search = node.create_client(LocalizeGlobally, 'localize_globally')
+        subscribe_guarded(node, PoseArray, 'localization_samples', self._on_samples, qos.LATCHED)
+        node.create_service(SetInitialPose, 'set_initial_pose', self._on_set_pose)
+        node.create_service(Empty, 'reinitialize_global_localization', self._on_search)
+        node.create_service(Empty, 'request_nomotion_update', self._on_update)
+
+    @property
+    def has_published(self) -> bool:
+        """Whether there was an estimate in a map."""
+        return self._last is not None
+
+    def publish(self, stamp_ns: int, estimate: Estimate) -> None:
+        """Publish the estimate of a scan."""
+        self._last = (stamp_ns, estimate)
+        if estimate.is_lost:
+            return
+        self._pose.publish(messages.estimate_msg(estimate, self._map_frame, stamp_ns))
+        if self._cloud.get_subscription_count():
+            self._cloud.publish(self._posterior(stamp_ns, estimate))
+
+    def _posterior(self, stamp_ns: int, estimate: Estimate) -> ParticleCloud:
+        rng = np.random.default_rng(stamp_ns)
+        samples = rng.multivariate_normal(
+            estimate.T_map_base, estimate.covariance, _SAMPLES, check_valid='ignore'
+        )
+        weight = 1.0 / _SAMPLES
+        return ParticleCloud(
+            header=messages.header(self._map_frame, stamp_ns),
+            particles=[Particle(pose=messages.pose_msg(T), weight=weight) for T in samples],
+        )
+
+    def _on_samples(self, message: PoseArray) -> None:
+        is_lost = self._last is None or self._last[1].is_lost
+        if not (is_lost and message.poses and self._cloud.get_subscription_count()):
+            return
+        poses = message.poses[:: -(-len(message.poses) // _SHOWN)]
+        weight = 1.0 / len(poses)
+        self._cloud.publish(
+            ParticleCloud(
+                header=message.header,
+                particles=[Particle(pose=pose, weight=weight) for pose in poses],
+            )
+        )
+
+    def _on_set_pose(
+        self, request: SetInitialPose.Request, response: SetInitialPose.Response
+    ) -> SetInitialPose.Response:
+        try:
+            self._set_pose(request.pose)
+        except InputError as error:
+            self._node.diagnostics.message_rejected('set_initial_pose', str(error))
+            self._node.get_logger().warning(f'set_initial_pose: {error}')
+        return response
+
+    def _on_search(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
+        if self._search.service_is_ready():
+            self._search.call_async(LocalizeGlobally.Request(discard_hypotheses=True))
+        else:
+            self._node.get_logger().warning(
+                'reinitialize_global_localization: global_localizer is not running'
+            )
+        return response
+
+    def _on_update(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
+        if self._last is not None:
+            self.publish(*self._last)
+        return response
+
+
+_KEYS = ('x', 'y', 'yaw')
+
+
+class LastPose:
+    """A small YAML file with the map and the last pose in it; it survives a restart."""
+
+    def __init__(self, node: Node, path: str, rate: float, map_name: str) -> None:
+        """path: '' for the default; rate: of saving, 1/s; map_name: the pose belongs to it."""
+        self._node = node
+        self._path = Path(path) if path else _default_path(node)
+        self._period_s = 1.0 / rate if rate > 0.0 else math.inf
+        self._map_name = map_name
+        self._saved_at_s = -math.inf
+        self._unsaved: Array | None = None
+
+    def load(self) -> Array | None:
+        """The pose (3,) in this map; None without one: no file, a broken one, or another map."""
+        if math.isinf(self._period_s) or not self._path.exists():
+            return None
+        try:
+            content = read_mapping(self._path, 'the last pose of a localizer')
+            pose = self._pose_of(content)
+        except InputError as error:
+            self._node.get_logger().warning(f'{error}: starting without a last pose')
+            return None
+        named = content.get('map')
+        if named == self._map_name:
+            return pose
+        self._node.get_logger().info(
+            f'{self._path}: pose in map {quoted(named)}, not in {quoted(self._map_name)}: '
+            'starting without a last pose'
+        )
+        return None
+
+    def save(self, T_map_base: Array) -> None:
+        """Save a pose (3,), unless the last one was saved recently."""
+        if math.isinf(self._period_s):
+            return
+        self._unsaved = T_map_base
+        if time.monotonic() - self._saved_at_s >= self._period_s:
+            self.save_latest()
+
+    def save_latest(self) -> None:
+        """Save the pose that was given last, if it is not saved: at the end of the node."""
+        if self._unsaved is None:
+            return
+        self._saved_at_s = time.monotonic()
+        values = zip(_KEYS, (round(value, 4) for value in self._unsaved.tolist()), strict=True)
+        self._unsaved = None
+        try:
+            write_text(self._path, yaml.safe_dump({'map': self._map_name, **dict(values)}))
+        except OSError as error:
+            self._node.get_logger().warning(
+                f'pose_file: {error.filename or self._path}: {error.strerror}: '
+                'last pose not saved: expected a file that can be written',
+                throttle_duration_sec=_WARN_PERIOD_S,
+            )
+
+    def _pose_of(self, content: dict[str, object]) -> Array:
+        values = [content.get(key) for key in _KEYS]
+        numbers = [float(value) for value in values if isinstance(value, int | float)]
+        if len(numbers) != len(_KEYS) or not se2.is_bounded_pose(se2.pose(*numbers)):
+            raise InputError(f'{self._path}: expected x, y (m) and yaw (rad)')
+        return se2.pose(*numbers)
+
+
+def _default_path(node: Node) -> Path:
+    chosen = os.environ.get('XDG_STATE_HOME')
+    state = Path(chosen) if chosen else Path.home() / '.local' / 'state'
+    return state / 'thinmap' / own_file_name(node, '.pose.yaml')
+
+
+class GivenMap:
+    """The given map: of a file, a session, or a topic; poses to start from, and AMCL's interface.
+
+    In mode mapping, a session. config: of the next localizer; has_loaded: whether a service has
+    loaded another map. Poses in other frames are transformed by the newest transforms.
+    """
+
+    def __init__(self, node: ThinmapNode, config: StartConfig) -> None:
+        """Declare the parameters.
+
+        Raises ConfigError where the parameters contradict each other, InputError for a file.
+        """
+        self._node = node
+        self.config = config
+        self.has_loaded = False
+        self._settings = parameters.declare_config(node, LocalizationConfig)
+        self._report = node.get_logger().warning
+        self._session = parameters.declare_session(node)
+        self._patch = self._read_file()
+        name = self._settings.map_file_name or self._session or 'topic map'
+        self._is_topic = not config.is_mapping and name == 'topic map'
+        self._last_pose = LastPose(
+            node, self._settings.pose_file, self._settings.save_pose_rate, name
+        )
+        node.add_end_callback(self._last_pose.save_latest)
+        self._amcl: AmclInterface | None = None
+        self._given_covariance: Array | None = None  # of an initial pose without a map
+
+    @property
+    def has_map(self) -> bool:
+        """Whether there is a map, or none is needed."""
+        is_given = bool(self._session) or self.has_loaded or self._patch is not None
+        return self.config.is_mapping or is_given
+
+    def subscribe_to_poses(
+        self,
+        map_frame: str,
+        on_pose: Callable[[Array, Array], None],
+        transform_received: Callable[[Any, bool], None],
+    ) -> None:
+        """Subscribe to initialpose; in mode localization, offer AMCL's topics and services.
+
+        on_pose: receives pose (3,) and covariance (3, 3), map frame. transform_received: is called
+        with each transform, and whether it is static.
+        """
+        transforms = TransformListener(self._node, transform_received)
+
+        def add_pose(message: PoseWithCovarianceStamped) -> None:
+            pose = messages.pose_from_msg(message.pose.pose)
+            covariance = messages.covariance_from_msg(message)
+            frame = message.header.frame_id.lstrip('/')
+            if frame not in ('', map_frame):
+                T_map_frame = _transform_to(map_frame, frame, transforms)
+                pose = se2.compose(T_map_frame, pose)
+                covariance = rotated_covariance(covariance, float(T_map_frame[2]))
+            on_pose(pose, covariance)
+
+        subscribe_guarded(
+            self._node, PoseWithCovarianceStamped, 'initialpose', add_pose, qos.STREAM
+        )
+        if not self.config.is_mapping:
+            self._amcl = AmclInterface(self._node, map_frame, add_pose)
+
+    def subscribe_to_map(self, changed: Callable[[], None]) -> None:
+        """Subscribe to topic map if the map is to come from there; changed: there is a new one."""
+        if not self._is_topic:
+            return
+
+        def on_map(patch: GridPatch) -> None:
+            known = self._patch
+            if known is not None and (
+                self._settings.first_map_only
+                or (known.frame == patch.frame and np.array_equal(known.cells, patch.cells))
+            ):
+                return
+            self._patch = patch
+            changed()
+
+        subscribe_to_map(self._node, 'map', on_map)
+
+    def first_localizer(self) -> AnyLocalizer:
+        """A localizer at the start pose.
+
+        It is initial_pose where set, else the start pose where it is not 0, else the last pose.
+        """
+        self._given_covariance = None
+        if self.config.is_mapping:
+            return self.localizer_at()
+        if self._settings.set_initial_pose:
+            return self.localizer_at(self._settings.initial_pose.pose, GIVEN_COVARIANCE)
+        last = None if self.config.is_start_given else self._last_pose.load()
+        if last is not None:
+            x, y, yaw = last.tolist()
+            self._node.get_logger().info(f'last pose: {x:.2f}, {y:.2f} m, {yaw:.2f} rad')
+        return self.localizer_at(last)
+
+    def localizer_at(
+        self, T_map_base: Array | None = None, covariance: Array | None = None
+    ) -> AnyLocalizer:
+        """A localizer in the map, at a pose (3,), None for the configured one.
+
+        covariance (3, 3): of a pose that somebody has given; without one, a localizer in a given
+        map is delocalized until scans fit. Raises InputError for a session that is broken.
+        """
+        config = self.config if T_map_base is None else config_at(self.config, T_map_base)
+        localizer = self._in_map(config)
+        if T_map_base is not None and covariance is not None:
+            localizer.set_pose(T_map_base, covariance)
+        return localizer
+
+    def with_new_map(self, localizer: AnyLocalizer) -> AnyLocalizer:
+        """The localizer that follows another one in a map from its topic."""
+        settings = self._settings
+        covariance = self._given_covariance
+        self._given_covariance = None
+        if covariance is not None:
+            placed = self.localizer_at(localizer.pose, covariance)
+            try:
+                require_near_map(placed.pose, placed)
+                return placed
+            except InputError as error:
+                self._node.diagnostics.message_rejected('initialpose', str(error))
+                self._node.get_logger().warning(f'initialpose: {error}')
+        is_first = self._amcl is None or not self._amcl.has_published
+        if is_first or (settings.set_initial_pose and settings.always_reset_initial_pose):
+            return self.first_localizer()
+        return self.localizer_at(localizer.pose)
+
+    def pose_set(self, covariance: Array) -> None:
+        """A user has given a pose, with a covariance (3, 3)."""
+        if not self.has_map:
+            self._given_covariance = covariance
+
+    def publish(self, stamp_ns: int, estimate: Estimate, state: int) -> None:
+        """Publish the estimate of a scan with AMCL's interface, and save the pose if known."""
+        if self._amcl is None:
+            return
+        logger = self._node.get_logger()
+        if state == SlamStatus.NO_MAP:
+            text = 'no map: waits for topic map'
+            logger.warning(text, throttle_duration_sec=_WARN_PERIOD_S)
+            return
+        self._amcl.publish(stamp_ns, estimate)
+        if state == SlamStatus.TRACKING:
+            self._last_pose.save(estimate.T_map_base)
+        elif state == SlamStatus.LOST:
+            text = 'lost: waits for initialpose, a global localization, or a scan that matches'
+            logger.warning(text, throttle_duration_sec=_WARN_PERIOD_S)
+
+    def _read_file(self) -> GridPatch | None:
+        """The map of map_file_name, None where there is none; checks the parameters."""
+        file = self._settings.map_file_name
+        if self.config.is_mapping:
+            if file:
+                raise ConfigError('map_file_name is given: expected mode = localization')
+            return None
+        if not self._session and not isinstance(self.config, LocalizerConfig):
+            raise ConfigError(
+                f'mode = localization with slam = {self.config.slam}: expected a session_path with '
+                'its line features'
+            )
+        return read_map(Path(file), report=self._report) if file else None
+
+    def _in_map(self, config: StartConfig) -> AnyLocalizer:
+        """A localizer at the configured pose, delocalized if in a given map."""
+        if self._patch is not None and isinstance(config, LocalizerConfig):
+            return Localizer.in_occupancy_map(self._patch, config)
+        if self._session:
+            loaded = sessions.load_localizer(self._session, config, report=self._report)
+            if loaded is not None:
+                return loaded
+        return localizer_class(config)(config)
+
+
+def _transform_to(map_frame: str, frame: str, transforms: TransformListener) -> Array:
+    """T_map_frame (3,). Raises InputError with what was expected where it is unknown."""
+    try:
+        return transforms.lookup(map_frame, frame)
+    except InputError as error:
+        expected = f'expected a frame connected to {quoted(map_frame)}'
+        raise InputError(f'frame {quoted(frame)}: {error}: {expected}') from error

@@ -30,8 +30,8 @@ from thinmap_ros.ros import diagnostics, messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import ReceivedScan
 from thinmap_ros.ros.maps import FollowedMap, updates_topic
-from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response, offer
+from thinmap_ros.ros.session_services import SaveDirectory
 from thinmap_ros.ros.team import heard_robots
 
 _FREE = np.int8(0)

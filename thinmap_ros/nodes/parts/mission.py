@@ -151,27 +151,6 @@ class Driver:
         """Process the present pose (3,) of the robot."""
 
 
-class TargetPublisher:
-    """Publishes each new target on exploration_target."""
-
-    def __init__(self, node: ThinmapNode, frame_id: str) -> None:
-        self._node = node
-        self._frame_id = frame_id
-        self._publisher = node.create_publisher(PoseStamped, 'exploration_target', qos.LATCHED)
-        self._last: Array | None = None
-
-    def publish(self, goal: Array) -> None:
-        """Publish a target (3,), unless it is the last one."""
-        if self._last is not None and is_same_goal(self._last, goal):
-            return
-        self._last = goal
-        self._publisher.publish(messages.pose_stamped_msg(goal, self._frame_id, self._node.now_ns))
-
-    def clear(self) -> None:
-        """Publish the next target in any case."""
-        self._last = None
-
-
 class ForeignDriver(Driver):
     """Another navigator drives to the published targets until it arrives, or the target changes."""
 
@@ -423,9 +402,9 @@ def _end_node_msg(node: EndNode) -> EndNodeMsg:
 
 
 class MissionPublishers:
-    """Publishes end nodes and status.
+    """Publishes end nodes, status, and each new target on exploration_target.
 
-    target: publishes where the robot drives; lite: the state as explore_lite does.
+    lite: publishes the state as explore_lite does.
     """
 
     def __init__(self, node: ThinmapNode, frame_id: str, on_resume: Callable[[bool], None]) -> None:
@@ -434,8 +413,20 @@ class MissionPublishers:
         self._frame_id = frame_id
         self._end_nodes = node.create_publisher(EndNodeArray, 'end_nodes', qos.LATCHED)
         self._status = node.create_publisher(ExplorationStatus, 'exploration_status', qos.LATCHED)
-        self.target = TargetPublisher(node, frame_id)
+        self._targets = node.create_publisher(PoseStamped, 'exploration_target', qos.LATCHED)
+        self._target: Array | None = None
         self.lite = ExploreLiteTopics(node, frame_id, on_resume)
+
+    def target(self, goal: Array) -> None:
+        """Publish where the robot drives (3,), unless it is the last target."""
+        if self._target is not None and is_same_goal(self._target, goal):
+            return
+        self._target = goal
+        self._targets.publish(messages.pose_stamped_msg(goal, self._frame_id, self._node.now_ns))
+
+    def clear_target(self) -> None:
+        """Publish the next target in any case."""
+        self._target = None
 
     def end_nodes(self, mission: Mission, stamp_ns: int) -> None:
         """Publish the end nodes of a decision about a scan."""

@@ -30,7 +30,7 @@ from thinmap_ros.files.sessions import GRID, PARTS, copy_map
 from thinmap_ros.nodes.parts.localization import GIVEN_COVARIANCE
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.save_directory import SaveDirectory
+from thinmap_ros.ros.session_services import SaveDirectory
 from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.velocity import (
     CommandPublisher,
