@@ -38,7 +38,7 @@ from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.services import offer
-from thinmap_ros.ros.session_services import SaveDirectory, offer_saving, save_on_exit
+from thinmap_ros.ros.session_services import SaveDirectory, offer_saving
 from thinmap_ros.ros.stop_topic import StopTopic
 
 _CHECK_PERIOD_S = 1.0
@@ -67,9 +67,7 @@ class ExplorerNode(ThinmapNode):
         self._settings.apply_base_frame(laser)
         self._team = declare_team(self, map_frame, self._strategies.is_default, self._progress)
         self._session = parameters.declare_session(self)
-        directory = SaveDirectory(self)
-        offer_saving(self, directory, EXPLORATION, self._save)
-        save_on_exit(self, directory, EXPLORATION, self._save_at_end)
+        offer_saving(self, SaveDirectory(self), EXPLORATION, self._save, self._save_at_end)
         parameters.reject_unknown(self)
         kernels.explorer()
         radius_m = self._strategies.config.planner.robot_radius_m
@@ -135,7 +133,11 @@ class ExplorerNode(ThinmapNode):
     def _make_driver(self, map_frame: str) -> Driver:
         if self._settings.drive:
             return NavigationClient(
-                self, self._settings, map_frame, self._on_drive_ended, self._on_path_longer
+                self,
+                self._settings,
+                map_frame,
+                self._on_drive_ended,
+                lambda remaining_m: self._mission.path_grew(remaining_m),
             )
         return ForeignDriver(self._on_drive_ended)
 
@@ -219,9 +221,6 @@ class ExplorerNode(ThinmapNode):
             self._output.end_nodes(self._mission, observation.scan.stamp_ns)
         self._execute(action)
 
-    def _on_path_longer(self, remaining_m: float) -> None:
-        self._mission.path_grew(remaining_m)
-
     def _on_drive_ended(self, success: bool, reason: str) -> None:
         self._output.clear_target()
         self._execute(self._mission.drive_ended(success, reason))
@@ -273,9 +272,7 @@ class ExplorerNode(ThinmapNode):
 
     def _progress(self, last: Observation | None) -> Progress:
         """The report to the other robots of a team after an observation."""
-        driver = self._driver
-        located = self._source.located(last)
-        return Progress(self._mission, located, driver.goal)
+        return Progress(self._mission, self._source.located(last), self._driver.goal)
 
     def _publish_progress(self) -> None:
         self._output.lite.publish_status(self._mission, self._driver.is_yielding)

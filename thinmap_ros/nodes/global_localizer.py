@@ -86,33 +86,6 @@ class GlobalLocalizerConfig(Config):
     )
 
 
-class _LostDetector:
-    """Detects that the localizer has been lost for some time of its own stamps."""
-
-    def __init__(self, limit_ns: int) -> None:
-        self._limit_ns = limit_ns
-        self._lost_since_ns: int | None = None
-        self._valid_after_ns = -1
-
-    def update(self, stamp_ns: int, is_lost: bool) -> bool:
-        """Add a state of the localizer; returns whether it has been lost for the limit."""
-        if not is_lost or stamp_ns <= self._valid_after_ns:
-            self._lost_since_ns = None
-        elif self._lost_since_ns is None:
-            self._lost_since_ns = stamp_ns
-        else:
-            return stamp_ns - self._lost_since_ns >= self._limit_ns
-        return False
-
-    def restart(self) -> None:
-        """Start to measure again."""
-        self._lost_since_ns = None
-
-    def ignore_until(self, stamp_ns: int) -> None:
-        """Ignore the states up to a pose that the localizer had not received yet."""
-        self._valid_after_ns = stamp_ns
-
-
 class _SearchDriver:
     """Drives the robot to where the pose candidates can be told apart best.
 
@@ -185,6 +158,7 @@ class GlobalLocalizerNode(ThinmapNode):
         super().__init__('global_localizer')
         self._search = parameters.declare_config(self, GlobalLocalizationConfig)
         self._config = parameters.declare_config(self, GlobalLocalizerConfig)
+        self._lost_ns = round(SECOND_NS * self._config.lost_timeout_s)
         self._map_frame = parameters.declare_map_frame(self)
         is_stamped = declare_stamped(self)
         self._laser_transform = LaserTransform(self)
@@ -234,7 +208,8 @@ class GlobalLocalizerNode(ThinmapNode):
         """Discard the search and all inputs but the map."""
         self._localization: GlobalLocalization | None = None
         self._is_requested = self._config.start_automatically
-        self._lost = _LostDetector(round(1e9 * self._config.lost_timeout_s))
+        self._lost_since_ns: int | None = None
+        self._found_ns = -1  # stamp of the last pose that was found
         self._pairing = ScanOdometrySynchronizer()
         self._odometry.reset()
         self._received: set[str] = set()
@@ -257,9 +232,14 @@ class GlobalLocalizerNode(ThinmapNode):
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         """Start when the localizer reports that it is lost (kidnapped robot)."""
-        is_lost = messages.is_lost(message) and not self._is_requested
-        is_kidnapped = self._lost.update(messages.stamp_ns(message.header.stamp), is_lost)
-        if is_kidnapped and self._config.start_automatically:
+        stamp_ns = messages.stamp_ns(message.header.stamp)
+        # Up to the pose that was found last, the localizer had not received that.
+        is_new = stamp_ns > self._found_ns
+        if not (is_new and messages.is_lost(message)) or self._is_requested:
+            self._lost_since_ns = None
+        elif self._lost_since_ns is None:
+            self._lost_since_ns = stamp_ns
+        elif self._config.start_automatically and stamp_ns - self._lost_since_ns >= self._lost_ns:
             self.get_logger().info('the localizer is lost: searching the whole map')
             self._start(clear=True)
 
@@ -270,7 +250,7 @@ class GlobalLocalizerNode(ThinmapNode):
 
     def _start(self, clear: bool) -> None:
         self._is_requested = True
-        self._lost.restart()
+        self._lost_since_ns = None
         if clear:
             self._discard_search()
 
@@ -306,7 +286,7 @@ class GlobalLocalizerNode(ThinmapNode):
     def _finish(self, stamp_ns: int) -> None:
         """The pose is found: wait for the next request."""
         self._is_requested = False
-        self._lost.ignore_until(stamp_ns)
+        self._found_ns = stamp_ns
         self._discard_search()
         self.stop()
 

@@ -61,7 +61,6 @@ from thinmap_ros.ros.session_services import (
     SaveDirectory,
     offer_loading,
     offer_saving,
-    save_on_exit,
 )
 from thinmap_ros.ros.subscription import AdaptiveSubscription, subscribe_guarded
 from thinmap_ros.ros.tf import MapBroadcaster, OdometrySource
@@ -136,13 +135,7 @@ class LocalizerNode(ThinmapNode):
             self, config_class(slam), self._on_config, LIVE_PARAMETERS
         )
         self._map_frame = parameters.declare_map_frame(self)
-        self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
-        self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
-        self._scan = self.create_publisher(LocalizedScan, 'localized_scan', qos.STREAM)
-        self._status = self.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
-        self._trajectory = self.create_publisher(Path, 'trajectory', qos.LATCHED)
-        self._keyframes = KeyframeOutput(self, self._map_frame)
-        self._corrected_ns = 0  # stamp of the last trajectory
+        self._create_publishers()
         self._laser_transform = LaserTransform(self)
         base_frame = self._laser_transform.base_frame
         self._odometry = OdometrySource(self, base_frame, self._on_odometry)
@@ -154,7 +147,7 @@ class LocalizerNode(ThinmapNode):
         )
         self._given = GivenMap(self, self._config)
         self._save_directory = SaveDirectory(self)
-        save_on_exit(self, self._save_directory, LOCALIZER, self._save_at_end)
+        offer_saving(self, self._save_directory, LOCALIZER, self._save, self._save_at_end)
         parameters.reject_unknown(self, parameters_elsewhere(slam))
         kernels.localizer()
         if slam != SCAN_MATCHING:
@@ -166,7 +159,6 @@ class LocalizerNode(ThinmapNode):
             self._living = self.create_subscription(
                 ProbabilityGrid, 'grid', self._on_living_map, qos.LATCHED
             )
-        self.create_pause_service()
         self.diagnostics.add_update_callback(self._report_unpaired)
         self.diagnostics.check_sole_publisher('pose')
         self.diagnostics.add_check(WARN, lambda: '; '.join(self._input.warnings.values()))
@@ -180,13 +172,25 @@ class LocalizerNode(ThinmapNode):
         )
         self._given.subscribe_to_map(self._on_new_map)
         AdaptiveSubscription(self, String, 'map_tag', self._on_map_tag, qos.LATCHED)
+        self._offer_services()
+
+    def _create_publishers(self) -> None:
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
+        self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
+        self._scan = self.create_publisher(LocalizedScan, 'localized_scan', qos.STREAM)
+        self._status = self.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
+        self._trajectory = self.create_publisher(Path, 'trajectory', qos.LATCHED)
+        self._keyframes = KeyframeOutput(self, self._map_frame)
+        self._corrected_ns = 0  # stamp of the last trajectory
+
+    def _offer_services(self) -> None:
+        self.create_pause_service()
         offer(
             self.create_service,
             SetMapTag,
             'set_map_tag',
             lambda request: self._enter_storey(request.tag),
         )
-        offer_saving(self, self._save_directory, LOCALIZER, self._save)
         offer_loading(self, LOCALIZER, self._check, self._load)
 
     def _on_config(self, config: StartConfig) -> None:
@@ -324,15 +328,13 @@ class LocalizerNode(ThinmapNode):
 
     def _report_warnings(self) -> None:
         """Log each kind of warning once."""
-        for kind, text in self._input.warnings.items():
-            if kind not in self._input.reported:
-                self.get_logger().warning(f'scan: {text}')
-                self._input.reported.add(kind)
         scale = self._input.consistency.odometry_scale.warning
         self.diagnostics.set_value(SCALE_KEY, scale)
-        if scale and SCALE_KEY not in self._input.reported:
-            self.get_logger().warning(scale)
-            self._input.reported.add(SCALE_KEY)
+        warnings = {kind: f'scan: {text}' for kind, text in self._input.warnings.items()}
+        for kind, text in (warnings | {SCALE_KEY: scale}).items():
+            if text and kind not in self._input.reported:
+                self.get_logger().warning(text)
+                self._input.reported.add(kind)
 
     def _on_living_map(self, message: ProbabilityGrid) -> None:
         """Continue in a map whose mapper has outlived a localizer, rather than begin another one.

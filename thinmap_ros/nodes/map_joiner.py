@@ -20,11 +20,10 @@ from thinmap_ros.nodes.parts.joining import (
 )
 from thinmap_ros.ros import messages, node_main, parameters
 from thinmap_ros.ros.diagnostics import OK
-from thinmap_ros.ros.lifecycle_node import Result, ThinmapNode, Worker
+from thinmap_ros.ros.lifecycle_node import POLL_S, Result, ThinmapNode, Worker
 from thinmap_ros.ros.services import offer
 from thinmap_ros.ros.time_jumps import STEADY
 
-_POLL_S = 0.1
 _MERGE = 'merge'
 _SEARCH = 'search'
 _SHARE = 0.3  # of a core that searches and merging may use
@@ -56,7 +55,7 @@ class MapJoinerNode(ThinmapNode):
         offer(self.create_active_service, SeparateMaps, 'separate_maps', self._on_separate)
         discovery_s = 1.0 / config.discovery_rate
         self.create_active_timer(discovery_s, self._robots.discover, clock=STEADY)
-        self.create_active_timer(_POLL_S, self._work, clock=STEADY)
+        self.create_active_timer(POLL_S, self._work, clock=STEADY)
         self.add_activation_callback(self._robots.discover)
 
     def reset_state(self) -> None:
@@ -126,9 +125,9 @@ class MapJoinerNode(ThinmapNode):
         self._report_dropped(self._team.found(search, link, log_odds))
         after = self._team.links.between(search.a, search.b)
         if after is not None and (before is None or not before.matches):
-            self._report_link(after, is_new=True)
+            self.get_logger().info(link_text(after, is_new=True))
         elif after is not None and before is not None and after.contradicts(before):
-            self._report_link(after, is_new=False)
+            self.get_logger().info(link_text(after, is_new=False))
         self._places_changed()
 
     def _places_changed(self) -> None:
@@ -163,9 +162,6 @@ class MapJoinerNode(ThinmapNode):
                 self._publish_places()
 
         return publish
-
-    def _report_link(self, link: MapLink, is_new: bool) -> None:
-        self.get_logger().info(link_text(link, is_new))
 
     def _report_dropped(self, links: list[MapLink]) -> None:
         for link in links:

@@ -83,7 +83,7 @@ class _NavigatorPublishers:
     @property
     def has_to_stand(self) -> bool:
         """Whether a base has come, or moves."""
-        return self.base.subscribers != self._subscribers or self.base.is_creeping
+        return self.base.subscribers != self._subscribers or self.base.supervisor.is_creeping
 
     def stand(self) -> bool:
         """Without a goal, tell to stand who has just subscribed, and a base that moves.
@@ -94,7 +94,7 @@ class _NavigatorPublishers:
         if count > self._subscribers and (self._subscribers == 0 or self.base.is_obeyed):
             self._stops = _STOPS
         self._subscribers = count
-        if self._stops > 0 or self.base.is_creeping:
+        if self._stops > 0 or self.base.supervisor.is_creeping:
             self._stops -= self._stops > 0
             self.command(0.0, 0.0)
             return True
@@ -180,7 +180,7 @@ class NavigatorNode(ThinmapNode):
         self._tasks.reset()
         self._navigator = Navigator(self._config)
         self._map.reset()
-        self._output.base.release()
+        self._output.base.supervisor.release()
         self._robot = RobotState(
             self.elapsed_time, self._odometry.source != NONE, self._laser_transform.scan_topics
         )
@@ -193,7 +193,7 @@ class NavigatorNode(ThinmapNode):
         topology = self._navigator.topology
         self._navigator = Navigator(config)
         self._navigator.topology = topology
-        self._output.base.set_config(config)
+        self._output.base.supervisor.set_config(config)
         if self._goals.active:
             self._drive_to(self._task.poses[-remaining:])
 
@@ -245,7 +245,7 @@ class NavigatorNode(ThinmapNode):
 
     def _on_stop(self, stop: StopTopic) -> None:
         if self._tasks.stop_reason and not stop.reason:
-            self._output.base.release()
+            self._output.base.supervisor.release()
         self._tasks.stop_reason = stop.reason
         self._output.velocity.hold(bool(stop.reason))
         if stop.reason:

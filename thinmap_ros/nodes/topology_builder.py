@@ -27,7 +27,6 @@ from thinmap_ros.ros.session_services import (
     SaveDirectory,
     offer_loading,
     offer_saving,
-    save_on_exit,
 )
 from thinmap_ros.ros.subscription import subscribe_guarded
 
@@ -85,7 +84,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._published = _GraphPublisher(self, 'topology', self._frame_id)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
-        save_on_exit(self, self._save_directory, TOPOLOGY, self._save_at_end)
+        offer_saving(self, self._save_directory, TOPOLOGY, self._save_and_route, self._save_at_end)
         self._route_graph = RouteGraphUpdates(
             self, self._frame_id, self._config, lambda: self._topology.builder
         )
@@ -96,7 +95,6 @@ class TopologyBuilderNode(ThinmapNode):
         kernels.topology_builder()
         subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
         subscribe_guarded(self, LocalGrid, 'local_grid', self._on_local_grid, qos.STREAM)
-        offer_saving(self, self._save_directory, TOPOLOGY, self._save_and_route)
         offer_loading(self, TOPOLOGY, self._check, self._load)
         self.diagnostics.check_sole_publisher('topology')
         self._stamp = StateStamp()

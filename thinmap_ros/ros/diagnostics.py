@@ -153,26 +153,6 @@ class MessageStatistics:
         return '; '.join(text for _, text in sorted(recent, reverse=True))
 
 
-class StepTimes:
-    """Durations of the last steps of each kind, ms."""
-
-    def __init__(self) -> None:
-        self._times_ms: dict[str, deque[float]] = {}
-
-    def add(self, step: str, milliseconds: float) -> None:
-        """Add the duration of a step, ms."""
-        self._times_ms.setdefault(step, deque(maxlen=_STEPS)).append(milliseconds)
-
-    def values(self) -> dict[str, str]:
-        """Median, 95th percentile and maximum."""
-        values = {}
-        for step, times in self._times_ms.items():
-            median, p95 = np.percentile(times, [50.0, 95.0])
-            text = f'median {median:.1f} ms, p95 {p95:.1f} ms, max {max(times):.1f} ms'
-            values[f'{step}: step time'] = text
-        return values
-
-
 class _StepFailures:
     """Steps that ended in an error that nobody expects, and the last of these errors."""
 
@@ -231,7 +211,7 @@ class NodeDiagnostics(MessageStatistics):
     def __init__(self, node: Node) -> None:
         super().__init__()
         self._node = node
-        self._step_times = StepTimes()
+        self._step_times_ms: dict[str, deque[float]] = {}
         self._state = (OK, 'running')
         self._is_paused = False
         self._values: dict[str, str] = {}
@@ -244,7 +224,7 @@ class NodeDiagnostics(MessageStatistics):
 
     def record_step_time(self, step: str, milliseconds: float) -> None:
         """Record the duration of a step, ms."""
-        self._step_times.add(step, milliseconds)
+        self._step_times_ms.setdefault(step, deque(maxlen=_STEPS)).append(milliseconds)
 
     def step_failed(self, step: str, error: Exception) -> None:
         """Report an error that nobody expects: ERROR, its traceback in the log, a count."""
@@ -350,7 +330,7 @@ class NodeDiagnostics(MessageStatistics):
     def _status(self, now_s: float) -> DiagnosticStatus:
         level, message = self._level_and_message()
         values = self._values | self._connections() | self.values(now_s)
-        values |= self._step_times.values()
+        values |= self._step_times()
         name = self._node.get_fully_qualified_name()
         return DiagnosticStatus(
             level=level,
@@ -358,6 +338,15 @@ class NodeDiagnostics(MessageStatistics):
             message=message,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
+
+    def _step_times(self) -> dict[str, str]:
+        """Median, 95th percentile and maximum of the last steps of each kind."""
+        values = {}
+        for step, times in self._step_times_ms.items():
+            median, p95 = np.percentile(times, [50.0, 95.0])
+            text = f'median {median:.1f} ms, p95 {p95:.1f} ms, max {max(times):.1f} ms'
+            values[f'{step}: step time'] = text
+        return values
 
     def _level_and_message(self) -> tuple[bytes, str]:
         level, message = (OK, 'paused') if self._is_paused else self._state

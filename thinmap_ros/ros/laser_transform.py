@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 
 from rclpy.node import Node
@@ -148,10 +147,8 @@ class LaserTransform:
         return self._mounts[frame_id]
 
     def _on_static(self, data: bytes) -> None:
-        with suppress(InputError):  # the frames of an invalid message stay unknown
-            for transform in self._reader.read(data):
-                with suppress(InputError):
-                    self._transforms.add(transform)
+        # The frames of an invalid message stay unknown.
+        self._reader.feed(data, self._transforms.add, lambda _: None)
         self._changes = {
             frame: f'static transform of laser {quoted(frame)} {change}: the first one is used; '
             'expected a laser that does not move on the robot: restart the node for the new one'

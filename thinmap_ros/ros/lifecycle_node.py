@@ -26,9 +26,9 @@ from thinmap_ros.ros.time_jumps import STEADY, ElapsedTime, TimeJumps
 
 _CHECKPOINT_PERIOD_S = 0.5
 _DEAR_INTERVAL = 200.0  # half a percent of the time
-_POLL_S = 0.1
+POLL_S = 0.1  # between two looks at long work
 
-# Takes what long work has found, in the thread of the node.
+# Processes what long work has found, in the thread of the node.
 Result = Callable[[], None]
 
 
@@ -312,7 +312,7 @@ class ThinmapNode(LifecycleNode):
 class Worker:
     """A thread for long work of a node: one thing after another, in a share of a core.
 
-    No scan waits for it. Its results are taken in the thread of the node, while that is active.
+    No scan waits for it. The node processes its results in its own thread, while it is active.
     """
 
     def __init__(
@@ -329,12 +329,12 @@ class Worker:
         self._job: Future[Result] | None = None
         self._rests_until_s = 0.0
         # Only while there is work.
-        self._poll = node.create_active_timer(_POLL_S, self._take_result, clock=STEADY)
+        self._poll = node.create_active_timer(POLL_S, self._process_result, clock=STEADY)
         self._poll.cancel()
 
     @property
     def is_busy(self) -> bool:
-        """Whether there is work whose result was not taken."""
+        """Whether there is work whose result is not processed yet."""
         return self._job is not None
 
     @property
@@ -348,8 +348,12 @@ class Worker:
         self._poll.reset()
 
     def drop(self) -> None:
-        """Do not take what the present work finds."""
+        """Ignore what the present work finds."""
         self._job = None
+
+    def close(self) -> None:
+        """Wait until what was begun is done."""
+        self._thread.shutdown()
 
     def _timed(self, work: Callable[[], Result]) -> Result:
         began_s = thread_time()
@@ -361,7 +365,7 @@ class Worker:
             used_s = thread_time() - began_s
             self._rests_until_s = monotonic() + used_s * (1.0 / self._share - 1.0)
 
-    def _take_result(self) -> None:
+    def _process_result(self) -> None:
         job = self._job
         if job is not None and not job.done():
             return

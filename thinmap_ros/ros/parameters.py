@@ -86,12 +86,7 @@ def declare_config(
     values = {}
     for name, field, default in declared:
         descriptor = _descriptor(field, read_only=name not in free)
-        _accept_integer(node, name, default)
-        try:
-            values[name] = node.declare_parameter(name, default, descriptor).value
-        except Exception as error:
-            # rclpy has an exception class for each kind of wrong value.
-            raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
+        values[name] = _declared(node, name, default, descriptor)
     current = with_values(defaults, values)
     if changed is not None:
         _Changes(node, current, free, changed)
@@ -149,11 +144,7 @@ def declare_parameter(
     Raises ConfigError where the value is outside of them, not finite, or of the wrong type.
     """
     descriptor = ParameterDescriptor(description=description, read_only=True)
-    _accept_integer(node, name, default)
-    try:
-        value = node.declare_parameter(name, default, descriptor).value
-    except Exception as error:
-        raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
+    value = _declared(node, name, default, descriptor)
     require_number(name, value, low, high)
     return value
 
@@ -175,14 +166,21 @@ def declare_texts(node: Node, name: str, default: str, description: str) -> tupl
     return tuple(texts)
 
 
-def _accept_integer(node: Node, name: str, default: Any) -> None:
-    """Take an integer that was given for a float as that float, as in many parameter files."""
+def _declared(node: Node, name: str, default: Any, descriptor: ParameterDescriptor) -> Any:
+    """Declare a parameter; return its value. Raises ConfigError where that is of a wrong type.
+
+    An integer that was given for a float is that float, as in many parameter files.
+    """
     overrides = given_parameters(node)
     given = overrides.get(name)
-    if given is None or not isinstance(default, float):
-        return
-    if given.type_ == Parameter.Type.INTEGER:
+    is_float = isinstance(default, float)
+    if is_float and given is not None and given.type_ == Parameter.Type.INTEGER:
         overrides[name] = Parameter(name, value=float(given.value))
+    try:
+        return node.declare_parameter(name, default, descriptor).value
+    except Exception as error:
+        # rclpy has an exception class for each kind of wrong value.
+        raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
 
 
 def translate(node: Node, program: str) -> None:
@@ -294,33 +292,22 @@ def reject_unknown(node: Node, elsewhere: Mapping[str, str] | None = None) -> No
     several nodes share a process, a parameter may be meant for another one: the last of them
     decides. Raises ConfigError.
     """
-    given = {
+    shared = _SHARED.get() or _Shared()
+    shared.names.append(node.get_name())
+    shared.given |= {
         name
         for name in set(given_parameters(node)).difference(ROBOT)
         if not name.startswith('qos_overrides.') and not is_known(name)
     }
-    known = {name for name in declared_names(node) if not name.startswith('qos_overrides')}
-    meant = dict(elsewhere or {})
-    shared = _SHARED.get()
-    if shared is not None:
-        shared.names.append(node.get_name())
-        shared.given |= given
-        shared.known |= known
-        shared.elsewhere |= meant
-        if len(shared.names) < shared.count:
-            return
-        given = shared.given
-        known = shared.known
-        meant = shared.elsewhere
-        names = shared.names
-    else:
-        names = [str(node.get_name())]
-    unknown = sorted(given - known)
-    if not unknown:
+    shared.known |= {name for name in declared_names(node) if not name.startswith('qos_overrides')}
+    shared.elsewhere |= elsewhere or {}
+    known = shared.known
+    unknown = sorted(shared.given - known)
+    if len(shared.names) < shared.count or not unknown:
         return
-    wrong = ', '.join(name + suggestion(name, known, meant) for name in unknown)
-    nodes = ', '.join(names)
-    is_one = len(names) == 1
+    wrong = ', '.join(name + suggestion(name, known, shared.elsewhere) for name in unknown)
+    nodes = ', '.join(shared.names)
+    is_one = len(shared.names) == 1
     if node.has_parameter(STRICT) and not node.get_parameter(STRICT).value:
         lack = f'node {nodes} does not have' if is_one else f'nodes {nodes} do not have'
         node.get_logger().warning(
@@ -336,7 +323,7 @@ def reject_unknown(node: Node, elsewhere: Mapping[str, str] | None = None) -> No
 class _Shared:
     """Parameters that the nodes of one process were given, and those that they declared."""
 
-    count: int
+    count: int = 1
     names: list[str] = dataclasses.field(default_factory=list)
     given: set[str] = dataclasses.field(default_factory=set)
     known: set[str] = dataclasses.field(default_factory=set)
@@ -349,7 +336,7 @@ _SHARED: ContextVar[_Shared | None] = ContextVar('shared', default=None)
 @contextmanager
 def shared_process(count: int) -> Iterator[None]:
     """Let `count` nodes that are created inside share the parameters that they are given."""
-    token = _SHARED.set(_Shared(count) if count > 1 else None)
+    token = _SHARED.set(_Shared(count))
     try:
         yield
     finally:

@@ -104,14 +104,22 @@ class SaveDirectory:
 
 
 def offer_saving(
-    node: ThinmapNode, directory: SaveDirectory, part: Part, save: Callable[[str, bool], str]
+    node: ThinmapNode,
+    directory: SaveDirectory,
+    part: Part,
+    save: Callable[[str, bool], str],
+    save_at_end: Callable[[str], str],
 ) -> None:
-    """Offer service save_PART; save: gets path and overwrite, returns what was saved."""
+    """Offer service save_PART, and declare the parameters of `save_on_exit`.
+
+    save: gets path and overwrite, returns what was saved; save_at_end: as of `save_on_exit`.
+    """
 
     def work(request: SaveMap.Request) -> str:
         return save(directory.resolve_for_saving(request.path, part), request.overwrite)
 
     offer(node.create_active_service, SaveMap, f'save_{part.name}', work)
+    save_on_exit(node, directory, part, save_at_end)
 
 
 def offer_loading(

@@ -221,6 +221,25 @@ class TransformReader:
         self._now_s = now_s
         self._read_s: dict[str, float] = {}
 
+    def feed(
+        self,
+        data: bytes,
+        add: Callable[[TransformStamped], object],
+        on_error: Callable[[InputError], None],
+    ) -> None:
+        """Call `add` with each transform of a message that is due; it may raise InputError.
+
+        on_error: receives what is wrong with the message, or with one of its transforms.
+        """
+        try:
+            for transform in self.read(data):
+                try:
+                    add(transform)
+                except InputError as error:
+                    on_error(error)
+        except InputError as error:
+            on_error(error)
+
     def read(self, data: bytes) -> Iterator[TransformStamped]:
         """Transforms of a message that are due. Raises InputError if the message is invalid."""
         if data[:2] != _LITTLE_ENDIAN:
@@ -370,22 +389,18 @@ class OdometrySource:
                 stamp_ns, T_odom_base, self.tilt_rad = sample
                 self._process(stamp_ns, T_odom_base)
         except InputError as error:
-            self._node.diagnostics.message_rejected('/tf', str(error))
+            self._reject(error)
 
     def _add(self, data: bytes, is_static: bool) -> None:
-        try:
-            for transform in self._readers[is_static].read(data):
-                self._add_transform(transform, is_static)
-        except InputError as error:
-            self._node.diagnostics.message_rejected('/tf', str(error))
-
-    def _add_transform(self, transform: Any, is_static: bool) -> None:
-        try:
+        def add(transform: TransformStamped) -> None:
             self._transforms.add(transform, is_static)
             if is_static:
                 self._frames.add_static(transform)
-        except InputError as error:
-            self._node.diagnostics.message_rejected('/tf', str(error))
+
+        self._readers[is_static].feed(data, add, self._reject)
+
+    def _reject(self, error: InputError) -> None:
+        self._node.diagnostics.message_rejected('/tf', str(error))
 
     def _report(self) -> None:
         """Report on /diagnostics what is missing of the chain of transforms."""
@@ -447,21 +462,16 @@ class TransformListener:
         is_static = profile is qos.STATIC_TRANSFORMS
         reader = TransformReader(self._buffer.is_used)
 
-        def add(data: bytes) -> None:
-            try:
-                for transform in reader.read(data):
-                    self._received(transform, is_static)
-                    self._add(transform, is_static)
-            except InputError as error:
-                self._warn(error)
-
-        return self._node.create_subscription(TFMessage, topic, add, profile, raw=True, **options)
-
-    def _add(self, transform: Any, is_static: bool) -> None:
-        try:
+        def add(transform: TransformStamped) -> None:
+            self._received(transform, is_static)
             self._buffer.add(transform, is_static)
-        except InputError as error:
-            self._warn(error)
+
+        def add_all(data: bytes) -> None:
+            reader.feed(data, add, self._warn)
+
+        return self._node.create_subscription(
+            TFMessage, topic, add_all, profile, raw=True, **options
+        )
 
     def _warn(self, error: InputError) -> None:
         self._node.get_logger().warning(f'/tf: {error}', throttle_duration_sec=5.0)

@@ -47,13 +47,14 @@ _RELEASE = 'no goal is driven before ~/reset, or a stop that is released'
 class BaseWatch:
     """Compares commands and odometry; reports at level ERROR what is wrong.
 
-    Where others publish cmd_vel too, or nobody hears it, any motion is allowed.
+    Where others publish cmd_vel too, or nobody hears it, any motion is allowed. supervisor: judges
+    the motion.
     """
 
     def __init__(self, node: ThinmapNode, config: NavigatorConfig) -> None:
         """Declare the parameter `base_velocity_topic`."""
         self._node = node
-        self._supervisor = BaseSupervisor(config)
+        self.supervisor = BaseSupervisor(config)
         topic = parameters.declare_parameter(
             node,
             'base_velocity_topic',
@@ -71,21 +72,8 @@ class BaseWatch:
     @property
     def fault(self) -> str:
         """Why no goal may be driven; '' for no reason."""
-        fault = self._supervisor.fault
-        return f'{fault}: {_RELEASE}' if self._supervisor.is_fast else fault
-
-    @property
-    def is_creeping(self) -> bool:
-        """Whether the robot moves though it is to stand."""
-        return self._supervisor.is_creeping
-
-    def set_config(self, config: NavigatorConfig) -> None:
-        """Continue with other limits."""
-        self._supervisor.set_config(config)
-
-    def release(self) -> None:
-        """Drive goals again."""
-        self._supervisor.release()
+        fault = self.supervisor.fault
+        return f'{fault}: {_RELEASE}' if self.supervisor.is_fast else fault
 
     def add_sent(self, v: float, w: float) -> None:
         """Add a command of this node, m/s and rad/s."""
@@ -95,8 +83,8 @@ class BaseWatch:
     def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         """Add a sample of the odometry, T_odom_base (3,)."""
         now_s = self._node.elapsed_time.now_s()
-        self._supervisor.set_unheard(now_s, not (self._is_behind or self.is_obeyed))
-        self._supervisor.add_odometry(now_s, stamp_ns, T_odom_base)
+        self.supervisor.set_unheard(now_s, not (self._is_behind or self.is_obeyed))
+        self.supervisor.add_odometry(now_s, stamp_ns, T_odom_base)
 
     @property
     def subscribers(self) -> int:
@@ -109,11 +97,11 @@ class BaseWatch:
         return self.subscribers > 0 and int(self._node.count_publishers(self._own_topic)) == 1
 
     def _add_command(self, v: float, w: float) -> None:
-        self._supervisor.add_command(self._node.elapsed_time.now_s(), v, w)
+        self.supervisor.add_command(self._node.elapsed_time.now_s(), v, w)
 
 
 # grid_mapper answers each scan: several of the slowest laser that a robot drives by, at 2.5 Hz.
-_WARN_S = 2.0
+MAPPER_TIMEOUT_NS = 2 * SECOND_NS
 
 
 @dataclass(frozen=True)
@@ -162,8 +150,9 @@ class MapInput:
         self._has_grid = False
         self._map_id = UNKNOWN
         self.pose_map_id = UNKNOWN
-        timeouts_s = [_WARN_S, self._timeout_s] if self._timeout_s > 0.0 else [_WARN_S]
-        timeouts_ns = [round(seconds * SECOND_NS) for seconds in timeouts_s]
+        timeouts_ns = [MAPPER_TIMEOUT_NS]
+        if self._timeout_s > 0.0:
+            timeouts_ns.append(round(self._timeout_s * SECOND_NS))
         self._streams = [InputStream('grid_mapper', ns, ns) for ns in timeouts_ns]
 
     @property
@@ -206,7 +195,7 @@ class MapInput:
 
 # Without a new pose the last correction of the odometry holds for a while; without odometry, the
 # robot does not know its pose meanwhile.
-_POSE_TIMEOUT_NS = 3_000_000_000
+POSE_TIMEOUT_NS = 3 * SECOND_NS
 _POSE_ONLY_TIMEOUT_NS = SECOND_NS
 
 
@@ -251,7 +240,7 @@ class RobotState:
         self.scans: tuple[Scan, ...] = ()
         self.pose_fault = ''
         self._time = time
-        pose_timeout_ns = _POSE_TIMEOUT_NS if has_odometry else _POSE_ONLY_TIMEOUT_NS
+        pose_timeout_ns = POSE_TIMEOUT_NS if has_odometry else _POSE_ONLY_TIMEOUT_NS
         self._streams = {
             'odometry': InputStream('odometry', SENSOR_TIMEOUT_NS, SENSOR_DELAY_NS),
             # A late pose corrects the odometry as well as a new one: they are as late as silent.

@@ -428,9 +428,8 @@ class LastPose:
 
 
 def _default_path(node: Node) -> Path:
-    chosen = os.environ.get('XDG_STATE_HOME')
-    state = Path(chosen) if chosen else Path.home() / '.local' / 'state'
-    return state / 'thinmap' / own_file_name(node, '.pose.yaml')
+    state = os.environ.get('XDG_STATE_HOME') or Path.home() / '.local' / 'state'
+    return Path(state, 'thinmap', own_file_name(node, '.pose.yaml'))
 
 
 class GivenMap:

@@ -626,9 +626,7 @@ class StrategySource:
 
     def has_learned(self, strategy: Strategy) -> bool:
         """Whether a strategy has something to save."""
-        if self._name != DEFAULT or not isinstance(strategy, Explorer):
-            return False
-        return sessions.EXPLORATION.has_content(strategy.state())
+        return sessions.EXPLORATION.has_content(self.state(strategy))
 
     def save(self, path: str, strategy: Strategy, overwrite: bool) -> str:
         """Save what a strategy has learned, if it can be saved; returns what was done.

@@ -26,6 +26,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.core.topology.graph import TopologyConfig, topology_from_msg
 from thinmap_ros.core.topology.topology import MapGraph
 from thinmap_ros.logs import decode
+from thinmap_ros.nodes.parts.driving import MAPPER_TIMEOUT_NS, POSE_TIMEOUT_NS
 from thinmap_ros.nodes.parts.mission import ExplorationSettings
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.diagnostics import WARN
@@ -192,16 +193,14 @@ class PublisherCheck:
     def is_found(self) -> bool:
         """Whether there is a publisher."""
         if monotonic() - self._checked_s >= _PERIOD_S:
-            self._set(any(self._count(topic) > 0 for topic in self._topics))
+            # rclpy counts the publishers of a name as it is, without the node's remapping rules.
+            names = map(self._node.resolve_topic_name, self._topics)
+            self._set(any(map(self._node.count_publishers, names)))
         return self._is_found
 
     def message_received(self) -> None:
         """Register a message: its publisher may not be discovered yet."""
         self._set(True)
-
-    def _count(self, topic: str) -> int:
-        # rclpy counts the publishers of a name as it is, without the node's remapping rules.
-        return int(self._node.count_publishers(self._node.resolve_topic_name(topic)))
 
     def _set(self, is_found: bool) -> None:
         self._is_found = is_found
@@ -212,10 +211,6 @@ _LOOK_PERIOD_S = 0.5
 # A publisher that is silent because its map does not change: the old one holds.
 _UNCHANGED_S = 10.0
 _AWAITED = 'scan that shows anything on local_grid of grid_mapper'
-# As of the map of navigator: a mapper answers each scan.
-_SILENT_NS = 2 * SECOND_NS
-# A robot that was not localized for so long is somewhere else, perhaps.
-_POSE_TIMEOUT_S = 3.0
 
 
 class _GridPublisher:
@@ -230,7 +225,9 @@ class _GridPublisher:
 
     def forget(self) -> None:
         """A mapper that is silent is gone, and not dead."""
-        self._stream = InputStream('local_grid of grid_mapper', _SILENT_NS, _SILENT_NS)
+        self._stream = InputStream(
+            'local_grid of grid_mapper', MAPPER_TIMEOUT_NS, MAPPER_TIMEOUT_NS
+        )
         self._is_heard = False
 
     def is_found(self) -> bool:
@@ -339,8 +336,9 @@ class ObservationSource:
                 return now_ns, self._view.newest_pose(now_ns)
             except InputError:
                 return None
-        silent_s = self._node.elapsed_time.now_s() - self.watchdog.last_scan_s
-        if last is None or self.watchdog.is_lost or silent_s > _POSE_TIMEOUT_S:
+        silent_ns = SECOND_NS * (self._node.elapsed_time.now_s() - self.watchdog.last_scan_s)
+        # A robot that was not localized for so long is somewhere else, perhaps.
+        if last is None or self.watchdog.is_lost or silent_ns > POSE_TIMEOUT_NS:
             return None
         return last.scan.stamp_ns, last.T_map_base
 

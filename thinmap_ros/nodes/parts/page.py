@@ -5,7 +5,6 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
@@ -24,12 +23,12 @@ from std_msgs.msg import Bool, String
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.srv import AddKeepOut, EraseArea, LoadMap, NameRegion, RemoveKeepOut, SaveMap
-from thinmap_ros.core.errors import InputError, ThinmapError, one_line, one_line_reason
+from thinmap_ros.core.errors import InputError, one_line, one_line_reason
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.sessions import GRID, PARTS, copy_map
 from thinmap_ros.nodes.parts.localization import GIVEN_COVARIANCE
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.lifecycle_node import Result, ThinmapNode, Worker
 from thinmap_ros.ros.session_services import SaveDirectory
 from thinmap_ros.ros.stop_topic import StopTopic
 from thinmap_ros.ros.velocity import (
@@ -126,12 +125,10 @@ class SessionMerge:
     def __init__(self, node: ThinmapNode, board: Board, tell: Callable[[str], None]) -> None:
         """Declare save_directory; tell: shows what has happened."""
         self._board = board
-        self._tell = tell
         self._directory = SaveDirectory(node)
         self._trial: _Trial | None = None
         self._is_shown = False
-        self._saver = ThreadPoolExecutor(1, thread_name_prefix='merge')
-        self._saving: Future[list[str]] | None = None
+        self._saver = Worker(node, 1.0, lambda error: tell(f'merge: {one_line_reason(error)}'))
 
     def list_sessions(self) -> None:
         """Show the names of the sessions in the directory."""
@@ -156,29 +153,27 @@ class SessionMerge:
     def save(self, name: str) -> None:
         """Save the joint map. Raises InputError where there is none, or the name is taken."""
         trial = self._trial
-        if trial is None or trial.code != 0 or self._saving is not None:
+        if trial is None or trial.code != 0 or self._saver.is_busy:
             raise InputError('merge: expected a joint map that is shown')
         path = self._directory.resolve_for_saving(name, GRID)
         if any(part.exists(path) for part in PARTS):
             raise InputError(f'merge: {name}: exists: expected a new name')
-        self._saving = self._saver.submit(copy_map, trial.stem, path)
+        self._saver.begin(lambda: self._copied(trial.stem, path))
 
     def drop(self) -> None:
         """Forget the joint map, or the work on it."""
-        if self._saving is not None:
+        if self._saver.is_busy:
             raise InputError('merge: is being saved')
         self._forget('', [])
 
     def tick(self) -> None:
         """Show what is done; called ten times a second."""
-        if self._saving is not None and self._saving.done():
-            self._end_saving(self._saving)
-        elif self._trial is not None and not self._is_shown:
+        if self._trial is not None and not self._is_shown:
             self._watch(self._trial)
 
     def close(self) -> None:
         """End the work."""
-        self._saver.shutdown()
+        self._saver.close()
         if self._trial is not None:
             self._trial.drop()
 
@@ -194,13 +189,12 @@ class SessionMerge:
         elif trial.code is not None:
             self._forget('failed', trial.lines()[-1:] or [f'ended with {trial.code}'])
 
-    def _end_saving(self, saving: Future[list[str]]) -> None:
-        self._saving = None
-        try:
-            said = '; '.join(saving.result())
-        except (ThinmapError, OSError) as error:
-            self._tell(f'merge: {one_line_reason(error)}')
-            return
+    def _copied(self, stem: str, path: str) -> Result:
+        """Copy the joint map, in the thread of the worker."""
+        saved = copy_map(stem, path)
+        return lambda: self._saved('; '.join(saved))
+
+    def _saved(self, said: str) -> None:
         self._forget('saved', [said])
         self.list_sessions()
 

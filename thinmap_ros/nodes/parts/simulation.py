@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -164,20 +163,6 @@ class RequestedExploration:
 _COMMAND_TIMEOUT_NS = 500_000_000
 
 
-@dataclass(frozen=True)
-class _VelocityCommand:
-    """A velocity command, m/s and rad/s, with the time at which it was received."""
-
-    v: float = 0.0
-    w: float = 0.0
-    received_ns: int = 0
-
-    def at(self, now_ns: int) -> tuple[float, float]:
-        """The velocity at a time; as a robot's controller, it stops without a recent command."""
-        is_recent = now_ns - self.received_ns <= _COMMAND_TIMEOUT_NS
-        return (self.v, self.w) if is_recent else (0.0, 0.0)
-
-
 class RobotInterface:
     """A simulated robot on the graph; its topics begin with a prefix, '' or 'robot1/'.
 
@@ -215,7 +200,8 @@ class RobotInterface:
         self._publish_tf = publish_tf
         self._last_collisions = -1
         self._last_scans: list[LaserScan] = []
-        self._command = _VelocityCommand()
+        self._command = (0.0, 0.0)  # m/s and rad/s
+        self._command_ns = 0
         VelocitySubscription(node, diagnostics, self._on_command, f'{prefix}{COMMANDS}')
         self._teleports = f'~/{prefix}set_pose'
         node.create_subscription(PoseStamped, self._teleports, self._on_teleport, qos.STREAM)
@@ -228,8 +214,9 @@ class RobotInterface:
         return min(int(scans.get_subscription_count()) for scans in self._scans.values())
 
     def move(self) -> None:
-        """Drive for one step as commanded."""
-        self._simulation.move(*self._command.at(self._simulation.stamp_ns))
+        """Drive for one step as commanded; as robots, it stops without a recent command."""
+        is_recent = self._simulation.stamp_ns - self._command_ns <= _COMMAND_TIMEOUT_NS
+        self._simulation.move(*(self._command if is_recent else (0.0, 0.0)))
 
     def publish(self) -> bool:
         """Publish the present sensor readings, the scans last; returns whether there was one."""
@@ -280,7 +267,8 @@ class RobotInterface:
             reason = f'command {(v, w)}: expected finite numbers'
             self._diagnostics.message_rejected(f'{self._prefix}{COMMANDS}', reason)
             return
-        self._command = _VelocityCommand(v, w, self._simulation.stamp_ns)
+        self._command = (v, w)
+        self._command_ns = self._simulation.stamp_ns
 
     def _on_teleport(self, message: PoseStamped) -> None:
         """Teleport the robot, for kidnapping tests: the odometry does not change."""
