@@ -1,7 +1,7 @@
 """The pose of the robot: each scan, with the odometry at its stamp, is a step of the localizer."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -72,47 +72,6 @@ _HEALTH = {
 }
 
 
-@dataclass(eq=False)
-class _Input:
-    """Scans with the odometry at their stamps, and the check of both.
-
-    reported: kinds of warnings that are in the log.
-    """
-
-    pairing: ScanOdometrySynchronizer = field(default_factory=ScanOdometrySynchronizer)
-    consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
-    reported: set[str] = field(default_factory=set)
-
-    @property
-    def warnings(self) -> dict[str, str]:
-        """What scans and odometry contradict, by kind."""
-        return self.pairing.warnings | self.consistency.warnings
-
-
-@dataclass(eq=False)
-class _MapIds:
-    """Id of the map that the localizer makes, and of the one that a reset has replaced by it.
-
-    is_given: whether the map was loaded, or begun by a reset, and not by the start of the node.
-    """
-
-    id: int
-    replaced: int = UNKNOWN
-    is_given: bool = False
-    _published: int = UNKNOWN
-
-    def begin(self, is_reset: bool) -> None:
-        """Another map: a reset begins it, or it was loaded."""
-        self.replaced = self._published if is_reset else UNKNOWN
-        self.id = new_map_id()
-        self.is_given = True
-
-    def published(self) -> dict[str, int]:
-        """The ids as fields of a status that is published."""
-        self._published = self.id
-        return {'map_id': self.id, 'replaced_map_id': self.replaced}
-
-
 class LocalizerNode(ThinmapNode):
     """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out.
 
@@ -152,7 +111,10 @@ class LocalizerNode(ThinmapNode):
         kernels.localizer()
         if slam != SCAN_MATCHING:
             kernels.ekf_localizer()
-        self._map_ids = _MapIds(new_map_id() if self._config.is_mapping else UNKNOWN)
+        self._map_id = new_map_id() if self._config.is_mapping else UNKNOWN
+        self._published_id = UNKNOWN
+        self._replaced_id = UNKNOWN  # of the map that a reset has replaced by the present one
+        self._is_map_given = False  # loaded, or begun by a reset, and not by the start of the node
         self._begin()
         self.enable_checkpoint(self._state, self._restore, self._map_state)
         if self._config.is_mapping:
@@ -161,7 +123,7 @@ class LocalizerNode(ThinmapNode):
             )
         self.diagnostics.add_update_callback(self._report_unpaired)
         self.diagnostics.check_sole_publisher('pose')
-        self.diagnostics.add_check(WARN, lambda: '; '.join(self._input.warnings.values()))
+        self.diagnostics.add_check(WARN, lambda: '; '.join(self._warnings.values()))
         # Before the scans: of messages that wait together, the executor processes the graph of the
         # last scan first.
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
@@ -204,8 +166,7 @@ class LocalizerNode(ThinmapNode):
 
         The robot is at the start pose. A new map is of the storey that the robot is on.
         """
-        if self._config.is_mapping:
-            self._map_ids.begin(is_reset=True)
+        self._begin_map(replaced_id=self._published_id)
         self._corrected_ns = 0
         before = self._localizer.config
         self._begin()
@@ -213,11 +174,20 @@ class LocalizerNode(ThinmapNode):
         if tag and not len(self._localizer.known_places()):
             self._enter_storey(tag)
 
+    def _begin_map(self, replaced_id: int) -> None:
+        """Another map, which is made here: it was loaded, or a reset has replaced one by it."""
+        if self._config.is_mapping:
+            self._replaced_id = replaced_id
+            self._map_id = new_map_id()
+            self._is_map_given = True
+
     def _begin(self) -> None:
         self._localizer = self._given.first_localizer()
         self._broadcaster.reset()
         self._odometry.reset()
-        self._input = _Input()
+        self._pairing = ScanOdometrySynchronizer()
+        self._consistency = ConsistencyMonitor()
+        self._reported: set[str] = set()  # kinds of warnings that are in the log
         self._topology: Graph | None = None
         self._recovery = Recovery()
 
@@ -226,7 +196,7 @@ class LocalizerNode(ThinmapNode):
         is_map_missing = self._config.is_mapping and not self._recovery.is_map_saved
         if pose is None or is_map_missing:
             return None
-        return {**pose, 'map_id': np.array(self._map_ids.id)}
+        return {**pose, 'map_id': np.array(self._map_id)}
 
     def _map_state(self) -> State | None:
         """What cannot be loaded again: the map, while it is made."""
@@ -244,17 +214,17 @@ class LocalizerNode(ThinmapNode):
         map_id, own = snapshot.split_number(state, 'map_id')
         localizer, last = restored(own, self._config)
         self._localizer = localizer or self._localizer
-        self._map_ids.id = map_id
+        self._map_id = map_id
         self._recovery = Recovery(last)
 
     def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         tilt_rad = self._odometry.tilt_rad
-        self._process(self._input.pairing.add_odometry(stamp_ns, T_odom_base, tilt_rad))
+        self._process(self._pairing.add_odometry(stamp_ns, T_odom_base, tilt_rad))
 
     def _on_scan(self, topic: str, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(topic, message)
         self._odometry.add_scan_stamp(scan.odometry_ns)
-        self._process(self._input.pairing.add_scan(scan))
+        self._process(self._pairing.add_scan(scan))
 
     def _on_initial_pose(self, T_map_base: Array, covariance: Array) -> None:
         require_near_map(T_map_base, self._localizer)
@@ -293,16 +263,14 @@ class LocalizerNode(ThinmapNode):
                 self.step_failed(f'scan at {scan.stamp_ns} ns', error)
         self._report_warnings()
         diagnostics = self.diagnostics
-        diagnostics.set_drop_total(
-            'scans without odometry at their time', self._input.pairing.dropped
-        )
-        discarded = self._input.pairing.discarded_odometry
+        diagnostics.set_drop_total('scans without odometry at their time', self._pairing.dropped)
+        discarded = self._pairing.discarded_odometry
         diagnostics.set_drop_total('odometry with stamps ahead of those after it', discarded)
         diagnostics.set_drop_total('invalid scans or odometry', self._localizer.rejected)
 
     def _report_unpaired(self) -> None:
         """Report on /diagnostics why scans were not paired with odometry."""
-        reasons = [f'{n} {reason}' for reason, n in self._input.pairing.reasons().items()]
+        reasons = [f'{n} {reason}' for reason, n in self._pairing.reasons().items()]
         if reasons:
             self.diagnostics.set_value('scans without odometry', '; '.join(reasons))
 
@@ -311,8 +279,8 @@ class LocalizerNode(ThinmapNode):
         self._resume(scan, T_odom_base)
         started = perf_counter()
         estimate = self._localizer.step(scan, T_odom_base)
-        estimate = self._input.consistency.checked(scan, T_odom_base, estimate)
-        self._input.pairing.add_estimate(scan, estimate)
+        estimate = self._consistency.checked(scan, T_odom_base, estimate)
+        self._pairing.add_estimate(scan, estimate)
         step_ms = 1000.0 * (perf_counter() - started)
         self._publish(scan, estimate, step_ms)
         if estimate.odometry_discontinuity:
@@ -326,15 +294,20 @@ class LocalizerNode(ThinmapNode):
         if estimate.correction is not None:
             self.checkpoint_now()
 
+    @property
+    def _warnings(self) -> dict[str, str]:
+        """What scans and odometry contradict, by kind."""
+        return self._pairing.warnings | self._consistency.warnings
+
     def _report_warnings(self) -> None:
         """Log each kind of warning once."""
-        scale = self._input.consistency.odometry_scale.warning
+        scale = self._consistency.odometry_scale.warning
         self.diagnostics.set_value(SCALE_KEY, scale)
-        warnings = {kind: f'scan: {text}' for kind, text in self._input.warnings.items()}
+        warnings = {kind: f'scan: {text}' for kind, text in self._warnings.items()}
         for kind, text in (warnings | {SCALE_KEY: scale}).items():
-            if text and kind not in self._input.reported:
+            if text and kind not in self._reported:
                 self.get_logger().warning(text)
-                self._input.reported.add(kind)
+                self._reported.add(kind)
 
     def _on_living_map(self, message: ProbabilityGrid) -> None:
         """Continue in a map whose mapper has outlived a localizer, rather than begin another one.
@@ -349,8 +322,7 @@ class LocalizerNode(ThinmapNode):
             self.get_logger().warning(f'grid: {error}')
             return
         self.destroy_subscription(self._living)
-        ids = self._map_ids
-        if message.map_id == ids.id or ids.is_given:
+        if message.map_id == self._map_id or self._is_map_given:
             return
         if not isinstance(self._config, LocalizerConfig):
             return  # a map of line features cannot be made of a grid
@@ -361,7 +333,7 @@ class LocalizerNode(ThinmapNode):
         # The robot has driven since it was at the start pose: a room may fit there by chance.
         self._localizer = Localizer.in_occupancy_map(patch, self._config, is_guess=True)
         self._recovery.awaited = None
-        ids.id = message.map_id
+        self._map_id = message.map_id
 
     def _resume(self, scan: Scan, T_odom_base: Array) -> None:
         """Continue where the killed localizer was; at the start pose if the odometry was reset."""
@@ -401,8 +373,7 @@ class LocalizerNode(ThinmapNode):
         self._localizer = loaded
         self._recovery = Recovery()
         self._given.has_loaded = True
-        if self._config.is_mapping:
-            self._map_ids.begin(is_reset=False)
+        self._begin_map(replaced_id=UNKNOWN)
         if self._topology is not None:
             loaded.set_topology(self._topology)
         features = loaded.features
@@ -440,8 +411,10 @@ class LocalizerNode(ThinmapNode):
             no_return_is_unknown=scan.drops_out,
             inlier_ratio=estimate.inlier_ratio,
             step_time_ms=step_ms,
-            **self._map_ids.published(),
+            map_id=self._map_id,
+            replaced_map_id=self._replaced_id,
         )
+        self._published_id = self._map_id
         lines = [_feature_msg(feature) for feature in features]
         self._features.publish(LineFeatureArray(header=status.header, features=lines))
         self._status.publish(status)
@@ -449,7 +422,7 @@ class LocalizerNode(ThinmapNode):
             localized_scan_msg(scan, estimate, status, self._map_frame, self._corrected_ns)
         )
         if self._config.is_mapping:
-            self._keyframes.publish(scan.stamp_ns, self._localizer, self._map_ids.id)
+            self._keyframes.publish(scan.stamp_ns, self._localizer, self._map_id)
 
 
 def _state_of(estimate: Estimate) -> int:

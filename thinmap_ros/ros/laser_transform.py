@@ -19,32 +19,6 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.ros.tf import TransformReader
 
 
-class _FirstScans:
-    """Logs what the first scans are, once there are two: with one, their rate is unknown."""
-
-    def __init__(self, node: Node, topic: str) -> None:
-        self._node = node
-        self._topic = topic
-        self._first_ns: int | None = None
-        self._is_reported = False
-
-    def report(self, scan: Scan) -> None:
-        """Take a scan into account."""
-        if self._is_reported:
-            return
-        if self._first_ns is None or scan.stamp_ns <= self._first_ns:
-            self._first_ns = scan.stamp_ns
-            return
-        self._is_reported = True
-        beams = scan.ranges_m.size
-        angle_deg = math.degrees(abs(scan.angle_increment_rad)) * (beams - 1)
-        rate_hz = 1e9 / (scan.stamp_ns - self._first_ns)
-        self._node.get_logger().info(
-            f'first scans on {self._node.resolve_topic_name(self._topic)}: {beams} beams over '
-            f'{angle_deg:.0f} degrees, {rate_hz:.3g} Hz, up to {scan.range_max_m:.3g} m'
-        )
-
-
 class LaserTransform:
     """The pose of each laser frame on the robot.
 
@@ -89,7 +63,9 @@ class LaserTransform:
         self._mounts: dict[str, Mount] = {}
         self._changes: dict[str, str] = {}
         self._topics: dict[str, str] = {}  # of each laser frame
-        self._first = {topic: _FirstScans(node, topic) for topic in self.scan_topics}
+        self._node = node
+        self._first_ns: dict[str, int] = {}  # stamp of the first scan of each topic
+        self._described: set[str] = set()  # topics
         if isinstance(node, ThinmapNode):
             node.diagnostics.add_check(WARN, lambda: '; '.join(self._changes.values()))
         if self._fixed is None:
@@ -117,13 +93,30 @@ class LaserTransform:
             )
         scan = messages.scan_from_msg(message, mount.T_base_laser, self._laser)
         self._require_own_frame(topic, scan.frame)
-        self._first[topic].report(scan)
+        self._describe(topic, scan)
         return mount.apply(scan)
 
     def pose(self, frame_id: str) -> Array | None:
         """T_base_laser (3,) of a laser frame; None until it is known."""
         mount = self._mount(frame_id)
         return None if mount is None else mount.T_base_laser
+
+    def _describe(self, topic: str, scan: Scan) -> None:
+        """Log what the first scans are, once there are two: with one, their rate is unknown."""
+        if topic in self._described:
+            return
+        first_ns = self._first_ns.get(topic)
+        if first_ns is None or scan.stamp_ns <= first_ns:
+            self._first_ns[topic] = scan.stamp_ns
+            return
+        self._described.add(topic)
+        beams = scan.ranges_m.size
+        angle_deg = math.degrees(abs(scan.angle_increment_rad)) * (beams - 1)
+        rate_hz = 1e9 / (scan.stamp_ns - first_ns)
+        self._node.get_logger().info(
+            f'first scans on {self._node.resolve_topic_name(topic)}: {beams} beams over '
+            f'{angle_deg:.0f} degrees, {rate_hz:.3g} Hz, up to {scan.range_max_m:.3g} m'
+        )
 
     def _require_own_frame(self, topic: str, frame: str) -> None:
         """Raise InputError where the frame of a scan is that of another topic."""
