@@ -38,7 +38,7 @@ from thinmap_ros.ros.localized_scan import ReceivedScan, localized_scan_from_msg
 from thinmap_ros.ros.maps import FollowedMap, Origin
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.session_services import SaveDirectory, SessionClient, joined, save_on_exit
-from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
+from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_all
 
 _OTHER_MAP = (
     'the localizer is in another map than the one here: scans are not mapped: expected that it '
@@ -108,8 +108,11 @@ class GridMapperNode(ThinmapNode):
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('map')
         self.diagnostics.add_check(ERROR, lambda: self._fault)
-        subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
-        subscribe_guarded(self, LocalizedScanMsg, 'localized_scan', self._on_scan, qos.STREAM)
+        subscribe_all(
+            self,
+            (Path, 'trajectory', self._on_trajectory, qos.LATCHED),
+            (LocalizedScanMsg, 'localized_scan', self._on_scan, qos.STREAM),
+        )
         # Mapping continues while a map is saved, and waits while one is loaded: no window of the
         # old map reaches the new graph.
         reentrant = ReentrantCallbackGroup()

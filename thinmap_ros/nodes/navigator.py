@@ -35,7 +35,7 @@ from thinmap_ros.ros.diagnostics import ERROR, OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.stop_topic import StopTopic
-from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
+from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_all, subscribe_guarded
 from thinmap_ros.ros.tf import OdometrySource
 from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.ros.velocity import VelocityPublisher, declare_stamped
@@ -142,9 +142,12 @@ class NavigatorNode(ThinmapNode):
         self._laser_transform.subscribe(self, self._on_scan)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._map.subscribe(self)
-        subscribe_guarded(self, KeepOut, 'keep_out', self._on_keep_out, qos.LATCHED)
-        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
-        subscribe_guarded(self, PoseStamped, 'goal_pose', self._on_goal_pose, qos.STREAM)
+        subscribe_all(
+            self,
+            (KeepOut, 'keep_out', self._on_keep_out, qos.LATCHED),
+            (TopologicalMap, 'topology', self._on_topology, qos.LATCHED),
+            (PoseStamped, 'goal_pose', self._on_goal_pose, qos.STREAM),
+        )
         self._goals = SingleGoalServer(
             self,
             NavigateToPose,

@@ -28,7 +28,7 @@ from thinmap_ros.ros.session_services import (
     offer_loading,
     offer_saving,
 )
-from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.subscription import subscribe_all
 
 _ID_RESERVE = 1000  # ids that a builder may have assigned after its last checkpoint
 
@@ -93,8 +93,11 @@ class TopologyBuilderNode(ThinmapNode):
         )
         parameters.reject_unknown(self)
         kernels.topology_builder()
-        subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
-        subscribe_guarded(self, LocalGrid, 'local_grid', self._on_local_grid, qos.STREAM)
+        subscribe_all(
+            self,
+            (ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED),
+            (LocalGrid, 'local_grid', self._on_local_grid, qos.STREAM),
+        )
         offer_loading(self, TOPOLOGY, self._check, self._load)
         self.diagnostics.check_sole_publisher('topology')
         self._stamp = StateStamp()

@@ -1,15 +1,12 @@
 """A page in the browser: shows map and robot, and steers it."""
 
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMsg
-from rclpy.qos import QoSProfile
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import (
@@ -32,7 +29,7 @@ from thinmap_ros.ros.diagnostics import OK
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.maps import subscribe_to_map
-from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.subscription import subscribe_all
 from thinmap_ros.ros.team import heard_robots
 from thinmap_ros.ros.time_jumps import STEADY
 from thinmap_ros.web import access, server
@@ -119,7 +116,8 @@ class WebNode(ThinmapNode):
         picture = self._picture
         subscribe_to_map(self, 'map', picture.grid)
         self._laser.subscribe(self, self._on_scan)
-        topics: list[tuple[type, str, Callable[[Any], None], QoSProfile]] = [
+        subscribe_all(
+            self,
             (PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM),
             (PathMsg, 'trajectory', self._on_trajectory, qos.LATCHED),
             (PathMsg, 'plan', picture.plan, qos.LATCHED),
@@ -131,9 +129,7 @@ class WebNode(ThinmapNode):
             (ExplorationStatus, 'exploration_status', picture.exploration, qos.LATCHED),
             (LocalizedScan, 'localized_scan', picture.localized_scan, qos.STREAM),
             (DiagnosticArray, '/diagnostics', picture.diagnostics, qos.STREAM),
-        ]
-        for kind, topic, process, profile in topics:
-            subscribe_guarded(self, kind, topic, process, profile)
+        )
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from_msg(message.pose.pose)

@@ -58,6 +58,16 @@ def subscribe_guarded(
     _GuardedSubscription(node, kind, topic, process, profile)
 
 
+# Type, topic, what processes a message, and quality of service.
+Topic = tuple[type, str, Callable[[Any], None], QoSProfile]
+
+
+def subscribe_all(node: ThinmapNode, *topics: Topic) -> None:
+    """Subscribe to several topics, each as `subscribe_guarded`."""
+    for topic in topics:
+        subscribe_guarded(node, *topic)
+
+
 class _GuardedSubscription:
     """A subscription with the state that its checks need."""
 

@@ -36,7 +36,7 @@ from thinmap_ros.ros.diagnostics import ERROR
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import map_update_from_msg
 from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
-from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.subscription import subscribe_all
 from thinmap_ros.ros.team import TileReceiver, heard_robots
 from thinmap_ros.ros.tf import TransformListener
 from thinmap_ros.ros.time_jumps import ElapsedTime
@@ -140,8 +140,11 @@ class MapInput:
 
     def subscribe(self, node: ThinmapNode) -> None:
         """Start to receive maps."""
-        subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
-        subscribe_guarded(node, LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
+        subscribe_all(
+            node,
+            (ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED),
+            (LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED),
+        )
         subscribe_to_map(node, 'map', self._on_map)
 
     def reset(self) -> None:

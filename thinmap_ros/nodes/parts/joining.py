@@ -33,7 +33,7 @@ from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.maps import UNKNOWN, subscribe_to_map
 from thinmap_ros.ros.private_rclpy import given_parameters
-from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.subscription import subscribe_all
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,15 +219,13 @@ class RobotMaps:
         node = self._node
         received = self._keyframes[name] = ReceivedKeyframes()
         subscribe_to_map(node, topic, partial(self._on_map, name), updates)
-        graph = f'{prefix}/topology'
-        subscribe_guarded(
-            node, TopologicalMapMsg, graph, partial(self._on_topology, name), qos.LATCHED
+        on_topology = partial(self._on_topology, name)
+        subscribe_all(
+            node,
+            (TopologicalMapMsg, f'{prefix}/topology', on_topology, qos.LATCHED),
+            (KeyframeMsg, f'{prefix}/keyframes', partial(_take, received), qos.KEYFRAMES),
+            (KeyframePoses, f'{prefix}/keyframe_poses', partial(_correct, received), qos.LATCHED),
         )
-        subscribe_guarded(
-            node, KeyframeMsg, f'{prefix}/keyframes', partial(_take, received), qos.KEYFRAMES
-        )
-        poses = f'{prefix}/keyframe_poses'
-        subscribe_guarded(node, KeyframePoses, poses, partial(_correct, received), qos.LATCHED)
         node.get_logger().info(f'{name}: a robot with the map {topic}')
 
     def _on_map(self, name: str, patch: GridPatch) -> None:

@@ -34,7 +34,7 @@ from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.localized_scan import localized_scan_from_msg
 from thinmap_ros.ros.maps import UNKNOWN, FollowedMap, Origin, updates_topic
-from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.subscription import subscribe_all
 from thinmap_ros.ros.tf import TransformListener
 
 
@@ -59,8 +59,11 @@ class ForeignMap:
         self._unread: OccupancyGrid | None = None
         self._map = MapReceiver()
         updates = settings.costmap_updates_topic or updates_topic(node, self.topic)
-        subscribe_guarded(node, OccupancyGrid, self.topic, self._on_map, qos.LATCHED)
-        subscribe_guarded(node, OccupancyGridUpdate, updates, self._on_update, qos.STREAM)
+        subscribe_all(
+            node,
+            (OccupancyGrid, self.topic, self._on_map, qos.LATCHED),
+            (OccupancyGridUpdate, updates, self._on_update, qos.STREAM),
+        )
 
     @property
     def topic(self) -> str:
@@ -303,11 +306,13 @@ class ObservationSource:
         self._map = ForeignMap(node, settings, map_frame, self._uses_foreign_map)
         self._keep_out = KeepOut()
         self.reset()
-        on_topology = self._topologies.received
-        subscribe_guarded(node, TopologicalMap, 'topology', on_topology, qos.LATCHED)
-        subscribe_guarded(node, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
-        subscribe_guarded(node, KeepOutMsg, 'keep_out', self._on_keep_out, qos.LATCHED)
-        subscribe_guarded(node, LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
+        subscribe_all(
+            node,
+            (TopologicalMap, 'topology', self._topologies.received, qos.LATCHED),
+            (ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED),
+            (KeepOutMsg, 'keep_out', self._on_keep_out, qos.LATCHED),
+            (LocalGrid, 'local_grid', self._on_local_grid, qos.LATCHED),
+        )
         laser.subscribe(node, self._on_scan)
         node.create_active_timer(_LOOK_PERIOD_S, self._look)
 
