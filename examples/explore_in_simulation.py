@@ -12,10 +12,10 @@ from thinmap_ros import ExplorationOptions, explore
 def main(name: str) -> None:
     """Explore a world and print how it went."""
     options = ExplorationOptions(localization='slam', speed_m_s=0.3, seed=1)
-    loop, report = explore(name, options=options)
+    robot, report = explore(name, options=options)
     print(f'{report["reason"]} after {report["time"]:.0f} s and {report["distance"]:.1f} m')
     print(f'{report["coverage"]:.1%} seen, {report["collisions"]} collisions')
-    print(f'{len(loop.pipeline.topology.map.nodes)} nodes in the graph')
+    print(f'{len(robot.pipeline.topology.map.nodes)} nodes in the graph')
 
 
 if __name__ == '__main__':

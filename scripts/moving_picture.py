@@ -19,7 +19,8 @@ import numpy as np
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
-from thinmap_ros.closed_loop import SCANS_PER_GRAPH, ClosedLoop, Options, make_loop, no_progress
+from thinmap_ros.closed_loop.loop import ClosedLoop, make_loop, no_progress
+from thinmap_ros.closed_loop.robot import SCANS_PER_GRAPH, Options, SimulatedRobot
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.strategy import Decision, Strategy
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
@@ -28,7 +29,6 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.evaluation.team_run import TeamOptions, make_team
 from thinmap_ros.files.package_data import world_path
 from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.files.worlds import read_world
@@ -37,7 +37,6 @@ from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.other_robots import starts_side_by_side
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
-from thinmap_ros.team.loop import TeamLoop
 from thinmap_ros.view import palette
 
 IMAGES = Path(__file__).resolve().parents[1] / 'docs' / 'images'
@@ -192,11 +191,10 @@ def shown_area(world: World) -> tuple[Array, Array]:
 class Film(Strategy):
     """A strategy that draws a frame of every few scans and leaves the decisions to another one."""
 
-    def __init__(self, world: World, loop: ClosedLoop, radius_m: float) -> None:
+    def __init__(self, world: World, robot: SimulatedRobot) -> None:
         self.low, self.high = shown_area(world)
-        self.loop = loop
-        self.strategy = loop.strategy
-        self.radius_m = radius_m
+        self.robot = robot
+        self.strategy = robot.mission.strategy
         self.images: list[Image.Image] = []
         self._scans = 0
 
@@ -226,14 +224,14 @@ class Film(Strategy):
         paste_map(canvas, patch)
         if not decision.finished:
             draw_laser(canvas, scan, T_map_base)
-        path = np.array(self.loop.log.poses)[:, :2]
+        path = np.array(self.robot.log.poses)[:, :2]
         draw_graph(canvas, topology)
         canvas.line(path, PATH, 2.5)
-        plan = self.loop.navigator.path
+        plan = self.robot.navigator.path
         if plan is not None and decision.target is not None:
             canvas.line(plan[:, :2], PLAN, 1.5)
             canvas.disc(decision.target.goal, 3.5, WHITE)
-        draw_robot(canvas, T_map_base, self.radius_m)
+        draw_robot(canvas, T_map_base, self.robot.radius_m)
         driven_m = np.hypot(*np.diff(path, axis=0).T).sum()
         text = f'{scan.stamp_ns / 1e9:.0f} s   {driven_m:.0f} m driven   '
         text += f'{decision.known_area_m2:.0f} m² known'
@@ -244,12 +242,12 @@ class Film(Strategy):
 
 def explore_on_film(world: World, options: Options) -> list[Image.Image]:
     """Explore a world with SLAM; returns a picture of every few seconds of simulated time."""
-    loop = make_loop(world, world.start, options)
-    loop.pipeline = fine_pipeline(world.start, options)
-    radius_m = PRESETS[options.robot].radius_m
-    film = Film(world, loop, radius_m)
-    loop.strategy = film
-    goal = observable_cells(world, world.start, radius_m, options.laser.range_max_m)
+    loop = make_loop(world, [world.start], options)
+    (robot,) = loop.robots
+    robot.pipeline = fine_pipeline(world.start, options)
+    film = Film(world, robot)
+    robot.mission.strategy = film
+    goal = observable_cells(world, world.start, robot.radius_m, options.laser.range_max_m)
     outcome = loop.run(goal, options.time_limit_s, no_progress)
     print(f'{world.name}: {outcome.reason}, {len(film.images)} frames')
     return film.images
@@ -259,7 +257,7 @@ def explore_together_on_film(world: World, options: Options, count: int) -> list
     """Explore a world with several robots; returns a picture of every few seconds."""
     radius_m = PRESETS[options.robot].radius_m
     starts = starts_side_by_side(world, world.start, count, radius_m)
-    loop = make_team(world, starts, options, TeamOptions())
+    loop = make_loop(world, starts, options)
     low, high = shown_area(world)
     images: list[Image.Image] = []
 
@@ -272,24 +270,24 @@ def explore_together_on_film(world: World, options: Options, count: int) -> list
     return images
 
 
-def team_image(loop: TeamLoop, canvas: Canvas, seconds: float) -> Image.Image:
+def team_image(loop: ClosedLoop, canvas: Canvas, seconds: float) -> Image.Image:
     """The joint map and graph, and the path of each robot."""
     patch = loop.maps.known_area()
     paste_map(canvas, patch)
-    for member in loop.members:
-        if member.moment.scans and not loop.is_finished:
-            draw_laser(canvas, member.moment.scans[0], member.pose)
+    for robot in loop.robots:
+        if robot.moment.scans and not loop.is_finished:
+            draw_laser(canvas, robot.moment.scans[0], robot.pose)
     draw_graph(canvas, loop.maps.view(0)[0])
     driven_m = 0.0
-    for member, colour in zip(loop.members, palette.ROBOTS, strict=False):
-        path = np.array(member.loop.log.poses)[:, :2]
+    for robot, colour in zip(loop.robots, palette.ROBOTS, strict=False):
+        path = np.array(robot.log.poses)[:, :2]
         driven_m += float(np.hypot(*np.diff(path, axis=0).T).sum())
         canvas.line(path, colour, 2.5)
-        draw_robot(canvas, member.pose, member.radius_m, colour)
+        draw_robot(canvas, robot.pose, robot.radius_m, colour)
     known_m2 = float(patch.free.sum()) * patch.frame.resolution**2
     text = f'{seconds:.0f} s   {driven_m:.0f} m driven   {known_m2:.0f} m² known'
     canvas.caption(f'{text}   exploration finished' if loop.is_finished else text)
-    robots = zip(loop.members, palette.ROBOTS, strict=False)
+    robots = zip(loop.robots, palette.ROBOTS, strict=False)
     canvas.key(KEY | {f'robot {i}': colour for i, (_, colour) in enumerate(robots, 1)})
     return canvas.smoothed()
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thinmap_ros.closed_loop import Options, make_loop
+from thinmap_ros.closed_loop.loop import make_loop
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
 from thinmap_ros.core.grid.edits import KeepOut, inside
 from thinmap_ros.core.planning.navigator import NavigatorConfig
@@ -41,8 +42,8 @@ def test_a_target_that_stays_although_it_was_reached_has_failed():
     world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
     start = np.asarray(world.start)
     strategy = Repeats(start + (0.8, 0.0, 0.0))
-    loop = make_loop(world, start, Options(speed_m_s=0.5))
-    loop.strategy = strategy
+    loop = make_loop(world, [start], Options(speed_m_s=0.5))
+    loop.robots[0].mission.strategy = strategy
     goal = observable_cells(world, start, 0.25, 8.0)
     outcome = loop.run(goal, 60.0, lambda seconds, coverage: None)
     assert outcome.finished
@@ -54,9 +55,9 @@ def explored(beams, limit_s):
     world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
     start = np.asarray(world.start)
     laser = LaserScannerConfig(beams=beams, field_of_view_deg=360.0)
-    loop = make_loop(world, start, Options(localization='slam', laser=laser))
+    loop = make_loop(world, [start], Options(localization='slam', laser=laser))
     outcome = loop.run(observable_cells(world, start, 0.25, 8.0), limit_s, lambda *shown: None)
-    steps = np.diff([pose[:2] for pose in loop.log.true_poses], axis=0)
+    steps = np.diff([pose[:2] for pose in loop.robots[0].log.true_poses], axis=0)
     return outcome, float(np.hypot(*steps.T).sum())
 
 
@@ -77,22 +78,23 @@ def test_a_large_robot_with_a_laser_at_two_corners_explores():
     world = World.from_patch(*read_world(package_data.world_path('office')))
     start = np.asarray(world.start)
     options = Options(robot='mir100', laser=LASERS['mir100'], localization='slam', speed_m_s=0.5)
-    loop = make_loop(world, start, options)
+    loop = make_loop(world, [start], options)
+    (robot,) = loop.robots
     frames = []
-    step = loop.pipeline.step
+    step = robot.pipeline.step
 
     def steps(scan, T_odom_base):
         frames.append(scan.frame)
         return step(scan, T_odom_base)
 
-    loop.pipeline.step = steps
+    robot.pipeline.step = steps
     outcome = loop.run(observable_cells(world, start, 0.6, 8.0), 15.0, lambda *shown: None)
-    errors = np.array(loop.log.poses) - np.array(loop.log.true_poses)
+    errors = np.array(robot.log.poses) - np.array(robot.log.true_poses)
     assert outcome.collisions == 0
     assert frames[:4] == 2 * ['front_laser', 'rear_laser']
     assert frames.count('front_laser') == pytest.approx(frames.count('rear_laser'), abs=1)
-    assert loop.log.coverage[-1][1] > 0.7
-    assert math.dist(loop.log.true_poses[-1][:2], start[:2]) > 1.0
+    assert loop.coverage[-1][1] > 0.7
+    assert math.dist(robot.log.true_poses[-1][:2], start[:2]) > 1.0
     assert np.hypot(*errors[:, :2].T).max() < 0.02
 
 
@@ -100,7 +102,7 @@ def test_a_wide_robot_keeps_away_as_far_as_its_radius():
     """The 3-AT is wider than what paths are planned with by default."""
     world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
     navigators = [
-        make_loop(world, world.start, Options(robot=name)).navigator.config
+        make_loop(world, [world.start], Options(robot=name)).robots[0].navigator.config
         for name in ('2dx', '3at')
     ]
     assert navigators[0].planner == NavigatorConfig().planner
@@ -113,8 +115,8 @@ def test_an_exploration_that_reaches_nothing_is_not_finished():
     world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
     start = np.asarray(world.start)
     strategy = Repeats(start + (100.0, 0.0, 0.0))
-    loop = make_loop(world, start, Options())
-    loop.strategy = strategy
+    loop = make_loop(world, [start], Options())
+    loop.robots[0].mission.strategy = strategy
     outcome = loop.run(observable_cells(world, start, 0.25, 8.0), 60.0, lambda *shown: None)
     assert strategy.failures and not outcome.finished
     assert outcome.reason == f'no target was reached: {strategy.failures[-1]}'
@@ -125,8 +127,9 @@ def test_a_robot_stands_still_once_its_laser_has_slipped():
     slip_s = 20.0
     world = World.from_patch(*read_world(package_data.world_path('warehouse')))
     start = np.asarray(world.start)
-    loop = make_loop(world, start, Options(speed_m_s=0.5, seed=2, localization='slam'))
-    simulation = loop.simulation
+    loop = make_loop(world, [start], Options(speed_m_s=0.5, seed=2, localization='slam'))
+    (robot,) = loop.robots
+    simulation = robot.simulation
     read_sensors = simulation.read_sensors
     path_m = [0.0]
 
@@ -145,7 +148,7 @@ def test_a_robot_stands_still_once_its_laser_has_slipped():
     assert outcome.collisions == 0
     assert path_m[-1] < 8.0
     assert path_m[-1] == path_m[-100], 'it stands in the last seconds'
-    assert any('laser turned by' in warning for warning in loop.pipeline.warnings)
+    assert any('laser turned by' in warning for warning in robot.pipeline.warnings)
 
 
 def test_an_exploration_does_not_enter_a_keep_out_area():
@@ -155,17 +158,18 @@ def test_an_exploration_does_not_enter_a_keep_out_area():
     goal = observable_cells(world, start, 0.25, 8.0)
 
     def path(keep_out):
-        loop = make_loop(world, start, Options(speed_m_s=0.5))
-        decide_on = loop.decide_on
+        loop = make_loop(world, [start], Options(speed_m_s=0.5))
+        (robot,) = loop.robots
+        decide_on = robot.decide
 
         def decide(observation, T_map_odom):
             patch = keep_out.laid_on(observation.patch, observation.T_map_base)
             decide_on(observation._replace(patch=patch), T_map_odom)
 
-        loop.decide_on = decide
+        robot.decide = decide
         outcome = loop.run(goal, 600.0, lambda seconds, coverage: None)
         assert outcome.finished, outcome.reason
-        return np.array(loop.log.true_poses)[:, :2]
+        return np.array(robot.log.true_poses)[:, :2]
 
     free = path(KeepOut())
     middle = free[np.hypot(*(free - start[:2]).T).argmax() // 2]

@@ -201,10 +201,10 @@ def test_the_nearest_node_is_that_of_a_place_or_two_numbers(finished) -> None:
 
 def test_a_world_of_the_package_is_explored_by_its_name() -> None:
     options = thinmap_ros.ExplorationOptions(time_limit_s=3.0)
-    loop, report = thinmap_ros.explore('room_10x10', options=options)
+    robot, report = thinmap_ros.explore('room_10x10', options=options)
     assert report['world'] == 'room_10x10'
     start = thinmap_ros.read_world(thinmap_ros.world_path('room_10x10'))[2]
-    np.testing.assert_allclose(loop.log.true_poses[0], start, atol=0.3)
+    np.testing.assert_allclose(robot.log.true_poses[0], start, atol=0.3)
 
 
 def test_keywords_are_shown_where_a_notebook_asks_for_them() -> None:

@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
-    from thinmap_ros.closed_loop import Options as ExplorationOptions
+    from thinmap_ros.closed_loop.robot import Options as ExplorationOptions
     from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
     from thinmap_ros.core.errors import ConfigError, InputError, ThinmapError
     from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
@@ -126,7 +126,7 @@ _PLACES = {
     'GlobalLocalizer': 'core.places.global_localizer.GlobalLocalization',
     'GlobalLocalizationConfig': 'core.places.place_database.GlobalLocalizationConfig',
     # exploration, also in the simulator
-    'ExplorationOptions': 'closed_loop.Options',
+    'ExplorationOptions': 'closed_loop.robot.Options',
     'LaserScannerConfig': 'sim.laser.LaserScannerConfig',
     'Explorer': 'core.exploration.explorer.Explorer',
     'ExplorerConfig': 'core.exploration.explorer.ExplorerConfig',

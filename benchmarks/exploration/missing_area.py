@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.exploration.observed_candidates import generated, known_free_cells, load_case
-from thinmap_ros.closed_loop import Options
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core.exploration.belief import MissingArea
-from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.sim.coverage import robot_observable_cells
 from thinmap_ros.sim.robot import PRESETS
@@ -37,21 +36,21 @@ def missed(name: str) -> Missed:
     """What an exploration of a case does not see."""
     world, start = load_case(name)
     options = Options(speed_m_s=_SPEED_M_S)
-    loop, _ = explore(world, start, options)
-    robot = PRESETS[options.robot]
-    observable = robot_observable_cells(world, start, robot, options.laser.range_max_m)
-    patch = loop.pipeline.grid.known_area()
+    robot, _ = explore(world, start, options)
+    preset = PRESETS[options.robot]
+    observable = robot_observable_cells(world, start, preset, options.laser.range_max_m)
+    patch = robot.pipeline.grid.known_area()
     unseen = np.argwhere(observable.cells & ~known_free_cells(patch, observable))
-    assert isinstance(loop.strategy, Explorer) and loop.decision is not None
-    assert loop.decision.missing is not None
-    frontiers = loop.strategy.frontier_map
+    decision = robot.mission.decision
+    assert decision is not None and decision.missing is not None
+    frontiers = robot.explorer.frontier_map
     at = frontiers.frame.cells_of(observable.frame.centres_of(unseen))
     is_there = ((at >= 0) & (at < frontiers.free.shape)).all(axis=1)
     occupied = ~frontiers.passable[tuple(at[is_there].T)]
     return Missed(
         len(unseen) - int(np.count_nonzero(occupied)),
         int(np.count_nonzero(frontiers.mask)),
-        loop.decision.missing,
+        decision.missing,
         observable.frame.resolution**2,
     )
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from benchmarks.buildings import BuildingConfig, generate_building
 from benchmarks.worlds import floor
-from thinmap_ros.closed_loop import Options, make_loop, no_progress
+from thinmap_ros.closed_loop.loop import make_loop, no_progress
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.strategy import Decision
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
@@ -83,15 +84,16 @@ def observe(case: Case) -> dict[str, Any]:
         nonlocal decisions
         decisions += 1
         if decisions % _DECISIONS_PER_ROW == 0:
-            assert isinstance(loop.strategy, Explorer)
-            rows.extend(_rows(loop.strategy, loop.pipeline.grid.known_area(), observable))
+            rows.extend(_rows(robot.explorer, robot.pipeline.grid.known_area(), observable))
 
-    loop = make_loop(world, start, options, None, watch)
+    loop = make_loop(world, [start], options)
+    (robot,) = loop.robots
+    robot.watch = watch
     outcome = loop.run(observable, _LIMIT_S, no_progress, scans_per_show=50)
     return {
         'rows': rows,
         'finished': outcome.finished,
-        'coverage': loop.log.coverage[-1][1],
+        'coverage': loop.coverage[-1][1],
         'options': case.name,
     }
 

@@ -12,7 +12,7 @@ from benchmarks.kidnapped import trials
 from benchmarks.kidnapped.trials import Map, Record, fresh, prepared, search
 from benchmarks.rows import Case
 from benchmarks.worlds import floor, floors
-from thinmap_ros.closed_loop import Options
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.se2 import pose
 from thinmap_ros.evaluation.exploration_run import explore

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from benchmarks.worlds import floor
-from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
+from thinmap_ros.closed_loop.loop import make_loop, no_progress
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
@@ -194,12 +195,13 @@ def make_exploration(worlds: Path, name: str, start: int, folder: Path, limit_s:
         return
     there = floor(name, worlds)
     options = Options(strategy='nearest_frontier', seed=start, speed_m_s=_SPEED_M_S)
-    made = make_loop(there.world, there.starts[start], options)
-    pipeline = Pipeline(replace(made.pipeline.config, localizer=LocalizerConfig()))
-    loop = ClosedLoop(made.simulation, pipeline, made.strategy, made.navigator)
+    loop = make_loop(there.world, [there.starts[start]], options)
+    (robot,) = loop.robots
+    pipeline = Pipeline(replace(robot.pipeline.config, localizer=LocalizerConfig()))
+    robot.pipeline = pipeline
     loop.run(_NO_GOAL, limit_s, no_progress, scans_per_show=10**9)
     pipeline.localizer.optimized_trajectory()
-    truth = dict(zip(loop.log.stamps_ns, loop.log.true_poses, strict=True))
+    truth = dict(zip(robot.log.stamps_ns, robot.log.true_poses, strict=True))
     _recorded(piece, pipeline, truth).save(folder)
 
 

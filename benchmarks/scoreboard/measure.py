@@ -30,13 +30,8 @@ from benchmarks.scoreboard.played import (
 from benchmarks.scoreboard.recordings import RecordedSimulation, read_recording
 from benchmarks.time_and_memory import forget_peak, peak_mb
 from benchmarks.worlds import floor
-from thinmap_ros.closed_loop import (
-    ClosedLoop,
-    Options,
-    ground_truth_poses,
-    make_loop,
-    no_progress,
-)
+from thinmap_ros.closed_loop.loop import ClosedLoop, make_loop, no_progress
+from thinmap_ros.closed_loop.robot import Options, SimulatedRobot
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import PAPER_GRID
@@ -49,7 +44,7 @@ from thinmap_ros.evaluation.exploration_run import observable_cells
 from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
 from thinmap_ros.experiments.slam.logs import laser_of
 from thinmap_ros.logs.reading import open_log, paired_scans
-from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.sim.coverage import ObservableCells
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
@@ -282,9 +277,7 @@ def record_drive(world: str, worlds: Path, path: Path, limit_s: float = RECORDED
     there = floor(world, worlds)
     start = there.starts[0]
     simulation = RecordedSimulation(there.world, start, _ROBOT, LASERS['lms200'], _RECORDED_SEED)
-    made = make_loop(there.world, start, Options(speed_m_s=_SPEED_M_S))
-    pipeline = Pipeline(made.pipeline.config, ground_truth_poses(simulation))
-    loop = ClosedLoop(simulation, pipeline, made.strategy, made.navigator)
+    loop = ClosedLoop([SimulatedRobot(simulation, Options(speed_m_s=_SPEED_M_S))])
     ending = loop.run(_NOTHING, limit_s, no_progress)
     recording = simulation.recording()
     recording.write(path)
@@ -312,20 +305,21 @@ def _measure_loop(case: LoopCase, task: Task) -> Numbers:
     world = there.world
     start = there.starts[0]
     options = Options(seed=case.seed, speed_m_s=_SPEED_M_S, laser=LASERS[case.laser])
-    made = make_loop(world, start, options)
+    loop = make_loop(world, [start], options)
+    (robot,) = loop.robots
     is_whole = case.world not in _LIMITS_S
     goal = observable_cells(world, start, options) if is_whole else _NOTHING
     rehearse()
     localizer = config_of(task.options, start)
-    pipeline = PlayedPipeline(replace(made.pipeline.config, localizer=localizer))
-    loop = ClosedLoop(made.simulation, pipeline, made.strategy, made.navigator)
+    pipeline = PlayedPipeline(replace(robot.pipeline.config, localizer=localizer))
+    robot.pipeline = pipeline
     forget_peak()
     ending = loop.run(goal, _LIMITS_S.get(case.world, _LIMIT_S), no_progress)
     played = pipeline.played
     played.final = pipeline.localizer.optimized_trajectory()
     played.peak_mb = peak_mb()
-    truth = np.array(loop.log.true_poses)
-    coverage = {'coverage': loop.log.coverage[-1][1]} if is_whole else {}
+    truth = np.array(robot.log.true_poses)
+    coverage = {'coverage': loop.coverage[-1][1]} if is_whole else {}
     return {
         **simulated_numbers(played, truth),
         **coverage,

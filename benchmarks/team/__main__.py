@@ -8,11 +8,12 @@ import numpy as np
 
 from benchmarks.rows import add_record, markdown, read_records
 from benchmarks.worlds import WORLDS, Floor, floor
-from thinmap_ros.closed_loop import Options
-from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
+from thinmap_ros.closed_loop.loop import TeamOptions
+from thinmap_ros.closed_loop.radio import Trouble
+from thinmap_ros.closed_loop.robot import Options
+from thinmap_ros.evaluation.exploration_run import explore_together
 from thinmap_ros.sim.other_robots import starts_side_by_side
 from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.team.radio import Trouble
 from thinmap_ros.tools import cli
 
 _SPEED_M_S = 0.5
@@ -41,12 +42,13 @@ class Case:
         )
         team = TeamOptions(trouble=self.trouble, has_own_maps=self.has_own_maps)
         loop, report = explore_together(floor.world, starts, options, team)
+        robots = report.get('robots', [report])
         working = [
             robot['coverage']
-            for number, robot in enumerate(report['robots'])
+            for number, robot in enumerate(robots)
             if not self.trouble.is_dead(number, loop.now_s)
         ]
-        sent = report['bytes_per_m']
+        sent = report.get('bytes_per_m', {})
         return {
             'finished': int(report['finished']),
             'time_s': report['time'],
@@ -55,8 +57,8 @@ class Case:
             'coverage': report['coverage'],
             'least_coverage': float(np.min(working)),
             'contacts': report['collisions'],
-            'yielded_s': sum(robot['yielded_s'] for robot in report['robots']),
-            'claim_bytes_m': sent['claims'],
+            'yielded_s': sum(robot.yielded_s for robot in loop.robots),
+            'claim_bytes_m': sent.get('claims', 0.0),
             'tile_bytes_m': sent.get('tiles', 0.0),
             'cpu_s': report['cpu_s'],
         }

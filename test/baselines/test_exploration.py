@@ -16,7 +16,7 @@ from thinmap_ros.baselines.exploration import (
     VisitAllEndNodes,
     shortest_rest,
 )
-from thinmap_ros.closed_loop import Options
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap

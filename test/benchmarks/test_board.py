@@ -13,7 +13,7 @@ from benchmarks.scoreboard.cases import BuildingCase, DriveCase, LogCase, LoopCa
 from benchmarks.scoreboard.measure import LASERS, record_drive
 from benchmarks.scoreboard.recordings import RecordedSimulation, read_recording
 from benchmarks.worlds import floor
-from thinmap_ros.closed_loop import Options
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.sim.robot import PRESETS
@@ -66,9 +66,9 @@ def test_a_recording_is_the_exploration_by_the_true_pose(lab):
     world, start, path, numbers = lab
     samples = list(read_recording(path).replay(PRESETS['2dx'], 0))
     assert numbers['scans'] == len(samples)
-    loop, _ = explore(world, start, Options(speed_m_s=0.5, time_limit_s=25.0))
+    robot, _ = explore(world, start, Options(speed_m_s=0.5, time_limit_s=25.0))
     truth = [sample.T_world_base for sample in samples]
-    np.testing.assert_array_equal(truth[: len(loop.log.true_poses)], loop.log.true_poses)
+    np.testing.assert_array_equal(truth[: len(robot.log.true_poses)], robot.log.true_poses)
     assert numbers['distance_m'] > 3.0
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from thinmap_ros.closed_loop import ExplorationOutcome
+from thinmap_ros.closed_loop.loop import ExplorationOutcome
 from thinmap_ros.core.exploration.belief import MissingArea
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.evaluation.exploration_metrics import (

@@ -1,6 +1,6 @@
 """A robot that is carried away in the closed loop finds its place again, and explores on."""
 
-from thinmap_ros.closed_loop import Options
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
@@ -13,8 +13,8 @@ def test_a_kidnapped_robot_drives_until_it_knows_its_place():
     options = Options(
         localization='slam', speed_m_s=0.5, kidnap_at_s=20.0, seed=1, time_limit_s=120.0
     )
-    loop, report = explore(world, world.start, options)
+    robot, report = explore(world, world.start, options)
     assert report['found_right'] and report['found_after_s'] < 30.0
     assert report['finished'] and report['coverage'] > 0.97
     assert report['collisions'] == 0
-    assert loop.mishap is not None and not loop.mishap.is_lost
+    assert robot.is_finished

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop
+from thinmap_ros.closed_loop.loop import make_loop
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.correction import CorrectableGrid
@@ -35,22 +36,24 @@ class Explored:
     def __init__(self) -> None:
         name, patch, start = read_world(ROOM)
         world = World(name, patch.occupied.astype(np.uint8), patch.frame, start)
-        self.loop: ClosedLoop = make_loop(world, start, Options(localization='slam', speed_m_s=0.4))
+        loop = make_loop(world, [start], Options(localization='slam', speed_m_s=0.4))
+        (robot,) = loop.robots
+        self.robot = robot
         self.scans: list[tuple[Any, Any]] = []
-        log_poses = self.loop.log_poses
+        log_poses = robot.log_poses
 
         def noted(scan: Any, estimate: Any) -> None:
             self.scans.append((scan, estimate.T_map_base))
             log_poses(scan, estimate)
 
-        self.loop.log_poses = noted  # type: ignore[method-assign]
-        self.loop.run(observable_cells(world, start, 0.3, 8.0), 40.0, lambda seconds, share: None)
-        pipeline = self.loop.pipeline
+        robot.log_poses = noted  # type: ignore[method-assign]
+        loop.run(observable_cells(world, start, 0.3, 8.0), 40.0, lambda seconds, share: None)
+        pipeline = robot.pipeline
         keyframes = pipeline.localizer.saved_keyframes()  # type: ignore[union-attr]
         assert keyframes is not None
         self.states: dict[str, State] = {
             'topology': pipeline.topology.state(),
-            'exploration': self.loop.strategy.state(),  # type: ignore[attr-defined]
+            'exploration': robot.explorer.state(),
             'localizer': pipeline.localizer.state(),
             'keyframes': keyframes.state(),
             'grid': pipeline.grid.state(),
@@ -67,25 +70,25 @@ class Explored:
         builder = TopologyBuilder.from_state(state)
 
         def work(scan: Any, T: Any) -> None:
-            builder.update(self.loop.pipeline.grid.window(T[0], T[1], 16.0), T)
+            builder.update(self.robot.pipeline.grid.window(T[0], T[1], 16.0), T)
             builder.local_map()
 
         return work
 
     def _use_exploration(self, state: State) -> Work:
         explorer = Explorer.from_state(state)
-        pipeline = self.loop.pipeline
+        pipeline = self.robot.pipeline
         patch = pipeline.grid.known_area()
         return lambda scan, T: explorer.step(pipeline.topology.map, patch, scan, T)
 
     def _use_localizer(self, state: State) -> Work:
-        localizer = Localizer.from_state(state, self.loop.pipeline.localizer.config)
+        localizer = Localizer.from_state(state, self.robot.pipeline.localizer.config)
         localizer.set_pose(self.scans[-STEPS][1], 1e-4 * np.eye(3))
         return localizer.step
 
     def _use_keyframes(self, state: State) -> Work:
         keyframes = SavedKeyframes.from_state(state)
-        config = self.loop.pipeline.localizer.config
+        config = self.robot.pipeline.localizer.config
         localizer = Localizer.from_state(self.states['localizer'], config, keyframes)
         localizer.set_pose(self.scans[-STEPS][1], 1e-4 * np.eye(3))
         grid = CorrectableGrid(OccupancyGrid(PAPER_GRID), scans=keyframes.scans)

@@ -1,6 +1,6 @@
 """Messages between robots: late, lost, or never sent."""
 
-from thinmap_ros.team.radio import Radio, Trouble
+from thinmap_ros.closed_loop.radio import Radio, Trouble
 
 
 def radio(robots=3, delay_s=0.0, **trouble):

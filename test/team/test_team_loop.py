@@ -7,15 +7,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from thinmap_ros.closed_loop import Options
+from thinmap_ros.closed_loop.loop import TeamOptions
+from thinmap_ros.closed_loop.radio import Trouble
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.evaluation.exploration_run import explore
-from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
+from thinmap_ros.core.grid.shared import TILE_PERIOD_S
+from thinmap_ros.core.planning import navigator
+from thinmap_ros.evaluation.exploration_run import explore_together
 from thinmap_ros.sim.world import World
-from thinmap_ros.team import loop as team_loop
-from thinmap_ros.team.maps import TILE_PERIOD_S
-from thinmap_ros.team.radio import Trouble
 
 START = se2.pose(5.0, 2.5, 0.5 * math.pi)
 BESIDE = se2.pose(5.8, 2.5, 0.5 * math.pi)
@@ -39,15 +39,6 @@ def run(robots, has_own_maps=False, **trouble):
     return explore_together(world(), starts, OPTIONS, team)
 
 
-def test_a_team_of_one_drives_as_a_robot_alone():
-    alone, report = explore(world(), START, OPTIONS)
-    team, of_team = run(1)
-    poses = np.array(team.members[0].loop.log.true_poses)
-    assert np.array_equal(poses, np.array(alone.log.true_poses))
-    assert of_team['time_at'] == report['time_at']
-    assert of_team['reason'] == report['reason']
-
-
 def test_two_robots_are_faster_and_do_not_touch():
     _, one = run(1)
     team, two = run(2)
@@ -57,22 +48,22 @@ def test_two_robots_are_faster_and_do_not_touch():
     assert two['distance'] < 1.3 * one['distance']
     assert two['collisions'] == 0
     # One room each.
-    ends = [member.loop.log.true_poses[-1][0] for member in team.members]
+    ends = [robot.log.true_poses[-1][0] for robot in team.robots]
     assert min(ends) < 3.0 < 7.0 < max(ends)
 
 
 def test_the_same_seed_gives_the_same_run():
     one = run(2)[0]
     again = run.__wrapped__(2)[0]
-    for a, b in zip(one.members, again.members, strict=True):
-        assert np.array_equal(a.loop.log.true_poses, b.loop.log.true_poses)
+    for a, b in zip(one.robots, again.robots, strict=True):
+        assert np.array_equal(a.log.true_poses, b.log.true_poses)
 
 
 def test_when_a_robot_dies_the_other_one_finishes():
     team, report = run(2, dead=(1, 5.0))
     assert report['finished']
     assert report['coverage'] >= 0.99
-    dead = np.array(team.members[1].loop.log.true_poses)
+    dead = np.array(team.robots[1].log.true_poses)
     assert len(dead) == 25
     assert report['collisions'] == 0
 
@@ -103,11 +94,11 @@ def test_a_robot_that_missed_messages_catches_up(trouble):
     assert min(robot['coverage'] for robot in report['robots']) >= 0.995
     one, other = team.maps._maps
     for receiver, sender in ((one, other), (other, one)):
-        assert receiver.received.version_of(sender.team.name) >= sender.sender.version - 1
+        assert receiver.received.version_of(sender.robot.name) >= sender.sender.version - 1
 
 
 def test_robots_that_would_touch_stand_and_turn(monkeypatch):
-    monkeypatch.setattr(team_loop, 'must_stop', lambda *situation: True)
+    monkeypatch.setattr(navigator, 'must_stop', lambda *situation: True)
     starts = [START, BESIDE]
     _, report = explore_together(world(), starts, replace(OPTIONS, time_limit_s=6.0))
     assert report['distance'] == 0.0
@@ -122,7 +113,7 @@ def test_a_dead_robot_becomes_a_wall_when_its_last_pose_is_old(limit_s, is_wall)
     team, _ = explore_together(world(), starts, options, TeamOptions(trouble=trouble))
     patch = team.maps.known_area()
     walls = patch.frame.centres_of(np.argwhere(patch.occupied))
-    place = team.members[1].loop.log.true_poses[-1][:2]
+    place = team.robots[1].log.true_poses[-1][:2]
     assert (np.hypot(*(walls - place).T).min() < 0.3) == is_wall
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.closed_loop import ExplorationOutcome
+from thinmap_ros.closed_loop.loop import ExplorationOutcome
 from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, MissingArea
 from thinmap_ros.core.exploration.paper import NEAR_M
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.closed_loop import ExplorationOutcome
+from thinmap_ros.closed_loop.loop import ExplorationOutcome
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.belief import MissingArea

@@ -6,15 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.closed_loop import Options, make_loop, no_progress
+from thinmap_ros.closed_loop.loop import make_loop, no_progress
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.strategy import Decision, Strategy
+from thinmap_ros.core.exploration.strategy import Decision
 from thinmap_ros.core.grid.occupancy import PAPER_GRID, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
-from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_tour, read_world
 from thinmap_ros.logs import decode
@@ -106,39 +105,24 @@ def _lost(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     return (next(samples) for _ in range(1 + SETUP.lost_steps * SETUP.scans_per_lost_step))
 
 
-class _Watched:
-    """A strategy that keeps what the robot had when it was asked."""
-
-    def __init__(self, strategy: Strategy, simulation: Simulation) -> None:
-        self._strategy = strategy
-        self._simulation = simulation
-        self.samples: list[DriveSample] = []
-
-    def step(
-        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
-    ) -> Decision:
-        self.samples.append(
-            DriveSample(
-                scan, self._simulation.robot.T_odom_base, self._simulation.robot.T_world_base
-            )
-        )
-        return self._strategy.step(topology, patch, scan, T_map_base)
-
-    def target_failed(self, reason: str) -> None:
-        self._strategy.target_failed(reason)
-
-
 def _exploration(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     world = world_of(recipe.world)
     options = Options('paper', seed=seed, robot=recipe.robot, speed_m_s=SETUP.speed_m_s)
-    loop = make_loop(world, world.start, options)
-    watched = _Watched(loop.strategy, loop.simulation)
-    loop.strategy = watched
+    loop = make_loop(world, [world.start], options)
+    (robot,) = loop.robots
+    samples = []
+
+    def watch(decision: Decision, T_map_base: Array) -> None:
+        moment = robot.moment
+        T_world_base = robot.simulation.robot.T_world_base
+        samples.append(DriveSample(moment.scans[0], moment.T_odom_base, T_world_base))
+
+    robot.watch = watch
     goal = robot_observable_cells(
         world, world.start, PRESETS[recipe.robot], LaserScannerConfig().range_max_m
     )
     loop.run(goal, SETUP.exploration_limit_s, no_progress)
-    return iter(watched.samples)
+    return iter(samples)
 
 
 RECIPES = {

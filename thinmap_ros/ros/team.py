@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Point32, Pose
@@ -15,11 +14,17 @@ from thinmap_msgs.msg import SettledPlace as SettledPlaceMsg
 from thinmap_ros.core import errors, se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, quoted
-from thinmap_ros.core.exploration.team import MAX_SETTLED, Claim, SettledPlace, SilenceConfig
+from thinmap_ros.core.exploration.team import (
+    MAX_SETTLED,
+    Claim,
+    Heard,
+    SettledPlace,
+    SilenceConfig,
+)
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.shared import JoinedMaps, TileMessage
-from thinmap_ros.core.planning.path_follower import Motion
-from thinmap_ros.core.se2 import SECOND_NS, Array, Place
+from thinmap_ros.core.planning.path_follower import HeardMotion, Motion
+from thinmap_ros.core.se2 import Array, Place
 from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
@@ -228,19 +233,6 @@ def _moved_place(T: Array, place: Place | None) -> Place | None:
 CLAIMS = '/team/claims'
 
 
-class HeardMotion(NamedTuple):
-    """Motion of a robot, and how long ago it was received, s."""
-
-    motion: Motion
-    age_s: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Heard:
-    claim: RobotClaim
-    received_ns: int
-
-
 class HeardRobots:
     """Newest claim of each other robot; those of robots that are not joined are only kept.
 
@@ -252,57 +244,47 @@ class HeardRobots:
         node: ThinmapNode,
         places: JoinedPlaces,
         name: str,
-        max_age_s: float,
+        silence: SilenceConfig,
         heard: Callable[[RobotClaim], bool] = lambda claim: True,
     ) -> None:
-        """heard: is called with each claim, and says whether to keep it.
-
-        max_age_s: a robot that was silent for longer is an obstacle as any other.
-        """
+        """heard: is called with each claim, and says whether to keep it."""
         self._node = node
         self.places = places
         self.name = name
-        self._max_age_s = max_age_s
         self._accepts = heard
-        self._heard: dict[str, _Heard] = {}
+        self._heard: Heard[RobotClaim] = Heard(silence)
         subscribe_guarded(node, TeamClaim, CLAIMS, self._on_claim, qos.SENSOR)
 
     def motions(self) -> list[HeardMotion]:
         """Motions of the robots that are joined and were heard lately, in this robot's map."""
         return [
-            HeardMotion(claim.in_map(self.places.poses[name]).motion, age_s)
-            for name, (claim, age_s) in self._lately().items()
-            if name in self.places.poses
+            HeardMotion(heard.in_map(self.places.poses[heard.claim.robot]).motion, age_s)
+            for heard, age_s in self._lately()
+            if heard.claim.robot in self.places.poses
         ]
 
     def own_motions(self) -> list[HeardMotion]:
         """Motions of all robots that were heard lately, joined or not, each in its own map."""
-        return [HeardMotion(claim.motion, age_s) for claim, age_s in self._lately().values()]
+        return [HeardMotion(heard.motion, age_s) for heard, age_s in self._lately()]
 
-    def _lately(self) -> dict[str, tuple[RobotClaim, float]]:
-        """Claims of the robots that were heard lately, with their ages, s."""
-        now_ns = self._node.elapsed_time.now_ns()
-        ages = {
-            name: (heard.claim, (now_ns - heard.received_ns) / SECOND_NS)
-            for name, heard in self._heard.items()
-        }
-        return {name: each for name, each in ages.items() if 0.0 <= each[1] <= self._max_age_s}
+    def _lately(self) -> list[tuple[RobotClaim, float]]:
+        return self._heard.lately(self._node.elapsed_time.now_ns())
 
     def _on_claim(self, message: TeamClaim) -> None:
         claim = claim_from_msg(message)
         name = claim.claim.robot
         if self._accepts(claim) and name != self.name:
-            self._heard[name] = _Heard(claim, self._node.elapsed_time.now_ns())
+            self._heard.add(name, claim, self._node.elapsed_time.now_ns())
 
 
 def heard_robots(node: ThinmapNode) -> HeardRobots | None:
     """The other robots of the node's team, None without a team; declares the parameters."""
     membership = declare_membership(node)
-    silence_s = parameters.declare_config(node, SilenceConfig).claim_timeout_s
+    silence = parameters.declare_config(node, SilenceConfig)
     if not membership.team:
         return None
     name = membership.team_name
-    return HeardRobots(node, JoinedPlaces(node, name), name, silence_s)
+    return HeardRobots(node, JoinedPlaces(node, name), name, silence)
 
 
 TILES = '/team/tiles'

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.closed_loop import Options
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array

@@ -1,19 +1,19 @@
 """Explores a simulated world without ROS, faster than real time."""
 
 import argparse
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thinmap_ros.closed_loop import ClosedLoop, Options
+from thinmap_ros.closed_loop.loop import ClosedLoop, TeamOptions
+from thinmap_ros.closed_loop.radio import Trouble
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_metrics import exploration_title, hidden_places
-from thinmap_ros.evaluation.exploration_run import explore
-from thinmap_ros.evaluation.team_run import TeamOptions, explore_together
+from thinmap_ros.evaluation.exploration_run import explore_together
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.laser import LaserScannerConfig
@@ -21,8 +21,6 @@ from thinmap_ros.sim.other_robots import starts_side_by_side
 from thinmap_ros.sim.robot import LASERS, PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, NAMES, check_strategy
-from thinmap_ros.team.loop import TeamLoop
-from thinmap_ros.team.radio import Trouble
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 from thinmap_ros.view.progress_bar import ProgressBar
@@ -34,37 +32,25 @@ WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's w
 
 
 def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> None:
-    """Write all files into a folder."""
-    log = loop.log
-    pipeline = loop.pipeline
+    """Write all files into a folder; of several robots a trajectory for each."""
     title = exploration_title(report)
-    run = RunResult(
-        pipeline.grid.known_area(),
-        pipeline.topology.map,
-        title,
-        {'trajectory': (log.stamps_ns, log.poses)},
-        np.array(log.poses),
-        {
-            'true': np.array(log.true_poses),
+    logs = {f'trajectory_{robot.name}': robot.log for robot in loop.robots}
+    shown: dict[str, Any] = {
+        'robots': {robot.name: np.array(robot.log.true_poses) for robot in loop.robots}
+    }
+    estimated = np.empty((0, 3))
+    if len(loop.robots) == 1:
+        (robot,) = loop.robots
+        logs = {'trajectory': robot.log}
+        estimated = np.array(robot.log.poses)
+        shown = {
+            'true': np.array(robot.log.true_poses),
             'hidden': hidden_places(report),
-            'apart': pipeline.localizer.apart_points(),
-        },
-    )
-    write_run(folder, run)
-    write_report(folder, title, report, cli.command_line())
-
-
-def write_team_outputs(loop: TeamLoop, report: dict[str, Any], folder: Path) -> None:
-    """Write all files of several robots into a folder; a trajectory for each."""
-    title = exploration_title(report)
-    logs = {member.name: member.loop.log for member in loop.members}
-    run = RunResult(
-        loop.maps.known_area(),
-        loop.maps.view(0)[0],
-        title,
-        {f'trajectory_{name}': (log.stamps_ns, log.poses) for name, log in logs.items()},
-        shown={'robots': {name: np.array(log.true_poses) for name, log in logs.items()}},
-    )
+            'apart': robot.pipeline.localizer.apart_points(),
+        }
+    trajectories = {name: (log.stamps_ns, log.poses) for name, log in logs.items()}
+    topology, _ = loop.maps.view(0)
+    run = RunResult(loop.maps.known_area(), topology, title, trajectories, estimated, shown)
     write_run(folder, run)
     write_report(folder, title, report, cli.command_line())
 
@@ -165,17 +151,12 @@ def _work(arguments: argparse.Namespace) -> None:
             share = max(coverage, seconds / options.time_limit_s)
             bar.show(share, f'{100.0 * coverage:.0f} % seen, {seconds:.0f} s simulated')
 
-        if arguments.robots == 1:
-            loop, report = explore(world, start, options, show)
-            write = partial(write_outputs, loop)
-        else:
-            radius_m = PRESETS[options.robot].radius_m
-            starts = starts_side_by_side(world, start, arguments.robots, radius_m)
-            trouble = Trouble(claim_delay_s=arguments.claim_delay_s)
-            team = TeamOptions(trouble=trouble, has_own_maps=arguments.own_maps)
-            team_loop, report = explore_together(world, starts, options, team, show)
-            write = partial(write_team_outputs, team_loop)
-    write(report, out)
+        radius_m = PRESETS[options.robot].radius_m
+        starts = starts_side_by_side(world, start, arguments.robots, radius_m)
+        trouble = Trouble(claim_delay_s=arguments.claim_delay_s)
+        team = TeamOptions(trouble=trouble, has_own_maps=arguments.own_maps)
+        loop, report = explore_together(world, starts, options, team, show)
+    write_outputs(loop, report, out)
     how = 'finished' if report['finished'] else 'not finished'
     print(
         f'{out}: {how} ({report["reason"]}), '

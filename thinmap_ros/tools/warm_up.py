@@ -4,7 +4,7 @@ import argparse
 import gc
 
 from thinmap_ros import kernels
-from thinmap_ros.closed_loop import Options
+from thinmap_ros.closed_loop.robot import Options
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world

@@ -8,7 +8,13 @@ import pytest
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.planning.navigator import Navigator
-from thinmap_ros.core.planning.path_follower import Motion, as_heard, moved_on, must_stop
+from thinmap_ros.core.planning.path_follower import (
+    HeardMotion,
+    Motion,
+    as_heard,
+    moved_on,
+    must_stop,
+)
 
 HALL = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((60, 60), dtype=np.int8))
 
@@ -102,3 +108,29 @@ def test_a_navigator_that_gives_way_waits_and_aborts():
     assert command.reason == 'another robot is in the way'
     assert command.is_timeout
     assert 0.1 * len(states) == pytest.approx(8.0, abs=0.5)
+
+
+def test_a_robot_that_would_touch_another_one_at_its_goal_stands_and_has_arrived():
+    """Its goal is gone: a navigator that only gave way would never say that it was reached."""
+    navigator = Navigator()
+    navigator.set_goal(2.0, 3.0)
+    other = HeardMotion(at('b', 2.6, 3.0, 0.0, 0.0), 0.0)
+    x = 0.9
+    states = []
+    while not states or states[-1] not in ('reached', 'idle'):
+        command = navigator.step(se2.pose(x, 3.0, 0.0), HALL, None, 0.1)
+        heard = [other] if command.state == 'reached' else []
+        assert command.v > 0.0
+        command = navigator.allowed(at('a', x, 3.0, 0.0, command.v), command, heard, 0.8, 0.1)
+        states.append(command.state)
+        x += 0.1 * command.v
+    assert states[-1] == 'reached'
+    assert command.v == 0.0
+    assert navigator.step(se2.pose(x, 3.0, 0.0), HALL, None, 0.1).v == 0.0
+
+
+def test_a_robot_alone_drives_as_its_navigator_wants():
+    navigator = Navigator()
+    navigator.set_goal(5.0, 3.0)
+    command = navigator.step(se2.pose(1.0, 3.0, 0.0), HALL, None, 0.1)
+    assert navigator.allowed(at('a', 1.0, 3.0, 0.0, command.v), command, [], 0.55, 0.1) is command

@@ -504,9 +504,8 @@ class Mission:
 
     def _end_of(self, decision: Decision) -> Finish:
         shortcoming = self.drives.shortcoming(decision, self.odometer.distance_m)
-        if shortcoming:
-            return Finish(decision.code, f'{decision.reason}; {shortcoming}', False)
-        return Finish(decision.code, decision.reason)
+        reasons = filter(None, (decision.reason, shortcoming))
+        return Finish(decision.code, '; '.join(reasons), has_explored=not shortcoming)
 
     def _finish_exploring(self, end: Finish) -> Action:
         """Return to the start if that was asked for, else finish."""

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,8 @@ from thinmap_ros.core.exploration.belief import Evidence
 from thinmap_ros.core.exploration.candidates import Candidate
 from thinmap_ros.core.planning.travel_times import TravelTimes
 from thinmap_ros.core.se2 import SECOND_NS, Array, Place
+
+Message = TypeVar('Message')
 
 NOTHING = -1
 _TIE_S = 0.2  # times that differ less are equal
@@ -79,6 +81,24 @@ class SilenceConfig(Config):
         low=1.0,
         high=1000.0,
     )
+
+
+class Heard(Generic[Message]):
+    """The newest message of each other robot, as long as the robot is not silent."""
+
+    def __init__(self, config: SilenceConfig) -> None:
+        self.config = config
+        self._newest: dict[str, tuple[Message, int]] = {}
+
+    def add(self, robot: str, message: Message, now_ns: int) -> None:
+        """Add a message of a robot, received now."""
+        self._newest[robot] = (message, now_ns)
+
+    def lately(self, now_ns: int) -> list[tuple[Message, float]]:
+        """Messages of the robots that were received recently, and their ages, s."""
+        newest = self._newest.values()
+        aged = [(message, (now_ns - then_ns) / SECOND_NS) for message, then_ns in newest]
+        return [each for each in aged if 0.0 <= each[1] <= self.config.claim_timeout_s]
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,8 @@ def _table() -> NDArray[np.uint8]:
     return bits
 
 
+TILE_PERIOD_S = 5.0  # from one message of a robot to the next
+
 EDGE = 16
 _PACKED_BYTES = EDGE * EDGE // 4
 _UNKNOWN_TILE = bytes(_PACKED_BYTES)
@@ -116,6 +118,7 @@ class TileSender:
         """frame: of the lattice; all maps lie on its cells."""
         self.frame = frame
         self.version = 0
+        self._next_after = 0  # version after which the next message begins
         self._tiles: dict[Key, tuple[bytes, int]] = {}
 
     def update(self, patch: GridPatch) -> None:
@@ -130,6 +133,16 @@ class TileSender:
         if changed:
             self.version += 1
             self._tiles |= {key: (packed, self.version) for key, packed in changed.items()}
+
+    def next_message(self) -> TileMessage:
+        """What has changed since the last message, or since what a receiver has asked for."""
+        message = self.changes_after(self._next_after)
+        self._next_after = self.version
+        return message
+
+    def repeat_after(self, version: int) -> None:
+        """Have the next message contain all that has changed after a version: it was missed."""
+        self._next_after = min(self._next_after, version)
 
     def changes_after(self, version: int) -> TileMessage:
         """All tiles that have changed after a version; 0: all tiles."""

@@ -2,8 +2,8 @@
 
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,9 +18,13 @@ from thinmap_ros.core.planning.obstacles import (
     StuckPlaces,
 )
 from thinmap_ros.core.planning.path_follower import (
+    HeardMotion,
+    Motion,
     PathFollower,
     PathFollowerConfig,
+    as_heard,
     length_from,
+    must_stop,
     nearest_point,
 )
 from thinmap_ros.core.planning.paths import LONG_PATH_M, Band, plan_short_path, route_band
@@ -249,6 +253,30 @@ class Navigator:
             if reason:
                 return self._wait(reason, dt_s)
         return self._drive(T_map_base, dt_s)
+
+    def allowed(
+        self,
+        own: Motion,
+        command: Command,
+        others: Iterable[HeardMotion],
+        distance_m: float,
+        dt_s: float,
+    ) -> Command:
+        """The command, or one that gives way where the robot would come too near to another one.
+
+        own: the motion that the command makes; others: those of the other robots; distance_m: from
+        centre to centre; dt_s: time between two commands.
+        """
+        places = [each for heard in others for each in as_heard(*heard)]
+        controller = self.config.controller
+        brakes_s = controller.max_speed_m_s / controller.max_acceleration_m_s2
+        if command.v <= 0.0 or not must_stop(own, places, distance_m, brakes_s):
+            return command
+        if command.state == 'reached':
+            self._follower.override_speed(0.0, command.w)
+            return replace(command, v=0.0)
+        robots = np.array([each.pose[:2] for each in places])
+        return self.give_way(command, dt_s, robots, distance_m)
 
     def give_way(self, command: Command, dt_s: float, robots: Array, distance_m: float) -> Command:
         """Command in place of one with which another robot would be touched: turn, or stand.

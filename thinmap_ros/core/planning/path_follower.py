@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -218,6 +219,13 @@ class Motion:
     pose: Array
     v: float
     w: float
+
+
+class HeardMotion(NamedTuple):
+    """Motion of a robot, and how long ago it was received, s."""
+
+    motion: Motion
+    age_s: float
 
 
 def moved_on(motion: Motion, seconds: float) -> Motion:

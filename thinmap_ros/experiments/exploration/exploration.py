@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thinmap_ros.closed_loop import SCANS_PER_GRAPH
+from thinmap_ros.closed_loop.robot import SCANS_PER_GRAPH
 from thinmap_ros.core.exploration.paper import PaperExplorer
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision
 from thinmap_ros.core.grid.occupancy import PAPER_GRID

@@ -24,7 +24,7 @@ from thinmap_ros.core.planning.navigator import (
     Navigator,
     NavigatorConfig,
 )
-from thinmap_ros.core.planning.path_follower import Motion, as_heard, must_stop
+from thinmap_ros.core.planning.path_follower import Motion
 from thinmap_ros.core.planning.supervision import BaseSupervisor
 from thinmap_ros.core.scan import Scan, with_newest
 from thinmap_ros.core.se2 import SECOND_NS, Array
@@ -544,13 +544,7 @@ class TeamDriving:
 
         T_map_base (3,): pose of the robot; dt_s: time between two commands.
         """
-        if self._heard is None or command.v <= 0.0:
+        if self._heard is None:
             return command
         own = Motion(self._heard.name, T_map_base, command.v, command.w)
-        others = [each for heard in self._heard.motions() for each in as_heard(*heard)]
-        controller = navigator.config.controller
-        brakes_s = controller.max_speed_m_s / controller.max_acceleration_m_s2
-        if not must_stop(own, others, self._distance_m, brakes_s):
-            return command
-        places = np.array([other.pose[:2] for other in others])
-        return navigator.give_way(command, dt_s, places, self._distance_m)
+        return navigator.allowed(own, command, self._heard.motions(), self._distance_m, dt_s)

@@ -15,7 +15,7 @@ from thinmap_ros.core.exploration.mission import Mission, MissionState
 from thinmap_ros.core.exploration.strategy import Observation, Strategy
 from thinmap_ros.core.exploration.team import Claim, Team, TeamConfig
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.grid.shared import TileSender
+from thinmap_ros.core.grid.shared import TILE_PERIOD_S, TileSender
 from thinmap_ros.core.planning.path_follower import MESSAGE_PERIOD_S, NEAR_ROBOT_M, Motion, moved_on
 from thinmap_ros.core.se2 import SECOND_NS, Array, Place
 from thinmap_ros.ros import messages, parameters, qos
@@ -54,18 +54,15 @@ class TileOutput:
         """Begin again with another map."""
         self._session = new_map_id()
         self._sender: TileSender | None = None
-        self._next_after = 0
 
     def send(self, patch: GridPatch) -> None:
         """Publish what has changed in the map, if anything has."""
         sender = self._sender_of(patch)
         sender.update(patch)
-        if sender.version == self._next_after:
-            return
-        tiles = sender.changes_after(self._next_after)
-        header = messages.header(self._frame_id, self._node.now_ns)
-        self._publisher.publish(tiles_msg(header, self._name, self._session, tiles))
-        self._next_after = sender.version
+        tiles = sender.next_message()
+        if tiles.version > tiles.after:
+            header = messages.header(self._frame_id, self._node.now_ns)
+            self._publisher.publish(tiles_msg(header, self._name, self._session, tiles))
 
     def _sender_of(self, patch: GridPatch) -> TileSender:
         """The sender of the lattice of a map: another lattice is another map."""
@@ -78,13 +75,13 @@ class TileOutput:
         return self._sender
 
     def _on_request(self, message: TileRequest) -> None:
-        if message.robot == self._name and message.session == self._session:
-            self._next_after = min(self._next_after, message.after)
+        is_asked = message.robot == self._name and message.session == self._session
+        if is_asked and self._sender is not None:
+            self._sender.repeat_after(message.after)
 
 
 _NEAR_PERIOD_S = 0.1
 _NEAR_STEP_M = 0.05  # near to another robot the pose is sent after each cell, not at standstill
-_TILE_PERIOD_S = 5.0
 
 
 class Progress(NamedTuple):
@@ -150,15 +147,14 @@ class TeamMember(Alone):
         self._node = node
         self._config = config
         self._places = JoinedPlaces(node, name)
-        silence_s = config.claim_timeout_s
-        self._heard = HeardRobots(node, self._places, name, silence_s, self._accepts)
+        self._heard = HeardRobots(node, self._places, name, config, self._accepts)
         self._received = TileReceiver(node, self._places, name)
         self._tiles = TileOutput(node, name, frame_id)
         self._claims = _ClaimOutput(node, name, frame_id, progress, self._on_sent)
         self._team = Team(name, config)
         self._last: Observation | None = None
         node.create_active_timer(_NEAR_PERIOD_S, self._tell)
-        node.create_active_timer(_TILE_PERIOD_S, self._send_tiles)
+        node.create_active_timer(TILE_PERIOD_S, self._send_tiles)
 
     def attach(self, strategy: Strategy) -> None:
         """As Alone.attach; one that is continued keeps what it has told."""

@@ -1,7 +1,6 @@
 """What robots of a team send each other: messages that may be late or lost, and their bytes."""
 
-from collections import Counter
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -43,7 +42,6 @@ class Radio(Generic[Message]):
 
     def __init__(self, robots: int, trouble: Trouble, delay_s: float, seed: int) -> None:
         self.sent_bytes = 0
-        self.sent: Counter[Hashable] = Counter()
         self._robots = robots
         self._trouble = trouble
         self._delay_s = delay_s
@@ -55,7 +53,6 @@ class Radio(Generic[Message]):
         if self._trouble.is_silent(sender, now_s):
             return
         self.sent_bytes += size
-        self.sent[sender] += 1
         self._pending.append((now_s + self._delay_s, sender, message))
 
     def received(self, now_s: float) -> Iterator[tuple[int, Message]]:

@@ -1,1 +1,0 @@
-"""Several robots that explore one simulated world together, without ROS."""
