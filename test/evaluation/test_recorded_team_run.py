@@ -123,7 +123,7 @@ class Robots:
 
 def results(out: Path, is_joined: bool):
     bag_maker.write(out / 'bag', partial(Robots, is_joined=is_joined))
-    return recorded_run.write_team(out, WORLD, '2dx', RESULT, [np.zeros(3), TRUE_PLACE])
+    return recorded_run.write(out, WORLD, '2dx', RESULT, [np.zeros(3), TRUE_PLACE])
 
 
 def test_the_report_has_way_contacts_and_errors_of_each_robot_and_of_the_joins(tmp_path):
@@ -160,4 +160,4 @@ def test_a_bag_of_fewer_robots_is_refused(tmp_path):
     results(tmp_path, is_joined=False)
     third = {**RESULT['robots'][0], 'name': 'robot3'}
     with pytest.raises(InputError, match='expected /robot3/ground_truth, /robot3/pose and'):
-        recorded_run.write_team(tmp_path, WORLD, '2dx', {'robots': [third]}, [np.zeros(3)])
+        recorded_run.write(tmp_path, WORLD, '2dx', {'robots': [third]}, [np.zeros(3)])

@@ -30,7 +30,7 @@ from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.readers.bag import Bag
 from thinmap_ros.sim.coverage import ObservableCells, robot_observable_cells
-from thinmap_ros.sim.robot import PRESETS, RobotConfig
+from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.view import rerun_sinks
 from thinmap_ros.view.message_view import recording_from_bag
@@ -62,11 +62,16 @@ _TOPICS = (
 
 @dataclass(eq=False)
 class Recording:
-    """The outputs of a run: paths by stamp, maps by stamp, the last graph, end nodes, contacts.
+    """The run of a robot: paths by stamp, maps by stamp, the last graph, end nodes, contacts.
 
-    hidden: position, m, and expected hidden area, m2, of each end node at the end; missing: area.
+    name: '' of a single robot; T_world_map (3,): pose of the frame of its map in the world; result:
+    of its exploration, as of demo_monitor. hidden: position, m, and expected hidden area, m2, of
+    each end node at the end; missing: area.
     """
 
+    name: str
+    T_world_map: Array
+    result: dict[str, Any]
     true: dict[int, Array] = field(default_factory=dict)
     estimated: dict[int, Array] = field(default_factory=dict)
     maps: list[tuple[int, GridPatch]] = field(default_factory=list)
@@ -77,14 +82,37 @@ class Recording:
     collisions: int = 0
     range_max_m: float = 8.0
 
+    @property
+    def start_ns(self) -> int:
+        """Stamp of the beginning of the exploration."""
+        return int(self.result['start_ns'])
 
-def read(path: Path, prefix: str = '/') -> Recording:
-    """Read the outputs from the bag of a run; prefix: of the topics of one of several robots.
+    @property
+    def end_ns(self) -> int:
+        """Stamp of its end."""
+        return int(self.result['end_ns'])
+
+    @property
+    def driven(self) -> Array:
+        """The true path (N, 3), world frame, of the exploration."""
+        within = [self.true[ns] for ns in self.true if self.start_ns <= ns <= self.end_ns]
+        return np.array(within).reshape(-1, 3)
+
+    @property
+    def distance_m(self) -> float:
+        """Length of this path."""
+        return se2.path_length_m(self.driven)
+
+
+def read(path: Path, T_world_map: Array, result: dict[str, Any]) -> Recording:
+    """Read the outputs from the bag of a run; arguments as of Recording.
 
     Raises InputError if a topic is missing.
     """
     bag = Bag(path)
-    recording = Recording()
+    name = str(result.get('name', ''))
+    prefix = f'/{name}/' if name else '/'
+    recording = Recording(name, T_world_map, result)
     known = MapReceiver()
     for raw in bag.messages({f'{prefix}{name}' for name in _TOPICS}):
         message = bag.decode(raw)
@@ -100,7 +128,7 @@ def read(path: Path, prefix: str = '/') -> Recording:
         elif topic in ('map', 'map_updates'):
             recording.maps += [(ns, patch) for patch in _known_map(known, ns, message)]
         elif topic == 'topology':
-            recording.topology = recorded_topology(path, raw.topic, message)
+            recording.topology = _topology(path, raw.topic, message)
         elif topic == 'end_nodes':
             nodes = decode.end_nodes(message)
             recording.end_nodes.append((ns, [node[:3] for node in nodes]))
@@ -128,7 +156,7 @@ def _known_map(known: MapReceiver, ns: int, message: Any) -> list[GridPatch]:
     return [known.patch] if is_new and known.patch is not None else []
 
 
-def recorded_topology(path: Path, topic: str, message: Any) -> TopologicalMap:
+def _topology(path: Path, topic: str, message: Any) -> TopologicalMap:
     """Topological map of a message. Raises InputError, with path and topic, if it is invalid."""
     try:
         return topology_from_msg(message)
@@ -141,42 +169,11 @@ def _missing_area(message: Any) -> MissingArea | None:
     return MissingArea(*areas) if min(areas) >= 0.0 else None
 
 
-def write(
-    out: Path, world_file: Path, robot: str, result: dict[str, Any], command: str = ''
-) -> dict[str, Any]:
-    """Write map, graph, trajectory, picture, report and, with rerun, recording of a run in out/bag.
-
-    Returns the report.
-    """
-    recording = read(out / 'bag')
-    world = World.from_patch(*read_world(world_file))
-    start = next(iter(recording.true.values()))
-    seen = robot_observable_cells(world, start, PRESETS[robot], recording.range_max_m)
-    report = _report(recording, seen, result) | {'world': world.name}
-    title = exploration_title(report)
-    estimated = np.array(list(recording.estimated.values()))
-    true = np.array(list(recording.true.values()))
-    run = RunResult(
-        recording.maps[-1][1],
-        recording.topology,
-        title,
-        {'trajectory': (list(recording.estimated), list(estimated))},
-        estimated,
-        {'true': true, 'hidden': hidden_places(report)},
-    )
-    write_run(out, run)
-    if rerun_sinks.is_installed():
-        recording_from_bag(out / 'bag', out / 'recording.rrd')
-    else:
-        print(f'no recording.rrd: {rerun_sinks.ADVICE}', file=sys.stderr)
-    write_report(out, title, report, command)
-    return report
-
-
-def _report(recording: Recording, seen: ObservableCells, result: dict[str, Any]) -> dict[str, Any]:
-    start_ns = int(result['start_ns'])
-    end_ns = int(result['end_ns'])
-    stamps = [ns for ns in recording.true if start_ns <= ns <= end_ns and ns in recording.estimated]
+def _report(recording: Recording, seen: ObservableCells) -> dict[str, Any]:
+    start_ns = recording.start_ns
+    result = recording.result
+    within = [ns for ns in recording.true if start_ns <= ns <= recording.end_ns]
+    stamps = [ns for ns in within if ns in recording.estimated]
     true = np.array([recording.true[ns] for ns in stamps])
     estimated = np.array([recording.estimated[ns] for ns in stamps])
     times = (np.array(stamps) - start_ns) / 1e9
@@ -224,34 +221,7 @@ class _Joint:
         self.places = {name: decode.pose(each.pose) for name, each in joined.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class RobotRun:
-    """The run of a robot: its name, what was recorded, and the result of its exploration.
-
-    T_world_map (3,): pose of the frame of its map in the world.
-    """
-
-    name: str
-    T_world_map: Array
-    recording: Recording
-    result: dict[str, Any]
-
-    @property
-    def true(self) -> Array:
-        """The driven path (N, 3), world frame, of the exploration."""
-        first_ns = int(self.result['start_ns'])
-        last_ns = int(self.result['end_ns'])
-        true = self.recording.true
-        within = [true[ns] for ns in true if first_ns <= ns <= last_ns]
-        return np.array(within).reshape(-1, 3)
-
-    @property
-    def distance_m(self) -> float:
-        """Length of this path."""
-        return se2.path_length_m(self.true)
-
-
-def write_team(
+def write(
     out: Path,
     world_file: Path,
     robot: str,
@@ -259,31 +229,58 @@ def write_team(
     map_poses: Sequence[Array],
     command: str = '',
 ) -> dict[str, Any]:
-    """Write map, graph, trajectories, picture and report of a run of several robots in out/bag.
+    """Write map, graph, trajectories, picture and report of a run in out/bag.
 
-    The map is the joint one, or that of the first robot where none is joined. robot: preset of all;
-    result: of demo_monitor; map_poses: pose (3,) in the world of the frame of each map.
-    Returns the report.
+    Of several robots the map is the joint one, or that of the first robot where none is joined; of
+    a single one there is, with rerun, a recording.
+    robot: preset of all; result: of demo_monitor; map_poses: pose (3,) in the world of the frame of
+    each map. Returns the report.
     """
     bag = out / 'bag'
-    robots = [
-        RobotRun(each['name'], pose, read(bag, f'/{each["name"]}/'), each)
-        for each, pose in zip(result['robots'], map_poses, strict=True)
-    ]
+    results = result.get('robots', [result])
+    robots = [read(bag, pose, each) for pose, each in zip(map_poses, results, strict=True)]
     joint = _read_joint(bag)
     world = World.from_patch(*read_world(world_file))
-    report = {'world': world.name, **_team_report(robots, joint, world, PRESETS[robot])}
-    first = robots[0].recording
-    patch = first.maps[-1][1] if joint.patch is None else joint.patch
-    topology = first.topology if joint.patch is None else joint.topology
-    T_merged_world = _world_pose(robots, joint)
+    first = robots[0]
+    start = next(iter(first.true.values()))
+    range_m = max(each.range_max_m for each in robots)
+    seen = robot_observable_cells(world, start, PRESETS[robot], range_m)
+    is_team = len(robots) > 1
+    report = _team_report(robots, joint, seen) if is_team else _report(first, seen)
+    report['world'] = world.name
     title = exploration_title(report)
-    estimated = {f'trajectory_{each.name}': each.recording.estimated for each in robots}
-    poses = {name: (list(found), list(found.values())) for name, found in estimated.items()}
-    paths = {each.name: se2.transform_points(T_merged_world, each.true[:, :2]) for each in robots}
-    write_run(out, RunResult(patch, topology, title, poses, shown={'robots': paths}))
+    trajectories = {
+        f'trajectory_{each.name}' if is_team else 'trajectory': (
+            list(each.estimated),
+            list(each.estimated.values()),
+        )
+        for each in robots
+    }
+    run = RunResult(
+        first.maps[-1][1] if joint.patch is None else joint.patch,
+        first.topology if joint.patch is None else joint.topology,
+        title,
+        trajectories,
+        np.empty((0, 3)) if is_team else np.array(list(first.estimated.values())),
+        _shown(robots, joint, report),
+    )
+    write_run(out, run)
+    if not is_team and rerun_sinks.is_installed():
+        recording_from_bag(bag, out / 'recording.rrd')
+    elif not is_team:
+        print(f'no recording.rrd: {rerun_sinks.ADVICE}', file=sys.stderr)
     write_report(out, title, report, command)
     return report
+
+
+def _shown(robots: Sequence[Recording], joint: _Joint, report: dict[str, Any]) -> dict[str, Any]:
+    """What the picture shows beside the map: the paths that were driven."""
+    if len(robots) == 1:
+        true = np.array(list(robots[0].true.values()))
+        return {'true': true, 'hidden': hidden_places(report)}
+    T_merged_world = _world_pose(robots, joint)
+    paths = [se2.transform_points(T_merged_world, each.driven[:, :2]) for each in robots]
+    return {'robots': {each.name: path for each, path in zip(robots, paths, strict=True)}}
 
 
 def _read_joint(path: Path) -> _Joint:
@@ -294,7 +291,7 @@ def _read_joint(path: Path) -> _Joint:
         if raw.topic == '/merged_map':
             joint.patch = decode.patch(message)
         elif raw.topic == '/merged_topology':
-            joint.topology = recorded_topology(path, raw.topic, message)
+            joint.topology = _topology(path, raw.topic, message)
         else:
             joint.add_status(decode.stamp_ns(message), message)
     if not joint.places:
@@ -302,7 +299,7 @@ def _read_joint(path: Path) -> _Joint:
     return joint
 
 
-def _world_pose(robots: Sequence[RobotRun], joint: _Joint) -> Array:
+def _world_pose(robots: Sequence[Recording], joint: _Joint) -> Array:
     """Pose (3,) of the world in the frame of the map that is written.
 
     By the map that lies in it without a search: its own frame, or the first one there.
@@ -313,11 +310,11 @@ def _world_pose(robots: Sequence[RobotRun], joint: _Joint) -> Array:
 
 
 def _team_report(
-    robots: Sequence[RobotRun], joint: _Joint, world: World, robot: RobotConfig
+    robots: Sequence[Recording], joint: _Joint, seen: ObservableCells
 ) -> dict[str, Any]:
-    start_ns = min(int(each.result['start_ns']) for each in robots)
-    end_ns = max(int(each.result['end_ns']) for each in robots)
-    curve = _coverage(robots, world, robot, start_ns)
+    start_ns = min(each.start_ns for each in robots)
+    end_ns = max(each.end_ns for each in robots)
+    curve = _coverage(robots, seen, start_ns)
     T_merged_world = _world_pose(robots, joint)
     reports = [_robot_report(each, joint, T_merged_world, start_ns) for each in robots]
     reasons = dict.fromkeys(str(each.result['reason']) for each in robots)
@@ -328,7 +325,7 @@ def _team_report(
         'distance': round(sum(each.distance_m for each in robots), 3),
         'time': round((end_ns - start_ns) / 1e9, 3),
         'time_at': {f'{share:.2f}': first_time(curve, share) for share in MILESTONES},
-        'collisions': sum(each.recording.collisions for each in robots),
+        'collisions': sum(each.collisions for each in robots),
         'robots': reports,
         'joins': [_join_text(each) for each in reports],
         'curve': [[round(float(at), 2), round(float(share), 4)] for at, share in curve],
@@ -336,13 +333,12 @@ def _team_report(
 
 
 def _robot_report(
-    robot: RobotRun, joint: _Joint, T_merged_world: Array, start_ns: int
+    robot: Recording, joint: _Joint, T_merged_world: Array, start_ns: int
 ) -> dict[str, Any]:
     """Figures of a robot; joined_at: of its map, s; join_error: m and deg against the truth."""
-    recording = robot.recording
-    shared = [ns for ns in recording.true if ns in recording.estimated]
-    estimated = np.array([se2.compose(robot.T_world_map, recording.estimated[ns]) for ns in shared])
-    errors = np.hypot(*(estimated - [recording.true[ns] for ns in shared])[:, :2].T)
+    shared = [ns for ns in robot.true if ns in robot.estimated]
+    estimated = np.array([se2.compose(robot.T_world_map, robot.estimated[ns]) for ns in shared])
+    errors = np.hypot(*(estimated - [robot.true[ns] for ns in shared])[:, :2].T)
     joined_ns = joint.joined_ns.get(robot.name)
     error = None
     if joined_ns is not None:
@@ -354,8 +350,8 @@ def _robot_report(
         'finished': robot.result['finished'],
         'reason': robot.result['reason'],
         'distance': round(robot.distance_m, 3),
-        'time': round((int(robot.result['end_ns']) - int(robot.result['start_ns'])) / 1e9, 3),
-        'collisions': recording.collisions,
+        'time': round((robot.end_ns - robot.start_ns) / 1e9, 3),
+        'collisions': robot.collisions,
         'pose_rmse': round(float(np.sqrt(np.mean(errors**2))), 5),
         'joined_at': None if joined_ns is None else round((joined_ns - start_ns) / 1e9, 3),
         'join_error': error,
@@ -371,12 +367,9 @@ def _join_text(robot: dict[str, Any]) -> str:
     return f'{after}, off by {off_m:.2f} m, {off_deg:.1f} deg'
 
 
-def _coverage(robots: Sequence[RobotRun], world: World, robot: RobotConfig, start_ns: int) -> Array:
+def _coverage(robots: Sequence[Recording], seen: ObservableCells, start_ns: int) -> Array:
     """Time, s, and share of the area that one of the maps holds, for each map (N, 2)."""
-    range_m = max(each.recording.range_max_m for each in robots)
-    start = next(iter(robots[0].recording.true.values()))
-    seen = robot_observable_cells(world, start, robot, range_m)
-    maps = [(ns, patch, each) for each in robots for ns, patch in each.recording.maps]
+    maps = [(ns, patch, each) for each in robots for ns, patch in each.maps]
     known = {}
     curve = []
     for ns, patch, each in sorted(maps, key=lambda entry: entry[0]):

@@ -275,12 +275,8 @@ def _stay(processes: Processes) -> None:
 
 def _write_results(arguments: argparse.Namespace, world: Path, starts: Sequence[Array]) -> None:
     result = json.loads((arguments.out / 'result.json').read_text())
-    run = (arguments.out, world, arguments.robot, result)
-    command = cli.command_line()
-    if len(starts) == 1:
-        report = recorded_run.write(*run, command)
-    else:
-        report = recorded_run.write_team(*run, map_poses(starts), command)
+    run = (arguments.out, world, arguments.robot, result, map_poses(starts))
+    report = recorded_run.write(*run, cli.command_line())
     print(
         f'{report["reason"]}: {100.0 * report["coverage"]:.1f} % seen, '
         f'{report["distance"]:.1f} m, {report["time"]:.1f} s, {report["collisions"]} collisions; '
