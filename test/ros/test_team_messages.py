@@ -31,7 +31,7 @@ POSE = se2.pose(1.0, 2.0, 0.5)
 def claimed(state=RobotState.DRIVING, visits=1):
     place = (3.0, 4.0) if state is RobotState.DRIVING else None
     settled = (SettledPlace(5.0, 6.0, visits, 2),) * MAX_SETTLED
-    claim = Claim('/a', 7, POSE, place, 2.5, settled, state in (1, 2))
+    claim = Claim('/a', 7, POSE, place, 2.5, settled)
     return RobotClaim(claim, Motion('/a', POSE, 0.5, -0.25), state, 9, place)
 
 
@@ -40,7 +40,7 @@ def test_a_claim_arrives_as_it_was(state):
     sent = claimed(state)
     found = claim_from_msg(claim_msg(sent, 'map'))
     assert found.claim.pose == pytest.approx(POSE, abs=1e-12)
-    for name in ('robot', 'stamp_ns', 'place', 'remaining_s', 'settled', 'explores'):
+    for name in ('robot', 'stamp_ns', 'place', 'remaining_s', 'settled'):
         assert getattr(found.claim, name) == getattr(sent.claim, name), name
     assert (found.motion.v, found.motion.w) == (0.5, -0.25)
     assert (found.state, found.session, found.goal) == (state, 9, sent.goal)

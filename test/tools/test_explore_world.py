@@ -119,7 +119,7 @@ def test_a_map_without_a_start_can_be_explored_from_a_given_one(tmp_path: Path) 
         (['WORLD', '--range-max-m', '-1'], 'range_max_m = -1.0: expected'),
         (['WORLD', '--speed-m-s', '0'], 'speed_m_s = 0.0: expected'),
         (['WORLD', '--kidnap-at-s', '5'], 'expected --localization=slam'),
-        (['WORLD', '--robots', '0'], '--robots=0: expected 1 to 10'),
+        (['WORLD', '--robots', '0'], '--robots=0: expected 1 to 9'),
         (['WORLD', '--robots', '9'], 'expected room for 9 robots 0.8 m apart, found room for'),
         (['WORLD', '--robots', '2', '--strategy', 'paper'], 'the only one that shares candidates'),
         (['WORLD', '--robots', '2', '--kidnap-at-s', '5'], '--robots=2: expected no --kidnap-at-s'),

@@ -53,6 +53,9 @@ class TeamOptions:
     has_own_maps: bool = False
 
 
+DEFAULT_TEAM = TeamOptions()
+
+
 class ClosedLoop:
     """Robots in one world, each called in turn; several share maps, claims and motions.
 
@@ -63,11 +66,10 @@ class ClosedLoop:
         self,
         robots: Sequence[SimulatedRobot],
         maps: Maps | None = None,
-        team: TeamOptions | None = None,
+        team: TeamOptions = DEFAULT_TEAM,
         seed: int = 0,
     ) -> None:
         """maps: None: those of their pipelines. seed: of the loss of messages."""
-        team = team or TeamOptions()
         self.robots = robots
         self.maps = maps or Maps(robots)
         self.trouble = team.trouble
@@ -201,13 +203,12 @@ class ClosedLoop:
 
 
 def make_loop(
-    world: World, starts: Sequence[Array], options: Options, team: TeamOptions | None = None
+    world: World, starts: Sequence[Array], options: Options, team: TeamOptions = DEFAULT_TEAM
 ) -> ClosedLoop:
     """Make a loop with a robot at each start (3,).
 
     Raises InputError where a robot does not fit, ConfigError where there is no such strategy.
     """
-    team = team or TeamOptions()
     preset = PRESETS[options.robot]
     simulations = simulations_in(world, starts, preset, options.laser, options.seed)
     kind = SimulatedRobot if options.kidnap_at_s is None else KidnappedRobot

@@ -58,7 +58,11 @@ class Options(Config):
     localization: str = parameter(
         'truth', 'Poses by SLAM, or the true ones.', choices=('slam', 'truth')
     )
-    robot: str = parameter('2dx', 'Simulated robot.', choices=tuple(PRESETS))
+    robot: str = parameter(
+        '2dx',
+        'Simulated robot: a Pioneer, or a MiR100 with its two lasers.',
+        choices=tuple(sorted(PRESETS)),
+    )
     laser: LaserScannerConfig = part(LaserScannerConfig)
     time_limit_s: float = parameter(
         20_000.0, 'Simulated time after which the exploration ends (s).', low=0.0

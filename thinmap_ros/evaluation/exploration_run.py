@@ -10,6 +10,7 @@ import numpy as np
 
 from thinmap_ros.closed_loop.kidnapping import KidnappedRobot
 from thinmap_ros.closed_loop.loop import (
+    DEFAULT_TEAM,
     ClosedLoop,
     ExplorationOutcome,
     TeamOptions,
@@ -68,14 +69,13 @@ def explore_together(
     world: World,
     starts: Sequence[Array],
     options: Options,
-    team: TeamOptions | None = None,
+    team: TeamOptions = DEFAULT_TEAM,
     show: Callable[[float, float], None] = no_progress,
 ) -> tuple[ClosedLoop, dict[str, Any]]:
     """Explore a world from several starts (3,); returns the finished loop and the report.
 
     From one start it is that of a robot alone.
     """
-    team = team or TeamOptions()
     loop = make_loop(world, starts, options, team)
     goal = observable_cells(world, starts[0], options)
     watched = _Watched(loop.robots[0])

@@ -181,7 +181,6 @@ def claim_from_msg(message: TeamClaim) -> RobotClaim:
         points[1] if is_driving else None,
         max(float(message.remaining_s), 0.0),
         tuple(SettledPlace(p.x, p.y, p.visits, p.failures) for p in message.settled),
-        state in (RobotState.DRIVING, RobotState.WAITING),
     )
     motion = Motion(name, T, float(message.v), float(message.w))
     return RobotClaim(claim, motion, state, message.session, points[0] if is_driving else None)

@@ -1,6 +1,7 @@
 """Explores a simulated world without ROS, faster than real time."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from thinmap_ros.evaluation.exploration_run import explore_together
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.laser import LaserScannerConfig
-from thinmap_ros.sim.other_robots import starts_side_by_side
+from thinmap_ros.sim.other_robots import MAX_ROBOTS, starts_side_by_side
 from thinmap_ros.sim.robot import LASERS, PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, NAMES, check_strategy
@@ -26,7 +27,6 @@ from thinmap_ros.tools.arguments import Parser, add_out, out_folder
 from thinmap_ros.view.progress_bar import ProgressBar
 from thinmap_ros.view.run_folder import RunResult, write_report, write_run
 
-MAX_ROBOTS = 10
 MAX_DELAY_S = 1000.0
 WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's worlds"
 
@@ -74,34 +74,14 @@ def _start(world: World, given: str | None) -> Array:
 
 def options_from(arguments: argparse.Namespace, strategy: str) -> Options:
     """Options as given on the command line (see add_options), for one strategy."""
-    return Options(
-        strategy=strategy,
-        seed=arguments.seed,
-        speed_m_s=arguments.speed_m_s,
-        localization=arguments.localization,
-        robot=arguments.robot,
-        laser=cli.config_from(arguments, LaserScannerConfig, LASERS.get(arguments.robot)),
-        time_limit_s=arguments.time_limit_s,
-        kidnap_at_s=arguments.kidnap_at_s,
-    )
+    options = cli.config_from(arguments, Options)
+    laser = cli.config_from(arguments, LaserScannerConfig, LASERS.get(options.robot))
+    return replace(options, strategy=strategy, laser=laser)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the common options of runs in a simulated world."""
-    parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
-    parser.add_argument(
-        '--speed-m-s', type=float, default=0.2, help='speed limit, m/s (default 0.2)'
-    )
-    parser.add_argument('--localization', default='truth', choices=('truth', 'slam'))
-    parser.add_argument(
-        '--robot',
-        default='2dx',
-        choices=sorted(PRESETS),
-        help='simulated robot: a Pioneer (default 2dx), or a MiR100 with its two lasers',
-    )
-    parser.add_argument(
-        '--time-limit-s', type=float, default=20_000.0, help='limit of simulated time, s'
-    )
+    cli.add_config(parser, Options, ['seed', 'speed_m_s', 'localization', 'robot', 'time_limit_s'])
     parser.add_argument(
         '--kidnap-at-s', type=float, help='kidnap the robot at this simulated time, s (with slam)'
     )

@@ -66,7 +66,7 @@ def test_a_robot_alone_has_everything_in_its_order():
 
 def test_a_robot_that_does_not_explore_takes_nothing():
     candidates = [candidate(1.0), candidate(-8.0)]
-    idle = Claim('a', 0, se2.pose(0.0, 0.0, 0.0), explores=False)
+    idle = Claim('a', 0, se2.pose(0.0, 0.0, 0.0))
     team = Team('b')
     team.add_claim(idle, 0)
     assert team.share(candidates, claim('b', 0.5), travel(), MARGIN_S) is candidates

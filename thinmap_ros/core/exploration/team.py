@@ -131,7 +131,7 @@ class Claim:
     own. It holds as long as its robot is received and comes nearer to the place.
     robot: its name; stamp_ns: by its own clock; pose (3,); place: of the frontier that it drives
     to, m, None without a target; remaining_s: time until it is there, 0 where that is not known;
-    settled: its latest places; explores: False for one that takes no candidate, whatever is left.
+    settled: its latest places.
     """
 
     robot: str
@@ -140,7 +140,6 @@ class Claim:
     place: Place | None = None
     remaining_s: float = 0.0
     settled: tuple[SettledPlace, ...] = ()
-    explores: bool = True
 
 
 @dataclass

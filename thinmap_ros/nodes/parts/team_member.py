@@ -284,16 +284,16 @@ class _ClaimOutput:
         now_ns = self._node.now_ns
         claim = strategy.claim(now_ns, T_map_base)
         if not explores:
-            claim = Claim(self.name, now_ns, T_map_base, settled=claim.settled, explores=False)
+            claim = Claim(self.name, now_ns, T_map_base, settled=claim.settled)
         v, w = self._track.speeds
-        state = _state_of(mission, claim)
+        state = _state_of(mission, explores, claim)
         motion = Motion(self.name, T_map_base, v, w)
         place = None if goal is None else (float(goal[0]), float(goal[1]))
         return RobotClaim(claim, motion, state, self.session, place)
 
 
-def _state_of(mission: Mission, claim: Claim) -> RobotState:
-    if claim.explores:
+def _state_of(mission: Mission, explores: bool, claim: Claim) -> RobotState:
+    if explores:
         return RobotState.WAITING if claim.place is None else RobotState.DRIVING
     return RobotState.FINISHED if mission.state > MissionState.EXPLORING else RobotState.IDLE
 
