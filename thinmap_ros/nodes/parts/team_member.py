@@ -133,7 +133,11 @@ def declare_team(node: ThinmapNode, frame_id: str, is_able: bool, progress: GetP
 
 
 class TeamMember(Alone):
-    """An explorer that sends its claims and tiles, and hears those of the others."""
+    """An explorer that sends its claims and tiles, and hears those of the others.
+
+    A claim is sent each second, when the claimed place changes, and often near others. A robot that
+    does not know its place is silent: others would cut their walls out at its pose.
+    """
 
     def __init__(
         self,
@@ -146,13 +150,21 @@ class TeamMember(Alone):
         name = membership.team_name
         self._node = node
         self._config = config
+        self._frame_id = frame_id
+        self._progress = progress
+        self._session = new_map_id()  # that others know this explorer by
         self._places = JoinedPlaces(node, name)
         self._heard = HeardRobots(node, self._places, name, config, self._accepts)
         self._received = TileReceiver(node, self._places, name)
         self._tiles = TileOutput(node, name, frame_id)
-        self._claims = _ClaimOutput(node, name, frame_id, progress, self._on_sent)
+        self._publisher = node.create_publisher(TeamClaim, CLAIMS, qos.SENSOR)
         self._team = Team(name, config)
         self._last: Observation | None = None
+        self._is_located = False  # whether it knew its place lately
+        self._told_s = -math.inf
+        self._told_place: Place | None = None
+        self._told_xy = np.zeros(2)
+        self._track = _Track()
         node.create_active_timer(_NEAR_PERIOD_S, self._tell)
         node.create_active_timer(TILE_PERIOD_S, self._send_tiles)
 
@@ -162,7 +174,7 @@ class TeamMember(Alone):
         if strategy.team is self._team:
             return
         present = self._team.claims.present(self._now_ns)
-        self._team = Team(self._claims.name, self._config)
+        self._team = Team(self._team.name, self._config)
         for claim in present:
             self._team.add_claim(claim, self._now_ns)
         strategy.team = self._team
@@ -196,10 +208,10 @@ class TeamMember(Alone):
 
         Raises InputError where that has the name of this one.
         """
-        if heard.session == self._claims.session:
+        if heard.session == self._session:
             return False
         name = heard.claim.robot
-        if name == self._claims.name:
+        if name == self._team.name:
             raise InputError(
                 f'another robot is called {quoted(name)}, too: expected another team_name'
             )
@@ -208,14 +220,8 @@ class TeamMember(Alone):
             self._team.add_claim(heard.in_map(T).claim, self._now_ns)
         return True
 
-    def _tell(self) -> None:
-        self._claims.tell([motion for motion, _ in self._heard.motions()], self._last)
-
-    def _on_sent(self, claim: Claim) -> None:
-        self._team.sent = claim
-
     def _send_tiles(self) -> None:
-        if self._last is None or not self._claims.is_located:
+        if self._last is None or not self._is_located:
             return
         try:
             self._tiles.send(self._last.patch)
@@ -224,56 +230,29 @@ class TeamMember(Alone):
                 f'tiles are not sent: {error}', throttle_duration_sec=WARN_PERIOD_S
             )
 
-
-class _ClaimOutput:
-    """Publishes claims: each second, when the claimed place changes, and often near others.
-
-    session: that others know this explorer by; is_located: whether it knew its place lately. A
-    robot that does not is silent: others would cut their walls out at its pose.
-    """
-
-    def __init__(
-        self,
-        node: ThinmapNode,
-        name: str,
-        frame_id: str,
-        progress: GetProgress,
-        sent: Callable[[Claim], None],
-    ) -> None:
-        """sent: is called with each claim that was sent."""
-        self.name = name
-        self.session = new_map_id()
-        self.is_located = False
-        self._node = node
-        self._frame_id = frame_id
-        self._progress = progress
-        self._sent = sent
-        self._publisher = node.create_publisher(TeamClaim, CLAIMS, qos.SENSOR)
-        self._told_s = -math.inf
-        self._told_place: Place | None = None
-        self._told_xy = np.zeros(2)
-        self._track = _Track()
-
-    def tell(self, others: list[Motion], last: Observation | None) -> None:
-        """Publish a claim if one is due; others: their motions; last: newest observation."""
-        progress = self._progress(last)
-        self.is_located = progress.located is not None
+    def _tell(self) -> None:
+        """Publish a claim if one is due."""
+        progress = self._progress(self._last)
+        self._is_located = progress.located is not None
         if progress.located is None:
             return
         now_s = self._node.elapsed_time.now_s()
         self._track.add(*progress.located, now_s)
         T_map_base = self._track.pose_at(now_s)
-        claim = self._claim(progress, T_map_base)
-        is_near = any(math.dist(T_map_base[:2], other.pose[:2]) < NEAR_ROBOT_M for other in others)
+        told = self._claim(progress, T_map_base)
+        others = self._heard.motions()
+        is_near = any(
+            math.dist(T_map_base[:2], other.motion.pose[:2]) < NEAR_ROBOT_M for other in others
+        )
         has_moved = math.dist(T_map_base[:2], self._told_xy) > _NEAR_STEP_M
         is_due = not 0.0 <= now_s - self._told_s < MESSAGE_PERIOD_S
-        place = claim.claim.place
+        place = told.claim.place
         if is_due or (is_near and has_moved) or place != self._told_place:
             self._told_s = now_s
             self._told_xy = T_map_base[:2]
             self._told_place = place
-            self._publisher.publish(claim_msg(claim, self._frame_id))
-            self._sent(claim.claim)
+            self._publisher.publish(claim_msg(told, self._frame_id))
+            self._team.sent = told.claim
 
     def _claim(self, progress: Progress, T_map_base: Array) -> RobotClaim:
         mission = progress.mission
@@ -281,15 +260,13 @@ class _ClaimOutput:
         strategy = mission.strategy
         assert isinstance(strategy, Explorer)
         goal = progress.goal
-        now_ns = self._node.now_ns
-        claim = strategy.claim(now_ns, T_map_base)
+        claim = strategy.claim(self._node.now_ns, T_map_base)
         if not explores:
-            claim = Claim(self.name, now_ns, T_map_base, settled=claim.settled)
-        v, w = self._track.speeds
+            claim = replace(claim, robot=self._team.name, place=None, remaining_s=0.0)
         state = _state_of(mission, explores, claim)
-        motion = Motion(self.name, T_map_base, v, w)
+        motion = Motion(self._team.name, T_map_base, *self._track.speeds)
         place = None if goal is None else (float(goal[0]), float(goal[1]))
-        return RobotClaim(claim, motion, state, self.session, place)
+        return RobotClaim(claim, motion, state, self._session, place)
 
 
 def _state_of(mission: Mission, explores: bool, claim: Claim) -> RobotState:
