@@ -78,7 +78,14 @@ def explore_together(
     """
     loop = make_loop(world, starts, options, team)
     goal = observable_cells(world, starts[0], options)
-    watched = _Watched(loop.robots[0])
+    census = EndNodeCensus()
+    targets = TargetLog()
+
+    def watch(decision: Decision, T_map_base: Array) -> None:
+        census.add([(n.node_id, n.x, n.y) for n in decision.end_nodes], T_map_base)
+        targets.add(None if decision.target is None else decision.target.goal)
+
+    loop.robots[0].watch = watch
     began = time.perf_counter()
     cpu_began = time.process_time()
     outcome = loop.run(goal, options.time_limit_s, show)
@@ -90,49 +97,36 @@ def explore_together(
         'cpu_s': round(time.process_time() - cpu_began, 3),
     }
     if len(starts) == 1:
-        return loop, watched.report(outcome, loop.coverage) | about
+        return loop, _report(loop, outcome, census, targets) | about
     decision_s = [round(sum(robot.log.decision_s), 3) for robot in loop.robots]
     report = _team_report(loop, outcome, starts, goal)
     return loop, {**report, **about, 'team': asdict(team), 'decision_s': decision_s}
 
 
-class _Watched:
-    """A robot that explores alone, and what is counted of its decisions."""
-
-    def __init__(self, robot: SimulatedRobot) -> None:
-        robot.watch = self._add
-        self._robot = robot
-        self._census = EndNodeCensus()
-        self._targets = TargetLog()
-
-    def report(
-        self, outcome: ExplorationOutcome, coverage: list[tuple[float, float]]
-    ) -> dict[str, Any]:
-        """Its report; coverage: as of the loop."""
-        log = self._robot.log
-        milliseconds = 1e3 * np.array(log.decision_s)
-        report = exploration_report(
-            outcome,
-            np.array(log.stamps_ns) / 1e9,
-            np.array(log.true_poses),
-            np.array(log.poses),
-            np.array(coverage),
-            self._census,
-        )
-        report['target_changes'] = self._targets.changes
-        report['reversals'] = self._targets.reversals
-        report['decision_ms'] = {
-            'median': round(float(np.median(milliseconds)), 2),
-            'max': round(milliseconds.max(), 2),
-        }
-        report['missing_area'] = _missing_area(self._robot.mission.decision)
-        if isinstance(self._robot, KidnappedRobot):
-            report |= self._robot.report()
-        return report
-
-    def _add(self, decision: Decision, T_map_base: Array) -> None:
-        self._census.add([(n.node_id, n.x, n.y) for n in decision.end_nodes], T_map_base)
-        self._targets.add(None if decision.target is None else decision.target.goal)
+def _report(
+    loop: ClosedLoop, outcome: ExplorationOutcome, census: EndNodeCensus, targets: TargetLog
+) -> dict[str, Any]:
+    (robot,) = loop.robots
+    log = robot.log
+    milliseconds = 1e3 * np.array(log.decision_s)
+    report = exploration_report(
+        outcome,
+        np.array(log.stamps_ns) / 1e9,
+        np.array(log.true_poses),
+        np.array(log.poses),
+        np.array(loop.coverage),
+        census,
+    )
+    report['target_changes'] = targets.changes
+    report['reversals'] = targets.reversals
+    report['decision_ms'] = {
+        'median': round(float(np.median(milliseconds)), 2),
+        'max': round(milliseconds.max(), 2),
+    }
+    report['missing_area'] = _missing_area(robot.mission.decision)
+    if isinstance(robot, KidnappedRobot):
+        report |= robot.report()
+    return report
 
 
 def _missing_area(decision: Decision | None) -> dict[str, Any] | None:
