@@ -401,11 +401,9 @@ def explorer() -> None:
     from thinmap_ros.core.exploration.space import search_beside
     from thinmap_ros.core.grid.patch import scan_in_map
     from thinmap_ros.core.grid.raytrace import line_is_clear
-    from thinmap_ros.core.planning.grid_search import downsample_mask, path_lengths_from
 
     patch = _room()
     # Of other strategies, and of a frontier that no viewpoint sees into.
-    path_lengths_from(downsample_mask(patch.free, 2), (20, 20), np.array([[30, 30]]))
     line_is_clear(patch.free, *np.array([20, 20, 30, 30]))
     search_beside(patch.free, np.array([[20, 20]]), patch.free, 5, (30, 30))
     rehearsed = Explorer()

@@ -23,21 +23,18 @@ from thinmap_ros.core.exploration.strategy import (
     is_at,
     unobserved,
 )
+from thinmap_ros.core.grid.fields import reachable
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import begin_ray, next_cell
-from thinmap_ros.core.planning.grid_search import (
-    downsample_mask,
-    escape_cells,
-    path_lengths_from,
-    reachable_cells,
-    traversable_cells,
-)
+from thinmap_ros.core.planning.grid_search import path_lengths_from
 from thinmap_ros.core.planning.obstacles import RecentPath
 from thinmap_ros.core.planning.paths import path_lengths_to_nodes
-from thinmap_ros.core.planning.wavefront import start_escape_m
+from thinmap_ros.core.planning.wavefront import ways_out
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import SECOND_NS, Array, Cells, Mask
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+from thinmap_ros.core.topology.segmentation import any_in_squares
+from thinmap_ros.core.topology.thinning import standing_room
 from thinmap_ros.jit import kernel
 
 _COARSE = 2
@@ -45,7 +42,6 @@ _PART_M = 1.0
 # The same robot and the same frontiers as for the exploration of the paper.
 _EXPLORER = ExplorerConfig()
 _MIN_FRONTIER_M = 0.5  # as of explore_lite
-_ESCAPE_M = start_escape_m(_EXPLORER.planner.robot_radius_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +90,11 @@ class FrontierFinder:
         frame = self.map.frame
         clusters = self._clusters()
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        standing = traversable_cells(
-            self.map.free, _EXPLORER.planner.robot_radius_m, frame.resolution
-        )
+        standing = standing_room(self.map.free, _EXPLORER.planner.robot_radius_m / frame.resolution)
         reach = self._reach_from(standing, xy)
         if not clusters:
             return []
-        self._reachable = downsample_mask(reach, _COARSE)
+        self._reachable = any_in_squares(reach, _COARSE)
         places = [self._place_at(cells, reach & standing, xy) for cells in clusters]
         found = [(c, p) for c, p in zip(clusters, places, strict=True) if p is not None]
         ways = self.path_lengths_from(
@@ -137,19 +131,19 @@ class FrontierFinder:
 
     def _reach_from(self, standing: Mask, xy: tuple[float, float]) -> Mask:
         """Cells (H, W) that are reachable from a point (m)."""
-        free = self.map.free
         frame = self.map.frame
-        row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
-        if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
+        row, col = frame.cells_of(np.array([xy]))[0].tolist()
+        if not (0 <= row < standing.shape[0] and 0 <= col < standing.shape[1]):
             return np.zeros_like(standing)
-        if self._recent_path is None:
-            ways = escape_cells(standing, free, frame, xy, _ESCAPE_M)
-            return reachable_cells(ways, (row, col)) & standing
-        trail = self._recent_path.cells(frame, free.shape)
-        return reachable_cells(
-            escape_cells(standing, free, frame, xy, _ESCAPE_M, trail),
-            (row, col),
-        )
+        path = self._recent_path
+        trail = None if path is None else path.cells(frame, standing.shape)
+        occupied = ~self.map.passable
+        cell = (row, col)
+        ways = ways_out(standing, occupied, cell, frame.resolution, _EXPLORER.planner, trail)
+        allowed = standing.copy()
+        allowed[tuple(ways.T)] = True
+        reach = reachable(allowed, np.array([cell]))
+        return reach & standing if path is None else reach
 
     def path_lengths_from(self, xy: Array, places: Array) -> Array:
         """Path lengths, m, from a point (2,) to viewpoints (N, 2) of `find`, (N,)."""

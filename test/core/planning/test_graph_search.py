@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core.planning.paths import (
     path_lengths_to_nodes,
-    path_points,
     shortest_path,
     shortest_route,
 )
@@ -39,14 +38,10 @@ def test_route_over_the_square():
     assert route.node_ids == (1, 2, 3, 4)
     assert route.edge_ids == (10, 11, 12)
     assert route.cost_m == pytest.approx(11.0)
-    points = path_points(square(), route)
-    np.testing.assert_allclose(points[[0, -1]], [[0, 0], [0, 3]])
-    assert np.hypot(*np.diff(points, axis=0).T).sum() == pytest.approx(11.0)
 
 
 def test_a_route_to_itself_and_one_that_does_not_exist():
     assert shortest_path(square(), 2, 2).cost_m == 0.0
-    assert path_points(square(), shortest_path(square(), 2, 2)).shape == (1, 2)
     assert shortest_path(square(), 1, 5) is None
 
 

@@ -6,12 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from thinmap_ros.core.planning.grid_search import (
-    distance_field_from,
-    downsample_mask,
-    path_lengths_from,
-    reachable_cells,
-)
+from thinmap_ros.core.planning.grid_search import distance_field_from, path_lengths_from
 
 
 def dijkstra(allowed, start):
@@ -65,7 +60,6 @@ def test_from_beyond_the_grid_nothing_can_be_reached(start):
     everywhere = np.argwhere(allowed)
     assert np.isinf(distance_field_from(allowed, start)).all()
     assert np.isinf(path_lengths_from(allowed, start, everywhere)).all()
-    assert not reachable_cells(allowed, start).any()
 
 
 def test_paths_are_at_most_a_twelfth_longer_than_straight_lines():
@@ -73,18 +67,3 @@ def test_paths_are_at_most_a_twelfth_longer_than_straight_lines():
     ratio = path_lengths_from(np.ones((60, 60), dtype=np.bool_), (0, 0), goals) / np.hypot(*goals.T)
     assert ratio.min() > 0.98
     assert ratio.max() < 1.0 + 1.0 / 12.0
-
-
-def test_a_coarse_square_is_set_where_any_of_its_cells_is():
-    mask = np.zeros((5, 7), dtype=np.bool_)
-    mask[4, 6] = mask[1, 2] = True
-    assert np.argwhere(downsample_mask(mask, 2)).tolist() == [[0, 1], [2, 3]]
-
-
-def test_the_path_field_holds_the_path_to_each_cell():
-    allowed = np.random.default_rng(9).random((30, 30)) < 0.8
-    everywhere = np.argwhere(np.ones_like(allowed))
-    field = distance_field_from(allowed, (3, 3))
-    expected = path_lengths_from(allowed, (3, 3), everywhere)
-    expected[3 * 30 + 3] = 0.0
-    assert (field.ravel() == expected).all()

@@ -8,17 +8,15 @@ from scipy import ndimage
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.space import _clusters, field_of_view, visible_places
+from thinmap_ros.core.grid.fields import reachable
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.planning.grid_search import (
-    downsample_mask,
-    path_collides,
-    reachable_cells,
-)
+from thinmap_ros.core.planning.grid_search import path_collides
 from thinmap_ros.core.planning.obstacles import _arc, _clear_steps, _points_around
 from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.topology.segmentation import any_in_squares
 
 SEEDS = range(20)
 
@@ -172,9 +170,9 @@ def test_what_is_joined(seed):
     assert (sizes == np.bincount(numbers)).all()
     room = ~mask
     parts, _ = ndimage.label(room, np.ones((3, 3)))
-    start = tuple(int(v) for v in np.argwhere(room)[0])
-    assert (reachable_cells(room, start) == (parts == parts[start])).all()
-    assert not reachable_cells(room, tuple(int(v) for v in cells[0])).any()
+    start = np.argwhere(room)[:1]
+    assert (reachable(room, start) == (parts == parts[tuple(start[0])])).all()
+    assert not reachable(room, cells[:1]).any()
 
 
 @pytest.mark.parametrize('seed', SEEDS)
@@ -185,7 +183,7 @@ def test_squares_of_cells(seed):
     padded = np.pad(cells, [(0, -size % factor) for size in cells.shape])
     shape = (padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
     expected = padded.reshape(shape).any(axis=(1, 3))
-    assert (downsample_mask(cells, factor) == expected).all()
+    assert (any_in_squares(cells, factor) == expected).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)

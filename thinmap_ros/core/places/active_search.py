@@ -18,11 +18,11 @@ from thinmap_ros.core.places.place_database import (
     free_way,
 )
 from thinmap_ros.core.places.wall_field import FREE, UNKNOWN, WALL
-from thinmap_ros.core.planning.grid_search import escape_cells, traversable_cells
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
-from thinmap_ros.core.planning.wavefront import WavefrontConfig, navigation_function, start_escape_m
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, navigation_function, ways_out
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.thinning import standing_room
 from thinmap_ros.jit import kernel
 
 # A goal stands so long, or until it is reached, or, after a quarter of that, the number of places
@@ -255,13 +255,11 @@ def _in_reach(
     The position of the robot is the first point.
     """
     resolution = patch.frame.resolution
-    xy = (float(T_odom_base[0]), float(T_odom_base[1]))
-    standing = traversable_cells(patch.free, driving.robot_radius_m, resolution)
-    ways = escape_cells(
-        standing, patch.free, patch.frame, xy, start_escape_m(driving.robot_radius_m)
-    )
+    standing = standing_room(patch.free, driving.robot_radius_m / resolution)
     middle = patch.shape[0] // 2, patch.shape[1] // 2
-    metres = navigation_function(np.where(ways, 1.0, np.inf), middle) * resolution
+    cost = np.where(standing, 1.0, np.inf)
+    cost[tuple(ways_out(standing, patch.occupied, middle, resolution, driving).T)] = 1.0
+    metres = navigation_function(cost, middle) * resolution
     near_by = np.argwhere(standing & (metres >= _NEAREST_M) & np.isfinite(metres))
     step = max(1, round(_SPACING_M / resolution))
     cells = near_by[((near_by - middle) % step == 0).all(axis=1)]

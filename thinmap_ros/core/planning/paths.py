@@ -8,18 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core.errors import InputError, require_type
-from thinmap_ros.core.grid.fields import nearest_true
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.grid_search import distance_field_from, path_collides
+from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.planning.grid_search import path_collides
 from thinmap_ros.core.planning.wavefront import (
     Obstacles,
     WavefrontConfig,
-    cost_of_cells,
     find_path,
     start_escape_m,
 )
 from thinmap_ros.core.se2 import Array, Cells, Mask, Place, lengths_along, path_length
-from thinmap_ros.core.topology.graph import TopologicalMap, TopologyConfig
+from thinmap_ros.core.topology.graph import Edge, TopologicalMap, TopologyConfig
 from thinmap_ros.jit import kernel
 
 _GAP_M = TopologyConfig().max_unknown_gap_m
@@ -32,7 +31,11 @@ _MAX_SHARE = 0.5  # of the map: a larger window saves nothing
 # Straight distance from which the wavefront in a band costs less than the wavefront alone.
 LONG_PATH_M = 20.0
 _BAND_M = 3.0  # half of its width: wide enough for the shortest path through most halls
-_ACCESS_M = 6.0  # the graph is looked for so far from either end; in halls twice that, and so on
+_ACCESS_M = 8.0  # the same around both ends: from a room to the corridor beside it
+# Of the path points nearest to an end, how many are looked at, each so manieth of them: they lie a
+# cell apart.
+_TRIED = 2000
+_STRIDE = 8
 _MAX_ROUTES = 6  # that are tried, each without the contradicted edges of those before
 
 
@@ -156,7 +159,7 @@ def shortest_route(
     topology: TopologicalMap,
     starts: Mapping[int, float],
     goals: Mapping[int, float],
-    goal_xy: tuple[float, float],
+    goal_xy: Place | Array,
     avoided: Collection[int] = (),
 ) -> Route | None:
     """Shortest route from a point to another, by A*; None if no edges connect them.
@@ -235,16 +238,7 @@ def _lengths_to_next_nodes(topology: TopologicalMap, x: float, y: float) -> dict
     return ends
 
 
-def path_points(topology: TopologicalMap, route: Route) -> Array:
-    """Points (K, 2) of a route from its first to its last node, m, map frame, no duplicates."""
-    first = topology.nodes[route.node_ids[0]]
-    parts = [np.array([[first.x, first.y]])]
-    for node_id, edge_id in zip(route.node_ids, route.edge_ids, strict=False):
-        parts.append(topology.edges[edge_id].path_from(node_id)[1:])
-    return np.concatenate(parts)
-
-
-def _away(topology: TopologicalMap, node_id: int, xy: tuple[float, float]) -> float:
+def _away(topology: TopologicalMap, node_id: int, xy: Place | Array) -> float:
     """Straight distance from a node to a point, m."""
     node = topology.nodes[node_id]
     return math.hypot(node.x - xy[0], node.y - xy[1])
@@ -268,100 +262,6 @@ class Band:
     cells: Mask
 
 
-@dataclass(frozen=True, eq=False)
-class _Approach:
-    """A path from a point to a node: along an edge from one of its path points.
-
-    length_m: to the node; path (K, 2): the part of the edge.
-    """
-
-    node_id: int
-    length_m: float
-    path: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Entry:
-    """The point of an edge's path that is nearest to a point over traversable cells."""
-
-    edge_id: int
-    index: int
-    length_m: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Surroundings:
-    """Path lengths, m, to the cells (H, W) around a point; row, col: of the first cell."""
-
-    row: int
-    col: int
-    lengths_m: Array
-
-
-class _Checked:
-    """A topological map, and what the grid and scan points say about its edges."""
-
-    def __init__(
-        self,
-        topology: TopologicalMap,
-        patch: GridPatch,
-        config: WavefrontConfig,
-        obstacles: Obstacles | None,
-    ) -> None:
-        self.topology = topology
-        self.patch = patch
-        self.config = config
-        self._obstacles = obstacles
-        edges = list(topology.edges.values())
-        self._points = np.concatenate([edge.path for edge in edges])
-        self._ids = np.array([edge.id for edge in edges])
-        self._ends = np.cumsum([len(edge.path) for edge in edges])
-
-    def is_drivable(self, path: Array) -> bool:
-        """Whether a path (K, 2) keeps its distance from occupied cells and scan points."""
-        if path_collides(self.patch, path, self.config.robot_radius_m):
-            return False
-        if self._obstacles is None or self._obstacles.points.size == 0:
-            return True
-        radius_m = self._obstacles.radius_m
-        points = self._obstacles.points
-        low = points.min(axis=0) - radius_m
-        near = path[((path >= low) & (path <= points.max(axis=0) + radius_m)).all(axis=1)]
-        away = np.hypot(*(near[:, None] - points[None]).transpose(2, 0, 1))
-        return not bool((away < radius_m).any())
-
-    def entries(self, around: _Surroundings) -> list[_Entry]:
-        """Where each edge that passes through the surroundings of a point is entered."""
-        cells = self.patch.frame.cells_of(self._points) - (around.row, around.col)
-        inside = ((cells >= 0) & (cells < around.lengths_m.shape)).all(axis=1)
-        at = np.flatnonzero(inside)
-        lengths = around.lengths_m[cells[at, 0], cells[at, 1]]
-        order = np.lexsort((lengths, np.searchsorted(self._ends, at, side='right')))
-        edges, first = np.unique(
-            np.searchsorted(self._ends, at[order], side='right'), return_index=True
-        )
-        found = []
-        for edge, k in zip(edges.tolist(), order[first].tolist(), strict=True):
-            if math.isfinite(lengths[k]):
-                begin = int(self._ends[edge - 1]) if edge else 0
-                index = int(at[k]) - begin
-                found.append(_Entry(int(self._ids[edge]), index, float(lengths[k])))
-        return found
-
-    def approaches(self, entries: list[_Entry]) -> dict[int, _Approach]:
-        """The shortest approach to each node at the edges that are entered."""
-        best: dict[int, _Approach] = {}
-        for entry in entries:
-            edge = self.topology.edges[entry.edge_id]
-            back = edge.path[entry.index :: -1]
-            for node_id, path in ((edge.a, back), (edge.b, edge.path[entry.index :])):
-                length_m = entry.length_m + path_length(path)
-                known = best.get(node_id)
-                if (known is None or length_m < known.length_m) and self.is_drivable(path):
-                    best[node_id] = _Approach(node_id, length_m, path)
-        return best
-
-
 def route_band(
     topology: TopologicalMap,
     patch: GridPatch,
@@ -372,150 +272,109 @@ def route_band(
 ) -> Band | None:
     """The band around the shortest route on the graph from start to goal (m, map frame).
 
-    A* on the graph finds the route of a long path, the wavefront the path along it: the wave
-    spreads only in the band. Its first and last part lead from the robot to the graph and from the
-    graph to the goal: the cells there are found on the grid. Edges that the grid or scan points
-    contradict are left out. None if the graph does not connect start and goal, or not by edges that
-    the grid confirms: the wavefront plans alone then, as for goals that are near.
+    A* on the graph finds the route of a long path, from the nearest edge in sight of the start to
+    that of the goal; the wavefront finds the path along it: the wave spreads only in the band. It
+    is wider around both ends, where the best path may begin in another direction. Edges that the
+    grid or scan points contradict are left out. None if the graph does not connect start and goal,
+    or not by edges that the grid confirms: the wavefront plans alone then, as for goals that are
+    near.
     Source: topological map paper section 3.2.
     """
-    if not topology.edges or not patch.contains(np.array([start_xy, goal_xy])).all():
-        return None
-    checked = _Checked(topology, patch, config, obstacles)
-    ends = []
-    for xy, reach_m in (
-        (start_xy, start_escape_m(config.robot_radius_m)),
-        (goal_xy, config.goal_search_radius_m),
-    ):
-        entrance = _entrance(checked, xy, reach_m)
-        if entrance is None:
-            return None
-        ends.append(entrance)
-    route = _route(checked, ends[0][1], ends[1][1], goal_xy)
-    if route is None:
-        return None
-    path, first_m, last_m = route
-    access = [(ends[0][0], first_m), (ends[1][0], last_m)]
-    return _band(patch, np.concatenate([[start_xy], path, [goal_xy]]), access, config)
-
-
-def _entrance(
-    checked: _Checked, xy: Place, reach_m: float
-) -> tuple[_Surroundings, list[_Entry]] | None:
-    """The smallest surroundings of a point through which edges pass, and where these are entered.
-
-    None if the point, or a traversable cell within reach_m, has no path to any edge.
-    """
-    patch = checked.patch
-    size = math.ceil(_ACCESS_M / patch.frame.resolution)
-    while True:
-        around = _surroundings(patch, xy, reach_m, size, checked.config)
-        if around is None:
-            return None
-        entries = checked.entries(around)
-        if entries:
-            return around, entries
-        if around.lengths_m.shape == patch.shape:
-            return None
-        size *= 2
-
-
-def _surroundings(
-    patch: GridPatch, xy: Place, reach_m: float, size: int, config: WavefrontConfig
-) -> _Surroundings | None:
-    """Path lengths within `size` cells of a point, or of the nearest traversable cell in reach."""
-    resolution = patch.frame.resolution
-    row, col = patch.frame.cells_of(np.array([xy]))[0].tolist()
-    part = patch.part((max(row - size, 0), max(col - size, 0), row + size + 1, col + size + 1))
-    first_row = max(row - size, 0)
-    first_col = max(col - size, 0)
-    allowed = np.isfinite(cost_of_cells(part, config))
-    start = nearest_true(allowed, (row - first_row, col - first_col), reach_m / resolution)
-    if start is None:
-        return None
-    lengths = distance_field_from(allowed, start) * resolution
-    return _Surroundings(first_row, first_col, lengths)
-
-
-def _route(
-    checked: _Checked, starts: list[_Entry], goals: list[_Entry], goal_xy: Place
-) -> tuple[Array, float, float] | None:
-    """Points (K, 2) on edges of the shortest drivable route, and its lengths to and from them."""
-    first = checked.approaches(starts)
-    last = checked.approaches(goals)
-    direct = _on_one_edge(checked, starts, goals)
-    topology = checked.topology
-    avoided: set[int] = set()
+    ends = np.array([start_xy, goal_xy])
+    edges = dict(topology.edges) if patch.contains(ends).all() else {}
     for _ in range(_MAX_ROUTES):
-        route = shortest_route(
-            topology,
-            {i: approach.length_m for i, approach in first.items()},
-            {i: approach.length_m for i, approach in last.items()},
-            goal_xy,
-            avoided,
-        )
-        if direct is not None and (route is None or direct[0] <= route.cost_m):
-            return direct[1:]
-        if route is None:
-            return None
-        paths = {i: topology.edges[i].path for i in route.edge_ids}
-        closed = {i for i, path in paths.items() if not checked.is_drivable(path)}
+        route = _route(topology, patch, ends, edges)
+        closed = [i for i, path in route if not _is_drivable(path, patch, config, obstacles)]
         if not closed:
-            begin = first[route.node_ids[0]]
-            end = last[route.node_ids[-1]]
-            parts = [begin.path, path_points(topology, route), end.path[::-1]]
-            return (
-                np.concatenate(parts),
-                begin.length_m - path_length(begin.path),
-                end.length_m - path_length(end.path),
-            )
-        avoided |= closed
+            return _band(patch, [path for _, path in route], ends, config) if route else None
+        for edge_id in closed:
+            edges.pop(edge_id, None)
     return None
 
 
-def _on_one_edge(
-    checked: _Checked, starts: list[_Entry], goals: list[_Entry]
-) -> tuple[float, Array, float, float] | None:
-    """Length and points of the shortest drivable path along an edge that passes both ends."""
-    best: tuple[float, Array, float, float] | None = None
-    by_edge = {entry.edge_id: entry for entry in goals}
-    for start in starts:
-        goal = by_edge.get(start.edge_id)
-        if goal is None:
-            continue
-        low = min(start.index, goal.index)
-        path = checked.topology.edges[start.edge_id].path[low : max(start.index, goal.index) + 1]
-        length_m = start.length_m + path_length(path) + goal.length_m
-        if (best is None or length_m < best[0]) and checked.is_drivable(path):
-            ordered = path if start.index <= goal.index else path[::-1]
-            best = (length_m, ordered, start.length_m, goal.length_m)
-    return best
+def _route(
+    topology: TopologicalMap, patch: GridPatch, ends: Array, edges: Mapping[int, Edge]
+) -> list[tuple[int, Array]]:
+    """Edges of the shortest route between two points (2, 2), each with the part (K, 2) driven.
+
+    edges: those that it may use. Empty without a route.
+    """
+    start, goal = (_entry(patch, xy, edges) for xy in ends)
+    if start is None or goal is None:
+        return []
+    first, begin = start
+    last, end = goal
+    starts = _parts_from(first, begin)
+    goals = _parts_from(last, end)
+    avoided = topology.edges.keys() - edges.keys()
+    route = shortest_route(topology, _lengths(starts), _lengths(goals), ends[1], avoided)
+    if first is last:
+        direct = first.path[min(begin, end) : max(begin, end) + 1]
+        if route is None or path_length(direct) <= route.cost_m:
+            return [(first.id, direct)]
+    if route is None:
+        return []
+    ends_of = [(first.id, starts[route.node_ids[0]]), (last.id, goals[route.node_ids[-1]])]
+    return ends_of + [(i, edges[i].path) for i in route.edge_ids]
 
 
-def _band(
-    patch: GridPatch,
-    path: Array,
-    access: list[tuple[_Surroundings, float]],
-    config: WavefrontConfig,
-) -> Band:
-    """Cells within _BAND_M of a path, and those between the ends and the graph."""
+def _entry(patch: GridPatch, xy: Array, edges: Mapping[int, Edge]) -> tuple[Edge, int] | None:
+    """The edge with the nearest point in sight of a place (2,), and the index of that point."""
+    points = np.concatenate([np.empty((0, 2)), *(edge.path for edge in edges.values())])
+    firsts = np.cumsum([0, *(len(edge.path) for edge in edges.values())])
+    cells = patch.frame.cells_of(points)
+    row, col = patch.frame.cells_of(xy[None])[0].tolist()
+    passable = ~patch.occupied
+    for k in np.argsort(np.hypot(*(points - xy).T))[:_TRIED:_STRIDE].tolist():
+        if line_is_clear(passable, row, col, *cells[k].tolist()):
+            number = int(np.searchsorted(firsts, k, side='right')) - 1
+            return list(edges.values())[number], k - int(firsts[number])
+    return None
+
+
+def _parts_from(edge: Edge, index: int) -> dict[int, Array]:
+    """The parts of an edge's path from one of its points, by the node at the end of each."""
+    back = edge.path[index::-1]
+    ahead = edge.path[index:]
+    if edge.a == edge.b:
+        return {edge.a: min(back, ahead, key=len)}
+    return {edge.a: back, edge.b: ahead}
+
+
+def _lengths(paths: Mapping[int, Array]) -> dict[int, float]:
+    return {i: path_length(path) for i, path in paths.items()}
+
+
+def _is_drivable(
+    path: Array, patch: GridPatch, config: WavefrontConfig, obstacles: Obstacles | None
+) -> bool:
+    """Whether a path (K, 2) keeps its distance from occupied cells and scan points."""
+    if path_collides(patch, path, config.robot_radius_m):
+        return False
+    if obstacles is None or not len(obstacles.points):
+        return True
+    away = np.hypot(*(path[:, None] - obstacles.points).transpose(2, 0, 1))
+    return not bool((away < obstacles.radius_m).any())
+
+
+def _band(patch: GridPatch, route: list[Array], ends: Array, config: WavefrontConfig) -> Band:
+    """Cells within _BAND_M of a route and of the ways to it, and within _ACCESS_M of its ends."""
     resolution = patch.frame.resolution
-    at = patch.frame.cells_of(path)
+    points = np.concatenate(route)
+    nearest = points[[np.hypot(*(points - end).T).argmin() for end in ends]]
+    steps = math.ceil(np.hypot(*(nearest - ends).T).max() / _BAND_M) + 1
+    ways = np.linspace(ends, nearest, steps).reshape(-1, 2)
+    at = patch.frame.cells_of(np.concatenate([points, ways]))
     # The costs of its cells depend on obstacles beside the band.
     beside_m = max(config.inflation_radius_m, config.robot_radius_m)
-    margin = math.ceil((_BAND_M + beside_m) / resolution) + 1
-    first = np.array([(around.row, around.col) for around, _ in access])
-    last = first + [around.lengths_m.shape for around, _ in access]
-    low = np.maximum(np.minimum(at.min(axis=0) - margin, first.min(axis=0)), 0)
-    high = np.minimum(np.maximum(at.max(axis=0) + margin + 1, last.max(axis=0)), patch.shape)
+    margin = math.ceil((_ACCESS_M + beside_m) / resolution) + 1
+    low = np.maximum(at.min(axis=0) - margin, 0)
+    high = np.minimum(at.max(axis=0) + margin + 1, patch.shape)
     part = patch.part((*low.tolist(), *high.tolist()))
     cells = np.zeros(part.shape, dtype=np.bool_)
     _paint_discs(cells, at - low, _BAND_M / resolution)
-    for around, length_m in access:
-        rows, cols = around.lengths_m.shape
-        row = around.row - int(low[0])
-        col = around.col - int(low[1])
-        cells[row : row + rows, col : col + cols] |= around.lengths_m <= length_m
+    for end in patch.frame.cells_of(ends) - low:
+        _paint_discs(cells, end[None], _ACCESS_M / resolution)
     return Band(part, cells)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridFrame
-from thinmap_ros.core.planning.grid_search import MAX_WEIGHT, weighted_distance_field_from
+from thinmap_ros.core.planning.grid_search import MAX_WEIGHT, distance_field_from, values_at
 from thinmap_ros.core.planning.obstacles import RecentPath
 from thinmap_ros.core.planning.path_follower import SpeedConfig
 from thinmap_ros.core.planning.wavefront import (
@@ -101,7 +101,7 @@ class TravelTimes:
             np.abs(se2.wrap(begins - self._pose[2])) / self._controller.max_angular_speed_rad_s
         )
         stop_s = self.speed_m_s / self._controller.max_acceleration_m_s2
-        return Arrivals(self._at(self.seconds, cells) + turns_s + stop_s, headings)
+        return Arrivals(values_at(self.seconds, cells) + turns_s + stop_s, headings)
 
     def seconds_to(self, goals: Array) -> Array:
         """Time (N,), s, to goals (N, 3) from where the robot is, turns and stop included."""
@@ -114,7 +114,7 @@ class TravelTimes:
         Where the map shows no path, that of a straight line: the other one may have one.
         """
         field = self._search(self._weights_from(T_map_base), T_map_base)
-        found = self._at(field, self.frame.cells_of(goals[:, :2]))
+        found = values_at(field, self.frame.cells_of(goals[:, :2]))
         straight_s = np.hypot(*(goals[:, :2] - T_map_base[:2]).T) / self.speed_m_s
         return np.asarray(np.where(np.isfinite(found), np.maximum(found, straight_s), straight_s))
 
@@ -134,7 +134,7 @@ class TravelTimes:
         return weights
 
     def _search(self, weights: NDArray[np.uint8], T_map_base: Array) -> Array32:
-        lengths = weighted_distance_field_from(weights, self._cell_of(T_map_base))
+        lengths = distance_field_from(weights, self._cell_of(T_map_base))
         # Half the memory; the order of lengths is that of whole numbers of steps.
         return (lengths * (self.frame.resolution / self.speed_m_s)).astype(np.float32)
 
@@ -145,14 +145,6 @@ class TravelTimes:
     def _holds(self, cell: tuple[int, int]) -> bool:
         rows, cols = self._weights.shape
         return bool(0 <= cell[0] < rows and 0 <= cell[1] < cols)
-
-    def _at(self, field: Array32, cells: Cells) -> Array:
-        """Values (N,) of a field (H, W) at cells (N, 2); inf outside."""
-        rows, cols = cells.T
-        inside = (rows >= 0) & (rows < field.shape[0]) & (cols >= 0) & (cols < field.shape[1])
-        found = np.full(len(cells), np.inf)
-        found[inside] = field[rows[inside], cols[inside]]
-        return found
 
 
 @kernel

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter, robot_radius
-from thinmap_ros.core.grid.fields import nearest_true
+from thinmap_ros.core.grid.fields import nearest_true, reachable
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.grid_search import disc, reachable_cells
+from thinmap_ros.core.planning.grid_search import disc
 from thinmap_ros.core.se2 import Array, Cell, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import column_distance, known_free
@@ -153,7 +153,7 @@ def find_path(
     if band is not None:
         cost[~band] = np.inf
     goal = nearest_true(
-        reachable_cells(np.isfinite(cost), start),
+        reachable(np.isfinite(cost), np.array([start])),
         wished,
         config.goal_search_radius_m / patch.frame.resolution,
     )

@@ -253,11 +253,11 @@ def coverage(
     whole: with at least one node.
     """
     radius = config.robot_radius_m / patch.frame.resolution
-    room = known_free(patch, config) & standing_room(column_distance(~patch.occupied), radius)
+    room = known_free(patch, config) & standing_room(~patch.occupied, radius)
     cells = _some_of(
         _touched(room, standing), max(round(_SPLIT_STEP_M / patch.frame.resolution), 1) ** 2
     )
-    beyond = standing_room(column_distance(~standing), radius)[cells[:, 0], cells[:, 1]]
+    beyond = standing_room(~standing, radius)[cells[:, 0], cells[:, 1]]
     kept = whole.copy()
     drop_rays(kept, patch)
     parts = [(edge.path, edge.id in kept.edges) for edge in whole.edges.values()]

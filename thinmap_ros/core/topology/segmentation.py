@@ -31,7 +31,6 @@ from thinmap_ros.core.topology.regions import Door, Region, RegionKind, RegionMa
 from thinmap_ros.core.topology.thinning import (
     UNKNOWN_END,
     VIEW_M,
-    column_distance,
     end_of_view,
     standing_room,
     view_ends,
@@ -411,9 +410,9 @@ def room_space(patch: GridPatch, config: RegionConfig) -> Mask:
     free = patch.free | _furniture(patch, config.max_furniture_m / patch.frame.resolution)
     free &= ~behind_glass(patch)
     # Squared distances are whole numbers: this is the next one above the radius.
-    standing = standing_room(column_distance(free), math.sqrt(math.floor(radius**2) + 1))
+    standing = standing_room(free, math.sqrt(math.floor(radius**2) + 1))
     margin = math.ceil(radius)  # nobody stands in the cells outside
-    apart = column_distance(np.pad(~standing, margin, constant_values=True))
+    apart = np.pad(~standing, margin, constant_values=True)
     return ~standing_room(apart, radius)[margin:-margin, margin:-margin]
 
 
@@ -452,11 +451,11 @@ def behind_glass(patch: GridPatch) -> Mask:
     reach = VIEW_M / resolution
     ends = view_ends(replace(patch))  # whose masks go with it: the map may be large
     side = int(reach) + 2
-    near = ndimage.binary_dilation(_any_in_squares(ends == UNKNOWN_END, side), _SQUARE)
+    near = ndimage.binary_dilation(any_in_squares(ends == UNKNOWN_END, side), _SQUARE)
     return _sees_unknown(patch.free, ends, near, stride, reach)
 
 
-def _any_in_squares(cells: Mask, side: int) -> Mask:
+def any_in_squares(cells: Mask, side: int) -> Mask:
     """Which squares of so many cells hold a true one of a mask (H, W)."""
     rows, cols = (np.arange(0, size, side) for size in cells.shape)
     return np.logical_or.reduceat(np.logical_or.reduceat(cells, rows, axis=0), cols, axis=1)

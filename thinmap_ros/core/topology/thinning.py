@@ -9,12 +9,17 @@ from numpy.typing import NDArray
 from thinmap_ros.core.config import MAX_ROBOT_RADIUS_M
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.fields import label, looked_up, nearest_true, reachable
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.jit import inlined, kernel
 
 FAR = 1 << 14  # rows; "nothing in this column"
+
+# States of cells.
+UNKNOWN = 0
+FREE = 1
+OCCUPIED = 2
 
 VIEW_M = 3.0  # beyond, whatever ends a view is no part of the place
 _DEPTH_M = 0.25  # less of the unknown is specks between beams, and the fringe before walls
@@ -44,7 +49,7 @@ def select_free_space(
     stated above. Raises InputError where the seed is not finite.
     """
     radius = config.robot_radius_m / patch.frame.resolution
-    standing = standing_room(column_distance(known_free(patch, config)), radius)
+    standing = standing_room(known_free(patch, config), radius)
     if seed_xy is None:
         return without_specks(standing, math.pi * radius**2)
     places = np.atleast_2d(seed_xy)
@@ -71,20 +76,31 @@ def beyond_radius(config: TopologyConfig, resolution: float) -> TopologyConfig:
 
 
 def known_free(patch: GridPatch, config: TopologyConfig) -> Mask:
-    """Free cells (H, W), with unknown gaps up to gap_m between them closed; not to be changed."""
-    gap = int(config.max_unknown_gap_m / patch.frame.resolution + 1e-6)
-    if gap == 0:
-        return patch.free
-    return _close_gaps(patch.free.astype(np.uint8) + 2 * patch.unknown.astype(np.uint8), gap)
+    """Free cells (H, W), with unknown gaps up to max_unknown_gap_m between them closed."""
+    return close_gaps(states_of(patch.cells), gap_cells(config, patch.frame.resolution))
 
 
-def standing_room(distance: NDArray[np.int16], radius_cells: float) -> Mask:
-    """Cells whose centre is at least radius_cells from the centre of each cell that is not free.
+def states_of(percent: NDArray[np.int8]) -> NDArray[np.uint8]:
+    """State of each cell (H, W) of a map."""
+    is_free = (percent >= 0) & (percent <= FREE_AT_MOST)
+    return np.uint8(FREE) * is_free + np.uint8(OCCUPIED) * (percent >= OCCUPIED_AT_LEAST)
+
+
+def gap_cells(config: TopologyConfig, resolution: float) -> int:
+    """Longest unknown gap between free cells that counts as free, in cells."""
+    return int(config.max_unknown_gap_m / resolution + 1e-6)
+
+
+def standing_room(free: Mask, radius_cells: float) -> Mask:
+    """Cells (H, W) whose centre is at least radius_cells from that of each that is not free.
 
     Cells outside are not free.
-
-    distance (H, W): from `column_distance`.
     """
+    return room_of_columns(column_distance(free), radius_cells)
+
+
+def room_of_columns(distance: NDArray[np.int16], radius_cells: float) -> Mask:
+    """As `standing_room`, from the `column_distance` (H, W) of the free cells."""
     reach = math.ceil(radius_cells - 1e-9) - 1
     offsets = np.arange(-reach, reach + 1)
     # In a column dx away, anything nearer than this many rows is too near.
@@ -122,12 +138,12 @@ def view_ends(patch: GridPatch) -> NDArray[np.uint8]:
     only where they are deep.
     """
     depth = _DEPTH_M / 2.0 / patch.frame.resolution
-    core = standing_room(column_distance(patch.unknown), depth)
-    deep = patch.unknown & ~standing_room(column_distance(~core), depth)
+    core = standing_room(patch.unknown, depth)
+    deep = patch.unknown & ~standing_room(~core, depth)
     beside = _BESIDE_M / patch.frame.resolution
     margin = math.ceil(beside)  # cells outside are no walls
     no_wall = np.pad(~patch.occupied, margin, constant_values=True)
-    apart = standing_room(column_distance(no_wall), beside)[margin:-margin, margin:-margin]
+    apart = standing_room(no_wall, beside)[margin:-margin, margin:-margin]
     walls = patch.occupied | (patch.unknown & ~apart)
     return np.where(walls, np.uint8(_WALL), UNKNOWN_END * deep.astype(np.uint8))
 
@@ -168,23 +184,23 @@ def end_of_view(ends: NDArray[np.uint8], row: int, col: int, reach: float, angle
 
 
 @kernel
-def _close_gaps(states: NDArray[np.uint8], gap: int) -> Mask:
-    """Free cells (1), and runs of unknown cells (2) up to `gap` long that lie between free ones."""
+def close_gaps(states: NDArray[np.uint8], gap: int) -> Mask:
+    """Free cells (H, W), and runs of unknown cells up to `gap` long that lie between free ones."""
     rows, cols = states.shape
-    free: Mask = states == 1
+    free: Mask = states == FREE
     last_free = np.full(cols, -1, dtype=np.int64)
     for row in range(rows):
         left = -1
         for col in range(cols):
             state = states[row, col]
-            if state == 1:
+            if state == FREE:
                 if left >= 0 and 1 < col - left <= gap + 1:
                     free[row, left + 1 : col] = True
                 if last_free[col] >= 0 and 1 < row - last_free[col] <= gap + 1:
                     free[last_free[col] + 1 : row, col] = True
                 left = col
                 last_free[col] = row
-            elif state == 0:
+            elif state == OCCUPIED:
                 left = -1
                 last_free[col] = -1
     return free

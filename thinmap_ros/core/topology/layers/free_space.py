@@ -1,39 +1,37 @@
 """Free space of the whole map, kept up to date from the cells that change."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.grid.patch import (
-    FREE_AT_MOST,
-    OCCUPIED_AT_LEAST,
-    GridPatch,
-)
-from thinmap_ros.core.grid.tiles import TILE
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Cells, Mask
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.layers.deletion_times import skeleton_cells
 from thinmap_ros.core.topology.layers.lattice import (
     COLS,
-    FREE,
-    OCCUPIED,
     ROWS,
-    UNKNOWN,
     Lattice,
     LatticeStore,
     cell_at,
-    cell_of,
     col_of,
     moved,
+    read_cells,
+    replace_cells,
     row_of,
-    tiles_around,
+    rows_and_cols,
 )
 from thinmap_ros.core.topology.thinning import (
+    UNKNOWN,
+    close_gaps,
     column_distance,
     deletion_times,
-    known_free,
-    standing_room,
+    gap_cells,
+    room_of_columns,
+    states_of,
 )
 from thinmap_ros.jit import inlined, kernel
 
@@ -51,9 +49,8 @@ class FreeSpace:
     """
 
     def __init__(self, config: TopologyConfig, resolution_m: float) -> None:
-        self._config = config
         self._radius = config.robot_radius_m / resolution_m
-        self._gap = int(config.max_unknown_gap_m / resolution_m + 1e-6)
+        self._gap = gap_cells(config, resolution_m)
         self._reach = max(math.ceil(self._radius), 2 * self._gap) + 2
         self._store = LatticeStore(self._reach)
 
@@ -80,16 +77,15 @@ class FreeSpace:
         The layer is empty before. free (H, W): traversable cells; None: all where the robot fits.
         lines (H, W): cells that are thinned instead of these. Returns the cells of the skeleton.
         """
-        known = known_free(patch, self._config)
+        states = states_of(patch.cells)
+        known = close_gaps(states, self._gap)
         columns = column_distance(known)
-        fits = standing_room(columns, self._radius) if free is None else free
-        occupied = patch.cells >= OCCUPIED_AT_LEAST
-        state = np.uint8(FREE) * patch.free + np.uint8(OCCUPIED) * occupied
+        fits = room_of_columns(columns, self._radius) if free is None else free
         self._store.add(row, col, patch.cells >= 0)
-        fields = {'state': state, 'known': known, 'free': fits, 'column': columns}
+        fields = {'state': states, 'known': known, 'free': fits, 'column': columns}
         for name, values in fields.items():
             self._store.put(name, values, row, col)
-        del occupied, state, columns, fields  # the map may be large
+        del states, columns, fields  # the map may be large
         times = deletion_times(fits if lines is None else lines)
         self._store.put('time', times, row, col)
         return skeleton_cells(self.lattice, times, row, col)
@@ -105,90 +101,44 @@ class FreeSpace:
         """
         self._store.add(row, col, percent >= 0)
         lattice = self.lattice
-        # Views, and maps that are read-only, would compile further variants of the kernel.
-        changed = _set_states(lattice, percent.copy(), row, col)
-        known = _close_gaps(lattice, changed, self._gap)
+        states = states_of(percent)
+        changed = replace_cells(lattice, lattice.cells['state'], row, col, states)
+        known = self._update_around(
+            changed, self._gap, 'known', 'state', lambda states: close_gaps(states, self._gap)
+        )
         _update_columns(lattice, known)
-        reach = math.ceil(self._radius)
-        tiles = tiles_around(lattice, known, reach)
-        room = standing_room(_columns_of(lattice, tiles, reach), self._radius)[:, reach:]
-        # Of no tile the view is contiguous, and would compile a second variant of the kernel.
-        return changed, _set_free(lattice, tiles, np.ascontiguousarray(room[:, :TILE]))
+        flipped = self._update_around(
+            known,
+            math.ceil(self._radius),
+            'free',
+            'column',
+            lambda columns: room_of_columns(columns, self._radius),
+        )
+        return changed, flipped
 
+    def _update_around(
+        self,
+        changed: Cells,
+        reach: int,
+        field: str,
+        source: str,
+        rule: Callable[[NDArray[Any]], Mask],
+    ) -> Cells:
+        """Update a field by a rule where some cells of its source changed; returns what changed.
 
-@inlined
-def _state_of(percent: int) -> int:
-    if percent < 0:
-        return UNKNOWN
-    if percent <= FREE_AT_MOST:
-        return FREE
-    return OCCUPIED if percent >= OCCUPIED_AT_LEAST else UNKNOWN
-
-
-@kernel
-def _set_states(lattice: Lattice, percent: NDArray[np.int8], row: int, col: int) -> Cells:
-    """Set the states of cells (H, W), the first at (row, col); returns the cells that changed."""
-    changed = np.empty(percent.size, dtype=np.int64)
-    count = 0
-    for i in range(percent.shape[0]):
-        at = 0
-        for j in range(percent.shape[1]):
-            if j == 0 or (col + j) % TILE == 0:
-                at = cell_at(lattice, row + i, col + j)
-            elif at > 0:
-                at += 1
-            state = _state_of(percent[i, j])
-            if at > 0 and lattice.cells[at]['state'] != state:
-                lattice.cells[at]['state'] = state
-                changed[count] = at
-                count += 1
-    return changed[:count].copy()
-
-
-@inlined
-def _is_gap(lattice: Lattice, at: int, rows: int, cols: int, longest: int) -> bool:
-    """Whether an unknown cell is in a run of at most `longest` between two free cells."""
-    length = 1
-    for sign in (-1, 1):
-        to = moved(lattice, at, sign * rows, sign * cols)
-        while lattice.cells[to]['state'] == UNKNOWN and length <= longest:
-            to = moved(lattice, to, sign * rows, sign * cols)
-            length += 1
-        if lattice.cells[to]['state'] != FREE:
-            return False
-    return length <= longest
-
-
-@kernel
-def _close_gaps(lattice: Lattice, changed: Cells, gap: int) -> Cells:
-    """Update the known cells near changed cells; returns those that changed."""
-    found = np.empty(changed.size * (4 * gap + 1), dtype=np.int64)
-    count = 0
-    for at in changed:
-        count = _close_gap(lattice, at, gap, found, count)
-        for k in range(0, 8, 2):
-            to = moved(lattice, at, ROWS[k], COLS[k])
-            length = 1
-            # Only the run of unknown cells that ends here may have become a gap, or ceased to be.
-            while length <= gap and lattice.cells[to]['state'] == UNKNOWN:
-                count = _close_gap(lattice, to, gap, found, count)
-                to = moved(lattice, to, ROWS[k], COLS[k])
-                length += 1
-    return found[:count].copy()
-
-
-@inlined
-def _close_gap(lattice: Lattice, at: int, gap: int, found: Cells, count: int) -> int:
-    """Update whether a cell is known; if that changes it, it is appended to `found`."""
-    state = lattice.cells[at]['state']
-    is_known = state == FREE
-    if state == UNKNOWN and gap > 0:
-        is_known = _is_gap(lattice, at, 0, 1, gap) or _is_gap(lattice, at, 1, 0, gap)
-    if is_known != lattice.cells[at]['known']:
-        lattice.cells[at]['known'] = is_known
-        found[count] = at
-        count += 1
-    return count
+        reach: rows and columns, up to which the rule asks for cells of the source.
+        """
+        if not changed.size:
+            return changed
+        lattice = self.lattice
+        places = rows_and_cols(lattice, changed)
+        row, col = (places.min(axis=0) - 2 * reach).tolist()
+        rows, cols = (np.ptp(places, axis=0) + 1 + 4 * reach).tolist()
+        found = rule(read_cells(lattice, lattice.cells[source], row, col, (rows, cols)))
+        inner = np.ascontiguousarray(found[reach : rows - reach, reach : cols - reach])
+        return replace_cells(
+            lattice, lattice.cells[field], row + reach, col + reach, inner.view(np.uint8)
+        )
 
 
 @kernel
@@ -222,38 +172,6 @@ def _update_columns(lattice: Lattice, changed: Cells) -> None:
         for k in range(1 - above, below):
             cells[to]['column'] = min(k + above, below - k)
             to = moved(lattice, to, 1, 0)
-
-
-@kernel
-def _columns_of(lattice: Lattice, tiles: Cells, margin: int) -> NDArray[np.int16]:
-    """Distances along columns (N * TILE, TILE + 2 * margin) in tiles, and on both sides."""
-    columns = np.empty((tiles.size * TILE, TILE + 2 * margin), dtype=np.int16)
-    for i in range(len(columns)):
-        tile = lattice.tiles[tiles[i // TILE]]
-        row = tile[0] * TILE + i % TILE
-        at = 0
-        for j in range(-margin, TILE + margin):
-            if j == -margin or j % TILE == 0:
-                at = cell_at(lattice, row, tile[1] * TILE + j)
-            elif at > 0:
-                at += 1
-            columns[i, j + margin] = lattice.cells[at]['column']
-    return columns
-
-
-@kernel
-def _set_free(lattice: Lattice, tiles: Cells, room: Mask) -> Cells:
-    """Set which cells (N * TILE, TILE) of tiles are traversable; returns those that changed."""
-    flipped = np.empty(room.size, dtype=np.int64)
-    count = 0
-    for i in range(len(room)):
-        first = cell_of(tiles[i // TILE], i % TILE)
-        for j in range(TILE):
-            if lattice.cells[first + j]['free'] != room[i, j]:
-                lattice.cells[first + j]['free'] = room[i, j]
-                flipped[count] = first + j
-                count += 1
-    return flipped[:count].copy()
 
 
 @inlined

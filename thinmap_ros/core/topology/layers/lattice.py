@@ -14,12 +14,9 @@ from thinmap_ros.core.grid.tiles import MAX_TILES, NO_TILE, TILE, TileStore
 from thinmap_ros.core.se2 import Cells, Mask
 from thinmap_ros.jit import inlined, kernel
 
-UNKNOWN = 0
-FREE = 1
-OCCUPIED = 2
 CELL = np.dtype(
     [
-        ('state', np.uint8),  # UNKNOWN, FREE or OCCUPIED
+        ('state', np.uint8),  # UNKNOWN, FREE or OCCUPIED, see thinning.py
         ('known', np.uint8),  # free, or an unknown gap between free cells
         ('free', np.uint8),  # traversable: the robot's centre may be here
         ('kept', np.uint8),  # belongs to the skeleton
@@ -234,6 +231,47 @@ def hash_of(lattice: Lattice, at: int) -> int:
 def cell_of(slot: int, row: int) -> int:
     """Index of the first cell in a row of the tile in a slot."""
     return (slot << (2 * _BITS)) + (row << _BITS)
+
+
+@kernel
+def read_cells(
+    lattice: Lattice, field: NDArray[Any], row: int, col: int, shape: tuple[int, int]
+) -> NDArray[Any]:
+    """Copy of a field (N,) of the cells in a rectangle (H, W), the first at (row, col)."""
+    values = np.empty(shape, dtype=field.dtype)
+    for i in range(shape[0]):
+        at = 0
+        for j in range(shape[1]):
+            if j == 0 or (col + j) % TILE == 0:
+                at = cell_at(lattice, row + i, col + j)
+            elif at > 0:
+                at += 1
+            values[i, j] = field[at]
+    return values
+
+
+@kernel
+def replace_cells(
+    lattice: Lattice, field: NDArray[Any], row: int, col: int, values: NDArray[Any]
+) -> Cells:
+    """Set a field (N,) of those of the cells (H, W) from (row, col) on that exist.
+
+    Returns the cells that changed.
+    """
+    changed = np.empty(values.size, dtype=np.int64)
+    count = 0
+    for i in range(values.shape[0]):
+        at = 0
+        for j in range(values.shape[1]):
+            if j == 0 or (col + j) % TILE == 0:
+                at = cell_at(lattice, row + i, col + j)
+            elif at > 0:
+                at += 1
+            if at > 0 and field[at] != values[i, j]:
+                field[at] = values[i, j]
+                changed[count] = at
+                count += 1
+    return changed[:count].copy()
 
 
 @kernel
