@@ -197,13 +197,6 @@ def angle_warning(
     )
 
 
-def require_lengths(what: str, lengths: Iterable[float]) -> None:
-    """Raise InputError unless all lengths (m) are from 0 to se2.MAX_COORDINATE_M."""
-    for length in lengths:
-        if not 0.0 <= length <= se2.MAX_COORDINATE_M:
-            raise InputError(f'{what}: {length} m: expected 0 to {se2.MAX_COORDINATE_M:g} m')
-
-
 def quoted_name(text: str) -> str:
     """Shorten a topic, type or frame of a file for an error message.
 

@@ -49,15 +49,20 @@ def validate(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]
 
     Raises InputError if a name is missing or unknown, or an array does not fit its field.
     """
-    for name in state:
+    return validate_arrays(state, fields, f'saved {what}')
+
+
+def validate_arrays(arrays: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:
+    """As `validate`, for arrays that are not those of a saved state."""
+    for name in arrays:
         if name not in fields:
-            raise InputError(f'saved {what}: {quoted(name)}: expected {", ".join(fields)} only')
+            raise InputError(f'{what}: {quoted(name)}: expected {", ".join(fields)} only')
     sizes: dict[str, int] = {}
     checked = {}
     for name, field in fields.items():
-        if name not in state:
-            raise InputError(f'saved {what}: no {name}: expected {", ".join(fields)}')
-        checked[name] = _checked(np.asarray(state[name]), field, sizes, f'saved {what}: {name}')
+        if name not in arrays:
+            raise InputError(f'{what}: no {name}: expected {", ".join(fields)}')
+        checked[name] = _checked(np.asarray(arrays[name]), field, sizes, f'{what}: {name}')
     return checked
 
 
@@ -152,8 +157,9 @@ def _fits(size: int, declared: int | str, sizes: dict[str, int]) -> bool:
 
 
 def _check_range(array: NDArray[Any], field: Field, what: str) -> None:
-    # Written so that NaN, which is in no range, is rejected as well.
-    wrong = ~((array >= np.asarray(field.low)) & (array <= np.asarray(field.high)))
+    # Written so that NaN, which is in no range, is rejected as well; a signalling one would warn.
+    with np.errstate(invalid='ignore'):
+        wrong = ~((array >= np.asarray(field.low)) & (array <= np.asarray(field.high)))
     if field.nan:
         wrong &= ~np.isnan(array)
     if not wrong.any():

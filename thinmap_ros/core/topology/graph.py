@@ -1,43 +1,27 @@
 """The topological map as values: nodes, edges, and the same as arrays."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import errors
+from thinmap_ros.core import errors, snapshot
 from thinmap_ros.core.config import Config, parameter, robot_radius
-from thinmap_ros.core.errors import InputError, one_line_reason, place_of
+from thinmap_ros.core.errors import InputError, one_line_reason, place_of, quoted
 from thinmap_ros.core.grid.fields import SpatialHash
-from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, Mask
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
+from thinmap_ros.core.snapshot import Field
+
+Flat = dict[str, NDArray[Any]]
 
 # Nodes are listed by squares, in which one is looked for up to so far away.
 _BUCKET_M = 4.0
 _FAR_M = 60.0
 
-# Arrays of thinmap_msgs/TopologicalMap.
-FIELDS = {
-    'node_ids': np.uint32,
-    'node_kinds': np.uint8,
-    'node_xy': np.float64,
-    'node_clearance_m': np.float32,
-    'edge_ids': np.uint32,
-    'edge_nodes': np.uint32,
-    'edge_length_m': np.float32,
-    'edge_clearance_m': np.float32,
-    'edge_first': np.uint32,
-    'edge_xy': np.float32,
-}
-# Ids of bags of 0.3.0 and before have 64 bits.
-_READ = {'node_ids': np.uint64, 'edge_ids': np.uint64}
-_PAIRS = ('node_xy', 'edge_nodes')
-_POINTS = 'edge_xy'
 MAX_ID = 2**32 - 1  # of ids in other messages (EndNode, Region), and in Nav2's route graphs
-
-Flat = dict[str, NDArray[Any]]
 
 
 class NodeKind(IntEnum):
@@ -243,6 +227,23 @@ class TopologicalMap:
         return sorted(parts, key=len, reverse=True)
 
 
+# Arrays of thinmap_msgs/TopologicalMap: of nodes, of edges, and of the points of all paths.
+FIELDS = {
+    'node_ids': Field(np.uint32, ('n',), 1, MAX_ID),
+    'node_kinds': Field(np.uint8, ('n',), 0, len(NodeKind) - 1),
+    'node_xy': Field(np.float64, ('2n',), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+    'node_clearance_m': Field(np.float32, ('n',), 0.0, MAX_COORDINATE_M),
+    'edge_ids': Field(np.uint32, ('e',), 1, MAX_ID),
+    'edge_nodes': Field(np.uint32, ('2e',)),
+    'edge_length_m': Field(np.float32, ('e',), 0.0, MAX_COORDINATE_M),
+    'edge_clearance_m': Field(np.float32, ('e',), 0.0, MAX_COORDINATE_M),
+    'edge_first': Field(np.uint32, ('e',)),
+    'edge_xy': Field(np.float32, ('2p',), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+}
+# Ids of bags of 0.3.0 and before have 64 bits.
+_READ = FIELDS | {name: replace(FIELDS[name], dtype=np.uint64) for name in ('node_ids', 'edge_ids')}
+
+
 def flat_topology(topology: TopologicalMap) -> Flat:
     """Arrays of a topological map by field of thinmap_msgs/TopologicalMap."""
     nodes = list(topology.nodes.values())
@@ -261,7 +262,7 @@ def flat_topology(topology: TopologicalMap) -> Flat:
         'edge_first': np.cumsum(sizes) - sizes,
         'edge_xy': np.concatenate([edge.path for edge in edges]) if edges else (),
     }
-    return {name: np.asarray(values[name], dtype).ravel() for name, dtype in FIELDS.items()}
+    return {name: np.asarray(values[name], field.dtype).ravel() for name, field in FIELDS.items()}
 
 
 def topology_from_msg(message: Any) -> TopologicalMap:
@@ -273,38 +274,41 @@ def topology_from_msg(message: Any) -> TopologicalMap:
     out of range or occurs twice, a kind is unknown, an edge has no path or no node, a number is not
     finite, or a length is negative.
     """
-    flat = _arrays(message)
-    _check_sizes(flat)
-    _check_nodes(flat)
-    _check_edges(flat)
-    return TopologicalMap(_nodes(flat), _edges(flat))
-
-
-def _nodes(flat: Flat) -> list[Node]:
-    names = ('node_ids', 'node_kinds', 'node_xy', 'node_clearance_m')
-    columns = (flat[name].tolist() for name in names)
-    rows = zip(*columns, strict=True)
-    return [
-        Node(number, NodeKind(kind), x, y, clearance) for number, kind, (x, y), clearance in rows
-    ]
-
-
-def _edges(flat: Flat) -> list[Edge]:
-    ids, lengths, clearances = (
-        flat[name].tolist() for name in ('edge_ids', 'edge_length_m', 'edge_clearance_m')
+    flat = snapshot.validate_arrays(_arrays(message), _READ, 'topological map')
+    node_ids = flat['node_ids'].tolist()
+    edge_ids = flat['edge_ids'].tolist()
+    errors.require_unique('nodes', node_ids)
+    errors.require_unique('edges', edge_ids)
+    nodes = zip(
+        node_ids,
+        flat['node_kinds'].tolist(),
+        flat['node_xy'].reshape(-1, 2).tolist(),
+        flat['node_clearance_m'].tolist(),
+        strict=True,
     )
-    ends = flat['node_ids'][flat['edge_nodes']].tolist()
-    paths = np.split(flat['edge_xy'].astype(np.float64), flat['edge_first'][1:])[: len(ids)]
-    rows = zip(ids, ends, paths, lengths, clearances, strict=True)
-    return [Edge(number, a, b, path, length, room) for number, (a, b), path, length, room in rows]
+    edges = zip(
+        edge_ids,
+        _ends_of(flat),
+        _paths_of(flat),
+        flat['edge_length_m'].tolist(),
+        flat['edge_clearance_m'].tolist(),
+        strict=True,
+    )
+    return TopologicalMap(
+        [Node(number, NodeKind(kind), x, y, room) for number, kind, (x, y), room in nodes],
+        [
+            Edge(number, node_ids[a], node_ids[b], path, length, room)
+            for number, (a, b), path, length, room in edges
+        ],
+    )
 
 
 def _arrays(message: Any) -> Flat:
     """Arrays of a message by field. Raises InputError where it is of another layout."""
     try:
         return {
-            name: np.asarray(getattr(message, name), _READ.get(name, dtype)).ravel()
-            for name, dtype in FIELDS.items()
+            name: np.asarray(getattr(message, name), field.dtype).ravel()
+            for name, field in _READ.items()
         }
     except AttributeError as error:
         raise InputError(
@@ -317,87 +321,30 @@ def _arrays(message: Any) -> Flat:
         ) from error
 
 
-def _check_sizes(flat: Flat) -> None:
-    """Raise InputError unless the sizes of all arrays fit; then make pairs of what are pairs."""
-    for name, values in flat.items():
-        owner = name.partition('_')[0]
-        count = flat[f'{owner}_ids'].size
-        expected = 2 * count if name in _PAIRS else count
-        if values.size != expected and name != _POINTS:
-            raise InputError(
-                f'{name}: {values.size} values for {count} {owner}s: expected {expected}'
-            )
-    if flat[_POINTS].size % 2:
-        raise InputError(f'{_POINTS}: {flat[_POINTS].size} values: expected x, y of each point')
-    for name in (*_PAIRS, _POINTS):
-        flat[name] = flat[name].reshape(-1, 2)
-
-
-def _check_nodes(flat: Flat) -> None:
-    ids = _checked_ids('node', flat['node_ids'])
-    kinds, places, clearances = (flat[f'node_{name}'] for name in ('kinds', 'xy', 'clearance_m'))
-    known = [int(kind) for kind in NodeKind]
-    for i in _first(~np.isin(kinds, known)):
-        raise InputError(f'node {ids[i]}: kind {kinds[i]}: expected one of {known}')
-    for i in _first(_is_unbounded(places)):
-        errors.require_bounded(f'node {ids[i]}', places[i].tolist())
-    for i in _first(_is_no_length(clearances)):
-        errors.require_lengths(f'node {ids[i]}: clearance', clearances[[i]].tolist())
-
-
-def _check_edges(flat: Flat) -> None:
-    ids = _checked_ids('edge', flat['edge_ids'])
+def _ends_of(flat: Flat) -> list[list[int]]:
+    """Indices of the two nodes of each edge."""
+    ends = flat['edge_nodes'].reshape(-1, 2)
     count = flat['node_ids'].size
-    for i in _first(np.any(flat['edge_nodes'] >= count, axis=1)):
-        a, b = flat['edge_nodes'][i].tolist()
+    for edge in np.flatnonzero(np.any(ends >= count, axis=1)).tolist():
+        a, b = ends[edge].tolist()
         raise InputError(
-            f'edge {ids[i]} from node {a} to {b} of {count}, counted from 0: expected nodes of '
-            'this map'
+            f'edge {flat["edge_ids"][edge]} from node {a} to {b} of {count}, counted from 0: '
+            'expected nodes of this map'
         )
-    _check_paths(ids, flat['edge_first'].astype(np.int64), flat[_POINTS])
-    lengths = np.column_stack([flat['edge_length_m'], flat['edge_clearance_m']])
-    for i in _first(np.any(_is_no_length(lengths), axis=1)):
-        errors.require_lengths(f'edge {ids[i]}: length, clearance', lengths[i].tolist())
+    return ends.tolist()
 
 
-def _check_paths(ids: list[int], begins: NDArray[np.int64], points: NDArray[np.float32]) -> None:
-    """Raise InputError unless each edge has some of the points (K, 2), and each point an edge."""
-    if not ids and len(points):
-        raise InputError(f'{_POINTS}: {len(points)} points for 0 edges: expected none')
-    if ids and begins[0] != 0:
-        raise InputError(f'edge_first: {begins[0]} of edge {ids[0]}, the first one: expected 0')
-    ends = np.append(begins[1:], len(points))
-    for i in _first(ends <= begins):
+def _paths_of(flat: Flat) -> list[Array]:
+    """Path (K, 2) of each edge."""
+    points = flat['edge_xy'].astype(np.float64).reshape(-1, 2)
+    first = flat['edge_first'].astype(np.int64)
+    sizes = np.diff(first, append=len(points))
+    if np.any(sizes < 1) or sizes.sum() != len(points):
         raise InputError(
-            f'edge {ids[i]}: empty path, from point {begins[i]} to before {ends[i]}: expected '
-            'points'
+            f'edge_first: {quoted(first.tolist())} of {len(points)} points: expected the first one '
+            'of each edge, and one or more for each'
         )
-    for i in _first(_is_unbounded(points)):
-        edge = int(np.searchsorted(begins, i, side='right')) - 1
-        errors.require_bounded(f'edge {ids[edge]}', points[i].tolist())
-
-
-def _checked_ids(what: str, numbers: NDArray[np.uint64]) -> list[int]:
-    """List of ids. Raises InputError where one is out of range or occurs twice."""
-    ids: list[int] = numbers.tolist()
-    for i in _first((numbers < 1) | (numbers > MAX_ID)):
-        raise InputError(f'{what} id {ids[i]}: expected 1 to {MAX_ID}')
-    errors.require_unique(f'{what}s', ids)
-    return ids
-
-
-def _is_unbounded(places: NDArray[Any]) -> Mask:
-    """For each place (K, 2) whether it is not finite or too far away."""
-    return np.asarray(np.any(~(np.abs(places) <= MAX_COORDINATE_M), axis=1))
-
-
-def _is_no_length(lengths: NDArray[Any]) -> Mask:
-    return ~((lengths >= 0.0) & (lengths <= MAX_COORDINATE_M))
-
-
-def _first(bad: Mask) -> list[int]:
-    """Index of the first one that is bad; empty where none is."""
-    return [int(index) for index in np.flatnonzero(bad)[:1]]
+    return np.split(points, first[1:])[: len(first)]
 
 
 @dataclass(frozen=True)

@@ -136,22 +136,18 @@ def _cells(tiles: Cells, packed: NDArray[np.uint8]) -> NDArray[np.int8]:
 def _map_of(checked: Mapping[str, NDArray[Any]]) -> TopologicalMap:
     nodes = checked['nodes']
     edges = checked['edges']
-    ids = np.concatenate((nodes[:, 0], edges[:, 0]))
-    snapshot.require_unique(ids, 'topology: id')
+    snapshot.require_unique(np.concatenate((nodes[:, 0], edges[:, 0])), 'topology: id')
     snapshot.require_known(edges[:, 1:].ravel(), nodes[:, 0], 'topology: node of an edge')
-    try:
-        return TopologicalMap(
-            [
-                Node(int(number), NodeKind(kind), float(x), float(y), 0.0)
-                for (number, kind), (x, y) in zip(nodes, checked['node_xy'], strict=True)
-            ],
-            [
-                Edge(int(number), int(a), int(b), middle[None], 0.0, 0.0)
-                for (number, a, b), middle in zip(edges, checked['edge_xy'], strict=True)
-            ],
-        )
-    except ValueError as error:
-        raise InputError(f'saved topology: {error}') from error
+    return TopologicalMap(
+        [
+            Node(int(number), NodeKind(kind), float(x), float(y), 0.0)
+            for (number, kind), (x, y) in zip(nodes, checked['node_xy'], strict=True)
+        ],
+        [
+            Edge(int(number), int(a), int(b), middle[None], 0.0, 0.0)
+            for (number, a, b), middle in zip(edges, checked['edge_xy'], strict=True)
+        ],
+    )
 
 
 def build(
