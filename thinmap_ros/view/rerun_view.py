@@ -1,7 +1,7 @@
 """Shows core values in rerun, live or in an .rrd file."""
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -152,6 +152,7 @@ _LOCAL = '#0072B2'  # lines and nodes of the local area
 _LINE = '#8FBEDB'
 _STAYS = '#7D7D7D'  # an end node with position probability 1
 _LABEL = '#000000'
+_NO_TEXT: Mapping[str, Any] = {}
 # Colour and radius in pixels: the estimated path is visible below the true one.
 _TRAILS = {
     'estimate': (palette.ESTIMATE, 2.4),
@@ -319,117 +320,85 @@ class View(NullView):
 
     def topology(self, ns: int, topology: TopologicalMap) -> None:
         """Show the skeleton, and the nodes coloured by kind, at most once a second."""
-        paths = [_lifted(edge.path, _Z['skeleton']) for edge in topology.edges.values()]
+        paths = [edge.path for edge in topology.edges.values()]
+        self._lines(ns, 'skeleton', paths, [palette.EDGE], [1.2])
         nodes = list(topology.nodes.values())
-        places = _lifted(np.array([node.position for node in nodes]).reshape(-1, 2), _Z['nodes'])
-        shades = [rgb(palette.NODES[node.kind]) for node in nodes]
-
-        def draw() -> None:
-            strips = self._rr.LineStrips3D(paths, colors=[rgb(palette.EDGE)], radii=[self._px(1.2)])
-            self._log('map/skeleton', strips)
-            self._log('map/nodes', self._rr.Points3D(places, colors=shades, radii=[self._px(4.0)]))
-
-        self._throttled('topology', ns, draw)
+        places = np.array([node.position for node in nodes]).reshape(-1, 2)
+        self._points(ns, 'nodes', places, [rgb(palette.NODES[node.kind]) for node in nodes], 4.0)
 
     def regions(self, ns: int, outlines: Sequence[Array], colours: Sequence[str]) -> None:
         """Show the outlines (K, 2) of regions in their colours, at most once a second."""
-
-        def draw() -> None:
-            closed = [np.concatenate([outline, outline[:1]]) for outline in outlines]
-            strips = self._rr.LineStrips3D(
-                [_lifted(outline, _Z['regions']) for outline in closed],
-                colors=[rgb(colour) for colour in colours],
-                radii=[self._px(3.0)],
-            )
-            self._log('map/regions', strips)
-
-        self._throttled('regions', ns, draw)
+        closed = [np.concatenate([outline, outline[:1]]) for outline in outlines]
+        self._lines(ns, 'regions', closed, colours, [3.0])
 
     def apart(self, ns: int, points: Array) -> None:
         """Show the scan points (N, 2) of pieces whose place is unknown, at most once a second."""
-
-        def draw() -> None:
-            lifted = _lifted(points, _Z['apart'])
-            self._log(
-                'map/apart',
-                self._rr.Points3D(lifted, colors=[rgb(palette.APART)], radii=[self._px(1.2)]),
-            )
-
-        self._throttled('apart', ns, draw)
+        self._points(ns, 'apart', points, [rgb(palette.APART)], 1.2)
 
     def end_nodes(self, ns: int, places: Array, probabilities: Array) -> None:
         """Show end nodes (N, 2) with their position probabilities (N,), at most once a second."""
-        labels = [f'{p:.2f}' for p in probabilities]
-
-        def draw() -> None:
-            lifted = _lifted(places, _Z['end_nodes'])
-            points = self._rr.Points3D(
-                lifted,
-                colors=[_faded(palette.NODES[NodeKind.END], float(p)) for p in probabilities],
-                radii=[self._px(6.0)],
-            )
-            self._log('map/end_nodes', points)
-            # Text has the colour of its point: grey cannot be read.
-            text = self._rr.Points3D(
-                lifted,
-                colors=[rgb(_LABEL)],
-                radii=[self._px(0.0)],
-                labels=labels,
-                show_labels=True,
-            )
-            self._log('map/end_nodes/probability', text)
-
-        self._throttled('end_nodes', ns, draw)
+        shades = [_faded(palette.NODES[NodeKind.END], float(p)) for p in probabilities]
+        self._points(ns, 'end_nodes', places, shades, 6.0)
+        # Text has the colour of its point: grey cannot be read.
+        text = {'labels': [f'{p:.2f}' for p in probabilities], 'show_labels': True}
+        self._points(ns, 'end_nodes/probability', places, [rgb(_LABEL)], 0.0, text)
 
     def lines(self, ns: int, segments: Array, local: NDArray[np.bool_]) -> None:
         """Show line features by their ends (N, 2, 2), at most once a second.
 
         local (N,): which are in the local area.
         """
-
-        def draw() -> None:
-            strips = [_lifted(ends, _Z['lines']) for ends in segments]
-            shades = [rgb(_LOCAL if near else _LINE) for near in local]
-            widths = [self._px(2.5 if near else 1.5) for near in local]
-            self._log('map/lines', self._rr.LineStrips3D(strips, colors=shades, radii=widths))
-
-        self._throttled('lines', ns, draw)
+        shades = [_LOCAL if near else _LINE for near in local]
+        self._lines(ns, 'lines', segments, shades, [2.5 if near else 1.5 for near in local])
 
     def local_area(self, ns: int, places: Array) -> None:
         """Show the nodes (N, 2) of the local area, at most once a second."""
-
-        def draw() -> None:
-            colour = [*rgb(_LOCAL), 90]
-            points = _lifted(places, _Z['local_area'])
-            self._log(
-                'map/local_area', self._rr.Points3D(points, colors=[colour], radii=[self._px(9.0)])
-            )
-
-        self._throttled('local_area', ns, draw)
+        self._points(ns, 'local_area', places, [[*rgb(_LOCAL), 90]], 9.0)
 
     def particles(self, ns: int, places: Array) -> None:
         """Show the particles (N, 2) of global localization, at most once a second."""
-
-        def draw() -> None:
-            points = _lifted(places, _Z['samples'])
-            self._log(
-                'map/samples',
-                self._rr.Points3D(points, colors=[rgb(_SAMPLE)], radii=[self._px(1.2)]),
-            )
-
-        self._throttled('samples', ns, draw)
+        self._points(ns, 'samples', places, [rgb(_SAMPLE)], 1.2)
 
     def plan(self, ns: int, points: Array) -> None:
         """Show the path (N, 2) that the robot follows, at most once a second."""
+        self._lines(ns, 'plan', [points] if len(points) > 1 else [], [_PLAN], [2.0])
+
+    def _points(
+        self,
+        ns: int,
+        layer: str,
+        points: Array,
+        colours: Sequence[list[int]],
+        radius_px: float,
+        text: Mapping[str, Any] = _NO_TEXT,
+    ) -> None:
+        """Show points (N, 2) at the height of their layer, at most once a second."""
+        lifted = _lifted(points, _Z[layer.partition('/')[0]])
 
         def draw() -> None:
-            strips = [_lifted(points, _Z['plan'])] if len(points) > 1 else []
-            self._log(
-                'map/plan',
-                self._rr.LineStrips3D(strips, colors=[rgb(_PLAN)], radii=[self._px(2.0)]),
-            )
+            radii = [self._px(radius_px)]
+            shown = self._rr.Points3D(lifted, colors=colours, radii=radii, **text)
+            self._log(f'map/{layer}', shown)
 
-        self._throttled('plan', ns, draw)
+        self._throttled(layer, ns, draw)
+
+    def _lines(
+        self,
+        ns: int,
+        layer: str,
+        lines: Iterable[Array],
+        colours: Sequence[str],
+        radii_px: Sequence[float],
+    ) -> None:
+        """Show lines, each (K, 2), at the height of their layer, at most once a second."""
+        lifted = [_lifted(line, _Z[layer]) for line in lines]
+
+        def draw() -> None:
+            radii = [self._px(radius) for radius in radii_px]
+            shades = [rgb(colour) for colour in colours]
+            self._log(f'map/{layer}', self._rr.LineStrips3D(lifted, colors=shades, radii=radii))
+
+        self._throttled(layer, ns, draw)
 
     def target(self, ns: int, place: Array | None) -> None:
         """Show the target (2,) of the robot, or remove it."""
