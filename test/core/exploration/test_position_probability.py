@@ -8,15 +8,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thinmap_ros.core.exploration.paper import (
-    angle_difference,
+    PaperConfig,
+    PaperEndNode,
     angle_index,
     bayes_update,
     distance_index,
-    nearest_distance,
     reliability,
 )
 
 shares = st.floats(0.05, 0.95)
+EACH_VIEW = PaperConfig(observation_distance_m=0.0, observation_angle_deg=0.0)
+
+
+def seen_from(views):
+    """End node after views from distances, m, and bearings, rad."""
+    node = PaperEndNode(1, (0.0, 0.0), (0.0, 0.0))
+    for distance, bearing in views:
+        laser = np.array([-distance * math.cos(bearing), -distance * math.sin(bearing)])
+        node.add_view(laser, EACH_VIEW)
+    return node
 
 
 @pytest.mark.parametrize(
@@ -33,9 +43,8 @@ def test_far_looks_speak_against_a_node_since_nothing_clips_the_index():
 
 @given(st.lists(st.floats(0.0, 30.0), min_size=1))
 def test_nearest_distance_is_the_smallest_so_far_and_never_below_half_a_metre(distances):
-    r = nearest_distance(np.array(distances))
-    assert r == max(0.5, min(distances))
-    assert nearest_distance(np.array([*distances, 100.0])) == r
+    node = seen_from([(distance, 0.0) for distance in [*distances, 100.0]])
+    assert node.distance_index == pytest.approx(distance_index(max(0.5, min(distances))))
 
 
 @given(st.lists(st.floats(-10.0, 10.0), min_size=1, max_size=8))
@@ -44,12 +53,15 @@ def test_angle_difference_is_the_largest_of_all_pairs(bearings):
         return abs(math.degrees(math.atan2(math.sin(a - b), math.cos(a - b))))
 
     largest = max(between(a, b) for a in bearings for b in bearings)
-    assert angle_difference(np.array(bearings)) == pytest.approx(largest, abs=1e-6)
+    found = seen_from([(2.0, bearing) for bearing in bearings]).angle_span_deg
+    assert found == pytest.approx(largest, abs=1e-6)
 
 
 def test_angle_difference_goes_the_shorter_way_round():
-    assert angle_difference(np.radians([170.0, -170.0])) == pytest.approx(20.0)
-    assert angle_difference(np.radians([10.0, 40.0, 80.0])) == pytest.approx(70.0)
+    across = seen_from([(2.0, math.radians(degrees)) for degrees in (170.0, -170.0)])
+    assert across.angle_span_deg == pytest.approx(20.0)
+    spread = seen_from([(2.0, math.radians(degrees)) for degrees in (10.0, 40.0, 80.0)])
+    assert spread.angle_span_deg == pytest.approx(70.0)
 
 
 @pytest.mark.parametrize(('span', 'index'), [(0.0, 0.0), (45.0, 0.5), (90.0, 1.0), (180.0, 1.0)])

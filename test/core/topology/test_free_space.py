@@ -8,14 +8,12 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.fields import label, reachable
+from thinmap_ros.core.grid.fields import label, reachable, squared_distance
 from thinmap_ros.core.topology.graph import TopologyConfig
 from thinmap_ros.core.topology.thinning import (
     beyond_radius,
-    column_distance,
     known_free,
     select_free_space,
-    squared_clearance,
     standing_room,
     without_islands,
 )
@@ -57,9 +55,8 @@ def test_the_largest_robot_has_no_larger_radius():
 @settings(max_examples=60)
 def test_squared_clearance_is_exact(seed):
     free = random_mask(seed)
-    cells = np.argwhere(np.ones_like(free))
-    squared = squared_clearance(column_distance(free), cells)
-    assert np.array_equal(squared, np.round(exact_distance(free) ** 2).ravel().astype(int))
+    squared = squared_distance(~free, is_rim_marked=True)
+    assert np.array_equal(squared, np.round(exact_distance(free) ** 2).astype(int))
 
 
 @given(st.integers(0, 10_000))

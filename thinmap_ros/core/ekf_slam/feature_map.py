@@ -279,23 +279,13 @@ AREA_FIELDS = {
 }
 
 
-@dataclass(frozen=True)
-class LocalAreaConfig:
-    """Which nodes make the local area.
-
-    path_m: largest path length to a node, except to the first one on each edge; beside_m: nodes
-    nearer than this are never behind the robot; list_m: radius in which nodes are listed, unless
-    none is near; near_m: tolerance within which nodes are as near as the nearest; turn_m_rad:
-    distance that costs as much as a rotation by a radian; trail_m: distance between nodes along the
-    robot's path, until a topology is set.
-    """
-
-    path_m: float = 8.0
-    beside_m: float = 2.0
-    list_m: float = 12.0
-    near_m: float = 1.0
-    turn_m_rad: float = 0.5
-    trail_m: float = 3.0
+# Of the local area: largest path length to a node, except to the first one on each edge.
+_PATH_M = 8.0
+_BESIDE_M = 2.0  # nodes nearer than this are never behind the robot
+_LIST_M = 12.0  # radius in which nodes are listed, unless none is near
+_AS_NEAR_M = 1.0  # tolerance within which nodes are as near as the nearest
+_TURN_M_RAD = 0.5  # distance that costs as much as a rotation by a radian
+_TRAIL_M = 3.0  # between nodes along the robot's path, until a topology is set
 
 
 class LocalArea:
@@ -307,10 +297,9 @@ class LocalArea:
     Source: EKF-SLAM/TI paper section 4, Fig. 6-8.
     """
 
-    def __init__(self, config: LocalAreaConfig | None = None) -> None:
-        self._config = config or LocalAreaConfig()
+    def __init__(self) -> None:
         self._topology = TopologicalMap()
-        self._trail: _Trail | None = _Trail(self._topology, self._config.trail_m)
+        self._trail: _Trail | None = _Trail(self._topology)
         self._features_at: dict[int, set[int]] = {}
         self._nodes_of: dict[int, set[int]] = {}
         # Ids and positions of the nodes that could be nearest, and the position (2,) of the robot
@@ -404,7 +393,7 @@ class LocalArea:
         found = set(self._features_at.get(here, ()))
         for node_id in self._along_edges(here):
             bearing, distance = _from_robot(T_map_base, self._topology.nodes[node_id].position)
-            if abs(bearing) <= half_view_rad or distance <= self._config.beside_m:
+            if abs(bearing) <= half_view_rad or distance <= _BESIDE_M:
                 found |= self._features_at.get(node_id, set())
         return found
 
@@ -417,7 +406,7 @@ class LocalArea:
             open_ids.remove(node_id)
             for edge in self._topology.edges_at(node_id):
                 length = lengths[node_id] + edge.length_m
-                if node_id != here and length > self._config.path_m:
+                if node_id != here and length > _PATH_M:
                     continue
                 other = edge.other(node_id)
                 if other not in lengths:
@@ -427,18 +416,18 @@ class LocalArea:
 
     def _node_at(self, T_map_base: Array) -> int | None:
         """Nearest node; among nodes about as near, the one with the smallest bearing."""
-        if math.dist(T_map_base[:2], self._listed_at) > self._config.near_m:
+        if math.dist(T_map_base[:2], self._listed_at) > _AS_NEAR_M:
             self._list_nodes(T_map_base)
         distances = np.hypot(*(self._places - T_map_base[:2]).T)
         cost = math.inf
         best = None
-        for i in np.flatnonzero(distances <= distances.min(initial=np.inf) + self._config.near_m):
+        for i in np.flatnonzero(distances <= distances.min(initial=np.inf) + _AS_NEAR_M):
             bearing, distance = _from_robot(T_map_base, self._places[i])
             if (
-                distance + self._config.turn_m_rad * abs(bearing) < cost
+                distance + _TURN_M_RAD * abs(bearing) < cost
                 and self._ids[i] in self._topology.nodes
             ):
-                cost = distance + self._config.turn_m_rad * abs(bearing)
+                cost = distance + _TURN_M_RAD * abs(bearing)
                 best = self._ids[i]
         return best
 
@@ -449,12 +438,12 @@ class LocalArea:
         """
         topology = self._topology
         (x, y) = T_map_base[:2].tolist()
-        near = topology.nodes_near(x, y, self._config.list_m)
+        near = topology.nodes_near(x, y, _LIST_M)
         # After the next metre the nearest node may be a metre farther away, and nodes about as near
         # another metre.
         nearest = min((math.hypot(n.x - x, n.y - y) for n in near), default=math.inf)
-        sure = nearest + 3.0 * self._config.near_m
-        if sure > self._config.list_m:
+        sure = nearest + 3.0 * _AS_NEAR_M
+        if sure > _LIST_M:
             near = list(topology.nodes.values())
         self._ids = [node.id for node in near]
         self._places = np.array([(n.x, n.y) for n in near]).reshape(-1, 2)
@@ -489,9 +478,8 @@ class LocalArea:
 class _Trail:
     """Places nodes along the robot's path in a topological map; returning to one reuses it."""
 
-    def __init__(self, topology: TopologicalMap, spacing_m: float) -> None:
+    def __init__(self, topology: TopologicalMap) -> None:
         self._map = topology
-        self._spacing_m = spacing_m
         self._last: int | None = None
         self._ids = count(1)
 
@@ -502,7 +490,7 @@ class _Trail:
         node = self._map.nearest_node(x, y)
         last = self._last
         known = len(self._map.nodes) + len(self._map.edges)
-        if node is None or math.dist(node.position, (x, y)) > self._spacing_m:
+        if node is None or math.dist(node.position, (x, y)) > _TRAIL_M:
             node = Node(next(self._ids), NodeKind.CORNER, x, y, 0.0)
             self._map.put_node(node)
         if last is not None and last != node.id and node.id not in self._map.neighbours(last):

@@ -25,20 +25,12 @@ from thinmap_ros.core.exploration.strategy import (
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.paths import path_lengths_to_nodes
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array, Place, wrap
+from thinmap_ros.core.se2 import Array, Place
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
 NEAR_M = 0.5
 PRIOR = 0.5
 _SUREST = 1.0 - 1e-6
-
-
-def nearest_distance(distances_m: Array) -> float:
-    """r: smallest of the distances (t,) between end node and robot so far, never less than 0.5 m.
-
-    Source: exploration paper equation (2).
-    """
-    return max(NEAR_M, float(np.min(distances_m)))
 
 
 def distance_index(r: float) -> float:
@@ -47,16 +39,6 @@ def distance_index(r: float) -> float:
     Source: exploration paper equations (1) and (2).
     """
     return 4.0 / (max(r, NEAR_M) + 3.5)
-
-
-def angle_difference(bearings_rad: Array) -> float:
-    """a_max, degrees: largest difference between any two bearings (t,) under which a node was seen.
-
-    Bearings are those of the vector from robot to node in the global frame; differences are taken
-    the shorter way round, so none is above 180 degrees.
-    Source: exploration paper equation (3).
-    """
-    return float(np.degrees(np.abs(wrap(bearings_rad[:, None] - bearings_rad[None, :])).max()))
 
 
 def angle_index(span_deg: float) -> float:
@@ -113,7 +95,8 @@ class PaperEndNode:
     """An end node of the graph with its position probability, and the evidence for it.
 
     place (x, y), m; began_at: where its evidence began; views: distance, m, and bearing, rad, of
-    each view that counted; angle_span_deg: largest difference between two of these bearings;
+    each view that counted; angle_span_deg: largest difference between two of these bearings, the
+    shorter way round, a_max of equation (3);
     visits, failures: how often the robot was there, and could not get there.
     """
 

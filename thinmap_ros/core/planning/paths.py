@@ -200,21 +200,7 @@ def shortest_route(
 
 def path_lengths_to_nodes(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:
     """Length of the shortest path from a point (m, map frame) to every reachable node, m."""
-    costs = _lengths_to_next_nodes(topology, x, y)
-    open_nodes = [(cost, node_id) for node_id, cost in costs.items()]
-    heapq.heapify(open_nodes)
-    closed: set[int] = set()
-    while open_nodes:
-        cost, node_id = heapq.heappop(open_nodes)
-        if node_id in closed:
-            continue
-        closed.add(node_id)
-        for edge in topology.edges_at(node_id):
-            other = edge.other(node_id)
-            if cost + edge.length_m < costs.get(other, np.inf):
-                costs[other] = cost + edge.length_m
-                heapq.heappush(open_nodes, (costs[other], other))
-    return costs
+    return dict(topology.nearest_first(_lengths_to_next_nodes(topology, x, y)))
 
 
 def _lengths_to_next_nodes(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:

@@ -1,6 +1,8 @@
 """The topological map as values: nodes, edges, and the same as arrays."""
 
-from collections.abc import Iterable, Sequence
+import heapq
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
@@ -210,19 +212,34 @@ class TopologicalMap:
                 best = (edge.id, index, distance)
         return best
 
+    def nearest_first(
+        self, starts: Mapping[int, float], most_m: float = math.inf
+    ) -> Iterator[tuple[int, float]]:
+        """Nodes that can be reached, and the lengths of the shortest paths to them, m, in order.
+
+        starts: length of the path to each node to begin at; most_m: others are nearer.
+        """
+        lengths = dict(starts)
+        open_nodes = [(length, node_id) for node_id, length in lengths.items()]
+        heapq.heapify(open_nodes)
+        while open_nodes:
+            length, node_id = heapq.heappop(open_nodes)
+            if length > lengths[node_id]:
+                continue
+            yield node_id, length
+            for edge in self.edges_at(node_id):
+                other = edge.other(node_id)
+                if length + edge.length_m < lengths.get(other, most_m):
+                    lengths[other] = length + edge.length_m
+                    heapq.heappush(open_nodes, (lengths[other], other))
+
     def components(self) -> list[set[int]]:
         """Node ids of each connected part, the largest part first."""
         parts: list[set[int]] = []
-        left = set(self.nodes)
+        left = dict.fromkeys(self.nodes)
         while left:
-            part: set[int] = set()
-            open_ids = [left.pop()]
-            while open_ids:
-                node_id = open_ids.pop()
-                part.add(node_id)
-                found = left.intersection(self.neighbours(node_id))
-                left -= found
-                open_ids.extend(found)
+            part = {node_id for node_id, _ in self.nearest_first({next(iter(left)): 0.0})}
+            left = {node_id: None for node_id in left if node_id not in part}
             parts.append(part)
         return sorted(parts, key=len, reverse=True)
 

@@ -24,7 +24,6 @@ _EVEN_M = 0.5
 _CORNER_REACH_M = 0.5 * _LONGEST_UNEVEN_M
 
 EMPTY_BOX = np.array([0, 0, -1, -1])
-_MORE_BOXES = 64
 
 _Key = tuple[int, int]  # cell; hash of the edge of whose path it is a corner, or 0
 
@@ -277,43 +276,6 @@ class _Passage:
         return np.array_equal(own, least_between(other.squared, other.stops))
 
 
-class _Boxes:
-    """For each path the box in which changed cells may concern it."""
-
-    def __init__(self) -> None:
-        self._boxes = np.empty((0, 4), dtype=np.int64)  # rows that are not used are empty boxes
-        self._unused: list[int] = []
-        self._hashes: dict[int, int] = {}
-        self._rows: dict[int, int] = {}
-
-    def put(self, number: int, box: Cells) -> None:
-        """Set the box of the path with a hash."""
-        if not self._unused:
-            count = len(self._boxes)
-            self._boxes = np.concatenate(
-                (self._boxes, np.tile(EMPTY_BOX, (count + _MORE_BOXES, 1)))
-            )
-            self._unused += range(count, len(self._boxes))
-        row = self._unused.pop()
-        self._boxes[row] = box
-        self._hashes[row] = number
-        self._rows[number] = row
-
-    def remove(self, number: int) -> None:
-        """Remove the box of a path."""
-        row = self._rows.pop(number)
-        del self._hashes[row]
-        self._unused.append(row)
-        self._boxes[row] = EMPTY_BOX
-
-    def touched(self, places: Cells) -> list[int]:
-        """Hashes of the paths that changed cells (K, 2) may concern."""
-        if not len(places):
-            return []
-        rows = np.flatnonzero(touched_boxes(self._boxes, places))
-        return [self._hashes[row] for row in rows.tolist()]
-
-
 @dataclass(frozen=True, eq=False)
 class Changes:
     """Changes of the edges of the skeleton graph, by the hashes of their paths.
@@ -349,7 +311,8 @@ class Registry:
         self._limits = _Limits(*(length_m / frame.resolution for length_m in lengths_m))
         self._passages: dict[int, _Passage] = {}
         self._nodes: dict[_Key, int] = {}
-        self._boxes = _Boxes()
+        # Of each path the box in which changed cells may concern it.
+        self._boxes: dict[int, Cells] = {}
 
     @property
     def hashes(self) -> set[int]:
@@ -390,9 +353,14 @@ class Registry:
 
     def _measured_again(self, lattice: Lattice, changes: Changes) -> dict[int, _Passage]:
         """Paths whose corners or clearances are changed by changed cells around them."""
-        new = {}
-        for number in self._boxes.touched(changes.places):
-            if number in self._passages and number not in changes.gone:
+        new: dict[int, _Passage] = {}
+        if not len(changes.places):
+            return new
+        numbers = list(self._boxes)
+        boxes = np.concatenate([EMPTY_BOX, *self._boxes.values()]).reshape(-1, 4)[1:]
+        for k in np.flatnonzero(touched_boxes(boxes, changes.places)).tolist():
+            number = numbers[k]
+            if number not in changes.gone:
                 again = _Passage.of(lattice, self._passages[number].cells, self._limits)
                 if not again.is_same(self._passages[number]):
                     new[number] = again
@@ -409,7 +377,7 @@ class Registry:
         """Remove the corners of paths, and vertices without edges, from the map."""
         places: list[_Key] = []
         for number in gone:
-            self._boxes.remove(number)
+            del self._boxes[number]
             places += [(cell, number) for cell in self._passages.pop(number).corners]
         for cell in loose:
             if not self.map.edges_at(self._nodes[cell, 0]):
@@ -471,7 +439,7 @@ class Registry:
             between.setdefault((min(edge.a, edge.b), max(edge.a, edge.b)), []).append(edge)
         for number, passage in new.items():
             self._passages[number] = passage
-            self._boxes.put(number, box_of(passage.places, passage.squared))
+            self._boxes[number] = box_of(passage.places, passage.squared)
             if passage.cells.size > 1:
                 self._put_edges(number, passage, between)
 

@@ -8,16 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from thinmap_ros.core.grid.fields import counts_of, label, looked_up, strips
+from thinmap_ros.core.grid.fields import counts_of, label, looked_up, squared_distance, strips
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.se2 import Array, Cells, Mask, distances_from_line, path_length
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap, TopologyConfig
 from thinmap_ros.core.topology.thinning import (
     VIEW_M,
-    column_distance,
     known_free,
-    squared_clearance,
     standing_room,
     view_ends,
     view_from,
@@ -54,7 +52,7 @@ class EditedGraph:
         self.frame = frame
         self.standing = standing
         self.ends = {n.id for n in topology.nodes.values() if n.kind is NodeKind.END}
-        self._distance = column_distance(known)
+        self._squared = squared_distance(~known, is_rim_marked=True)
         self._next_id = 1 + max([0, *topology.nodes, *topology.edges])
 
     def cell(self, node_id: int) -> tuple[int, int]:
@@ -97,7 +95,7 @@ class EditedGraph:
 
     def clearances(self, points: Array) -> Array:
         """Distance of points (N, 2) to the nearest cell that is not free, m."""
-        squared = squared_clearance(self._distance, self.frame.cells_of(points))
+        squared = self._squared[tuple(self.frame.cells_of(points).T)]
         return np.asarray(np.sqrt(squared) * self.frame.resolution)
 
     def _new_id(self) -> int:
@@ -778,24 +776,9 @@ def cross_edges(graph: EditedGraph, reach_m: float) -> None:
     away_m = np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]]).T)
     for k in np.argsort(away_m, kind='stable').tolist():
         a, b = (ids[i] for i in pairs[k].tolist())
-        if not _is_reached(graph.map, a, b, _DETOUR * float(away_m[k])):
+        reached = graph.map.nearest_first({a: 0.0}, _DETOUR * float(away_m[k]))
+        if all(node_id != b for node_id, _ in reached):
             graph.put_straight(0, a, b)
-
-
-def _is_reached(topology: TopologicalMap, start: int, goal: int, most_m: float) -> bool:
-    """Whether a route between two nodes is shorter than a length."""
-    costs = {start: 0.0}
-    open_nodes = [(0.0, start)]
-    while open_nodes:
-        cost, node_id = heapq.heappop(open_nodes)
-        if node_id == goal:
-            return True
-        for edge in topology.edges_at(node_id):
-            to = edge.other(node_id)
-            if cost + edge.length_m < costs.get(to, most_m):
-                costs[to] = cost + edge.length_m
-                heapq.heappush(open_nodes, (costs[to], to))
-    return False
 
 
 def _can_split(graph: EditedGraph, edge: Edge, cell: Cells) -> bool:

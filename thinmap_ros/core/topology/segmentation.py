@@ -41,6 +41,11 @@ Labels = NDArray[np.int32]
 Squares = NDArray[np.int32]  # squared distances, in cells
 
 # Of passages.
+_NECK_RATIO = 0.75  # a passage separates two places if it is narrower than this share of both
+_MIN_DOOR_WIDTH_M = 0.5  # narrower passages are gaps along walls, and no doors
+# On both sides of a door it gets wider within this distance; else it is the mouth of a narrow
+# corridor.
+_MAX_DOOR_DEPTH_M = 2.0
 _JAMB_M = 0.6  # on each side of a passage, over which a straight wall is no jamb
 # The cells around one, row after row.
 _ROWS_ROUND = np.array([-1, -1, -1, 0, 0, 1, 1, 1])
@@ -48,8 +53,10 @@ _COLS_ROUND = np.array([-1, 0, 1, -1, 1, -1, 0, 1])
 _SQUARE = np.ones((3, 3), dtype=np.bool_)  # a cell and its eight neighbours
 _FACE_M = 0.15  # up to which a straight wall is rough
 
-# Of furniture. Least area in relation to its squared length: a square has a half, a wall 0.15 m
-# thick and 1 m long 0.13. What it encloses counts: a laser sees the rim of a table.
+# Of furniture: compact obstacles apart from walls up to this length.
+_MAX_FURNITURE_M = 2.5
+# Least area in relation to its squared length: a square has a half, a wall 0.15 m thick and 1 m
+# long 0.13. What it encloses counts: a laser sees the rim of a table.
 _COMPACT = 0.15
 _LEG = 0.2  # length up to which any shape is furniture, as a share of the largest
 
@@ -64,6 +71,8 @@ _SEED = 1 / 3
 _MIN_AREA_M2 = 3.0  # a smaller part is a niche of the one behind its widest passage
 # Free cells this near to a region lie within its outline: regions end before the walls, m.
 _WALL_MARGIN_M = 0.5
+
+_CORRIDOR_RATIO = 5.0  # a corridor is at least so many times as long as wide
 
 # Of ids that stay.
 _UPDATES = 5  # after which a cell forgets its earlier id
@@ -82,20 +91,9 @@ class RegionConfig(Config):
     """What separates two regions, and which kind a region is.
 
     robot_radius_m: free space that the robot does not fit into belongs to no region.
-    neck_ratio: a passage separates two places if it is narrower than this share of both.
-    min_door_width_m: narrower passages are gaps along walls, and no doors.
-    max_door_depth_m: on both sides of a door it gets wider within this distance; else it is the
-    mouth of a narrow corridor.
-    max_furniture_m: compact obstacles apart from walls up to this length are furniture.
-    corridor_ratio: a corridor is at least so many times as long as wide.
     """
 
     robot_radius_m: float = 0.25
-    neck_ratio: float = 0.75
-    min_door_width_m: float = 0.5
-    max_door_depth_m: float = 2.0
-    max_furniture_m: float = 2.5
-    corridor_ratio: float = 5.0
     max_door_width_m: float = parameter(
         2.6,
         'Widest passage that separates two regions (m). Raise it for gates, lower it if rooms are '
@@ -118,19 +116,6 @@ class RegionConfig(Config):
     )
 
 
-@dataclass(frozen=True)
-class Neck:
-    """When a saddle separates two basins.
-
-    ratio: clearance there relative to the smaller peak, at most. widest: largest clearance there,
-    m. least_cells: of the smaller basin.
-    """
-
-    ratio: float
-    widest: float
-    least_cells: int
-
-
 @dataclass(frozen=True, eq=False)
 class Clearance:
     """Distance of each cell of a space to the nearest cell outside; the rim of the map is outside.
@@ -151,13 +136,16 @@ class Clearance:
         return np.asarray(np.sqrt(self.squared[part]) * self.resolution_m)
 
 
-def flood(clearance: Clearance, neck: Neck) -> tuple[Labels, Cells]:
+def flood(
+    clearance: Clearance, ratio: float, widest_m: float, least_cells: int
+) -> tuple[Labels, Cells]:
     """Basins of a clearance (H, W): a watershed by merge tree.
 
     Cells are flooded from the roomiest one down. A cell beside one basin joins it; a cell beside
     two is their saddle, the widest place of the narrowest path between them: they become one basin,
     unless the saddle is a neck. So a path round a table, where basins meet again lower down, is no
-    door.
+    door. At a neck the clearance is at most widest_m, and a ratio of that of the smaller peak, and
+    both basins have least_cells.
     Returns the basin of each cell, from 1, 0 outside, (H, W); and the saddles between basins,
     widest first (N, 3): flat index of the cell, lower and higher basin.
     Source: watershed after F. Meyer, "Topographic distance and watershed lines", 1994; compared for
@@ -165,7 +153,7 @@ def flood(clearance: Clearance, neck: Neck) -> tuple[Labels, Cells]:
     """
     shape = clearance.squared.shape
     flat = clearance.squared.ravel()
-    limits = (neck.ratio, neck.widest, neck.least_cells)
+    limits = (ratio, widest_m, least_cells)
     basin, parent, saddles = _flood(
         flat, _roomiest_first(flat), shape[1], clearance.resolution_m, *limits
     )
@@ -314,16 +302,15 @@ def mean_widths_m(basins: Labels, clearance: Clearance) -> Array:
     return 4.0 * sums / np.maximum(cells, 1)
 
 
-def gets_wider(
-    passage: Passage, basins: Labels, clearance: Clearance, reach_m: float, ratio: float
-) -> bool:
-    """Whether both basins are wider than a passage, by a ratio, within a reach of it, m."""
+def gets_wider(passage: Passage, basins: Labels, clearance: Clearance) -> bool:
+    """Whether both basins are wider than a passage near by: else it is no neck of theirs."""
     row, col = divmod(passage.cell, basins.shape[1])
-    reach = math.ceil(reach_m / clearance.resolution_m)
+    reach = math.ceil(_MAX_DOOR_DEPTH_M / clearance.resolution_m)
     box = (slice(max(row - reach, 0), row + reach + 1), slice(max(col - reach, 0), col + reach + 1))
     clearance_m = clearance.within(box)
     return all(
-        ratio * float(clearance_m[basins[box] == basin].max(initial=0.0)) > 0.5 * passage.width_m
+        _NECK_RATIO * float(clearance_m[basins[box] == basin].max(initial=0.0))
+        > 0.5 * passage.width_m
         for basin in (passage.a, passage.b)
     )
 
@@ -407,7 +394,7 @@ def room_space(patch: GridPatch, config: RegionConfig) -> Mask:
     the robot does not fit, as between the two faces of a wall, would join what the wall separates.
     """
     radius = config.robot_radius_m / patch.frame.resolution
-    free = patch.free | _furniture(patch, config.max_furniture_m / patch.frame.resolution)
+    free = patch.free | _furniture(patch, _MAX_FURNITURE_M / patch.frame.resolution)
     free &= ~behind_glass(patch)
     # Squared distances are whole numbers: this is the next one above the radius.
     standing = standing_room(free, math.sqrt(math.floor(radius**2) + 1))
@@ -565,17 +552,12 @@ def segment(patch: GridPatch, config: RegionConfig) -> Segmentation:
     clearance = Clearance.of(room_space(patch, config), resolution)
     least_cells = int(_MIN_AREA_M2 / resolution**2)
     seed_cells = max(1, int(_SEED * least_cells))
-    basins, saddles = flood(
-        clearance, Neck(config.neck_ratio, 0.5 * config.max_door_width_m, seed_cells)
-    )
-    passages = passages_at(saddles, clearance, config.min_door_width_m)
+    basins, saddles = flood(clearance, _NECK_RATIO, 0.5 * config.max_door_width_m, seed_cells)
+    passages = passages_at(saddles, clearance, _MIN_DOOR_WIDTH_M)
     widths_m = mean_widths_m(basins, clearance)
     is_door = [
         max(widths_m[p.a], widths_m[p.b]) > config.max_corridor_width_m
-        or (
-            gets_wider(p, basins, clearance, config.max_door_depth_m, config.neck_ratio)
-            and not has_flat_jamb(p, clearance)
-        )
+        or (gets_wider(p, basins, clearance) and not has_flat_jamb(p, clearance))
         for p in passages
     ]
     labels, doors = joined(basins, passages, is_door, patch.free, least_cells)
@@ -627,11 +609,11 @@ def _outline(found: Segmentation, number: int, box: tuple[slice, ...]) -> Array:
 def _is_corridor(to_walls: Array, resolution_m: float, config: RegionConfig) -> bool:
     """Whether a region is one, by the distances (H, W) of its cells from walls, m, 0 outside.
 
-    Discs of the width that a strip of its area and corridor_ratio has cover a room, and leave most
+    Discs of the width that a strip of its area and _CORRIDOR_RATIO has cover a room, and leave most
     of a corridor: niches, bends and furniture along walls do not change which.
     """
     inside = to_walls > 0.0
-    strip_m = math.sqrt(float(inside.sum()) * resolution_m**2 / config.corridor_ratio)
+    strip_m = math.sqrt(float(inside.sum()) * resolution_m**2 / _CORRIDOR_RATIO)
     wide = wide_cells(to_walls, min(strip_m, config.max_corridor_width_m), resolution_m)
     return bool(wide[inside].mean() <= 0.5)
 

@@ -241,32 +241,6 @@ def _standing_room(distance: NDArray[np.int16], need: NDArray[np.int16]) -> Mask
 
 
 @kernel
-def squared_clearance(distance: NDArray[np.int16], cells: Cells) -> Cells:
-    """Squared distance, in cells, from each cell (N, 2) to the nearest one that is not free.
-
-    Cells outside are not free.
-
-    distance (H, W): from `column_distance`. Searches columns outwards until they are too far to
-    matter.
-    """
-    cols = distance.shape[1]
-    squared = np.empty(cells.shape[0], dtype=np.int64)
-    for i in range(cells.shape[0]):
-        row = cells[i, 0]
-        col = cells[i, 1]
-        best = np.int64(distance[row, col]) ** 2
-        step = 1
-        while step * step < best:
-            left = np.int64(distance[row, col - step]) if col - step >= 0 else np.int64(0)
-            right = np.int64(distance[row, col + step]) if col + step < cols else np.int64(0)
-            near = min(left, right)
-            best = min(best, step * step + near * near)
-            step += 1
-        squared[i] = best
-    return squared
-
-
-@kernel
 def true_cells(mask: Mask) -> Cells:
     """The true cells (N, 2) of a mask (H, W), row after row."""
     # Room for all; the system provides only what is written to.
