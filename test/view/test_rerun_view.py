@@ -363,7 +363,9 @@ def test_regions_are_shown_in_the_colour_of_their_kind():
             shown.append((ns, [o.tolist() for o in outlines], list(colours)))
 
     points = [plain(x=float(x), y=float(y)) for x, y in ((0, 0), (2, 0), (2, 1))]
-    region = plain(id=5, kind=1, outline=plain(points=points))
+    middle = plain(x=1.0, y=0.5)
+    outline = plain(points=points)
+    region = plain(id=5, kind=1, outline=outline, center=middle, area_m2=1.0, name='')
     feed = MessageView(Outlines(), lambda frame: None)
     feed.show('regions', stamped(regions=[region], doors=[]))
     ((ns, (outline,), (colour,)),) = shown

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import errors, se2
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, one_line
 from thinmap_ros.core.grid.edits import KeepOut, KeepOutArea
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.scan import LaserConfig, Scan
-from thinmap_ros.core.se2 import SECOND_NS, Array
+from thinmap_ros.core.se2 import SECOND_NS, Array, Place
 from thinmap_ros.core.topology.regions import RegionKind
 
 
@@ -115,19 +115,37 @@ def map_update(message: Any) -> tuple[int, int, NDArray[np.int8]]:
     return int(message.y), int(message.x), cells
 
 
-def outline(region: Any) -> Array:
-    """Outline (K, 2) of a thinmap_msgs/Region. Raises InputError where it is not finite."""
-    points = corners(region.outline)
-    errors.require_bounded(f'region {region.id}', points.ravel().tolist())
-    return points
+class ShownRegion(NamedTuple):
+    """A region as viewers show it: name, or kind and id; centre (x, y), m; outline (K, 2), m."""
+
+    id: int
+    kind: RegionKind
+    name: str
+    centre: Place
+    area_m2: float
+    outline: Array
 
 
-def region_kind(region: Any) -> RegionKind:
-    """Kind of a thinmap_msgs/Region. Raises InputError where it is unknown."""
+def regions(message: Any) -> list[ShownRegion]:
+    """Regions of a thinmap_msgs/RegionArray.
+
+    Raises InputError where a kind is unknown or a number is invalid.
+    """
+    return [_region(each) for each in message.regions]
+
+
+def _region(message: Any) -> ShownRegion:
     try:
-        return RegionKind(region.kind)
+        kind = RegionKind(message.kind)
     except ValueError as error:
-        raise InputError(f'region {region.id}: kind {region.kind}: expected 0 to 2') from error
+        raise InputError(f'region {message.id}: kind {message.kind}: expected 0 to 2') from error
+    centre = (float(message.center.x), float(message.center.y))
+    area_m2 = float(message.area_m2)
+    outline = corners(message.outline)
+    numbers = [*centre, area_m2, *outline.ravel().tolist()]
+    errors.require_bounded(f'region {message.id}', numbers)
+    name = one_line(message.name) or f'{kind.name.lower()} {message.id}'
+    return ShownRegion(int(message.id), kind, name, centre, area_m2, outline)
 
 
 class ShownEndNode(NamedTuple):

@@ -9,9 +9,8 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, Region, RegionArray, TopologicalMap
+from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, RegionArray, TopologicalMap
 from thinmap_ros.core import errors
-from thinmap_ros.core.errors import one_line
 from thinmap_ros.core.topology.graph import NodeKind, topology_from_msg
 from thinmap_ros.logs import decode
 from thinmap_ros.ros import node_main, parameters, qos
@@ -83,31 +82,20 @@ def regions(message: RegionArray) -> MarkerArray:
     """
     outlines = _marker(message.header, 'regions', Marker.LINE_LIST, _REGION.size_m, palette.EDGE)
     names = []
-    for region in message.regions:
-        kind = decode.region_kind(region)
-        corners = [_point(x, y, _REGION.z_m) for x, y in decode.outline(region).tolist()]
+    for region in decode.regions(message):
+        corners = [_point(x, y, _REGION.z_m) for x, y in region.outline.tolist()]
         ends = [point for pair in pairwise([*corners, *corners[:1]]) for point in pair]
         outlines.points += ends
-        colour = _colour(palette.region(kind, region.id))
-        outlines.colors += len(ends) * [colour]
-        names.append(_region_name(message.header, region))
+        outlines.colors += len(ends) * [_colour(palette.region(region.kind, region.id))]
+        text = _text(message.header, 'region_names', region.id % 2**31, region.name)
+        text.pose.position = _point(*region.centre, _TEXT.z_m)
+        names.append(text)
     doors = _marker(message.header, 'doors', Marker.SPHERE_LIST, _DOOR.size_m, palette.ESTIMATE)
     for door in message.doors:
         place = (door.position.x, door.position.y)
         errors.require_bounded(f'door {door.region_a}-{door.region_b}', place)
         doors.points.append(_point(*place, _DOOR.z_m))
     return _shown([outlines, doors, *names])
-
-
-def _region_name(header: Header, region: Region) -> Marker:
-    """Name of a region, or its kind and id, as text at its centre."""
-    place = (region.center.x, region.center.y)
-    errors.require_bounded(f'region {region.id}', place)
-    text = _marker(header, 'region_names', Marker.TEXT_VIEW_FACING, _TEXT.size_m, _TEXT_COLOUR)
-    text.id = region.id % 2**31
-    text.text = one_line(region.name) or f'{decode.region_kind(region).name.lower()} {region.id}'
-    text.pose.position = _point(*place, _TEXT.z_m)
-    return text
 
 
 def end_nodes(message: EndNodeArray) -> MarkerArray:
@@ -127,11 +115,7 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
         ball.id = len(markers)
         ball.color.a = 0.3 + 0.7 * node.probability
         ball.pose.position = _point(node.x, node.y, _NODE.z_m)
-        text = _marker(
-            message.header, 'probabilities', Marker.TEXT_VIEW_FACING, _TEXT.size_m, _TEXT_COLOUR
-        )
-        text.id = len(markers)
-        text.text = f'{node.probability:.2f}'
+        text = _text(message.header, 'probabilities', len(markers), f'{node.probability:.2f}')
         text.pose.position = _point(node.x, node.y, _TEXT.z_m)
         markers += [ball, text]
     return _shown(markers)
@@ -168,6 +152,13 @@ def _marker(header: Header, namespace: str, kind: int, size_m: float, colour: st
     )
     marker.scale.x = marker.scale.y = marker.scale.z = size_m
     marker.pose.orientation.w = 1.0
+    return marker
+
+
+def _text(header: Header, namespace: str, number: int, words: str) -> Marker:
+    marker = _marker(header, namespace, Marker.TEXT_VIEW_FACING, _TEXT.size_m, _TEXT_COLOUR)
+    marker.id = number
+    marker.text = words
     return marker
 
 

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.shared import MapReceiver
-from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import topology_from_msg
 from thinmap_ros.files.safe import atomic_write
@@ -94,15 +92,11 @@ class MessageView:
 
     def _on_scan(self, ns: int, message: Any) -> None:
         T_base_laser = self._laser_pose(message.header.frame_id)
-        if T_base_laser is None:
-            return
-        angles = (message.angle_min, message.angle_increment)
-        limits = (message.range_min, message.range_max)
-        scan = Scan.create(ns, message.ranges, *angles, *limits, T_base_laser)
-        self._view.scan(ns, replace(scan, frame=message.header.frame_id))
+        if T_base_laser is not None:
+            self._view.scan(ns, decode.scan(message, ns, T_base_laser))
 
     def _on_pose(self, ns: int, message: Any) -> None:
-        T_map_base = _pose(message.pose.pose)
+        T_map_base = decode.checked_pose(message.pose.pose)
         full = np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6)
         covariance = full[np.ix_((0, 1, 5), (0, 1, 5))]
         if not np.isfinite(covariance).all():
@@ -115,12 +109,12 @@ class MessageView:
 
     def _on_odometry(self, ns: int, message: Any) -> None:
         """Trajectory of dead reckoning from the first pose."""
-        self._T_odom_base = _pose(message.pose.pose)
+        self._T_odom_base = decode.checked_pose(message.pose.pose)
         if self._T_map_odom is not None:
             self._view.trajectory(ns, 'odometry', se2.compose(self._T_map_odom, self._T_odom_base))
 
     def _on_truth(self, ns: int, message: Any) -> None:
-        T_map_base = _pose(message.pose)
+        T_map_base = decode.checked_pose(message.pose)
         self._view.trajectory(ns, 'truth', T_map_base)
         self._compare(ns, self._pairs.add_right(ns, T_map_base))
 
@@ -141,9 +135,9 @@ class MessageView:
         self._view.scalar(ns, 'count', 'nodes', len(topology.nodes))
 
     def _on_regions(self, ns: int, message: Any) -> None:
-        outlines = [decode.outline(region) for region in message.regions]
-        colours = [palette.region(decode.region_kind(r), int(r.id)) for r in message.regions]
-        self._view.regions(ns, outlines, colours)
+        regions = decode.regions(message)
+        colours = [palette.region(region.kind, region.id) for region in regions]
+        self._view.regions(ns, [region.outline for region in regions], colours)
 
     def _on_end_nodes(self, ns: int, message: Any) -> None:
         nodes = decode.end_nodes(message)
@@ -238,10 +232,3 @@ def _static_transforms(bag: Bag) -> StaticTransforms:
 def _laser_pose(transforms: StaticTransforms, frame: str) -> Array | None:
     mount = transforms.laser_mount(frame, 'base_link')
     return None if mount is None else mount.T_base_laser
-
-
-def _pose(message: Any) -> Array:
-    T = decode.pose(message)
-    if not se2.is_finite(T):
-        raise InputError(f'pose {T.tolist()}: expected finite numbers')
-    return T

@@ -19,7 +19,7 @@ from thinmap_ros.core.grid.patch import GridFrame, GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.regions import RegionKind, RegionMap
-from thinmap_ros.core.topology.segmentation import RegionConfig, find_regions
+from thinmap_ros.core.topology.segmentation import WALL_MARGIN_M, RegionConfig, find_regions
 from thinmap_ros.files.safe import atomic_write
 from thinmap_ros.view import palette
 from thinmap_ros.view.figures import DPI, draw_graph, draw_hidden_areas, draw_map, draw_shades
@@ -68,9 +68,6 @@ _UNKNOWN = '#CCCCCC'
 _FREE = '#FFFFFF'
 _WALL = '#000000'
 _BOUNDARY = '#777777'
-_KINDS = {RegionKind.ROOM: 'room', RegionKind.CORRIDOR: 'corridor', RegionKind.HALL: 'hall'}
-# Free cells this near to a region are drawn as part of it: regions end before the walls, m.
-_REGION_MARGIN_M = 0.5
 _NO_POINTS = np.empty((0, 2))
 _ELLIPSIS = '…'
 
@@ -237,13 +234,13 @@ def _draw_cells(axes: 'Axes', patch: GridPatch, regions: RegionMap | None) -> di
     labels = None
     if regions is not None and regions.regions:
         labels = block_maximum(regions.labels.astype(np.int32), factor)
-        labels = _spread_labels(labels, cells.free, round(_REGION_MARGIN_M / cell_m))
-        for kind, name in _KINDS.items():
+        labels = _spread_labels(labels, cells.free, round(WALL_MARGIN_M / cell_m))
+        for kind in RegionKind:
             ids = [region.id for region in regions.regions.values() if region.kind == kind]
             colour = palette.REGIONS[kind][0]
             if ids:
                 shade[np.isin(labels, ids)] = palette.rgb(colour)
-                surfaces[name] = colour
+                surfaces[kind.name.lower()] = colour
     if (shade[cells.free] == 255).all(axis=1).any():
         surfaces['free'] = _FREE
     shade[cells.occupied] = palette.rgb(_WALL)
@@ -309,15 +306,7 @@ def _draw_paths(axes: 'Axes', estimated: Array, true: Array | None) -> None:
             *true[:, :2].T, color=palette.TRUTH, linewidth=0.9, label='path, driven', zorder=3
         )
     if len(estimated):
-        style: dict[str, Any] = {
-            'color': 'white',
-            'markeredgecolor': palette.TRUTH,
-            'markeredgewidth': 1.2,
-            'linestyle': '',
-            'zorder': 6,
-        }
-        axes.plot(*estimated[0, :2], marker='*', markersize=14, label='start', **style)
-        axes.plot(*estimated[-1, :2], marker='X', markersize=9, label='end', **style)
+        _draw_ends(axes, estimated, palette.TRUTH, ('start', 'end'))
 
 
 def _draw_robots(axes: 'Axes', robots: Mapping[str, Array]) -> None:
@@ -325,9 +314,22 @@ def _draw_robots(axes: 'Axes', robots: Mapping[str, Array]) -> None:
     for number, (name, path) in enumerate(robots.items()):
         colour = palette.ROBOTS[number % len(palette.ROBOTS)]
         axes.plot(*path[:, :2].T, color=colour, linewidth=1.5, label=name, zorder=3)
-        style: dict[str, Any] = {'color': 'white', 'markeredgecolor': colour, 'zorder': 6}
-        axes.plot(*path[0, :2], marker='*', markersize=14, markeredgewidth=1.2, **style)
-        axes.plot(*path[-1, :2], marker='X', markersize=9, markeredgewidth=1.2, **style)
+        _draw_ends(axes, path, colour)
+
+
+def _draw_ends(
+    axes: 'Axes', path: Array, colour: str, labels: tuple[str | None, str | None] = (None, None)
+) -> None:
+    """Draw a star where a path (N, 2 or more) begins, and a cross where it ends."""
+    style: dict[str, Any] = {
+        'color': 'white',
+        'markeredgecolor': colour,
+        'markeredgewidth': 1.2,
+        'linestyle': '',
+        'zorder': 6,
+    }
+    axes.plot(*path[0, :2], marker='*', markersize=14, label=labels[0], **style)
+    axes.plot(*path[-1, :2], marker='X', markersize=9, label=labels[1], **style)
 
 
 def _draw_scale_bar(axes: 'Axes', width_m: float, height_in: float) -> None:

@@ -384,8 +384,19 @@ class Picture:
 
     def regions(self, message: Any) -> None:
         """Show a thinmap_msgs/RegionArray. Raises InputError where it is invalid."""
-        shown = [_region(region) for region in message.regions]
-        self.centres = {region['id']: tuple(region['center']) for region in shown}
+        regions = decode.regions(message)
+        shown = [
+            {
+                'id': region.id,
+                'name': region.name,
+                'area': round(region.area_m2, 1),
+                'center': [round(number, 2) for number in region.centre],
+                'colour': palette.region(region.kind, region.id),
+                'outline': np.round(region.outline, 2).ravel().tolist(),
+            }
+            for region in regions
+        ]
+        self.centres = {region.id: region.centre for region in regions}
         self.board.put('regions', shown)
 
     def keep_out(self, message: Any) -> None:
@@ -453,17 +464,3 @@ class Picture:
         self.board.put('diagnostics', self._table.rows())
         if self._scanned_s is not None:
             self.board.put('scan_age', int(monotonic() - self._scanned_s))
-
-
-def _region(region: Any) -> dict[str, Any]:
-    kind = decode.region_kind(region)
-    center = (region.center.x, region.center.y)
-    errors.require_bounded(f'region {region.id}', (*center, region.area_m2))
-    return {
-        'id': int(region.id),
-        'name': one_line(region.name) or f'{kind.name.lower()} {region.id}',
-        'area': round(float(region.area_m2), 1),
-        'center': [round(number, 2) for number in center],
-        'colour': palette.region(kind, int(region.id)),
-        'outline': np.round(decode.outline(region), 2).ravel().tolist(),
-    }

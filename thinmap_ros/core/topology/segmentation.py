@@ -70,7 +70,7 @@ _OPEN = 0.6  # share of directions; it is a half at the edge of an explored hall
 _SEED = 1 / 3
 _MIN_AREA_M2 = 3.0  # a smaller part is a niche of the one behind its widest passage
 # Free cells this near to a region lie within its outline: regions end before the walls, m.
-_WALL_MARGIN_M = 0.5
+WALL_MARGIN_M = 0.5
 
 _CORRIDOR_RATIO = 5.0  # a corridor is at least so many times as long as wide
 
@@ -595,7 +595,7 @@ def describe(segmentation: Segmentation, ids: NDArray[np.int64], config: RegionC
 
 def _outline(found: Segmentation, number: int, box: tuple[slice, ...]) -> Array:
     """Outline (K, 2) of a region and of the free cells between it and its walls, m, map frame."""
-    margin = round(_WALL_MARGIN_M / found.patch.frame.resolution)
+    margin = round(WALL_MARGIN_M / found.patch.frame.resolution)
     low = (max(box[0].start - margin, 0), max(box[1].start - margin, 0))
     wider = (slice(low[0], box[0].stop + margin), slice(low[1], box[1].stop + margin))
     labels = found.labels[wider]
