@@ -513,6 +513,8 @@ WALL_FLATNESS_M = 0.02
 
 _WALL_FLATNESS_RAD = 0.006
 
+_ONE_WALL_M = 3.0 * WALL_FLATNESS_M  # largest distance between two lines that may be one wall
+
 MAX_MISSES = 5  # consecutive scans through a feature until it is removed: a door has opened
 
 _SPARE = 8  # additional features that may stay in the local area
@@ -737,13 +739,8 @@ class FeatureMap:
         ends = ends_of(self._features[ekf.area[b]], ekf.local.lines[b])
         apart = np.abs(ends @ normals_of(ekf.local.lines[[a]])[0] - ekf.local.lines[a, 0]).max()
         return (
-            bool(apart <= self._near) and mahalanobis(v, S + self._wall) <= self._association.gate
+            bool(apart <= _ONE_WALL_M) and mahalanobis(v, S + self._wall) <= self._association.gate
         )
-
-    @property
-    def _near(self) -> float:
-        """Largest distance between two lines that may be one wall, m."""
-        return 3.0 * WALL_FLATNESS_M
 
     def _drop(self, ekf: CompressedEkf, feature_id: int, heir: int | None) -> None:
         ekf.remove(ekf.area.index(feature_id))
@@ -778,7 +775,7 @@ class FeatureMap:
         start, end = ends_of(candidate.span, candidate.line)
         middle = 0.5 * (start + end)
         reach = 0.25 * (end - start)
-        near = np.abs(normals_of(lines) @ middle - lines[:, 0]) <= self._near
+        near = np.abs(normals_of(lines) @ middle - lines[:, 0]) <= _ONE_WALL_M
         # Only features whose lines are near the candidate.
         ids = ids[near]
         lines = lines[near]

@@ -98,7 +98,8 @@ class LookAround:
             part = 2.0 * math.pi / _PARTS
             self._goals = [se2.pose(x, y, theta + k * part) for k in range(1, _PARTS + 1)]
         self._was_tried = True
-        while self._goals and _has_heading(T_map_base, self._goals[0]):
+        heading = float(T_map_base[2])
+        while self._goals and abs(se2.wrap(float(self._goals[0][2]) - heading)) <= _IS_THERE_RAD:
             self._goals.pop(0)
         return self._goals[0] if self._goals else None
 
@@ -112,10 +113,6 @@ def turn_target(goal: Array) -> Candidate:
     place = float(goal[0]), float(goal[1])
     nothing = np.zeros((0, 2), dtype=np.int64)
     return Candidate(Evidence(TURN_ID, place), nothing, place, goal=goal)
-
-
-def _has_heading(T_map_base: Array, goal: Array) -> bool:
-    return abs(se2.wrap(float(goal[2] - T_map_base[2]))) <= _IS_THERE_RAD
 
 
 @dataclass(frozen=True)

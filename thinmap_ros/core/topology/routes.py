@@ -396,8 +396,9 @@ def _enclosed(known: Mask, ring: Cells) -> int:
 class Sight:
     """Places on a lattice of traversable cells, the node nearest to each, and whether it is seen.
 
-    A route server starts at the node nearest to the robot, whatever walls are between. reach_m: how
-    far a node may be that is added.
+    A route server starts at the node nearest to the robot, whatever walls are between. xy (N, 2):
+    the places, m; away_m, seen (N,): distance of the nearest node, and whether it is in sight;
+    reach_m: how far a node may be that is added.
     """
 
     def __init__(
@@ -412,11 +413,11 @@ class Sight:
         self._step = step
         self._numbers = np.full(standing[::step, ::step].shape, -1, dtype=np.int64)
         self._numbers[tuple((self._cells // step).T)] = np.arange(len(self._cells))
-        self._xy = frame.centres_of(self._cells)
-        self._tree = cKDTree(self._xy)
-        self._away = np.full(len(self._cells), np.inf)
+        self.xy = frame.centres_of(self._cells)
+        self._tree = cKDTree(self.xy)
+        self.away_m = np.full(len(self._cells), np.inf)
         self._owner = np.zeros(len(self._cells), dtype=np.int64)
-        self._seen: Mask = np.zeros(len(self._cells), dtype=np.bool_)
+        self.seen: Mask = np.zeros(len(self._cells), dtype=np.bool_)
         self._places: dict[int, Cells] = {}
         self._assign(list(nodes))
 
@@ -427,12 +428,12 @@ class Sight:
         points = np.array([(other.x, other.y) for other in others])
         cells = self._frame.cells_of(points)
         nearest, away, seen = _nearest_of(
-            self._known, self._cells[places], self._xy[places], cells, points
+            self._known, self._cells[places], self.xy[places], cells, points
         )
-        if np.count_nonzero(seen) < np.count_nonzero(self._seen[places]):
+        if np.count_nonzero(seen) < np.count_nonzero(self.seen[places]):
             return False
-        self._seen[places] = seen
-        self._away[places] = away
+        self.seen[places] = seen
+        self.away_m[places] = away
         for k in np.flatnonzero(np.bincount(nearest, minlength=1)).tolist():
             self._give(others[k].id, places[nearest == k])
         del self._places[node.id]
@@ -442,73 +443,53 @@ class Sight:
         """Add a node, if so some more places see the node nearest to them."""
         places, away = self._closer(node)
         seen = self._sees(node, places)
-        if np.count_nonzero(seen) < np.count_nonzero(self._seen[places]) + least_gain:
+        if np.count_nonzero(seen) < np.count_nonzero(self.seen[places]) + least_gain:
             return False
         owners = np.unique(self._owner[places]).tolist()
         self._owner[places] = -1
         for owner in owners:
             had = self._places[owner]
             self._places[owner] = had[self._owner[had] == owner]
-        self._seen[places] = seen
-        self._away[places] = away
+        self.seen[places] = seen
+        self.away_m[places] = away
         self._give(node.id, places)
         return True
-
-    def unseen(self) -> Cells:
-        """Indices of the places that do not see the node nearest to them."""
-        return np.flatnonzero(~self._seen)
 
     def farthest(self, gone: list[Node]) -> Cells:
         """Indices of the places, those farthest from a node first, none nearer to one that is gone.
 
         gone: nodes that were dropped with the places around them.
         """
-        order = np.argsort(-self._away, kind='stable')
+        order = np.argsort(-self.away_m, kind='stable')
         if not gone:
             return order
-        away = cKDTree([node.position for node in gone]).query(self._xy[order])[0]
-        return order[away > self._away[order]]
-
-    def beyond(self, places: Cells, reach_m: float) -> Cells:
-        """Those places that are farther from each node than a reach."""
-        return places[self._away[places] > reach_m]
-
-    def away_m(self, place: int) -> float:
-        """Distance of a place from the node nearest to it."""
-        return float(self._away[place])
+        away = cKDTree([node.position for node in gone]).query(self.xy[order])[0]
+        return order[away > self.away_m[order]]
 
     def around(self, place: int, reach_m: float) -> Cells:
         """Places (N, 2), as cells, that see one, within a reach of it."""
-        near = self._cells[self._tree.query_ball_point(self._xy[place], reach_m)]
+        near = self._cells[self._tree.query_ball_point(self.xy[place], reach_m)]
         row, col = self._cells[place].tolist()
         return np.asarray(near[_lines_clear(self._known, row, col, near)])
-
-    def is_seen(self, place: int) -> bool:
-        """Whether a place sees the node nearest to it."""
-        return bool(self._seen[place])
 
     def first_seeing(self, place: int, cells: Cells) -> int:
         """Index of the first of some cells (N, 2) that a place sees; -1: none."""
         row, col = self._cells[place].tolist()
         return int(_first_clear(self._known, row, col, cells))
 
-    def position(self, place: int) -> Array:
-        """A place (2,), m."""
-        return np.asarray(self._xy[place])
-
     def _assign(self, nodes: list[Node]) -> None:
         """Find the nearest of the nodes for each place."""
         self._places = {node.id: np.empty(0, dtype=np.int64) for node in nodes}
         if not nodes or not len(self._cells):
             return
-        found = cKDTree([(node.x, node.y) for node in nodes]).query(self._xy)
-        self._away = np.asarray(found[0])
+        found = cKDTree([(node.x, node.y) for node in nodes]).query(self.xy)
+        self.away_m = np.asarray(found[0])
         nearest = np.asarray(found[1])
         order = np.argsort(nearest, kind='stable')
         first = np.searchsorted(nearest[order], np.arange(len(nodes) + 1))
         for k, node in enumerate(nodes):
             places = order[first[k] : first[k + 1]]
-            self._seen[places] = self._sees(node, places)
+            self.seen[places] = self._sees(node, places)
             self._give(node.id, places)
 
     def _give(self, node_id: int, places: Cells) -> None:
@@ -519,7 +500,7 @@ class Sight:
     def _candidates(self, node: Node, graph: TopologicalMap) -> list[Node]:
         """Other nodes that may be nearest to one of the places of a node with a neighbour."""
         around = [graph.nodes[i] for i in graph.neighbours(node.id) if i != node.id]
-        reach_m = float(self._away[self._places[node.id]].max(initial=0.0))
+        reach_m = float(self.away_m[self._places[node.id]].max(initial=0.0))
         nearest_m = min(math.dist((node.x, node.y), (other.x, other.y)) for other in around)
         found = graph.nodes_near(node.x, node.y, 2.0 * reach_m + nearest_m)
         return [other for other in found if other.id != node.id]
@@ -529,7 +510,7 @@ class Sight:
         row, col = (index // self._step for index in self._frame.cell_at(node.x, node.y))
         reach = math.ceil(self.reach_m / (self._step * self._frame.resolution)) + 1
         box = np.array([row - reach, col - reach, row + reach + 1, col + reach + 1])
-        return _closer(self._numbers, box, self._xy, self._away, node.position, self.reach_m)
+        return _closer(self._numbers, box, self.xy, self.away_m, node.position, self.reach_m)
 
     def _sees(self, node: Node, places: Cells) -> Mask:
         row, col = self._frame.cell_at(node.x, node.y)
@@ -699,8 +680,8 @@ class _EdgePoints:
 def show_places(graph: EditedGraph, sight: Sight) -> None:
     """Put nodes on edges from which places are in sight that do not see their nearest node."""
     points = _EdgePoints(graph)
-    for place in sight.unseen().tolist():
-        if not sight.is_seen(place):
+    for place in np.flatnonzero(~sight.seen).tolist():
+        if not sight.seen[place]:
             _put_on_edge(graph, sight, points, place, _NODE_REACH_M, _MIN_GAIN)
 
 
@@ -713,16 +694,19 @@ def _put_on_edge(
     least_gain: int,
 ) -> bool:
     """Put a node on the nearest edge in sight of a place, if so some more places see a node."""
-    near = points.near(sight.position(place), reach_m)
+    near = points.near(sight.xy[place], reach_m)
     first = sight.first_seeing(place, points.cells[near])
-    edge_id = int(points.edges[near[first]]) if first >= 0 else 0
-    if not edge_id or not _can_split(graph, graph.map.edges[edge_id], points.cells[near[first]]):
+    edge = graph.map.edges.get(int(points.edges[near[first]])) if first >= 0 else None
+    if edge is None:
+        return False
+    row, col = points.cells[near[first]].tolist()
+    if not all(graph.is_clear((row, col), graph.cell(end)) for end in (edge.a, edge.b)):
         return False
     node_id = graph.put_node(graph.frame.centres_of(points.cells[near[first]][None])[0])
     if not sight.add(graph.map.nodes[node_id], least_gain):
         graph.map.drop_node(node_id)
         return False
-    points.split(int(near[first]), graph.split(graph.map.edges[edge_id], node_id))
+    points.split(int(near[first]), graph.split(edge, node_id))
     return True
 
 
@@ -740,9 +724,9 @@ def spread_nodes(graph: EditedGraph, sight: Sight, reach_m: float, gone: list[No
     count = 0
     while count < len(graph.map.nodes):
         count = len(graph.map.nodes)
-        places = sight.beyond(places, reach_m)
+        places = places[sight.away_m[places] > reach_m]
         for place in places.tolist():
-            if reach_m < sight.away_m(place) < 2.0 * reach_m and not _put_on_edge(
+            if reach_m < sight.away_m[place] < 2.0 * reach_m and not _put_on_edge(
                 graph, sight, points, place, reach_m, 0
             ):
                 _put_in_space(graph, sight, place, reach_m)
@@ -779,11 +763,6 @@ def cross_edges(graph: EditedGraph, reach_m: float) -> None:
         reached = graph.map.nearest_first({a: 0.0}, _DETOUR * float(away_m[k]))
         if all(node_id != b for node_id, _ in reached):
             graph.put_straight(0, a, b)
-
-
-def _can_split(graph: EditedGraph, edge: Edge, cell: Cells) -> bool:
-    at = (int(cell[0]), int(cell[1]))
-    return all(graph.is_clear(at, graph.cell(i)) for i in (edge.a, edge.b))
 
 
 def route_graph(

@@ -51,7 +51,7 @@ def select_free_space(
     radius = config.robot_radius_m / patch.frame.resolution
     standing = standing_room(known_free(patch, config), radius)
     if seed_xy is None:
-        return without_specks(standing, math.pi * radius**2)
+        return _without_small(*label(standing), math.pi * radius**2)
     places = np.atleast_2d(seed_xy)
     if not np.isfinite(places).all():
         raise InputError(f'seed {seed_xy}: expected finite coordinates')
@@ -109,12 +109,8 @@ def room_of_columns(distance: NDArray[np.int16], radius_cells: float) -> Mask:
     return _standing_room(distance, need)
 
 
-def without_specks(cells: Mask, smallest: float) -> Mask:
-    """Cells without the parts (joined over edges and corners) of fewer than `smallest` cells."""
-    return _without_small(*label(cells), smallest)
-
-
 def _without_small(labels: NDArray[np.int32], sizes: Cells, smallest: float) -> Mask:
+    """Cells without the parts (joined over edges and corners) of fewer than `smallest` cells."""
     keep = sizes >= smallest
     keep[0] = False
     return looked_up(keep, labels)
