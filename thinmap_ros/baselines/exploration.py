@@ -161,17 +161,14 @@ class FrontierFinder:
         return None if cell is None else np.asarray(frame.centres_of(np.array([cell]))[0])
 
 
-@dataclass(frozen=True)
-class TargetConfig:
-    """When a target is chosen, reached, the same as another, or given up."""
-
-    choice_period_s: float = 1.0
-    goal_tolerance_m: float = 0.3
-    same_place_m: float = 1.0
-    visit_radius_m: float = 0.5  # an end node is visited where the robot comes nearer
-    max_failures: int = 3
-    progress_m: float = 0.1
-    progress_timeout_s: float = 30.0  # without this progress
+# When a target is chosen, reached, the same as another, or given up.
+_CHOICE_PERIOD_NS = SECOND_NS
+_GOAL_TOLERANCE_M = 0.3
+_SAME_PLACE_M = 1.0
+_VISIT_RADIUS_M = 0.5  # an end node is visited where the robot comes nearer
+_MAX_FAILURES = 3
+_PROGRESS_M = 0.1
+_PROGRESS_TIMEOUT_NS = 30 * SECOND_NS  # without this progress
 
 
 @dataclass(eq=False)
@@ -186,29 +183,26 @@ class _Progress:
 class _ProgressTimeout:
     """Detects targets without progress while the robot drives to them."""
 
-    def __init__(self, config: TargetConfig) -> None:
-        self._config = config
-        self._timeout_ns = SECOND_NS * config.progress_timeout_s
+    def __init__(self) -> None:
         self._watched: list[_Progress] = []
         self._driven: _Progress | None = None
         self._stamp_ns = 0
 
     def has_expired(self, place: Array, length_m: float, stamp_ns: int) -> bool:
         """Add driving time towards a place (2,) at a remaining path length, m."""
-        same_place_m = self._config.same_place_m
-        same = (p for p in self._watched if math.dist(p.place, place) <= same_place_m)
+        same = (p for p in self._watched if math.dist(p.place, place) <= _SAME_PLACE_M)
         progress = next(same, None)
         if progress is None:
             progress = _Progress((float(place[0]), float(place[1])), length_m)
             self._watched.append(progress)
-        if length_m < progress.nearest_m - self._config.progress_m:
+        if length_m < progress.nearest_m - _PROGRESS_M:
             progress.nearest_m = length_m
             progress.waited_ns = 0
         if self._driven is progress:
             progress.waited_ns += max(stamp_ns - self._stamp_ns, 0)
         self._driven = progress
         self._stamp_ns = stamp_ns
-        if progress.waited_ns <= self._timeout_ns:
+        if progress.waited_ns <= _PROGRESS_TIMEOUT_NS:
             return False
         self._watched.remove(progress)
         return True
@@ -217,8 +211,7 @@ class _ProgressTimeout:
 class FrontierExplorer(ABC):
     """Visits frontiers until no reachable one is left."""
 
-    def __init__(self, config: TargetConfig | None = None) -> None:
-        self.config = config or TargetConfig()
+    def __init__(self) -> None:
         self.finder = FrontierFinder()
         self.target: Frontier | None = None
         self._survey_ns = 0
@@ -257,26 +250,21 @@ class FrontierExplorer(ABC):
             or self._frame != self.finder.map.frame
             or not self.finder.is_open(self.target)
         )
-        return gone or stamp_ns - self._survey_ns >= SECOND_NS * self.config.choice_period_s
+        return gone or stamp_ns - self._survey_ns >= _CHOICE_PERIOD_NS
 
     def _choose(self, T_map_base: Array) -> None:
-        left = [
-            f for f in self.finder.find(T_map_base) if self._tries(f) < self.config.max_failures
-        ]
+        left = [f for f in self.finder.find(T_map_base) if self._tries(f) < _MAX_FAILURES]
         fewest = min((self._tries(f) for f in left), default=0)
         left = [f for f in left if self._tries(f) == fewest]
         before = self.target
         self.target = None
         if left:
             best = left[int(np.argmin(self.costs(left, T_map_base)))]
-            if (
-                before is None
-                or math.dist(before.centroid, best.centroid) > self.config.same_place_m
-            ):
+            if before is None or math.dist(before.centroid, best.centroid) > _SAME_PLACE_M:
                 self._number += 1
             near = (
                 before is not None
-                and math.dist(before.viewpoint, best.viewpoint) < self.config.goal_tolerance_m
+                and math.dist(before.viewpoint, best.viewpoint) < _GOAL_TOLERANCE_M
             )
             # A goal that hardly moved is kept: the robot would otherwise replan every second.
             if near and before:
@@ -285,8 +273,7 @@ class FrontierExplorer(ABC):
 
     def _tries(self, frontier: Frontier) -> int:
         return sum(
-            math.dist(frontier.viewpoint, place) <= self.config.same_place_m
-            for place in self._failures
+            math.dist(frontier.viewpoint, place) <= _SAME_PLACE_M for place in self._failures
         )
 
     def _drop_unchanged_target(self, T_map_base: Array) -> None:
@@ -313,14 +300,14 @@ class NearestFrontier(FrontierExplorer):
 
 
 class ImpatientExplorer(FrontierExplorer):
-    """Gives up a target without progress for progress_timeout_s, also after an interruption.
+    """Gives up a target without progress for 30 s, also after an interruption.
 
     Where costs are other than the path length, two targets may alternate for ever.
     """
 
-    def __init__(self, config: TargetConfig | None = None) -> None:
-        super().__init__(config)
-        self._progress_timeout = _ProgressTimeout(self.config)
+    def __init__(self) -> None:
+        super().__init__()
+        self._progress_timeout = _ProgressTimeout()
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
@@ -413,12 +400,12 @@ class VisitAllEndNodes(NearestFrontier):
     Source: Choset and Nagatani, "Topological simultaneous localization and mapping (SLAM)", 2001.
     """
 
-    def __init__(self, config: TargetConfig | None = None) -> None:
-        super().__init__(config)
+    def __init__(self) -> None:
+        super().__init__()
         self.finder = FrontierFinder(
             allow_backtracking=True
         )  # the graph may lead through narrow passages
-        self._progress_timeout = _ProgressTimeout(self.config)
+        self._progress_timeout = _ProgressTimeout()
         self._visited: list[tuple[float, float]] = []
         self._end_node: Array | None = None  # the goal (3,) there
 
@@ -456,7 +443,7 @@ class VisitAllEndNodes(NearestFrontier):
         self._visited += [
             (node.x, node.y)
             for node in ends
-            if math.dist((node.x, node.y), T_map_base[:2]) < self.config.visit_radius_m
+            if math.dist((node.x, node.y), T_map_base[:2]) < _VISIT_RADIUS_M
             and not self._was_visited(node.x, node.y)
         ]
         left = {node.id: node for node in ends if not self._was_visited(node.x, node.y)}
@@ -475,17 +462,14 @@ class VisitAllEndNodes(NearestFrontier):
         """Whether the present end node is at a goal (3,)."""
         if self._end_node is None:
             return False
-        return math.dist(self._end_node[:2], goal[:2]) < self.config.goal_tolerance_m
+        return math.dist(self._end_node[:2], goal[:2]) < _GOAL_TOLERANCE_M
 
     def _is_followed(self, x: float, y: float) -> bool:
         """Whether the end node at a place is the present target, which moves as the map grows."""
-        return (
-            self._end_node is not None
-            and math.dist((x, y), self._end_node[:2]) < self.config.same_place_m
-        )
+        return self._end_node is not None and math.dist((x, y), self._end_node[:2]) < _SAME_PLACE_M
 
     def _was_visited(self, x: float, y: float) -> bool:
-        return any(math.dist((x, y), place) < self.config.visit_radius_m for place in self._visited)
+        return any(math.dist((x, y), place) < _VISIT_RADIUS_M for place in self._visited)
 
 
 def _place(xy: Array) -> tuple[float, float]:

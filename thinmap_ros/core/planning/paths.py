@@ -39,21 +39,6 @@ _STRIDE = 8
 _MAX_ROUTES = 6  # that are tried, each without the contradicted edges of those before
 
 
-@dataclass(frozen=True, eq=False)
-class _Window:
-    """Part of a map; row, col: its first cell; bound_m: least length of a path that leaves it."""
-
-    patch: GridPatch
-    row: int
-    col: int
-    bound_m: float
-
-    def cells(self, cells: Cells) -> Cells:
-        """Those of the map's cells (N, 2) that lie in the window, as its own cells (M, 2)."""
-        moved = cells - (self.row, self.col)
-        return moved[np.all((moved >= 0) & (moved < self.patch.shape), axis=1)]
-
-
 def plan_short_path(
     patch: GridPatch,
     start_xy: Place,
@@ -72,9 +57,11 @@ def plan_short_path(
     """
     window = _window(patch, start_xy, goal_xy, config, obstacles)
     if window is not None:
-        inside = window.cells(trail)
-        found = find_path(window.patch, start_xy, goal_xy, config, obstacles, inside)
-        if found is not None and found.is_exact and found.cost_m <= window.bound_m:
+        part, bound_m = window
+        moved = trail - patch.offset_of(part)
+        inside = moved[np.all((moved >= 0) & (moved < part.shape), axis=1)]
+        found = find_path(part, start_xy, goal_xy, config, obstacles, inside)
+        if found is not None and found.is_exact and found.cost_m <= bound_m:
             return found.points
     found = find_path(patch, start_xy, goal_xy, config, obstacles, trail)
     return None if found is None else found.points
@@ -86,8 +73,11 @@ def _window(
     goal_xy: Place,
     config: WavefrontConfig,
     obstacles: Obstacles | None,
-) -> _Window | None:
-    """Window around start and goal; None where it is no smaller than most of the map."""
+) -> tuple[GridPatch, float] | None:
+    """Window around start and goal, and the least length of a path that leaves it, m.
+
+    None where it is no smaller than most of the map.
+    """
     resolution = patch.frame.resolution
     ends = patch.frame.cells_of(np.array([start_xy, goal_xy]))
     shape = np.array(patch.shape)
@@ -100,10 +90,9 @@ def _window(
     high = np.minimum(ends.max(axis=0) + room + 1, shape)
     if np.prod(high - low) > _MAX_SHARE * np.prod(shape):
         return None
-    row, col = (int(first) for first in low)
-    cells = np.ascontiguousarray(patch.cells[row : high[0], col : high[1]])
     bound_m = _least_detour(ends, low + rim, high - 1 - rim, low > 0, high < shape) * resolution
-    return _Window(GridPatch(patch.frame.with_origin_at(row, col), cells), row, col, bound_m)
+    part = patch.part((*low.tolist(), *high.tolist()))
+    return GridPatch(part.frame, np.ascontiguousarray(part.cells)), bound_m
 
 
 def _least_detour(
