@@ -34,7 +34,7 @@ from thinmap_ros.jit import cache as kernel_cache
 
 _WORTH_BYTES = 4e6
 _REPORT_PERIOD_S = 5.0
-# All 184 kernels took 115 s on one core of 2026. The time that they take here counts for more once
+# 184 kernels took 115 s on one core of 2026. The time that they take here counts for more once
 # there are as many.
 _USUAL_S = 0.63
 _USUAL_KERNELS = 20

@@ -1,4 +1,4 @@
-"""The way of a scan through the core is the one that the architecture tells."""
+"""A scan goes through the files that the page on the architecture names."""
 
 import cProfile
 import pstats
@@ -25,7 +25,7 @@ MAX_CALLS = 700
 
 def documented() -> list[tuple[list[str], str]]:
     """Files of each row of the table, and the function that it names."""
-    section = PAGE.read_text().split('## The way of a scan')[1].split('\n## ')[0]
+    section = PAGE.read_text().split('## From a scan to the map')[1].split('\n## ')[0]
     rows = re.findall(r'^\| (`.+?) \| `(\w+)` \|', section, re.MULTILINE)
     return [(re.findall(r'`([\w/]+)`', files), function) for files, function in rows]
 
