@@ -83,11 +83,10 @@ class RecordedSimulation(Simulation):
             self._poses.append(self.robot.T_world_base)
         return moment
 
-    def step(self, v: float, w: float) -> SensorReadings:
+    def move(self, v: float, w: float) -> None:
         """Drive for one step, and keep its exact distance and turn."""
-        moment = super().step(v, w)
+        super().move(v, w)
         self._steps.append((self.robot.v * _STEP_S, self.robot.w * _STEP_S))
-        return moment
 
     def recording(self) -> Recording:
         """Return what was recorded. Raises InputError where there was no scan."""
