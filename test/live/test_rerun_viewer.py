@@ -35,7 +35,7 @@ def test_recording_can_be_read_after_a_signal(graph, tmp_path):
     broken = messages.pose_stamped_msg([float('nan'), 0.0, 0.0], 'map', 5 * SECOND_NS)
     truth.publish(broken)
     graph.until(
-        lambda: 'ground_truth: pose' in graph.log('rerun_viewer'),
+        lambda: 'ground_truth: position: nan' in graph.log('rerun_viewer'),
         'the refusal of a pose that is none',
     )
     assert graph.stop('rerun_viewer') == 0

@@ -137,9 +137,13 @@ def test_a_person_sees_the_robot_sends_it_and_stops_it(graph, browser):
     tab.page.keyboard.press('Space')
     for each in (tab, narrow):
         each.until(lambda each=each: each.text('stop') == 'STOPPED', 'stopped')
-        each.until(lambda each=each: each.is_disabled('go'), 'no goal while it is stopped')
+        goal = each.page.locator('#go')
+        each.until(
+            lambda goal=goal: 'released first' in goal.get_attribute('title'),
+            'no goal while it is stopped',
+        )
+        assert each.is_disabled('go')
         assert each.text('status').startswith('stopped: ')
-        assert 'released first' in each.page.locator('#go').get_attribute('title')
     narrow.page.get_by_role('button', name='Release').click()
     tab.until(lambda: tab.text('stop') == 'STOP', 'released')
 

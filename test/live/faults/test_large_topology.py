@@ -85,5 +85,6 @@ def test_a_map_that_contradicts_itself_is_refused_and_a_truncated_one_disturbs_n
             ),
             'a rejected map',
         )
-    assert 'topology: node_kinds: 0 values for 2 nodes: expected 2' in graph.log('localizer')
+    refusal = 'topology: topological map: node_kinds: (0,): expected uint8 (n); n = 2'
+    assert refusal in graph.log('localizer')
     assert graph.stop('localizer') == 0

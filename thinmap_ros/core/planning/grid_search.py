@@ -108,7 +108,8 @@ def path_collides(patch: GridPatch, path: Array, radius_m: float) -> bool:
     """Whether an occupied cell is closer to a path (K, 2), m, map frame, than a radius."""
     frame = patch.frame
     at = (frame.origin_x, frame.origin_y, frame.resolution)
-    return bool(_collides(patch.cells, at, path, radius_m / frame.resolution - 1e-6))
+    points = np.ascontiguousarray(path)  # backwards, a path has another layout in memory
+    return bool(_collides(patch.cells, at, points, radius_m / frame.resolution - 1e-6))
 
 
 def disc(
