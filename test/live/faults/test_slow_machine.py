@@ -7,16 +7,20 @@ this machine makes no difference.
 """
 
 import signal
+import time
 
 import pytest
+from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 from support.doctor import Doctor
 
 from thinmap_msgs.msg import LocalizedScan, TopologicalMap
+from thinmap_ros.core.se2 import SECOND_NS
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
+HALTED_S = 2.0
 RATE = 8.0
 SCANS_WHILE_HALTED = 18
 SCANS_IN_ALL = 500
@@ -41,6 +45,22 @@ def no_shared_memory(monkeypatch):
     then keep the old segment, and receive nothing any more. This is not the subject of this test.
     """
     monkeypatch.setenv('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
+
+
+def test_a_simulation_in_real_time_makes_up_what_it_has_missed(graph):
+    """Its stamps keep their distance from the clock: other nodes judge by it what is late."""
+    odometry = graph.heard('odom', Odometry)
+    process = graph.start('sim', start='2.0,2.0,0.9')
+
+    def behind_s():
+        return time.monotonic() - stamps(odometry)[-1] / SECOND_NS
+
+    graph.until(lambda: len(odometry) > 20, 'odometry')
+    usual_s = behind_s()
+    process.send_signal(signal.SIGSTOP)
+    graph.until(lambda: behind_s() > usual_s + HALTED_S, 'stamps that are behind')
+    process.send_signal(signal.SIGCONT)
+    graph.until(lambda: behind_s() < usual_s + 0.5 * HALTED_S, 'stamps that have caught up')
 
 
 def test_old_scans_are_dropped_and_counted_and_the_delay_does_not_grow(no_shared_memory, graph):
