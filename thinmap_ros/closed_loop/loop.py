@@ -128,7 +128,7 @@ class ClosedLoop:
                 is_dead = self.trouble.is_dead(number, self.now_s)
                 robot.simulation.move(*((0.0, 0.0) if is_dead else robot.command))
                 robot.sense()
-            steps = steps + 1
+            steps += 1
         for robot in self.robots:
             robot.pipeline.finish()
         show(*self._measure(goal))

@@ -32,8 +32,8 @@ _MAX_SHARE = 0.5  # of the map: a larger window saves nothing
 LONG_PATH_M = 20.0
 _BAND_M = 3.0  # half of its width: wide enough for the shortest path through most halls
 _ACCESS_M = 8.0  # the same around both ends: from a room to the corridor beside it
-# Of the path points nearest to an end, how many are looked at, each so manieth of them: they lie a
-# cell apart.
+# How many of the path points nearest to an end are tried, and one of how many of these is: they are
+# a cell apart.
 _TRIED = 2000
 _STRIDE = 8
 _MAX_ROUTES = 6  # that are tried, each without the contradicted edges of those before
