@@ -9,6 +9,8 @@ import yaml
 from support.forks import forked
 from support.timeouts import PROGRAM_S
 
+import thinmap_ros
+
 ROOT = Path(__file__).resolve().parents[2]
 ROOM = {
     'name': 'closet',
@@ -71,6 +73,9 @@ def test_a_room_is_explored_and_everything_written(world: Path, tmp_path: Path) 
         'report.html',
     ):
         assert (out / name).stat().st_size > 0
+    compared = thinmap_ros.evaluate(out, out / 'true_trajectory.tum')
+    rmse = compared['trajectory.tum'].errors['APE, m'].rmse
+    assert rmse == pytest.approx(report['pose_rmse'], abs=1e-3)
 
 
 @pytest.mark.programs
@@ -91,6 +96,7 @@ def test_two_robots_explore_together_and_everything_is_written(world: Path, tmp_
         assert (out / name).stat().st_size > 0
     for robot in report['robots']:
         assert (out / f'trajectory_{robot["name"]}.tum').stat().st_size > 0
+        assert (out / f'true_trajectory_{robot["name"]}.tum').stat().st_size > 0
 
 
 @pytest.mark.programs

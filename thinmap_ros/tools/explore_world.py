@@ -32,7 +32,7 @@ WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's w
 
 
 def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> None:
-    """Write all files into a folder; of several robots a trajectory for each."""
+    """Write all files into a folder; of several robots trajectories for each."""
     title = exploration_title(report)
     logs = {f'trajectory_{robot.name}': robot.log for robot in loop.robots}
     shown: dict[str, Any] = {
@@ -49,6 +49,8 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
             'apart': robot.pipeline.localizer.apart_points(),
         }
     trajectories = {name: (log.stamps_ns, log.poses) for name, log in logs.items()}
+    for name, log in logs.items():
+        trajectories[f'true_{name}'] = (log.stamps_ns, log.true_poses)
     topology, _ = loop.maps.view(0)
     run = RunResult(loop.maps.known_area(), topology, title, trajectories, estimated, shown)
     write_run(folder, run)

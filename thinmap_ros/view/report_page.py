@@ -149,6 +149,7 @@ _FILES = {
     'topology.geojson': 'route graph with regions and doors, for the Nav2 route server',
     'trajectory.tum': 'pose at the time of each scan (TUM format)',
     'trajectory_final.tum': 'the same poses after all corrections',
+    'true_trajectory.tum': 'true poses of the simulated robot, in the same frame',
     'report.json': 'all figures',
     'recording.rrd': 'recording for the rerun viewer: rerun recording.rrd',
     'bag': 'rosbag2 of all topics',
