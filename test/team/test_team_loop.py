@@ -133,3 +133,16 @@ def test_claims_may_be_late():
     assert report['finished']
     # Both may drive to one place until each has heard of the other.
     assert report['time'] < 0.8 * run(1)[1]['time']
+
+
+@pytest.mark.parametrize('has_own_maps', [False, True])
+def test_the_graph_has_no_gap_that_is_too_narrow_for_the_robots(has_own_maps):
+    narrow = world()
+    narrow.occupied[:27, 98:102] = 1
+    narrow.occupied[33:, 98:102] = 1
+    starts = [START - (1.5, 0.0, 0.0), START - (3.0, 0.0, 0.0)]
+    options = replace(OPTIONS, robot='3at')
+    team, report = explore_together(narrow, starts, options, TeamOptions(has_own_maps=has_own_maps))
+    nodes = team.maps.view(0)[0].nodes.values()
+    assert report['finished']
+    assert max(node.x for node in nodes) < 5.0

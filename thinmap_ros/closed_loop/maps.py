@@ -59,7 +59,7 @@ class SharedMap(Maps):
     def __init__(self, robots: Sequence[SimulatedRobot]) -> None:
         super().__init__(robots)
         self.grid = OccupancyGrid(robots[0].pipeline.config.grid)
-        self.topology = TopologyBuilder()
+        self.topology = TopologyBuilder(robots[0].pipeline.config.topology)
         self._updates = 0
 
     def add_scan(self, robot: int, scan: Scan) -> Estimate | None:
@@ -98,7 +98,7 @@ class _OwnMap:
         self.robot = robot
         self.sender = TileSender(frame)
         self.received = ReceivedTiles(frame)
-        self.topology = TopologyBuilder()
+        self.topology = TopologyBuilder(robot.pipeline.config.topology)
         self.patch = GridPatch(frame, np.full((1, 1), -1, dtype=np.int8))
         self._corrections = 0
         self._thinned = self.patch
