@@ -25,6 +25,7 @@ from thinmap_ros.core.slam import localizer as localizing
 from thinmap_ros.core.slam import place_belief, track
 from thinmap_ros.core.slam.graph import loop_closure, reckoned
 from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.matching import visibility
 from thinmap_ros.core.slam.track import LocalizerConfig
 from thinmap_ros.core.stage import Estimate
 from thinmap_ros.sim.drives import DriveSample, random_drive, random_start
@@ -36,7 +37,7 @@ CONSTANTS: dict[str, tuple[ModuleType, ...]] = {
     '_GIVEN': (place_belief,),
     '_LEAST_ODDS': (place_belief,),
     'INLIERS_PER_CONTRADICTION': (place_belief, track),
-    '_SEEN_THROUGH': (place_belief,),
+    'MOST_SEEN_THROUGH': (place_belief, visibility),
     '_OPENING_RADIUS_M': (place_belief,),
     '_OPENING_PATH_M': (place_belief,),
     'RETURNS': (reckoned, loop_closure),

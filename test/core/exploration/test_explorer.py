@@ -481,6 +481,29 @@ def test_a_target_that_was_left_is_taken_again_for_a_larger_saving_only():
     assert explorer._target.candidate is not chosen
 
 
+def test_a_target_that_comes_and_goes_with_the_heading_does_not_hold_up_the_robot():
+    """Each time that the robot turns to it, the place to see it from is gone."""
+    explorer = Explorer()
+    far, near = (
+        Candidate(
+            Evidence(FIRST_FRONTIER_ID + i, (x, 0.0)),
+            np.zeros((15, 2), dtype=np.int64),
+            (x, 0.0),
+            goal=se2.pose(0.9 * x, 0.0, 0.0),
+            seconds=seconds,
+        )
+        for i, (x, seconds) in enumerate(((-10.0, 18.0), (5.0, 10.0)))
+    )
+    explorer.frontier_map.free_cells = 10
+    chosen = []
+    for turn in range(8):
+        explorer._finder.candidates = [far, near] if turn % 2 else [far]
+        explorer._choose(TopologicalMap(), START)
+        chosen.append(explorer._target.candidate)
+    assert chosen[:4] == [far, near, far, far]
+    assert chosen[4:] == [far] * 4
+
+
 def test_after_a_visit_or_a_failure_the_next_viewpoint_counts():
     explorer = Explorer()
     evidence = Evidence(FIRST_FRONTIER_ID, (2.0, 2.0))

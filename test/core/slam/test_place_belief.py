@@ -5,7 +5,8 @@ import pytest
 
 from thinmap_ros.core.places.place_odds import SURE
 from thinmap_ros.core.slam.matching.scan_matcher import Match
-from thinmap_ros.core.slam.place_belief import PlaceBelief, SeenThrough
+from thinmap_ros.core.slam.matching.visibility import SeenThrough
+from thinmap_ros.core.slam.place_belief import PlaceBelief
 
 ANGLES = np.linspace(-np.pi, np.pi, 90)
 ALL_AROUND = 4.0 * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])

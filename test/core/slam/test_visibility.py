@@ -9,7 +9,7 @@ from support.slam_room import map_of, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.matching.local_map import LocalMap
-from thinmap_ros.core.slam.track import seen_through
+from thinmap_ros.core.slam.matching.visibility import is_seen_through, seen_through
 
 PERIOD_NS = 200_000_000
 # A hall of 30 x 30 m: in its middle no wall is in range.
@@ -103,3 +103,17 @@ def test_returns_behind_walls_are_counted_and_those_on_them_and_beside_them_not(
     closer = scan_in(np.array([[2.0, -4.0, 2.0, 0.9]]), here)
     assert seen_ratio(closer, seen, here, SURE) == 0.0
     assert seen_ratio(through, LocalMap(), here, SURE) == 0.0
+
+
+def test_of_two_parallel_walls_what_lies_between_tells_which_one_it_is():
+    """A corridor beside a hall: from the hall its wall fits the far wall of the corridor."""
+    corridor = np.array([[-10.0, 3.0, 10.0, 3.0], [-10.0, -3.0, 10.0, -3.0]])
+    hall = np.array([[-10.0, 3.0, 10.0, 3.0], [-10.0, -12.0, 10.0, -12.0]])
+    seen = map_of(corridor, [se2.pose(x, 0.0, 0.0) for x in (-3.0, -2.0, -1.0, 0.0, 1.0)])
+    for x in (-1.5, -0.5, 0.5):
+        here = se2.pose(x, 0.0, 0.3)
+        assert is_seen_through(scan_in(hall, here), seen, here)
+        assert not is_seen_through(scan_in(corridor, here), seen, here)
+    here = np.zeros(3)
+    wall = map_of(hall[:1], [here] * 3)
+    assert not is_seen_through(scan_in(corridor, here), wall, here), 'unknown behind'

@@ -296,8 +296,9 @@ class Explorer:
     def _best(self, ready: list[Candidate]) -> Candidate:
         """The target, unless another candidate saves the margin; else that which is reached first.
 
-        The margin is twice as large for each time that the other one was left, so that the robot
-        never oscillates without end, whatever the costs are.
+        The margin is twice as large for each time that one of the two was left, so that the robot
+        never oscillates without end: neither by what a turn costs, nor with one that comes and
+        goes.
         """
         kept = self._kept(ready)
         if kept is not None:
@@ -306,7 +307,8 @@ class Explorer:
         if kept is None or kept is best:
             return best
         known_area_m2 = self.frontier_map.known_area_m2
-        margin_s = _SWITCH_MARGIN_S * 2.0 ** best.evidence.times_left(known_area_m2)
+        times_left = max(each.evidence.times_left(known_area_m2) for each in (kept, best))
+        margin_s = _SWITCH_MARGIN_S * 2.0**times_left
         if best.seconds >= kept.seconds - margin_s:
             return kept
         kept.evidence.leave(known_area_m2)

@@ -5,7 +5,6 @@ else. Drawing, holding, leaving the map and coming back are thresholds of it.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,17 +12,7 @@ from thinmap_ros.core.places.place_odds import SURE
 from thinmap_ros.core.places.views import WINDOW_M
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.scan_matcher import Match
-
-
-class SeenThrough(NamedTuple):
-    """Walls of the map (M, 2), m, map frame, behind which a scan has returns; ratio: of all."""
-
-    walls: Array
-    ratio: float
-
-
-NOTHING = SeenThrough(np.empty((0, 2)), 0.0)
-
+from thinmap_ros.core.slam.matching.visibility import MOST_SEEN_THROUGH, NOTHING, SeenThrough
 
 _GIVEN = math.log(1e2)  # of a start pose that a user gave: how rarely it is another one
 
@@ -31,10 +20,6 @@ _LEAST_ODDS = 0.05  # of a kidnapping, that are followed up: a crowd passes
 
 # Inliers for each contradicting point with which a match overrides the odometry.
 INLIERS_PER_CONTRADICTION = 3.0
-
-# Ratio of returns behind walls, between that of the worst real log (mean 0.11, of an office with
-# much glass) and that of robots that were kidnapped (mean 0.4 in the first seconds).
-_SEEN_THROUGH = 0.25
 
 _OPENING_RADIUS_M = 1.5  # a gate for hospital beds, or two leaves of an automatic door
 
@@ -256,7 +241,7 @@ class PlaceBelief:
         self.level = max(self.level + more, 0.0)
         if not is_stationary:
             self._end_look(self._seen_through)
-        self._seen_through = max(self._before_look + seen_through.ratio - _SEEN_THROUGH, 0.0)
+        self._seen_through = max(self._before_look + seen_through.ratio - MOST_SEEN_THROUGH, 0.0)
         if self._seen_through > 0.0:
             self._opening.add(seen_through, moved_m)
         if self.is_delocalized:

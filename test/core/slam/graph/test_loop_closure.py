@@ -207,6 +207,28 @@ def test_a_loop_that_is_5_m_open_is_closed_in_its_place(monkeypatch):
     assert np.hypot(*(driver.pose - truth)[:2]) < 0.5
 
 
+def test_the_wall_of_a_hall_is_not_that_of_the_corridor_beside_it(monkeypatch):
+    """Scans in the hall fit the far wall of the corridor, 3.3 m off, and see through the others.
+
+    The hall is so deep that the laser does not see its other walls.
+    """
+    ends = [[0.0, 0.0, 0.0, 3.0], [40.0, 0.0, 40.0, 3.0]]
+    corridor = [[0.0, 0.0, 40.0, 0.0], [0.0, 3.0, 40.0, 3.0], *ends]
+    driver = Driver(walls=np.array([*corridor, [-20.0, -0.3, 60.0, -0.3]]), seed=2)
+    along = [5.0 + 0.6 * k for k in range(50)]
+    for x in along:
+        driver.go(se2.pose(x, 1.5, 0.0), works=2)
+    with monkeypatch.context() as there:
+        there.setattr(f'{__name__}.STEP', STEP + WIDE)
+        driver.go(se2.pose(along[0], -3.0, 0.0))
+    driver.pose = driver.pose + [0.0, 2.0, 0.0]  # as far as the odometry may have drifted
+    matches = []
+    monkeypatch.setattr(driver.loops.pieces, 'add_match', matches.append)
+    for x in along[1:]:
+        driver.go(se2.pose(x, -3.0, 0.0), works=2)
+    assert len(matches) < driver.loops.min_consistent_matches
+
+
 def edge_to(loops, a, b, off, sigma=0.03):
     """Edge between keyframes a and b, at an offset (3,) from their current relative pose."""
     frames = loops.keyframes.frames

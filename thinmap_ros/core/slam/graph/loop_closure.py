@@ -39,6 +39,7 @@ from thinmap_ros.core.slam.graph.reckoned import CONTRARY_RATIO, RETURNS, Reckon
 from thinmap_ros.core.slam.graph.tables import EdgeTable
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
+from thinmap_ros.core.slam.matching.visibility import is_seen_through
 from thinmap_ros.core.slam.odometry import CHI2, OdometryCalibration
 from thinmap_ros.core.stage import Correction, are_two_storeys
 
@@ -753,6 +754,8 @@ class LoopClosure:
         if match.inlier_ratio < config.min_inlier_ratio:
             if reckoned is not None and match.contradiction_ratio > CONTRARY_RATIO:
                 reckoned.add_contrary(here.T_map_base[:2])
+            return
+        if not is_step and is_seen_through(here.scan, submap, match.pose):
             return
         covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + EDGE_NOISE
         off = se2.pose_difference(match.pose, prior)
