@@ -318,7 +318,7 @@ def test_after_dead_reckoning_a_few_points_that_fit_badly_do_not_move_the_pose(s
     rng = np.random.default_rng(seed)
     rows, localizer = driven(60)
     odom = rows[-1][2]
-    for k in range(150):
+    for k in range(200):
         odom = se2.compose(odom, se2.pose(0.05, 0.0, 0.03))
         predicted = localizer.step(replace(BLIND, stamp_ns=(60 + k) * PERIOD_NS), odom)
     assert localizer.config.matching.is_wide(localizer._tracker.uncertainty.since_match)

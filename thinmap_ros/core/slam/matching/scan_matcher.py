@@ -1,9 +1,9 @@
 """Scan-to-map matching: maximum a posteriori pose given point-to-wall distances and a motion prior.
 
 The cost is a robust loss of the distance of each point to its nearest wall, plus that of the prior.
-Its minimum near the prior is refined (`minimize`). If few points are inliers there, or if
-the prior is wider than the basin of convergence, the poses within three sigmas of the prior are
-searched (`search`). The lower cost is used.
+Its minimum near the prior is refined (`minimize`). If few points are inliers there, though the map
+tells of enough of them, or if the prior is wider than the basin of convergence, the poses within
+three sigmas of the prior are searched (`search`). The lower cost is used.
 
 The distance of a point is measured along the wall's normal: a smooth wall has no information along
 itself. If the normals of a cell's hits differ, as in a corner, both directions have information.
@@ -446,7 +446,9 @@ class Matcher:
         scan = weighted_points(points, T_base_laser, local_map.config.resolution_m)
         information = inverse(covariance)
         match = self._refined(scan, local_map, prior, prior, information)
-        fits_badly = match.inlier_ratio < self.config.min_inlier_ratio
+        # Points outside of the map fit nowhere, and do not say that the pose is wrong.
+        told = (match.inlier_ratio + match.contradiction_ratio) * len(points)
+        fits_badly = match.inlier_ratio < self.config.min_inlier_ratio and told >= MIN_POINTS
         if not fits_badly and not self.config.is_wide(covariance):
             return match
         if fits_badly:  # wheels may have slipped
