@@ -81,7 +81,7 @@ def is_seen_through(scan: Scan, local_map: LocalMap, T_map_base: Array) -> bool:
     """Whether a scan at a pose (3,) sees through more of a map than has changed since.
 
     Beams without a return count where a wall is in range: of parallel walls each fits like the
-    next one, and what lies between them tells which one it is.
+    next one, and the space between them tells which one it is.
     """
     exact = np.zeros((3, 3))
     missed = len(_missed(scan, local_map, T_map_base, exact))
