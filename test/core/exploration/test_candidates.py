@@ -166,6 +166,19 @@ def test_a_frontier_longer_than_the_range_is_observed_in_part_from_the_nearest_p
         assert abs(candidate.goal[1] - y) < 2.5
 
 
+def test_a_frontier_of_a_wide_hall_is_observed_from_where_a_wall_is_in_range():
+    """In the middle of a hall of 20 m, a laser of 8 m sees nothing that tells the place."""
+    at = se2.pose(9.5, 10.0, 0.0)
+    (candidate,) = Room(open_hall(12.0)).find(at)
+    x, y = candidate.goal[:2].tolist()
+    assert x > 8.0, 'not at the wall behind the robot'
+    assert min(y, 20.0 - y) <= 7.2
+    without_walls = open_hall(12.0)
+    without_walls[[0, -1]] = without_walls[:, 0] = -1
+    candidates = Room(without_walls).find(at)
+    assert min(math.dist(each.goal[:2], at[:2]) for each in candidates) < 1.5
+
+
 def test_a_frontier_near_which_a_cell_changes_is_examined_at_once_and_the_others_in_turn():
     cells = open_hall(12.0)
     cells[95:105, 118:120] = 100

@@ -234,6 +234,8 @@ def _choose_viewpoint(
 ) -> None:
     """Choose the place that sees most of a frontier for each second that it costs.
 
+    One with a wall in range, if there is any: in a hall that is wider than the laser sees, the
+    robot else goes where the odometry alone tells its place.
     Not one from where a visit showed nothing; for the last visit, it is the one that sees most at
     all. Without such a place, it is the nearest one beside the frontier: from there a passage that
     looks too narrow may turn out to be wide enough.
@@ -248,6 +250,8 @@ def _choose_viewpoint(
     if not is_new.any():
         _choose_beside(candidate, frontiers, travel)
         return
+    if not candidate.evidence.is_last_visit and (is_new & view.near_walls).any():
+        is_new &= view.near_walls
     off = se2.wrap(view.directions - arrivals.headings)
     turns = off - np.clip(off, -slack_rad, slack_rad)
     seconds = arrivals.seconds + travel.turn_s(turns)

@@ -22,7 +22,7 @@ from thinmap_ros.core.exploration.space import (
 from thinmap_ros.core.grid.patch import GridFrame
 from thinmap_ros.core.grid.raytrace import axis_setup
 from thinmap_ros.core.planning.travel_times import TravelTimes
-from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.scan import SURE_REACH, Scan
 from thinmap_ros.core.se2 import Array, Cells, Mask
 from thinmap_ros.jit import kernel
 
@@ -66,6 +66,7 @@ class View(NamedTuple):
     hidden_m2: unknown area in line of sight of it; depth_m: of the unknown straight behind it.
     cells (N, 2): of the map, places of the robot; areas_m2 (N,): unknown area behind it that is
     expected in sight from there; directions (N,), rad, map frame: of the middle of that;
+    near_walls (N,): whether a wall is in range from there, by which the robot knows its place;
     is_enclosed: whether its free cells connect to nowhere that the robot fits, and no place sees
     it.
     """
@@ -75,6 +76,7 @@ class View(NamedTuple):
     cells: Cells
     areas_m2: Array
     directions: Array
+    near_walls: Mask
     is_enclosed: bool
 
     @property
@@ -83,7 +85,10 @@ class View(NamedTuple):
         return float(self.areas_m2.max(initial=0.0))
 
 
-NO_VIEW = View(0.0, 0.0, np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0), False)
+_NONE = np.zeros(0)
+NO_VIEW = View(
+    0.0, 0.0, np.zeros((0, 2), dtype=np.int64), _NONE, _NONE, np.zeros(0, dtype=np.bool_), False
+)
 
 
 class ViewFinder:
@@ -185,6 +190,7 @@ class _Examiner:
             places[seen],
             areas_m2[seen],
             np.arctan2(sums[seen, 1], sums[seen, 0]),
+            _near_walls(frontiers.passable, places[seen], SURE_REACH * self._reach[0]),
             not seen.any() and is_enclosed(frontiers.free, cells, self._travel.allowed),
         )
 
@@ -205,6 +211,25 @@ def _first_reached(seconds: NDArray[np.float32], stands: Mask, size: int) -> Cel
                         found[count] = r, c
             count += best < np.inf
     return found[:count].copy()
+
+
+@kernel
+def _near_walls(passable: Mask, places: Cells, reach: float) -> Mask:
+    """Whether a cell within reach of each place (N, 2) is not passable, (N,)."""
+    rows, cols = passable.shape
+    size = int(reach)
+    found = np.zeros(len(places), dtype=np.bool_)
+    for i in range(len(places)):
+        row, col = places[i]
+        for r in range(max(row - size, 0), min(row + size + 1, rows)):
+            half = int(math.sqrt(reach * reach - (r - row) * (r - row)))
+            for c in range(max(col - half, 0), min(col + half + 1, cols)):
+                if not passable[r, c]:
+                    found[i] = True
+                    break
+            if found[i]:
+                break
+    return found
 
 
 @kernel
