@@ -31,7 +31,7 @@ MOST_SEEN_THROUGH = 0.25
 
 _STEP_CELLS = 0.5
 
-_BETWEEN_CELLS = 2.0  # a way may end in a cell whose offset is longer by less than this
+_BETWEEN_CELLS = 2.0  # a step may end in a cell whose offset is longer by less than this
 
 _BEHIND_M = 0.3  # by which a beam ends behind a wall that it has passed through
 
@@ -59,7 +59,7 @@ def seen_through(
 
     T_map_base (3,) with covariance (3, 3), map frame: a return behind a wall by no more than the
     pose is uncertain may lie in front of it. So drift up to a loop is told from a robot that was
-    carried off.
+    kidnapped.
     """
     total = int(np.count_nonzero(scan.returned))
     if total == 0:
