@@ -1,10 +1,11 @@
 """A scan against the previous one: a robot that drives on, a crowd, and a kidnapped robot."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.slam_room import ROOM, scan_in
+from support.slam_room import BLIND, ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.continuity import Motion, continues, continuity, log_ratio, seen_again
@@ -12,6 +13,7 @@ from thinmap_ros.core.slam.continuity import Motion, continues, continuity, log_
 HERE = np.array([3.0, 2.0, 0.3])
 MOVED = np.array([0.4, 0.0, 0.2])
 RNG = np.random.default_rng(3)
+HALL = np.array([[0.0, 0.0, 60.0, 0.0], [0.0, 40.0, 60.0, 40.0]])
 
 
 def seen_from(T, stamp_ns=1):
@@ -56,6 +58,24 @@ def test_a_scan_without_returns_tells_nothing():
     blind = scan.blinded('covered')
     assert seen_again(scan, blind, MOVED) is None
     assert continuity(scan, blind, [Motion(MOVED)]) == 0.0
+
+
+def test_in_a_hall_beams_without_return_tell_of_another_place():
+    """A wall on the left, and then one on the right: no return is in front of another one."""
+    left = scan_in(HALL, np.array([30.0, 37.0, 0.0]), RNG)
+    right = scan_in(HALL, np.array([30.0, 3.0, 0.0]), RNG)
+    driven = scan_in(HALL, np.array([30.5, 37.0, 0.0]), RNG)
+    ahead = Motion(np.array([0.5, 0.0, 0.0]))
+    assert continuity(left, right, [ahead]) < -5.0
+    assert continuity(left, driven, [ahead]) == 0.0
+    dropping = [replace(scan, drops_out=True) for scan in (left, right)]
+    assert continuity(*dropping, [ahead]) == 0.0, 'its beams without return say nothing'
+
+
+def test_what_sees_nothing_at_all_does_not_tell_of_free_space():
+    scan = seen_from(HERE)
+    assert seen_again(BLIND, scan, MOVED) is None
+    assert continues(BLIND, scan, MOVED) and not continues(BLIND, scan, MOVED, is_told=True)
 
 
 @pytest.mark.parametrize('found', [0.3, 0.5, 0.7, 0.9])

@@ -89,6 +89,23 @@ def test_a_robot_that_was_kidnapped_in_a_given_map_is_lost_until_scans_fit():
     assert belief.is_lost
 
 
+def test_where_the_robot_may_have_been_kidnapped_scans_that_fit_wait_to_be_drawn():
+    """Places look alike: a map that grows by the first scan would fit all that follow."""
+    belief = PlaceBelief(4.0, 0.6)
+    belief.update(match(0.8, 0.0))
+    assert not belief.forbids_mapping
+    belief.move(-8.0)
+    belief.update(match(0.8, 0.0))
+    assert belief.is_doubted and not belief.needs_submap
+    scans = 0
+    while belief.forbids_mapping:
+        belief.move(0.0)
+        belief.update(match(0.8, 0.0))
+        scans += 1
+    assert 2 < scans < 10
+    assert 2.0 * belief.log_odds >= SURE and not belief.permits_mapping
+
+
 def test_a_given_pose_ends_a_guess():
     evidence = tried((0.0, 1.0), is_guess=True)
     evidence.place()

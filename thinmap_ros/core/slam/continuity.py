@@ -2,7 +2,7 @@
 
 A kidnapped robot sees other walls than a moment ago, though a map that grows soon agrees
 with them. A crowd, a door that is shut and wheels that slip change a scan as well; each has its
-share in the likelihood.
+share in the likelihood. A beam without return shows free space, as in the map: in a hall, most do.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.scan import MIN_HITS, Scan
+from thinmap_ros.core.scan import MIN_HITS, NO_RETURN_CLEAR_RANGE_M, Scan
 from thinmap_ros.core.se2 import Array, Mask
 from thinmap_ros.jit import kernel
 
@@ -76,10 +76,15 @@ def continuity(before: Scan, scan: Scan, motions: list[Motion]) -> float:
     return best
 
 
-def continues(before: Scan, scan: Scan, T: Array) -> bool:
-    """Whether a scan, T (3,) from the previous one, shows it again, or cannot tell."""
+def continues(before: Scan, scan: Scan, T: Array, is_told: bool = False) -> bool:
+    """Whether a scan, T (3,) from the previous one, shows it again.
+
+    is_told: not where it cannot tell, either.
+    """
     share = seen_again(before, scan, T)
-    return share is None or log_ratio(share, math.hypot(*T)) >= 0.0
+    if share is None:
+        return not is_told
+    return log_ratio(share, math.hypot(*T)) >= 0.0
 
 
 def seen_again(before: Scan, scan: Scan, T: Array) -> float | None:
@@ -95,15 +100,19 @@ def seen_again(before: Scan, scan: Scan, T: Array) -> float | None:
 def _shown_by(a: Scan, b: Scan, T_a_b: Array) -> float | None:
     """Share of the returns of b that a shows again, of those of which it tells; None: too few.
 
-    A return in front of those of a is where a has seen free space. One behind them is hidden.
+    A return in front of those of a is where a has seen free space, and so is one where a beam of a
+    has no return, if others have. One behind them is hidden.
     """
     points = _compared(b)
     if len(points) < MIN_HITS:
         return None
     T_laser = se2.compose(se2.invert(a.T_base_laser), T_a_b)
     seen = se2.transform_points(T_laser, points)
+    clear_m = min(a.range_max_m, a.max_range_m, NO_RETURN_CLEAR_RANGE_M)
+    ranges = np.where(a.no_return, clear_m, a.ranges_m)
+    clears = a.hit if np.count_nonzero(a.hit) < MIN_HITS else a.hit | a.no_return
     first = a.angle_min_rad
-    found, contrary = _counts(seen, a.ranges_m, a.hit, first, a.angle_increment_rad)
+    found, contrary = _counts(seen, ranges, a.hit, clears, first, a.angle_increment_rad)
     told = found + contrary
     return None if told < max(_LEAST_TOLD * len(points), 1.0) else found / told
 
@@ -120,11 +129,12 @@ def _compared(scan: Scan) -> Array:
 
 @kernel
 def _counts(
-    points: Array, ranges: NDArray[np.float64], hit: Mask, first: float, step: float
+    points: Array, ranges: NDArray[np.float64], hit: Mask, clears: Mask, first: float, step: float
 ) -> tuple[int, int]:
     """Numbers of points (M, 2), laser frame, that a scan shows, and that lie in its free space.
 
-    ranges, hit (N,): of its beams, the first at an angle, the next each a step further, rad.
+    ranges, hit, clears (N,): of its beams, the first at an angle, the next each a step further,
+    rad; clears: the space is free up to the range.
     """
     found = 0
     contrary = 0
@@ -152,7 +162,7 @@ def _counts(
             continue
         is_free = True
         for k in range(max(beam - 1, 0), min(beam + 2, count)):
-            is_free = is_free and hit[k] and ranges[k] - _FREE_M > range_m
+            is_free = is_free and clears[k] and ranges[k] - _FREE_M > range_m
         if is_free:
             contrary += 1
     return found, contrary

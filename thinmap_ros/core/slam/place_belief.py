@@ -121,6 +121,7 @@ class PlaceBelief:
         self.level = level
         self._carried = 0.0  # odds of a kidnapping by the last motion
         self._is_elsewhere = False  # it was kidnapped before
+        self._is_held = False  # nothing is drawn, as it may have been
         self._end_look(0.0)
 
     def _end_look(self, seen_through: float) -> None:
@@ -156,9 +157,9 @@ class PlaceBelief:
         """Whether the last scan may show another place than the map does.
 
         A map that such scans change soon agrees with them, wherever the robot is. A scan that fits
-        shows this place, with people or furniture.
+        shows this place, with people or furniture, unless the robot may have been kidnapped.
         """
-        return self._is_foreign
+        return self._is_foreign or self._is_held
 
     @property
     def _is_grave(self) -> bool:
@@ -193,6 +194,9 @@ class PlaceBelief:
             self.level = self._lost_evidence * (1.0 - self._log_odds_of_level / SURE)
         odds = math.exp(-SURE) * math.expm1(-continuity)
         self._carried = 0.0 if odds < _LEAST_ODDS or self.is_delocalized else odds
+        # Places that look alike differ in what is around them, which is to be compared yet.
+        is_doubtful = self._is_held or self._carried > 0.0
+        self._is_held = is_doubtful and 2.0 * self.log_odds < SURE
 
     @property
     def is_doubted(self) -> bool:

@@ -311,7 +311,9 @@ class Tracker:
             likelihood = -0.5 * float(off @ np.linalg.solve(expected, off))
             by_match = se2.compose(look.T_scan_base, se2.between(prediction.prior, match.pose))
             motions.append(Motion(by_match, likelihood))
-        is_again = look.is_kept and self._is_at_rest(look)
+        is_again = look.is_kept and (
+            self._is_at_rest(look) or continues(look.scan, scan, look.T_scan_base, is_told=True)
+        )
         self.belief.move(continuity(look.scan, scan, motions), is_again)
 
     def _judge_start(self, scan: Scan, points: Array, match: Match, there: Surroundings) -> None:
