@@ -79,7 +79,7 @@ def continuity(before: Scan, scan: Scan, motions: list[Motion]) -> float:
 def continues(before: Scan, scan: Scan, T: Array, is_told: bool = False) -> bool:
     """Whether a scan, T (3,) from the previous one, shows it again.
 
-    is_told: not where it cannot tell, either.
+    is_told: whether it has to tell so; else one that cannot tell counts as one that does.
     """
     share = seen_again(before, scan, T)
     if share is None:
