@@ -117,6 +117,20 @@ def test_a_robot_in_another_building_is_told_so():
     assert SearchState.LOCALIZED not in states
 
 
+def test_a_robot_that_would_have_left_half_a_map_is_told_that_it_is_not_in_it():
+    """Places that have moved to where nothing is mapped, and late ones, do not count."""
+    half = OFFICE.copy()
+    half[:, 45:] = -1
+    other = floor((15, 0, 18, 50), (30, 30, 33, 90), (42, 0, 45, 60), rows=60, cols=90)
+    ahead = [(0.15, 0.0)]
+    turn = [(0.0, 0.4)] * 4
+    way = [*ahead * 30, *turn, *ahead * 15, *turn, *ahead * 30]
+    results = run(GlobalLocalization(*map_of(half), seed=1), drive(other, (-0.2, 2.7, 0.0), way))
+    states = [result.state for result, _ in results]
+    assert states[-1] == SearchState.NOT_IN_MAP
+    assert SearchState.LOCALIZED not in states
+
+
 def test_a_pose_found_is_followed_and_a_robot_carried_off_is_found_again(finder):
     before = list(drive(OFFICE, START, WAY))
     after = [

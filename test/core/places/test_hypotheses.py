@@ -115,6 +115,17 @@ def test_doubles_become_one_and_the_hopeless_are_dropped():
     assert len(known.samples) == len(known.owners) == 500
 
 
+def test_a_place_that_is_found_again_keeps_what_its_own_looks_have_told():
+    """Odometry tells the looks of the new one, by which the known ones miss something, too."""
+    known = looked(some([0, 0, 0], [5, 0, 1]), *([[60.0, 60.0]] * 30))
+    looks = [look_of([50.0, 50.0, 60.0]) for _ in range(6)]
+    known.add(np.array([[0.05, 0.0, 0.02]]), -6.0, looks, MOST)
+    known.prune()
+    assert known.poses[:, 0].tolist() == [0.0, 5.0]
+    assert known.evidence.tolist() == [MOST, MOST]
+    assert not known.log_weights.any()
+
+
 def test_odometry_moves_hypotheses_and_samples_alike():
     known = some([1, 1, np.pi / 2])
     mean = known.samples.mean(axis=0)

@@ -31,7 +31,6 @@ from thinmap_ros.core.places.place_database import (
 )
 from thinmap_ros.core.places.place_odds import (
     IN_THIS_MAP,
-    MAX_LOG_RATIO,
     SURE,
     MissingShares,
     log_odds_of_any,
@@ -334,7 +333,7 @@ class GlobalLocalization:
     @property
     def _log_prior(self) -> float:
         """Log odds of a place that turns up late, against those that are known, and none."""
-        return max(self._searches * _LOG_MISSED, -MAX_LOG_RATIO)
+        return max(self._searches * _LOG_MISSED, -SURE)
 
     def _draw(self, count: int) -> Array:
         """Samples (N, 3) of all poses at which the robot can stand."""
@@ -361,8 +360,16 @@ class GlobalLocalization:
         return log_odds_of_first(evidence, math.log(self._crowd), self._elsewhere)
 
     def _log_odds_of_any(self) -> float:
-        """Log odds that one of the places is the right one, against none of them."""
-        return log_odds_of_any(self._known.evidence, math.log(self._crowd), self._elsewhere)
+        """Log odds that one of the places is the right one, against none of them.
+
+        A robot that has driven out of what is mapped is at none of its places.
+        """
+        known = self._known
+        alternatives = math.log(self._crowd)
+        here = self.places.are_free(known.poses[:, :2])
+        outside = known.evidence[~here] - alternatives
+        elsewhere = float(np.logaddexp.reduce(outside, initial=self._elsewhere))
+        return log_odds_of_any(known.evidence[here], alternatives, elsewhere)
 
     @property
     def is_sure(self) -> bool:

@@ -279,11 +279,15 @@ class Hypotheses:
             setattr(self, name, np.concatenate([getattr(self, name), values]))
 
     def prune(self) -> None:
-        """Drop what is out of the question, and of what has come together all but the likeliest."""
-        logs = self.log_weights
-        order = self.order()
-        order = order[logs[order] > _MIN_LOG_WEIGHT]
+        """Drop what is out of the question, and of what has come together all but one.
+
+        That is the one for which beams and looks together speak most: beams alone would prefer one
+        that was just found, where odometry leads the known ones back to poses a little off.
+        """
+        order = np.argsort(-(self.log_weights + self.evidence), kind='stable')
         kept = order[se2.distinct(self.poses[order], _SAME_M, _SAME_RAD, _MAX_HYPOTHESES)]
+        logs = self.log_weights[kept]
+        kept = kept[logs - logs.max(initial=-np.inf) > _MIN_LOG_WEIGHT]
         if len(kept) == len(self) == int(self.owners.max(initial=-1)) + 1:
             return
         renumbered = np.full(len(self.poses), -1)

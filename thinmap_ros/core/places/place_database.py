@@ -117,6 +117,13 @@ class Places:
         """Area on which the robot can stand."""
         return len(self.standing) * self.frame.resolution**2
 
+    def are_free(self, points: Array) -> NDArray[np.bool_]:
+        """Whether points (N, 2) lie in cells that are known to be free, (N,)."""
+        cells = self.frame.cells_of(points)
+        inside = ((cells >= 0) & (cells < self.states.shape)).all(axis=1)
+        cells[~inside] = 0
+        return np.asarray(inside & (self.states[cells[:, 0], cells[:, 1]] == FREE))
+
     def memory_bytes(self) -> int:
         """What all arrays take."""
         return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
