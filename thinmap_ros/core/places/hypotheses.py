@@ -249,7 +249,7 @@ class Hypotheses:
         self.found = look.found
 
     def add(self, poses: Array, prior: float, looks: Sequence[Look], most: float) -> None:
-        """Add new hypotheses (N, 3).
+        """Add new hypotheses (N, 3), but for those at a known one for which more speaks.
 
         prior: log odds, of places that turn up as late; looks: earlier ones, at the existing
         hypotheses and at these; most: as in `take_evidence`.
@@ -267,6 +267,7 @@ class Hypotheses:
             evidence = np.minimum(evidence + look.log_ratios, most)
         covariance = np.diag([_NEW_SIGMA_M**2, _NEW_SIGMA_M**2, _NEW_SIGMA_RAD**2])
         fresh = np.broadcast_to(covariance, (count, 3, 3))
+        unknown = ~self._are_known(poses, evidence[old:])
         for name, values in (
             ('poses', poses),
             ('priors', np.full(count, prior)),
@@ -276,18 +277,24 @@ class Hypotheses:
             ('evidence', evidence[old:]),
             ('found', looks[0].found[old:] if looks else every[old:]),
         ):
-            setattr(self, name, np.concatenate([getattr(self, name), values]))
+            setattr(self, name, np.concatenate([getattr(self, name), values[unknown]]))
+
+    def _are_known(self, poses: Array, evidence: Array) -> NDArray[np.bool_]:
+        """Whether poses (N, 3) are at a hypothesis with more than their evidence (N,), (N,).
+
+        Odometry leads back from a known one to where it misses beams that it explained, and by
+        them a new one at the same place would seem better.
+        """
+        off = np.abs(poses[:, None] - self.poses)
+        near = (off[..., :2] <= _SAME_M).all(axis=2) & (np.abs(se2.wrap(off[..., 2])) <= _SAME_RAD)
+        return np.asarray((near & (self.evidence > evidence[:, None])).any(axis=1))
 
     def prune(self) -> None:
-        """Drop what is out of the question, and of what has come together all but one.
-
-        That is the one for which beams and looks together speak most: beams alone would prefer one
-        that was just found, where odometry leads the known ones back to poses a little off.
-        """
-        order = np.argsort(-(self.log_weights + self.evidence), kind='stable')
+        """Drop what is out of the question, and of what has come together all but the likeliest."""
+        logs = self.log_weights
+        order = self.order()
+        order = order[logs[order] > _MIN_LOG_WEIGHT]
         kept = order[se2.distinct(self.poses[order], _SAME_M, _SAME_RAD, _MAX_HYPOTHESES)]
-        logs = self.log_weights[kept]
-        kept = kept[logs - logs.max(initial=-np.inf) > _MIN_LOG_WEIGHT]
         if len(kept) == len(self) == int(self.owners.max(initial=-1)) + 1:
             return
         renumbered = np.full(len(self.poses), -1)
