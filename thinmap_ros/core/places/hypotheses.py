@@ -249,7 +249,7 @@ class Hypotheses:
         self.found = look.found
 
     def add(self, poses: Array, prior: float, looks: Sequence[Look], most: float) -> None:
-        """Add new hypotheses (N, 3), but for those at a known one for which more speaks.
+        """Add new hypotheses (N, 3), but for those at a known one for which much more speaks.
 
         prior: log odds, of places that turn up as late; looks: earlier ones, at the existing
         hypotheses and at these; most: as in `take_evidence`.
@@ -280,14 +280,15 @@ class Hypotheses:
             setattr(self, name, np.concatenate([getattr(self, name), values[unknown]]))
 
     def _are_known(self, poses: Array, evidence: Array) -> NDArray[np.bool_]:
-        """Whether poses (N, 3) are at a hypothesis with more than their evidence (N,), (N,).
+        """Whether at poses (N, 3) with evidence (N,) there is one for which much more speaks, (N,).
 
-        Odometry leads back from a known one to where it misses beams that it explained, and by
-        them a new one at the same place would seem better.
+        Much: more than one look may tell. Odometry leads back from it to where it misses beams that
+        it explained, and by them a new one at the same place would seem better.
         """
         off = np.abs(poses[:, None] - self.poses)
         near = (off[..., :2] <= _SAME_M).all(axis=2) & (np.abs(se2.wrap(off[..., 2])) <= _SAME_RAD)
-        return np.asarray((near & (self.evidence > evidence[:, None])).any(axis=1))
+        is_more = self.evidence > evidence[:, None] + MAX_LOG_RATIO
+        return np.asarray((near & is_more).any(axis=1))
 
     def prune(self) -> None:
         """Drop what is out of the question, and of what has come together all but the likeliest."""
