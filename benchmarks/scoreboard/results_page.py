@@ -72,12 +72,12 @@ IRIS LaMa closes no loops: one error is recorded for each log, and it loses all 
 
 """
 _INTEL_NOTES = """\
-Compare times with care: the other machines are not recorded, and a scan of release 0.3.0 takes
-1.97 ms on one machine and 3.78 ms on that of this page. [Side by side](peers.md), IRIS LaMa takes
-about a tenth of thinmap's time for a scan that it processes. It takes a twentieth of the memory and
-is about as exact: better in its first build, worse in its third. slam_toolbox takes less time, and
-Karto and IRIS LaMa have the smaller final errors. Cartographer was tuned by hand for this log; its
-published 0.023 m are final poses of the complete log, so that 0.081 m is what to compare.
+Compare times with care: the machines of the other programs are not recorded, and one release of
+thinmap takes twice as long on one machine as on another. [On one machine](peers.md), IRIS LaMa
+takes about a tenth of thinmap's time for a scan that it processes. It takes a twentieth of the
+memory and is about as exact: better in its first build, worse in its third. slam_toolbox takes less
+time, and Karto and IRIS LaMa have the smaller final errors. Cartographer was tuned by hand for this
+log; its published 0.023 m are final poses of the complete log, so that 0.081 m is what to compare.
 
 """
 _WHY = """\

@@ -267,7 +267,7 @@ class Hypotheses:
             evidence = np.minimum(evidence + look.log_ratios, most)
         covariance = np.diag([_NEW_SIGMA_M**2, _NEW_SIGMA_M**2, _NEW_SIGMA_RAD**2])
         fresh = np.broadcast_to(covariance, (count, 3, 3))
-        unknown = ~self._are_known(poses, evidence[old:])
+        is_new = ~self._are_known(poses, evidence[old:])
         for name, values in (
             ('poses', poses),
             ('priors', np.full(count, prior)),
@@ -277,7 +277,7 @@ class Hypotheses:
             ('evidence', evidence[old:]),
             ('found', looks[0].found[old:] if looks else every[old:]),
         ):
-            setattr(self, name, np.concatenate([getattr(self, name), values[unknown]]))
+            setattr(self, name, np.concatenate([getattr(self, name), values[is_new]]))
 
     def _are_known(self, poses: Array, evidence: Array) -> NDArray[np.bool_]:
         """Whether at poses (N, 3) with evidence (N,) there is one for which much more speaks, (N,).
