@@ -85,7 +85,7 @@ __all__ = [
 ]
 
 # The only place of the version: setup.py reads it, and a test compares the two package.xml with it.
-__version__ = '0.3.0'
+__version__ = '0.4.0'
 
 _PLACES = {
     # SLAM
