@@ -166,7 +166,7 @@ def test_a_frontier_longer_than_the_range_is_observed_in_part_from_the_nearest_p
         assert abs(candidate.goal[1] - y) < 2.5
 
 
-def test_a_frontier_of_a_wide_hall_is_observed_from_where_a_wall_is_in_range():
+def test_a_robot_without_a_wall_in_range_observes_a_frontier_from_where_one_is():
     """In the middle of a hall of 20 m, a laser of 8 m sees nothing that tells the place."""
     at = se2.pose(9.5, 10.0, 0.0)
     (candidate,) = Room(open_hall(12.0)).find(at)
@@ -177,6 +177,12 @@ def test_a_frontier_of_a_wide_hall_is_observed_from_where_a_wall_is_in_range():
     without_walls[[0, -1]] = without_walls[:, 0] = -1
     candidates = Room(without_walls).find(at)
     assert min(math.dist(each.goal[:2], at[:2]) for each in candidates) < 1.5
+
+
+def test_a_robot_with_a_wall_in_range_observes_a_frontier_from_anywhere():
+    (candidate,) = Room(open_hall(12.0)).find(se2.pose(2.0, 10.0, 0.0))
+    x, y = candidate.goal[:2].tolist()
+    assert min(x, y, 20.0 - y) > 8.0
 
 
 def test_a_frontier_near_which_a_cell_changes_is_examined_at_once_and_the_others_in_turn():

@@ -28,10 +28,10 @@ from thinmap_ros.core.exploration.belief import (
 )
 from thinmap_ros.core.exploration.space import FrontierMap, search_beside
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode, unobserved
-from thinmap_ros.core.exploration.views import NO_VIEW, Sight, View, ViewFinder
+from thinmap_ros.core.exploration.views import NO_VIEW, Sight, View, ViewFinder, sees_walls
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.travel_times import Arrivals, TravelTimes
-from thinmap_ros.core.se2 import Array, Cells, Place
+from thinmap_ros.core.se2 import Array, Cells, Mask, Place
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 
 SETTLED = 0.999  # probability of an end node without a frontier
@@ -162,14 +162,21 @@ class CandidateFinder:
     def _choose_viewpoints(
         self, chosen: list[Candidate], frontiers: FrontierMap, travel: TravelTimes, sight: Sight
     ) -> None:
+        """Choose from where to observe each candidate.
+
+        A robot without a wall in range goes to where one is, if it can: in a hall that is wider
+        than the laser sees, the odometry alone else tells its place all the way.
+        """
         places = [candidate.view.cells for candidate in chosen]
         arrivals = travel.arrivals(np.concatenate([NO_VIEW.cells, *places]))
+        is_blind = not sees_walls(frontiers, np.array([travel.start]), sight).any()
         end = 0
         for candidate, cells in zip(chosen, places, strict=True):
             part = slice(end, end + len(cells))
             end = part.stop
             own = Arrivals(arrivals.seconds[part], arrivals.headings[part])
-            _choose_viewpoint(candidate, frontiers, travel, own, sight.slack_rad)
+            wanted = sees_walls(frontiers, cells, sight) if is_blind else np.ones(len(cells), bool)
+            _choose_viewpoint(candidate, frontiers, travel, own, sight.slack_rad, wanted)
 
     def _find(
         self, topology: TopologicalMap, frontiers: FrontierMap, clusters: list[Cells]
@@ -231,16 +238,15 @@ def _choose_viewpoint(
     travel: TravelTimes,
     arrivals: Arrivals,
     slack_rad: float,
+    wanted: Mask,
 ) -> None:
     """Choose the place that sees most of a frontier for each second that it costs.
 
-    One with a wall in range, if there is any: in a hall that is wider than the laser sees, the
-    robot else goes where the odometry alone tells its place.
     Not one from where a visit showed nothing; for the last visit, it is the one that sees most at
     all. Without such a place, it is the nearest one beside the frontier: from there a passage that
     looks too narrow may turn out to be wide enough.
     arrivals: at the places of its view; slack_rad: angle by which the robot need not turn to what
-    it observes.
+    it observes; wanted (N,): places that come before the others, but not for the last visit.
     """
     view = candidate.view
     centres = frontiers.frame.centres_of(view.cells)
@@ -250,8 +256,8 @@ def _choose_viewpoint(
     if not is_new.any():
         _choose_beside(candidate, frontiers, travel)
         return
-    if not candidate.evidence.is_last_visit and (is_new & view.near_walls).any():
-        is_new &= view.near_walls
+    if not candidate.evidence.is_last_visit and (is_new & wanted).any():
+        is_new &= wanted
     off = se2.wrap(view.directions - arrivals.headings)
     turns = off - np.clip(off, -slack_rad, slack_rad)
     seconds = arrivals.seconds + travel.turn_s(turns)

@@ -66,7 +66,6 @@ class View(NamedTuple):
     hidden_m2: unknown area in line of sight of it; depth_m: of the unknown straight behind it.
     cells (N, 2): of the map, places of the robot; areas_m2 (N,): unknown area behind it that is
     expected in sight from there; directions (N,), rad, map frame: of the middle of that;
-    near_walls (N,): whether a wall is in range from there, by which the robot knows its place;
     is_enclosed: whether its free cells connect to nowhere that the robot fits, and no place sees
     it.
     """
@@ -76,7 +75,6 @@ class View(NamedTuple):
     cells: Cells
     areas_m2: Array
     directions: Array
-    near_walls: Mask
     is_enclosed: bool
 
     @property
@@ -85,10 +83,7 @@ class View(NamedTuple):
         return float(self.areas_m2.max(initial=0.0))
 
 
-_NONE = np.zeros(0)
-NO_VIEW = View(
-    0.0, 0.0, np.zeros((0, 2), dtype=np.int64), _NONE, _NONE, np.zeros(0, dtype=np.bool_), False
-)
+NO_VIEW = View(0.0, 0.0, np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0), False)
 
 
 class ViewFinder:
@@ -190,7 +185,6 @@ class _Examiner:
             places[seen],
             areas_m2[seen],
             np.arctan2(sums[seen, 1], sums[seen, 0]),
-            _near_walls(frontiers.passable, places[seen], SURE_REACH * self._reach[0]),
             not seen.any() and is_enclosed(frontiers.free, cells, self._travel.allowed),
         )
 
@@ -211,6 +205,12 @@ def _first_reached(seconds: NDArray[np.float32], stands: Mask, size: int) -> Cel
                         found[count] = r, c
             count += best < np.inf
     return found[:count].copy()
+
+
+def sees_walls(frontiers: FrontierMap, places: Cells, sight: Sight) -> Mask:
+    """Whether a wall, by which a robot knows its place, is in range from each place (N, 2)."""
+    reach = SURE_REACH * sight.range_m / frontiers.frame.resolution
+    return _near_walls(frontiers.passable, places, reach)
 
 
 @kernel

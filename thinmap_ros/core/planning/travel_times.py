@@ -66,6 +66,11 @@ class TravelTimes:
         return self._controller.max_speed_m_s
 
     @property
+    def start(self) -> tuple[int, int]:
+        """Cell where the robot is."""
+        return self._cell_of(self._pose)
+
+    @property
     def reachable(self) -> Mask:
         """Traversable cells (H, W) to which the robot can get."""
         return np.isfinite(self.seconds) & self.traversable
@@ -93,7 +98,7 @@ class TravelTimes:
     def arrivals(self, cells: Cells) -> Arrivals:
         """When the robot stops at some cells (N, 2), and with which heading it comes."""
         reach = _END_M / self.frame.resolution
-        first, last = _ends(self.seconds, cells, self._cell_of(self._pose), reach)
+        first, last = _ends(self.seconds, cells, self.start, reach)
         # Beside the robot there is no path whose ends have directions.
         begins = np.where(np.isnan(first), self._pose[2], first)
         headings = np.where(np.isnan(last), self._pose[2], last)
