@@ -208,7 +208,7 @@ def _first_reached(seconds: NDArray[np.float32], stands: Mask, size: int) -> Cel
 
 
 def sees_walls(frontiers: FrontierMap, places: Cells, sight: Sight) -> Mask:
-    """Whether a wall, by which a robot knows its place, is in range from each place (N, 2)."""
+    """Whether a wall, which tells a robot its place, is in range from each place (N, 2)."""
     reach = SURE_REACH * sight.range_m / frontiers.frame.resolution
     return _near_walls(frontiers.passable, places, reach)
 
