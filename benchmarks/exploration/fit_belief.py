@@ -21,7 +21,12 @@ from thinmap_ros.core.exploration import fitted
 from thinmap_ros.core.exploration.belief import WORTH_SEEING_M2, BeliefModel
 from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.parallel_jobs import add_run_options, failure_summary, run_pending
+from thinmap_ros.evaluation.parallel_jobs import (
+    add_run_options,
+    failure_summary,
+    provenance,
+    run_pending,
+)
 from thinmap_ros.files.safe import read_text, write_text
 
 FITTED_ON = ('dungeon/d114', 'dungeon/d1305', 'dungeon/d1336', 'dungeon/d1407', 'kth/50052749')
@@ -190,7 +195,8 @@ def main() -> None:
         table = reliability_table(predicted(model, test.columns), test)
         print(f'\n{name}: {model}\n', *table, sep='\n')
     # Of the constants that hold from now on: the last ones.
-    write_text(arguments.out / 'reliability.md', '\n'.join(table) + '\n')
+    lines = [*table, '', f'{provenance()}.']
+    write_text(arguments.out / 'reliability.md', '\n'.join(lines) + '\n')
     if arguments.write:
         write_text(Path(fitted.__file__), source(model))
 

@@ -35,8 +35,8 @@ _HEAD = """\
 
 {chart}
 Simulated robots explore worlds that they do not know. Each section of runs states the laser, the
-speed, the source of the poses, and the commit and machine. The calibration of the belief is of an
-earlier commit, with the same constants. `python -m benchmarks release` generates this page.
+speed, the source of the poses, and the commit and machine. `python -m benchmarks release`
+generates this page.
 
 | strategy | what it is |
 |---|---|

@@ -20,6 +20,7 @@ from benchmarks.exploration.fit_belief import (
 from benchmarks.exploration.observed_candidates import COLUMNS, Case, generated, hidden_areas
 from thinmap_ros.core.exploration.fitted import FITTED
 from thinmap_ros.core.grid.patch import GridFrame, GridPatch
+from thinmap_ros.evaluation.parallel_jobs import provenance
 from thinmap_ros.sim.coverage import ObservableCells
 
 
@@ -65,6 +66,7 @@ def test_a_fitted_model_predicts_what_the_explorer_believes(tmp_path):
     assert float(table[-1].split('mean error ')[1].split(';')[0]) < 0.03
 
 
+@pytest.mark.programs
 def test_the_published_table_is_that_of_the_present_constants(tmp_path, monkeypatch):
     data, _ = candidates(tmp_path)
     kept = (tmp_path / 'one.json').read_text()
@@ -75,7 +77,8 @@ def test_the_published_table_is_that_of_the_present_constants(tmp_path, monkeypa
     written = (tmp_path / 'reliability.md').read_text().splitlines()
     # Scores alone: there are 25 times as many candidates.
     expected = reliability_table(predicted(FITTED, data.columns), data)
-    assert written[-1].split(';')[:2] == expected[-1].split(';')[:2]
+    assert written[-3].split(';')[:2] == expected[-1].split(';')[:2]
+    assert written[-1] == f'{provenance()}.'
 
 
 def test_candidates_seen_often_count_once(tmp_path):
