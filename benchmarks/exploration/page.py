@@ -118,7 +118,8 @@ def page(reports: list[Report], reliability: str = '') -> str:
     reports: each with a line `made` of commit and machine; reliability: table of `fit_belief`.
     """
     caption = 'Distance of thinmap relative to other strategies; left of the line: thinmap drives '
-    caption += 'less. Bars: 95 % confidence intervals of paired runs.'
+    caption += 'less. Worlds, range of the laser: strategy. Bars: 95 % confidence intervals of '
+    caption += 'paired runs.'
     parts = [_HEAD.format(chart=picture(_CHART, caption))]
     for title, chosen in _sections(reports).items():
         worlds = sorted({report['world'] for report in chosen})
@@ -148,14 +149,18 @@ _KEYS = (('nearest frontier, explore_lite', OTHERS[Origin.TEAM], True),)
 
 
 def panel(reports: list[Report]) -> Panel:
-    """Differences of distance to what others drive by, a row for each section and strategy."""
+    """Differences of distance to what others drive by, a row for each section and strategy.
+
+    The range of the laser tells sections of the same worlds apart.
+    """
     marks = []
     for title, chosen in _sections(reports).items():
         runs = by_strategy(chosen)
+        where = f'{title.split(":")[0]}, {chosen[0]["options"]["laser"]["range_max_m"]:g} m'
         for name in _PEERS:
             shares = relative_saving(runs.get(OURS, {}), runs.get(name, {}), 'distance')
             if len(shares) > 1:
-                marks.append(difference(f'{title.split(":")[0]}: {name}', shares))
+                marks.append(difference(f'{where}: {name}', shares))
     return Panel('', 'difference of the distance (%)', marks, limit=0.0)
 
 
