@@ -41,7 +41,7 @@ class Graph:
         self.processes: dict[str, forked.Started] = {}
         self._clients: dict[str, Client] = {}
         self._pacemaker: Publisher | None = None
-        self._heard = 0
+        self._published_ns = math.inf  # when what was heard last was published
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain)
         self.node = Node('test_client', context=self.context)
@@ -86,8 +86,8 @@ class Graph:
             depth=_DEPTH, reliability=profile.reliability, durability=profile.durability
         )
 
-        def hear(message: Any) -> None:
-            self._heard += 1
+        def hear(message: Any, info: dict[str, int]) -> None:
+            self._published_ns = info['source_timestamp']
             messages.append(message)
 
         self.node.create_subscription(kind, topic, hear, deep)
@@ -107,17 +107,24 @@ class Graph:
         return (f'{topic}:=heard_too', *own)
 
     def drain(self) -> None:
-        """Receive queued messages until there are no more: stopped nodes publish nothing later."""
-        last_heard = self._heard
-        quiet = 0
+        """Receive what has been published before: a stopped node publishes nothing later.
 
-        def is_quiet() -> bool:
-            nonlocal last_heard, quiet
-            quiet = quiet + 1 if self._heard == last_heard else 0
-            last_heard = self._heard
-            return quiet > 3
+        Others may publish all the time.
+        """
+        began_ns = time.time_ns()
+        rounds = 0
+        last_round = 0  # in which a message of before was heard
 
-        self.until(is_quiet, 'quiet')
+        def has_heard_all() -> bool:
+            nonlocal rounds, last_round
+            rounds += 1
+            if self._published_ns <= began_ns:
+                last_round = rounds
+            self._published_ns = math.inf
+            # Each subscription with a message in its queue has its turn.
+            return rounds - last_round > 3 + len(list(self.node.subscriptions))
+
+        self.until(has_heard_all, 'all that was published before')
 
     def until(self, condition: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> None:
         end = time.monotonic() + seconds
