@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from support.hidden_library import hide_ros
+from support.peers.foreign_map import write_foreign_map
 
 from thinmap_ros import __main__ as command
 from thinmap_ros import __version__
@@ -70,6 +71,30 @@ def test_a_subcommand_has_its_own_arguments_and_errors() -> None:
     done = run('carmen_to_bag', '/no/such.clf', '/no/bag')
     assert done.returncode == 2
     assert done.stderr.startswith('thinmap carmen_to_bag: error: /no/such.clf: ')
+
+
+@pytest.mark.parametrize('unbuffered', ['', '1'])
+@pytest.mark.parametrize('words', ['--help', '--version', 'evaluate --help', 'map_to_graph'])
+def test_it_ends_in_silence_once_nobody_reads_what_it_prints(
+    words: str, unbuffered: str, tmp_path: Path
+) -> None:
+    """As with `| head`: the code is that of a program which the signal of the pipe has ended."""
+    if words == 'map_to_graph':
+        words += f' {write_foreign_map(tmp_path, "room_10x10")} -o {tmp_path / "graph.geojson"}'
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, '-m', 'thinmap_ros', *words.split()],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, 'PYTHONUNBUFFERED': unbuffered},
+    )
+    os.close(writer)
+    assert done.stderr == ''
+    # argparse itself ignores that its help is not read.
+    assert done.returncode == (0 if unbuffered and 'evaluate' in words else 141)
+    assert 'map_to_graph' not in words or (tmp_path / 'graph.geojson').exists()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import thinmap_ros.startup  # isort: skip  # noqa: F401  before all other module
 from thinmap_ros import __version__
 from thinmap_ros.core.errors import ThinmapError, did_you_mean
 from thinmap_ros.nodes.thinmap import NODES
-from thinmap_ros.tools.arguments import BAD_INPUT, is_asked, require_ros, subcommand
+from thinmap_ros.tools.arguments import BAD_INPUT, is_asked, require_ros, subcommand, while_read
 
 
 class _Program(NamedTuple):
@@ -86,6 +86,11 @@ def main() -> None:
 
     Ends with 2, after one line on what is wrong, where there is no such subcommand.
     """
+    with while_read():
+        _main()
+
+
+def _main() -> None:
     if is_asked():
         _complete()
     arguments = sys.argv[1:]

@@ -7,7 +7,8 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
@@ -46,7 +47,22 @@ def complete(parser: argparse.ArgumentParser) -> None:
 
 
 BAD_INPUT = 2
+_UNREAD = 141  # the exit code of a program that SIGPIPE has ended
 _UNKNOWN = 'unrecognized arguments: '
+
+
+@contextmanager
+def while_read() -> Iterator[None]:
+    """Print within it: once the reader of the output has ended (`| head`), the program ends."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # Python flushes once more at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(_UNREAD)
 
 
 class Parser(argparse.ArgumentParser):

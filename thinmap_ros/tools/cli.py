@@ -19,7 +19,7 @@ from thinmap_ros.logs.frames import SOURCES
 from thinmap_ros.logs.log import LaserOptions, Log
 from thinmap_ros.logs.transforms import parse_pose
 from thinmap_ros.startup import print_warnings
-from thinmap_ros.tools.arguments import BAD_INPUT
+from thinmap_ros.tools.arguments import BAD_INPUT, while_read
 from thinmap_ros.tools.parameter_file import NodeParameters
 
 _INTERRUPTED = 130
@@ -32,8 +32,13 @@ Options = argparse._ActionsContainer
 def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentParser) -> None:
     """Parse the arguments, run the work, and exit.
 
-    0, 2 after one line on what is wrong, or 130 on Ctrl-C.
+    0, 2 after one line on what is wrong, 130 on Ctrl-C, or 141 once nobody reads what it prints.
     """
+    with while_read():
+        _run(work, parser)
+
+
+def _run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentParser) -> None:
     words = sys.argv[1:]
     arguments = parser.parse_args(_files_first(words) if _takes_files(parser) else words)
     print_warnings(parser.prog)
@@ -41,6 +46,8 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
     try:
         _catch_interrupts()
         work(arguments)
+    except BrokenPipeError:
+        raise
     except (ThinmapError, OSError) as error:
         print(f'{parser.prog}: error: {" ".join(str(error).split())}', file=sys.stderr)
         sys.exit(BAD_INPUT)
