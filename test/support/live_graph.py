@@ -25,6 +25,7 @@ from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.ros import qos
 
 _DEPTH = 1000
+_ON_ITS_WAY_S = 0.2  # of a message that is published, but not received
 # Time after which a response is taken to be lost.
 _ASK_AGAIN_S = 20.0
 
@@ -112,17 +113,19 @@ class Graph:
         Others may publish all the time.
         """
         began_ns = time.time_ns()
-        rounds = 0
-        last_round = 0  # in which a message of before was heard
+        rounds = 0  # since a message of before was heard
+        end_s = 0.0
 
         def has_heard_all() -> bool:
-            nonlocal rounds, last_round
+            nonlocal rounds, end_s
             rounds += 1
-            if self._published_ns <= began_ns:
-                last_round = rounds
+            if self._published_ns <= began_ns or not end_s:
+                rounds = 0
+                end_s = time.monotonic() + _ON_ITS_WAY_S
             self._published_ns = math.inf
             # Each subscription with a message in its queue has its turn.
-            return rounds - last_round > 3 + len(list(self.node.subscriptions))
+            turns = len(list(self.node.subscriptions))
+            return rounds > turns and time.monotonic() > end_s
 
         self.until(has_heard_all, 'all that was published before')
 
