@@ -126,7 +126,7 @@ def test_ctrl_c_ends_everything(ros_domain, tmp_path, robots, nodes):
 def test_a_page_stays_open_when_the_exploration_has_ended(ros_domain, tmp_path):
     out = tmp_path / 'demo'
     port = random.SystemRandom().randrange(20_000, 30_000)
-    process = demo(out, '--rate', '20', '--time-limit-s', '1', '--web', '--web-port', str(port))
+    process = demo(out, '--rate', '2', '--time-limit-s', '1', '--web', '--web-port', str(port))
     until_there_is_a_page(process, port)
     until = time.monotonic() + PATIENCE_S
     while not (out / 'report.html').exists():
