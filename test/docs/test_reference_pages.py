@@ -34,8 +34,8 @@ Made from the programs themselves; do not edit (see `test/docs/test_reference_pa
 | ROS 2 workspace | `ros2 run thinmap_ros PROGRAM` (instead of `nodes`: `thinmap`) |
 | `pip install` | `thinmap PROGRAM` |
 
-The exit code is 0 after success, 2 after an error in the input and 130 after Ctrl-C. One line on
-the error stream describes the error.
+The exit code is 0 after success, 2 after an error in the input, 130 after Ctrl-C and 141 once
+nobody reads what is printed (`| head`). One line on the error stream describes the error.
 
 """
 

@@ -148,6 +148,35 @@ def test_a_feature_enters_after_several_sightings_and_keeps_its_id():
     assert {round(float(p[1]), 1) for p in (grown.start, grown.end)} == {-1.0, 2.5}
 
 
+def test_a_wall_that_the_odometry_has_turned_out_of_its_gate_is_no_second_feature():
+    """A duplicate would confirm the wrong heading for ever."""
+    ekf, features = known([[[3.0, 1.0], [3.0, 5.0]]])
+    ekf.local.set_pose(np.array([0.0, 0.0, 0.06]), np.diag([1e-6, 1e-6, 0.01**2]))
+    wall = seen_lines([[3.0, 1.0], [3.0, 5.0]])
+    features.observe(ekf, wall, BLIND)
+    assert ekf.local.pose[2] == pytest.approx(0.06)
+    assert len(ekf) == 1
+    ekf.local.predict(ekf.local.pose, np.zeros(3), np.diag([1e-6, 1e-6, 0.03**2]))
+    features.observe(ekf, wall, BLIND)
+    assert ekf.local.pose[2] == pytest.approx(0.0, abs=0.02)
+    assert len(ekf) == 1
+
+
+def test_what_is_not_confirmed_yet_corrects_the_pose_and_is_not_in_a_session():
+    ekf = CompressedEkf(np.zeros(3), SURE)
+    features = FeatureMap(FeatureConfig(), AssociationConfig(), local_areas=False)
+    wall = seen_lines([[3.0, -2.0], [3.0, 2.0]])
+    features.observe(ekf, wall, BLIND)
+    ekf.local.set_pose(np.array([0.0, 0.0, 0.06]), np.diag([1e-6, 1e-6, 0.04**2]))
+    features.observe(ekf, wall, BLIND)
+    assert ekf.local.pose[2] == pytest.approx(0.0, abs=0.01)
+    assert len(ekf) == 1
+    assert not features.line_features(ekf)
+    state = features.state(ekf)
+    assert not state['ids'].size
+    assert not state['stored_at'].size
+
+
 def test_what_was_seen_once_and_then_no_more_is_forgotten():
     ekf = CompressedEkf(np.zeros(3), SURE)
     features = FeatureMap(

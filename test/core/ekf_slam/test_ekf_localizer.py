@@ -44,6 +44,22 @@ def test_line_features_bound_the_error_of_systematic_odometry_drift(slam):
     assert off[-1] < 3.0 * sigma < 1.0
 
 
+@pytest.mark.parametrize('slam', ['ekf_ti', 'ekf_full'])
+@pytest.mark.parametrize('turn_rad', [0.2, 0.35])
+def test_a_robot_that_turns_to_new_walls_keeps_its_heading(slam, turn_rad):
+    """The wall that it has seen is out of view at once, and the odometry turns 12 % too far."""
+    walls = np.array([[0.5, 3.0, 2.5, 3.0], [-2.5, -3.0, 0.0, -3.0], [-4.0, -2.0, -4.0, 2.0]])
+    rng = np.random.default_rng(0)
+    localizer = EkfLocalizer(EkfConfig(slam=slam))
+    headings_rad = np.r_[np.zeros(6), -np.arange(0.0, np.pi, turn_rad)]
+    ahead_m = 0.05 * np.minimum(np.arange(len(headings_rad)), 5)
+    for k, (x, heading) in enumerate(zip(ahead_m, headings_rad, strict=True)):
+        truth = se2.pose(x, 0.0, heading)
+        scan = scan_in(walls, truth, rng, PERIOD_NS * k)
+        estimate = localizer.step(scan, se2.pose(x, 0.0, 1.12 * heading))
+    assert abs(se2.between(truth, estimate.T_map_base)[2]) < 0.02
+
+
 def test_the_local_area_estimates_what_all_features_do():
     local, _ = driven(at_start('ekf_ti'), 300)
     full, _ = driven(at_start('ekf_full'), 300)

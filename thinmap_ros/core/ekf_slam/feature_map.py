@@ -7,7 +7,7 @@ state, and removed after several consecutive scans saw through it.
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.ekf_slam.ekf import CompressedEkf, EkfSlam, line_difference
+from thinmap_ros.core.ekf_slam.ekf import CompressedEkf, EkfSlam
 from thinmap_ros.core.ekf_slam.features import (
     FeatureTrack,
     LineFeature,
@@ -25,7 +25,6 @@ from thinmap_ros.core.ekf_slam.features import (
     ends_of,
     interval,
     normals_of,
-    place_line,
     sides_of,
     tangents_of,
 )
@@ -65,15 +64,16 @@ class FeatureConfig(Config):
 
     min_observations: int = parameter(
         4,
-        'Number of observations after which a line becomes a feature. Raise it against features '
-        'on moving objects, lower it to use new walls sooner.',
+        'Number of observations after which a line stays in the map; it corrects the pose from the '
+        'first one on. Raise it against features on moving objects, lower it for walls that are '
+        'seen in passing.',
         low=1,
         high=100,
     )
     candidate_max_misses: int = parameter(
         15,
-        'Number of observations without a match after which a feature candidate is dropped. Raise '
-        'it for walls that are often hidden.',
+        'Number of observations without a match after which a line that has too few is dropped. '
+        'Raise it for walls that are often hidden.',
         low=1,
         high=10_000,
     )
@@ -110,7 +110,7 @@ def associate(
     """
     chosen = np.full(len(lines), -1, dtype=np.int64)
     passing = np.zeros(len(lines), dtype=np.int64)
-    if not features:
+    if not (features and len(lines)):
         return Associations(chosen, passing > 1)
     ends_map = transform_points(ekf.pose, lines.ends.reshape(-1, 2)).reshape(-1, 2, 2)
     pairs = np.argwhere(meeting(ekf.lines, features, ends_map, laser_map, config.max_gap_m))
@@ -161,76 +161,6 @@ def mahalanobis(v: Array, S: Array) -> float:
         return math.inf
     squares = v[0] * v[0] * S[1, 1] + v[1] * v[1] * S[0, 0] - v[0] * v[1] * (S[0, 1] + S[1, 0])
     return float(squares / determinant)
-
-
-@dataclass(eq=False)
-class FeatureCandidate:
-    """A line (r, alpha), map frame, and its observed interval.
-
-    z (2,) with covariance (2, 2): the last observation, robot frame.
-    """
-
-    line: Array
-    span: FeatureTrack
-    z: Array
-    covariance: Array
-    observations: int
-    last_observed: int
-
-
-class FeatureCandidates:
-    """The lines with too few observations at one place to be features."""
-
-    def __init__(self, config: FeatureConfig, association: AssociationConfig) -> None:
-        self._config = config
-        self._association = association
-        self._all: list[FeatureCandidate] = []
-        self._observations = 0
-
-    def update(self, pose: Array, lines: Lines, laser_map: Array) -> list[FeatureCandidate]:
-        """Update by the lines of a scan at a pose (3,), with the laser at laser_map (2,).
-
-        Returns the candidates that have become features.
-        """
-        self._observations += 1
-        seen = [
-            self._take(pose, z, covariance, transform_points(pose, ends), laser_map)
-            for z, covariance, ends in zip(lines.z, lines.covariances, lines.ends, strict=True)
-        ]
-        ripe = [c for c in dict.fromkeys(seen) if c.observations >= self._config.min_observations]
-        oldest = self._observations - self._config.candidate_max_misses
-        self._all = [c for c in self._all if c.last_observed >= oldest and c not in ripe]
-        return ripe
-
-    def _take(
-        self, pose: Array, z: Array, covariance: Array, ends_map: Array, laser_map: Array
-    ) -> FeatureCandidate:
-        """Update the candidate that an observed line matches, or add a new one."""
-        line, _, by_seen = place_line(pose, z)
-        # Two observations of a line differ by the noise of both; the robot has hardly moved.
-        S = 2.0 * by_seen @ covariance @ by_seen.T
-        for candidate in self._meeting(ends_map, laser_map):
-            v, signs = line_difference(line, candidate.line)
-            if mahalanobis(v, S) <= self._association.gate:
-                candidate.line = v + signs * candidate.line
-                candidate.span.grow(*interval(candidate.line, ends_map))
-                candidate.z = z
-                candidate.covariance = covariance
-                candidate.observations += candidate.last_observed != self._observations
-                candidate.last_observed = self._observations
-                return candidate
-        span = FeatureTrack(0, *interval(line, ends_map), laser_map)
-        self._all.append(FeatureCandidate(line, span, z, covariance, 1, self._observations))
-        return self._all[-1]
-
-    def _meeting(self, ends_map: Array, laser_map: Array) -> list[FeatureCandidate]:
-        if not self._all:
-            return []
-        lines = np.array([c.line for c in self._all])
-        spans = [c.span for c in self._all]
-        gap_m = self._association.max_gap_m
-        near = meeting(lines, spans, ends_map[None], laser_map, gap_m)[0]
-        return [self._all[i] for i in np.flatnonzero(near)]
 
 
 # Of features that a scan sees through.
@@ -327,15 +257,15 @@ class LocalArea:
             self._hand_over(list(self._features_at))
             self._listed_at = np.full(2, np.inf)
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Stored features (K, 2) as (feature, node), and the ids and positions of the nodes."""
+    def state(self, ids: set[int]) -> dict[str, NDArray[Any]]:
+        """Where these features are stored (K, 2), (feature, node); ids and places of the nodes."""
         nodes = self._topology.nodes
-        stored = [(f, n) for f, at in self._nodes_of.items() for n in sorted(at) if n in nodes]
-        ids = sorted({n for _, n in stored})
+        stored = [(i, n) for i in sorted(ids) for n in self.nodes_of(i) if n in nodes]
+        used = sorted({n for _, n in stored})
         return {
             'stored_at': np.array(stored, dtype=np.int64).reshape(-1, 2),
-            'node_ids': np.array(ids, dtype=np.int64),
-            'node_places': np.array([nodes[n].position for n in ids]).reshape(-1, 2),
+            'node_ids': np.array(used, dtype=np.int64),
+            'node_places': np.array([nodes[n].position for n in used]).reshape(-1, 2),
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -515,6 +445,8 @@ _WALL_FLATNESS_RAD = 0.006
 
 _ONE_WALL_M = 3.0 * WALL_FLATNESS_M  # largest distance between two lines that may be one wall
 
+_NEW = 3.0  # times the gate: the distance from which on a line is a new one (99.99 %)
+
 MAX_MISSES = 5  # consecutive scans through a feature until it is removed: a door has opened
 
 _SPARE = 8  # additional features that may stay in the local area
@@ -552,10 +484,12 @@ FIELDS = {
 
 
 class FeatureMap:
-    """All features by id, the local area of the filter, and the feature candidates.
+    """All features by id, and the local area of the filter.
 
     With local areas (EKF-SLAM/TI) association and update use the features of the local area;
-    without, they use all.
+    without, they use all. A line is in the filter from its first observation on, so that a robot
+    that turns towards walls it has not seen yet does not turn by odometry alone; it is a feature of
+    the map once it has been observed often enough.
     """
 
     def __init__(
@@ -567,26 +501,28 @@ class FeatureMap:
         self._local_areas = local_areas
         self._wall = np.diag(np.square([WALL_FLATNESS_M, _WALL_FLATNESS_RAD]))
         self._features: dict[int, FeatureTrack] = {}
-        self._candidates = FeatureCandidates(config, association)
         # Features outside the local area that were observed, to be added to it.
         self._called: set[int] = set()
         self._next_id = 1
 
     def __len__(self) -> int:
-        return len(self._features)
+        return sum(feature.is_confirmed for feature in self._features.values())
 
     def state(self, ekf: CompressedEkf) -> dict[str, NDArray[Any]]:
-        """All features as arrays by name, with the covariance of their lines; no candidates."""
+        """All features as arrays by name, with the covariance of their lines."""
         mean, covariance = ekf.flush()
-        features = [self._features[i] for i in ekf.ids]
+        kept = np.array([self._features[i].is_confirmed for i in ekf.ids], dtype=np.bool_)
+        ids = np.array(ekf.ids, dtype=np.int64)[kept]
+        features = [self._features[i] for i in ids.tolist()]
         spans = [(f.low, f.high, *f.first_seen_from, f.misses) for f in features]
+        numbers = 3 + np.flatnonzero(np.repeat(kept, 2))
         return {
-            'ids': np.array(ekf.ids, dtype=np.int64),
-            'lines': mean[3:].reshape(-1, 2),
-            'line_covariance': covariance[3:, 3:],
+            'ids': ids,
+            'lines': mean[numbers].reshape(-1, 2),
+            'line_covariance': covariance[np.ix_(numbers, numbers)],
             'spans': np.array(spans).reshape(-1, 5),
             'next_id': np.array(self._next_id),
-            **self.area.state(),
+            **self.area.state(set(ids.tolist())),
         }
 
     def restore(self, ekf: CompressedEkf, state: Mapping[str, NDArray[Any]]) -> None:
@@ -612,6 +548,7 @@ class FeatureMap:
         return [
             as_seen(feature, lines[i].copy(), covariances[i], self.area.nodes_of(i), i in local)
             for i, feature in self._features.items()
+            if feature.is_confirmed
         ]
 
     def observe(
@@ -636,10 +573,9 @@ class FeatureMap:
         if not learn:
             return len(matched), taken
         seen = self._grow(ekf, chosen[matched], lines.select(matched))
-        ripe = self._candidates.update(ekf.local.pose, lines.select(unknown), laser_map)
         self._miss(ekf, seen, scan)
         self._merge(ekf, seen)
-        new = [i for candidate in ripe for i in self._take_up(ekf, candidate)]
+        new = self._take_up(ekf, lines.select(unknown), laser_map)
         self.area.store(ekf.local.pose, [i for i in (*seen, *new) if i in self._features])
         return len(matched), taken
 
@@ -682,25 +618,39 @@ class FeatureMap:
         half_view = 0.5 * abs(scan.angle_increment_rad) * scan.ranges_m.size
         wanted = self.area.features_near(ekf.local.pose, half_view) | self._called
         if not wanted <= set(ekf.area) or len(ekf.area) > len(wanted) + _SPARE:
+            for feature_id in set(ekf.area) - wanted:
+                if not self._features[feature_id].is_confirmed:
+                    self._drop(ekf, feature_id, None)
             ekf.set_local_area(sorted(wanted))
             self._called.clear()
 
     def _grow(self, ekf: CompressedEkf, indices: NDArray[np.int64], lines: Lines) -> list[int]:
         """Extend features by the observed segments; returns their ids."""
         for index, ends in zip(indices, lines.ends, strict=True):
-            feature = self._features[ekf.area[index]]
-            feature.grow(*interval(ekf.local.lines[index], transform_points(ekf.local.pose, ends)))
-            feature.misses = 0
-        return [ekf.area[i] for i in np.unique(indices)]
+            self._extend(ekf, index, ends)
+        seen = [ekf.area[i] for i in np.unique(indices)]
+        for feature_id in seen:
+            self._features[feature_id].observe()
+        return seen
+
+    def _extend(self, ekf: CompressedEkf, index: int, ends: Array) -> None:
+        """Extend a feature by a segment with ends (2, 2), robot frame."""
+        ends_map = transform_points(ekf.local.pose, ends)
+        self._features[ekf.area[index]].grow(*interval(ekf.local.lines[index], ends_map))
 
     def _miss(self, ekf: CompressedEkf, seen: Iterable[int], scan: Scan) -> None:
-        """Count the features that the scan saw through; remove those with too many misses."""
+        """Count scans through features, and those without a new one; remove what has too many."""
         through = seen_through(scan, ekf.local.pose, ekf.local.lines, self._local(ekf))
-        for feature_id in [
-            i for i, gone in zip(ekf.area, through, strict=True) if gone and i not in seen
-        ]:
-            self._features[feature_id].misses += 1
-            if self._features[feature_id].misses >= MAX_MISSES:
+        for feature_id, gone in list(zip(ekf.area, through.tolist(), strict=True)):
+            if feature_id in seen:
+                continue
+            feature = self._features[feature_id]
+            feature.misses += gone
+            feature.unseen += 1
+            is_rare = (
+                not feature.is_confirmed and feature.unseen > self._config.candidate_max_misses
+            )
+            if feature.misses >= MAX_MISSES or is_rare:
                 self._drop(ekf, feature_id, None)
 
     def _merge(self, ekf: CompressedEkf, seen: Iterable[int]) -> None:
@@ -716,6 +666,9 @@ class FeatureMap:
             if ekf.local.merge(a, b, self._wall):
                 ends = ends_of(self._features[dropped], ekf.local.lines[b])
                 self._features[kept].grow(*interval(ekf.local.lines[a], ends))
+                self._features[kept].awaited = min(
+                    self._features[i].awaited for i in (kept, dropped)
+                )
                 self._drop(ekf, dropped, kept)
 
     def _twin(self, ekf: CompressedEkf, feature_id: int) -> int | None:
@@ -748,44 +701,58 @@ class FeatureMap:
         self._called.discard(feature_id)
         del self._features[feature_id]
 
-    def _take_up(self, ekf: CompressedEkf, candidate: FeatureCandidate) -> list[int]:
-        """Add a candidate as a feature, unless existing features cover it.
+    def _take_up(self, ekf: CompressedEkf, lines: Lines, laser_map: Array) -> list[int]:
+        """Add the lines that are of no feature; returns the ids of the new features.
 
-        Returns the id of the new feature, or an empty list.
+        A line that fails the gate of a feature may still be of it, and is not new unless it fails
+        by far: a duplicate would keep the wrong heading with which it was added.
         """
-        known = self._covering(ekf, candidate)
-        if known:
-            self._called |= known - set(ekf.area)
-            return []
-        feature_id = self._next_id
-        self._next_id = self._next_id + 1
-        index = ekf.add(feature_id, candidate.z, candidate.covariance)
-        span = interval(ekf.local.lines[index], ends_of(candidate.span, candidate.line))
-        self._features[feature_id] = FeatureTrack(feature_id, *span, candidate.span.first_seen_from)
-        return [feature_id]
+        first = self._next_id
+        wider = replace(self._association, gate=_NEW * self._association.gate)
+        known = associate(ekf.local, self._local(ekf), lines, laser_map, wider).index >= 0
+        lines = lines.select(np.flatnonzero(~known))
+        for k, covering in enumerate(self._covering(ekf, lines, laser_map)):
+            self._called |= covering - set(ekf.area)
+            if not covering:
+                self._add(ekf, lines.select(np.array([k])), laser_map)
+        return list(range(first, self._next_id))
 
-    def _covering(self, ekf: CompressedEkf, candidate: FeatureCandidate) -> set[int]:
-        """Ids of features that cover the candidate although it failed their gate.
+    def _add(self, ekf: CompressedEkf, line: Lines, laser_map: Array) -> None:
+        """Add a line as a feature, or to one of the same scan: two may be of one new wall."""
+        features = self._local(ekf)
+        same = associate(ekf.local, features, line, laser_map, self._association).index[0]
+        if same >= 0:
+            self._extend(ekf, int(same), line.ends[0])
+            return
+        feature_id = self._next_id
+        self._next_id += 1
+        index = ekf.add(feature_id, line.z[0], line.covariances[0])
+        ends_map = transform_points(ekf.local.pose, line.ends[0])
+        span = interval(ekf.local.lines[index], ends_map)
+        awaited = self._config.min_observations - 1
+        self._features[feature_id] = FeatureTrack(feature_id, *span, laser_map, awaited=awaited)
+
+    def _covering(self, ekf: CompressedEkf, seen: Lines, laser_map: Array) -> list[set[int]]:
+        """For each line, ids of features that cover it although it failed their gate.
 
         Prevents duplicate features of one wall.
         """
-        if not self._features:
-            return set()
+        if not len(seen):
+            return []
         ids, lines = ekf.line_array()
-        start, end = ends_of(candidate.span, candidate.line)
-        middle = 0.5 * (start + end)
-        reach = 0.25 * (end - start)
-        near = np.abs(normals_of(lines) @ middle - lines[:, 0]) <= _ONE_WALL_M
-        # Only features whose lines are near the candidate.
-        ids = ids[near]
-        lines = lines[near]
-        features = [self._features[i] for i in ids.tolist()]
-        ends = np.stack([middle - reach, middle + reach])
-        return set(
-            ids[
-                meeting(lines, features, ends[None], candidate.span.first_seen_from, 0.0)[0]
-            ].tolist()
-        )
+        normals = normals_of(lines)
+        found = []
+        ends_map = transform_points(ekf.local.pose, seen.ends.reshape(-1, 2))
+        for start, end in ends_map.reshape(-1, 2, 2):
+            middle = 0.5 * (start + end)
+            reach = 0.25 * (end - start)
+            # Only features whose lines are near.
+            near = np.abs(normals @ middle - lines[:, 0]) <= _ONE_WALL_M
+            features = [self._features[i] for i in ids[near].tolist()]
+            ends = np.stack([middle - reach, middle + reach])
+            is_covering = meeting(lines[near], features, ends[None], laser_map, 0.0)[0]
+            found.append(set(ids[near][is_covering].tolist()))
+        return found
 
 
 def _check_references(state: Mapping[str, NDArray[Any]]) -> None:
