@@ -501,17 +501,19 @@ class FeatureMap:
         self._local_areas = local_areas
         self._wall = np.diag(np.square([WALL_FLATNESS_M, _WALL_FLATNESS_RAD]))
         self._features: dict[int, FeatureTrack] = {}
+        # Observations that those which are not in the map yet still need.
+        self._awaited: dict[int, int] = {}
         # Features outside the local area that were observed, to be added to it.
         self._called: set[int] = set()
         self._next_id = 1
 
     def __len__(self) -> int:
-        return sum(feature.is_confirmed for feature in self._features.values())
+        return len(self._features) - len(self._awaited)
 
     def state(self, ekf: CompressedEkf) -> dict[str, NDArray[Any]]:
         """All features as arrays by name, with the covariance of their lines."""
         mean, covariance = ekf.flush()
-        kept = np.array([self._features[i].is_confirmed for i in ekf.ids], dtype=np.bool_)
+        kept = np.array([i not in self._awaited for i in ekf.ids], dtype=np.bool_)
         ids = np.array(ekf.ids, dtype=np.int64)[kept]
         features = [self._features[i] for i in ids.tolist()]
         spans = [(f.low, f.high, *f.first_seen_from, f.misses) for f in features]
@@ -548,7 +550,7 @@ class FeatureMap:
         return [
             as_seen(feature, lines[i].copy(), covariances[i], self.area.nodes_of(i), i in local)
             for i, feature in self._features.items()
-            if feature.is_confirmed
+            if i not in self._awaited
         ]
 
     def observe(
@@ -618,9 +620,8 @@ class FeatureMap:
         half_view = 0.5 * abs(scan.angle_increment_rad) * scan.ranges_m.size
         wanted = self.area.features_near(ekf.local.pose, half_view) | self._called
         if not wanted <= set(ekf.area) or len(ekf.area) > len(wanted) + _SPARE:
-            for feature_id in set(ekf.area) - wanted:
-                if not self._features[feature_id].is_confirmed:
-                    self._drop(ekf, feature_id, None)
+            for feature_id in (set(ekf.area) - wanted) & self._awaited.keys():
+                self._drop(ekf, feature_id, None)
             ekf.set_local_area(sorted(wanted))
             self._called.clear()
 
@@ -630,8 +631,16 @@ class FeatureMap:
             self._extend(ekf, index, ends)
         seen = [ekf.area[i] for i in np.unique(indices)]
         for feature_id in seen:
-            self._features[feature_id].observe()
+            self._features[feature_id].misses = 0
+            self._features[feature_id].unseen = 0
+            self._await(feature_id, self._awaited.get(feature_id, 0) - 1)
         return seen
+
+    def _await(self, feature_id: int, observations: int) -> None:
+        """Keep a feature out of the map until it has been observed so many times again."""
+        self._awaited.pop(feature_id, None)
+        if observations > 0:
+            self._awaited[feature_id] = observations
 
     def _extend(self, ekf: CompressedEkf, index: int, ends: Array) -> None:
         """Extend a feature by a segment with ends (2, 2), robot frame."""
@@ -647,9 +656,8 @@ class FeatureMap:
             feature = self._features[feature_id]
             feature.misses += gone
             feature.unseen += 1
-            is_rare = (
-                not feature.is_confirmed and feature.unseen > self._config.candidate_max_misses
-            )
+            is_new = feature_id in self._awaited
+            is_rare = is_new and feature.unseen > self._config.candidate_max_misses
             if feature.misses >= MAX_MISSES or is_rare:
                 self._drop(ekf, feature_id, None)
 
@@ -666,9 +674,7 @@ class FeatureMap:
             if ekf.local.merge(a, b, self._wall):
                 ends = ends_of(self._features[dropped], ekf.local.lines[b])
                 self._features[kept].grow(*interval(ekf.local.lines[a], ends))
-                self._features[kept].awaited = min(
-                    self._features[i].awaited for i in (kept, dropped)
-                )
+                self._await(kept, min(self._awaited.get(i, 0) for i in (kept, dropped)))
                 self._drop(ekf, dropped, kept)
 
     def _twin(self, ekf: CompressedEkf, feature_id: int) -> int | None:
@@ -699,6 +705,7 @@ class FeatureMap:
         ekf.remove(ekf.area.index(feature_id))
         self.area.remove(feature_id, heir)
         self._called.discard(feature_id)
+        self._awaited.pop(feature_id, None)
         del self._features[feature_id]
 
     def _take_up(self, ekf: CompressedEkf, lines: Lines, laser_map: Array) -> list[int]:
@@ -729,8 +736,8 @@ class FeatureMap:
         index = ekf.add(feature_id, line.z[0], line.covariances[0])
         ends_map = transform_points(ekf.local.pose, line.ends[0])
         span = interval(ekf.local.lines[index], ends_map)
-        awaited = self._config.min_observations - 1
-        self._features[feature_id] = FeatureTrack(feature_id, *span, laser_map, awaited=awaited)
+        self._features[feature_id] = FeatureTrack(feature_id, *span, laser_map)
+        self._await(feature_id, self._config.min_observations - 1)
 
     def _covering(self, ekf: CompressedEkf, seen: Lines, laser_map: Array) -> list[set[int]]:
         """For each line, ids of features that cover it although it failed their gate.

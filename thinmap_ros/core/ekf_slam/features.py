@@ -19,7 +19,7 @@ class FeatureTrack:
     Positions along a line are relative to the foot of the perpendicular from the map's origin,
     positive to the left of the normal. first_seen_from (2,): position of the laser at the first
     observation, map frame, m. misses: number of consecutive scans that saw through the feature.
-    awaited: observations that it still needs to stay in the map. unseen: scans since the last one.
+    unseen: number of scans since the last observation.
     """
 
     id: int
@@ -27,19 +27,7 @@ class FeatureTrack:
     high: float
     first_seen_from: Array
     misses: int = 0
-    awaited: int = 0
     unseen: int = 0
-
-    @property
-    def is_confirmed(self) -> bool:
-        """Whether it has been observed often enough to stay in the map."""
-        return self.awaited == 0
-
-    def observe(self) -> None:
-        """Count a scan in which it was observed."""
-        self.misses = 0
-        self.unseen = 0
-        self.awaited = max(self.awaited - 1, 0)
 
     def grow(self, low: float, high: float) -> None:
         """Extend the interval to include another one, m."""
