@@ -89,7 +89,6 @@ def share_inside(runs, looks, local_areas):
     return float(np.mean((nees >= low) & (nees <= high))), float(nees.mean())
 
 
-@pytest.mark.cpu_budget(20.0, 'two dozen drives: the error of the first scan stays with each')
 @pytest.mark.parametrize('local_areas', [True, False])
 def test_the_errors_match_the_covariance_of_the_filter(local_areas):
     inside, mean = share_inside(24, 120, local_areas)
